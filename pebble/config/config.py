@@ -16,7 +16,7 @@ from pebble import extension
 from pebble.config import problems
 from pebble.config.home import in_home
 from pebble.config.masking import holds_secret, masked
-from pebble.config.problems import UNKNOWN_UNLIKE, Note, Notes
+from pebble.config.problems import Note, Notes
 from pebble.config.raw import Pairs, decode, plain, read_text, with_instances, without
 from pebble.config.reader import Check, Reader, Rule
 from pebble.config.rules.between_keys import CHECKS
@@ -173,13 +173,11 @@ def _config(
     lacking = [Note(tuple(one.key.split(".", 1)), one.reason) for one in missing]
     (notes.warnings if lenient else notes.problems).extend(lacking)
     tree, kind, rules = _tree(installed)
-    reader = Reader(folder, env, rules, notes)
+    reader = Reader(folder, env, rules, notes, other_forms=True)
     merged = with_instances(own)
     unread = [*extension.keys_of_missing(installed), *(key for one in found if core_only for key in one.sections)]
     root = reader.section(tree, without(merged, unread))
     notes.forget_inherited(own, merged)
-    if lenient and any(one.key.startswith("extensions.") for one in lost):
-        _excuse(notes)
     if path is not None and holds_secret(own):
         warn_if_readable(notes, (), path, "it, and there is a password in it")
     if notes.problems:
@@ -237,14 +235,6 @@ def _without_broken(config: Config) -> Config:
             warnings = (*config.warnings, str(error))
             config = replace(config, installed=installed, missing=(*config.missing, lost), warnings=warnings)
     return config
-
-
-def _excuse(notes: Notes) -> None:
-    """Make warnings of sections that are like none that is known: they may be of the extension that is missing."""
-    for note in list(notes.problems):
-        if note.text.startswith(UNKNOWN_UNLIKE) and note.path[:-1] in ((), ("services",)):
-            notes.problems.remove(note)
-            notes.warning(note.path, "is not read: it is of no extension that is installed")
 
 
 @cache

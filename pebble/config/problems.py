@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from pebble.config.secret_text import without_secrets
 
 Path = tuple[str | int, ...]
-UNKNOWN_UNLIKE = "unknown key, the nearest is"  # and none that is alike
+_ALIKE = 0.6  # of 1.0, which is equal
 _FEW_REASONS = 2  # why keys are no longer used, that are told; a file of the original has a dozen
 
 
@@ -53,7 +53,8 @@ def _unused(retired: list[Note]) -> Iterator[str]:
     """Example: ``video.{shm_size, io_mode}: no longer used, …``; of many keys only the ends of their paths."""
     reasons = dict.fromkeys(note.text for note in retired)
     if len(reasons) > _FEW_REASONS:
-        names = ", ".join(dict.fromkeys(show_path(note.path[-2:]) for note in retired))
+        paths = (tuple(step for step in note.path if isinstance(step, str)) for note in retired)
+        names = ", ".join(dict.fromkeys(show_path(path[-2:]) for path in paths))
         yield without_secrets(f"no longer used, delete them: {names}; `pebble check --keys` says what replaces each")
         return
     for text in reasons:
@@ -84,14 +85,18 @@ def holds(raw: Any, path: Path) -> bool:
     return True
 
 
-def nearest(key: str, known: Iterable[str]) -> str:
-    """The text after "unknown key": the most similar known key, and all of them if none is similar."""
+def near(key: str, known: Iterable[str], likeness: float = _ALIKE) -> str:
+    """The most similar known key; empty: none is as similar."""
     from difflib import get_close_matches  # only a file with a mistake pays for this import
 
+    return next(iter(get_close_matches(key, sorted(known), n=1, cutoff=likeness)), "")
+
+
+def nearest(key: str, known: Iterable[str]) -> str:
+    """The text after "unknown key": the most similar known key, and all of them if none is similar."""
     names = sorted(known)
-    if close := get_close_matches(key, names, n=1):
-        return f'did you mean "{close[0]}"?'
+    if close := near(key, names):
+        return f'did you mean "{close}"?'
     if len(names) == 1:
         return f'the only one is "{names[0]}"'
-    best = get_close_matches(key, names, n=1, cutoff=0.0)
-    return f'the nearest is "{best[0]}" of {", ".join(names)}'
+    return f'the nearest is "{near(key, names, 0.0)}" of {", ".join(names)}'

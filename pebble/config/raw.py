@@ -1,4 +1,4 @@
-"""From a config file to plain data: JSON with `//` keys as comments, and what instances share copied to them."""
+"""From a config file to plain data: JSON, `//` and `_` keys are comments, and what instances share copied to them."""
 
 import json
 import math
@@ -11,6 +11,8 @@ from pebble.config.visible import hidden, shown
 from pebble.errors import ConfigError
 
 _WORDS = ("command", "player_command", "env", "robots", "robot_discovery")
+#: Objects whose keys are names of the owner's, which may begin with _.
+_OF_NAMES = ("env", "instances", "scripts", "extensions", "aliases", "settings", "camera_controls")
 _DEEPEST = 50  # levels: far more than any section has, and few enough for whatever reads it later
 
 
@@ -68,7 +70,7 @@ def plain(raw: Any, notes: problems.Notes, path: problems.Path = ()) -> Any:
 def _object(pairs: Pairs, notes: problems.Notes, path: problems.Path) -> dict[str, Any]:
     data: dict[str, Any] = {}
     for key, value in pairs:
-        if key.startswith("//"):
+        if key.startswith("//") or (key.startswith("_") and not (path and path[-1] in _OF_NAMES)):
             continue
         if flaw := hidden(key):
             notes.problem(path, f'has a key "{shown(key)}" that {flaw}')

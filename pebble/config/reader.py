@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
-from msgspec import Meta
+from msgspec import NODEFAULT, Meta
 from msgspec.structs import FieldInfo, fields
 
 from pebble.config import problems
+from pebble.config.other_forms import reading_of, switch
 from pebble.config.types import Secret, Section
 from pebble.errors import PebbleError
 
@@ -22,6 +23,7 @@ Check = Callable[["Reader", Any, problems.Path], Any]
 Rule = tuple[type[Section], Check]
 
 _NUMBER = re.compile(r"[+-]?[0-9.]{1,10}|true|false", re.ASCII).fullmatch
+_SAME_SECTION = 0.7  # of 1.0: so like a known one is a mistake, not the section of another program
 _WRONG = object()  # in place of a refused value: the key gets its default
 
 
@@ -31,26 +33,35 @@ def _known(kind: type[Section]) -> dict[str, FieldInfo]:
 
 
 class Reader:
-    """Reads one file. Relative paths start at ``folder``; ``env`` is the environment for secrets."""
+    """Reads one file. Relative paths start at ``folder``; ``env`` is the environment for secrets.
+
+    With ``other_forms`` it reads what the original accepts as well; where that changes a value, it is a warning.
+    """
 
     def __init__(
-        self, folder: Path, env: Mapping[str, str], rules: Sequence[Rule], notes: problems.Notes | None = None
+        self,
+        folder: Path,
+        env: Mapping[str, str],
+        rules: Sequence[Rule],
+        notes: problems.Notes | None = None,
+        *,
+        other_forms: bool = False,
     ) -> None:
-        self.folder, self.env, self.notes = folder, env, notes or problems.Notes()
+        self.folder, self.env, self.notes, self._other_forms = folder, env, notes or problems.Notes(), other_forms
         self.password_variables: dict[str, None] = {}  # those that were read, in order
         self._rules = rules
 
     def section(self, kind: type[S], raw: Any, path: problems.Path = ()) -> S:
         """A section of ``kind``. Refused values are noted and replaced by their defaults (missing ones by None)."""
-        if not isinstance(raw, dict):
-            self.notes.problem(path, f"must be an object {{…}}, not {_shown(raw)}")
-            raw = {}
         known = _known(kind)
+        if not isinstance(raw, dict):
+            is_switch = self._other_forms and "enabled" in known and switch(raw) is not None
+            raw = {"enabled": raw} if is_switch else self._otherwise(kind, raw, path, {} if path else NODEFAULT)
         values: dict[str, Any] = {}
-        for key, value in raw.items():
-            self._note_key(kind, known, key, (*path, key))
-            if key in known and value not in ("", None):
-                read = self._value(known[key].type, value, (*path, key))
+        for written, value in () if raw is _WRONG else raw.items():
+            key = self._key(kind, known, written, (*path, written))
+            if key in known and value not in ("", None) and not (value == [] and known[key].default):
+                read = self._value(known[key].type, value, (*path, written), _default(known[key]))
                 if read is not _WRONG:
                     values[known[key].name] = read
         for field in known.values():
@@ -64,15 +75,20 @@ class Reader:
                 section = check(self, section, path)
         return section
 
-    def _note_key(self, kind: type[Section], known: Mapping[str, Any], key: str, path: problems.Path) -> None:
-        for name, replacement in kind.all_retired().items():
-            if key == name or (name.endswith("*") and key.startswith(name[:-1])):
+    def _key(self, kind: type[Section], known: Mapping[str, Any], key: str, path: problems.Path) -> str:
+        """Return the key, or the one of which it is another name. One that is not known is noted."""
+        name = kind.other_names.get(key, key)
+        for retired, replacement in kind.all_retired().items():
+            if key == retired or (retired.endswith("*") and key.startswith(retired[:-1])):
                 self.notes.retired.append(problems.Note(path, replacement))
-                return
+                return key
         if key in kind.refused:
             self.notes.problem(path[:-1], f"{key} {kind.refused[key]}")
-        elif key not in known:
+        elif name not in known and kind.holds_others and not problems.near(key, known, _SAME_SECTION):
+            self.notes.warning(path, "is not read: nothing that is installed has a section of this name")
+        elif name not in known:
             self.notes.problem(path, f"unknown key, {problems.nearest(key, known)}")
+        return name
 
     def _missing(self, field: FieldInfo, path: problems.Path) -> Any:
         kind, metas = unwrap(field.type)
@@ -81,27 +97,51 @@ class Reader:
         self.notes.doubt(path, f"is missing, write {expected(kind, metas)}")
         return None
 
-    def _value(self, annotation: Any, raw: Any, path: problems.Path) -> Any:
+    def _value(self, annotation: Any, raw: Any, path: problems.Path, default: Any = NODEFAULT) -> Any:
         kind, metas = unwrap(annotation)
         if _is_section(kind):
             return self.section(kind, raw, path)
         if get_origin(kind) is tuple:
-            return self._list(get_args(kind)[0], raw, path)
-        if get_origin(kind) is dict:
+            listed = self._words(raw, path) if isinstance(raw, str) and unwrap(get_args(kind)[0])[0] is str else raw
+            if isinstance(listed, list):
+                return self._list(get_args(kind)[0], listed, path)
+        elif get_origin(kind) is dict and isinstance(raw, dict):
             name, item = get_args(kind)
             return self._map(name, item, raw, path)
-        if kind is Path:
-            return self._path(raw, metas, path) if isinstance(raw, str) else self._refuse(kind, metas, raw, path)
+        elif kind is Path and isinstance(raw, str):
+            return self._path(raw, metas, path)
+        elif get_origin(kind) is not dict and kind is not Path:
+            return self._plain(annotation, raw, path, default)
+        return self._otherwise(annotation, raw, path, default)
+
+    def _plain(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:
+        kind, metas = unwrap(annotation)
         choices = _choices(kind, metas)
         if choices and isinstance(raw, str):
             raw = next((choice for choice in choices if str(choice).lower() == raw.lower()), raw)
         try:
             value = msgspec.convert(raw, annotation)
         except msgspec.ValidationError:
-            return self._refuse(kind, metas, raw, path)
+            return self._otherwise(annotation, raw, path, default)
         if choices and value not in choices:
-            return self._refuse(kind, metas, raw, path)
+            return self._otherwise(annotation, raw, path, default)
         return Secret(value) if _extra(metas, "secret") else self._parsed(metas, value, path)
+
+    def _otherwise(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:
+        """Return what is used for a value that is not as expected, and note where that is another one."""
+        kind, metas = unwrap(annotation)
+        shown = "a value of another kind" if _extra(metas, "secret") else _shown(raw)
+        instead = "" if shown == "text" and (get_origin(kind) is Literal or kind in (str, Path)) else f", not {shown}"
+        must_be = f"must be {expected(kind, metas)}{instead}"
+        reading = reading_of(annotation, kind, metas, raw, default) if self._other_forms else None
+        if reading is None or (not reading.differs and (type(reading.value), reading.value) == (type(raw), raw)):
+            self.notes.problem(path, must_be)
+            return _WRONG
+        if not reading.differs:
+            return self._plain(annotation, reading.value, path, NODEFAULT)
+        used = f"{msgspec.json.encode(reading.value).decode()} is used" if reading.value or reading.value == 0 else ""
+        self.notes.warning(path, f"{must_be}; {used or 'it counts as not set'}")
+        return reading.value
 
     def _parsed(self, metas: list[Meta], value: Any, path: problems.Path) -> Any:
         parse = _extra(metas, "parse")
@@ -120,12 +160,7 @@ class Reader:
             self.notes.problem(path, "names a home folder that is not known, write the whole path")
             return _WRONG
 
-    def _list(self, item: Any, raw: Any, path: problems.Path) -> Any:
-        if isinstance(raw, str) and unwrap(item)[0] is str:
-            raw = self._words(raw, path)
-        if not isinstance(raw, list):
-            self.notes.problem(path, f"must be a list […], not {_shown(raw)}")
-            return _WRONG
+    def _list(self, item: Any, raw: list[Any], path: problems.Path) -> Any:
         items = [self._value(item, value, (*path, index)) for index, value in enumerate(raw)]
         return tuple(value for value in items if value is not _WRONG)
 
@@ -138,19 +173,15 @@ class Reader:
             self.notes.problem(path, f"cannot be split into words: {error}; write a list of words")
             return []
 
-    def _map(self, name: Any, item: Any, raw: Any, path: problems.Path) -> Any:
-        if not isinstance(raw, dict):
-            self.notes.problem(path, f"must be an object {{…}}, not {_shown(raw)}")
-            return _WRONG
+    def _map(self, name: Any, item: Any, raw: dict[str, Any], path: problems.Path) -> Any:
         items = {key: self._value(item, value, (*path, key)) for key, value in raw.items()}
         named = {key: self._value(name, key, path) for key in raw}
         return {key: value for key, value in items.items() if _WRONG not in (value, named[key])}
 
-    def _refuse(self, kind: Any, metas: list[Meta], raw: Any, path: problems.Path) -> Any:
-        shown = "a value of another kind" if _extra(metas, "secret") else _shown(raw)
-        instead = "" if shown == "text" and (get_origin(kind) is Literal or kind in (str, Path)) else f", not {shown}"
-        self.notes.problem(path, f"must be {expected(kind, metas)}{instead}")
-        return _WRONG
+
+def _default(field: FieldInfo) -> Any:
+    """Return the default of a key; NODEFAULT: it has none."""
+    return field.default if field.default_factory is NODEFAULT else field.default_factory()
 
 
 def unwrap(annotation: Any) -> tuple[Any, list[Meta]]:
@@ -174,6 +205,10 @@ def expected(kind: Any, metas: list[Meta]) -> str:
     if choices := _choices(kind, metas):
         *most, last = (msgspec.json.encode(choice).decode() for choice in choices)
         return f"{', '.join(most)} or {last}" if most else last
+    if get_origin(kind) is tuple:
+        return "a list […]"
+    if get_origin(kind) is dict or _is_section(kind):
+        return "an object {…}"
     if get_origin(kind) in (Union, types.UnionType):
         return " or ".join(expected(member, []) for member in get_args(kind))
     name = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}[kind]

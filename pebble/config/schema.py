@@ -52,10 +52,12 @@ def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
             value.pop("default", None)
         if value.get("items") == {"type": "string"}:
             value["type"] = ["array", "string"]  # words, or one line of them
-    patterns: dict[str, Any] = {"^//": {"description": "A comment."}}
+    patterns: dict[str, Any] = {"^(//|_)": {"description": "A comment."}}
     for key, replacement in kind.all_retired().items():
         pattern = f"^{key[:-1]}" if key.endswith("*") else f"^{key}$"
         patterns[pattern] = {"deprecated": True, "description": f"No longer used: {replacement}."}
+    for key, name in kind.other_names.items():
+        patterns[f"^{key}$"] = {"deprecated": True, "description": f"Read as {name}."}
     definition["patternProperties"] = patterns
 
 

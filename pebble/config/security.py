@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pebble.config.types import Section, doc
+from pebble.config.types import EXACT, Section, doc
 
 SecurityLevel = Literal["open", "login", "named"]
 Strangers = Literal["drive", "free", "refuse"]
@@ -13,6 +13,7 @@ class Security(Section, frozen=True, kw_only=True):
 
     level: Annotated[
         SecurityLevel,
+        EXACT,
         doc(
             "`open`: whoever may publish at the broker does everything. `login`: every connection beyond this machine "
             "is encrypted and logs in, and the broker knows roles. `named`: with a checked name in the topics, too."
@@ -20,6 +21,7 @@ class Security(Section, frozen=True, kw_only=True):
     ] = "open"
     strangers: Annotated[
         Strangers | None,
+        EXACT,
         doc(
             "Drive commands without a key of control: always obeyed, only while nobody has control, or never. "
             "Unset: `free`, at `named` `refuse`."

@@ -5,6 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from msgspec import Meta, field
 
 from pebble.config.types import (
+    EXACT,
     ONE_VALUE,
     Account,
     BrokerHost,
@@ -24,6 +25,7 @@ class Tls(Section, frozen=True, kw_only=True):
     """Encryption of one connection."""
 
     retired: ClassVar = {"ciphers": "OpenSSL's own are used, of TLS 1.2 or newer"}
+    other_names: ClassVar = {"ca_certs": "ca_cert", "certfile": "client_cert", "keyfile": "client_key"}  # paho's
 
     enabled: Annotated[bool, doc("Encrypt the connection; otherwise the other keys have no effect.")] = False
     ca_cert: Annotated[File | None, doc("Authority to trust; unset: those of the system.")] = None
@@ -99,6 +101,7 @@ class TransportSection(ZenohSection, frozen=True, kw_only=True):
     state_dir: Annotated[File | None, doc("Folder of what survives a power cut; unset: see above.")] = None
     allowed_names: Annotated[
         tuple[CommonName, ...] | None,
+        EXACT,
         doc(
             "Names (CN) of the certificates that may connect by `tls/` and `quic/`, or be connected to; "
             "unset: every one that tls.ca_cert signed."
@@ -106,6 +109,7 @@ class TransportSection(ZenohSection, frozen=True, kw_only=True):
     ] = None
     access: Annotated[
         File | None,
+        EXACT,
         doc("File of `pebble fleet zenoh`: what each of these names may do. It is read again when it changes."),
     ] = None
     journal: Annotated[File | None, doc("File for a Zenoh robot's retained messages; unset: memory only.")] = None

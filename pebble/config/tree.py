@@ -11,6 +11,7 @@ from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, Transpor
 from pebble.config.types import (
     BY_CONTRACT,
     EMPTY,
+    EXACT,
     ONE_VALUE,
     Cells,
     Command,
@@ -179,7 +180,9 @@ class SerialPort(Section, frozen=True, kw_only=True):
     port: Annotated[Device | None, doc("Device: `ls /dev/serial/by-id/*`; required where the bridge is enabled.")] = (
         None
     )
-    baud: Annotated[int, Meta(ge=50, le=12_000_000, description="Bits per second; must be the firmware's.")] = 115200
+    baud: Annotated[int, Meta(ge=50, le=12_000_000, description="Bits per second; must be the firmware's."), EXACT] = (
+        115200
+    )
 
 
 class SerialTelemetry(Section, frozen=True, kw_only=True):
@@ -255,6 +258,8 @@ class SerialBridge(ServiceSection, frozen=True, kw_only=True):
 class Services(Section, frozen=True, kw_only=True):
     """Sections of services, one each; extensions add theirs."""
 
+    holds_others: ClassVar = True
+
     defaults: Annotated[Defaults, doc("Values for several services.")] = Defaults()
     launcher: Annotated[Launcher, doc("Starts the others.")] = Launcher()
     mqtt_bridge: Annotated[MqttBridge, doc("Connection to operators.")] = MqttBridge()
@@ -270,6 +275,8 @@ class ExtensionEntry(Section, frozen=True, kw_only=True):
 
 class Root(Section, frozen=True, kw_only=True):
     """The top of the file; extensions add their sections."""
+
+    holds_others: ClassVar = True
 
     schema_: Annotated[str | None, doc("Where editors find the JSON Schema; not used otherwise.")] = field(
         name="$schema", default=None

@@ -60,8 +60,13 @@ _LINE = r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]{1,%d}$(?!\n)"
 Label = Annotated[str, Meta(pattern=_LINE % 32, extra={"expected": "a name in one line, 32 characters at most"})]
 Sentence = Annotated[str, Meta(pattern=_LINE % 60, extra={"expected": "one line, 60 characters at most"})]
 Cells = Annotated[int, Meta(ge=1, le=14)]
-LogLevel = Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"]
-Port = Annotated[int, Meta(ge=1, le=65535)]
+_LEVELS = {"WARN": "WARNING", "FATAL": "CRITICAL", "NOTSET": "DEBUG"}
+LogLevel = Annotated[
+    Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"], Meta(extra={"synonyms": _LEVELS, "unlike": "INFO"})
+]
+#: A value that is not replaced by another one: it is an address, or says who may do what.
+EXACT = Meta(extra={"exact": True})
+Port = Annotated[int, Meta(ge=1, le=65535), EXACT]
 Count = Annotated[int, Meta(ge=1, le=1_000_000_000)]
 # A wait beyond 100 days is a typing mistake, and some clocks and locks of the system refuse it.
 Seconds = Annotated[float, Meta(ge=0, le=10_000_000)]
@@ -70,7 +75,7 @@ Interval = Annotated[float, Meta(gt=0, le=10_000_000)]
 Silence = Annotated[float, Meta(gt=0, le=5)]
 Pixels = Annotated[int, Meta(ge=1, le=16384)]
 FramesPerSecond = Annotated[float, Meta(gt=0, le=1000)]
-Rotation = Literal[0, 90, 180, 270]
+Rotation = Annotated[Literal[0, 90, 180, 270], Meta(extra={"circle": 360, "unlike": 0})]
 SampleRate = Annotated[int, Meta(ge=4000, le=384_000)]
 AudioChannels = Annotated[int, Meta(ge=1, le=8)]
 #: A list of words, or one line that is split as a shell would; it is never run by a shell.
@@ -116,6 +121,10 @@ class Section(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     #: Keys that are accepted and do nothing, with what replaces them; a final ``*`` stands for any ending.
     retired: ClassVar[Mapping[str, str]] = {}
+    #: Other names of keys, which the original or its libraries know.
+    other_names: ClassVar[Mapping[str, str]] = {}
+    #: Sections of other programs may be here: an unknown key is a warning unless it is like a known one.
+    holds_others: ClassVar[bool] = False
     #: Keys of earlier versions that are errors, and what to write.
     refused: ClassVar[Mapping[str, str]] = {}
 

@@ -193,14 +193,16 @@ class Catalogue:
         self, folder: Path, entry: Path, section: ScriptSection, described: Description, *, ours: bool
     ) -> tuple[str, ...]:
         """The command line without options."""
-        if described.command:
-            program, *more = described.command
-            return (str(folder / program) if "/" in program else program, *more)
         python = section.python
-        if python is None and entry.suffix != ".py" and os.access(entry, os.X_OK):
-            return (str(entry),)
         if python is not None and "/" in python:
             python = str(self._config.folder / in_home(python))
+        if described.command:
+            program, *more = described.command
+            if program in ("python", "python3"):
+                program = interpreter(python, ours=ours)
+            return (str(folder / program) if "/" in program else program, *more)
+        if python is None and entry.suffix != ".py" and os.access(entry, os.X_OK):
+            return (str(entry),)
         return (interpreter(python, ours=ours), str(entry))
 
     def _settings(

@@ -1,17 +1,28 @@
 """The environment variables of a script."""
 
+import os
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 
 from pebble.config import Config
 from pebble.extensions.scripts.runs import CONFIG, RUN
 from pebble.runtime.environment import child_environment
+from pebble.services.autonomy_manager.interpreter import SYSTEM
 
 
-def environment(*more: Mapping[str, str]) -> dict[str, str]:
-    """This process's variables and ``more`` of them; later ones replace earlier ones."""
+def environment(*more: Mapping[str, str], ours: bool = True) -> dict[str, str]:
+    """This process's variables and ``more`` of them; later ones replace earlier ones.
+
+    For scripts of others, with ``ours`` False, ``python3`` is the system's, also where Pebble's is in its place.
+    """
     merged = {"PYTHONUNBUFFERED": "1", **child_environment()}  # else what it prints comes in blocks, long after
     for name in (RUN, CONFIG):
         merged.pop(name, None)
+    if not ours and sys.prefix != sys.base_prefix and SYSTEM.is_file():
+        own = str(Path(sys.prefix, "bin"))
+        merged["PATH"] = os.pathsep.join(place for place in merged.get("PATH", "").split(os.pathsep) if place != own)
+        merged.pop("VIRTUAL_ENV", None)
     for variables in more:
         merged |= variables
     return merged

@@ -48,7 +48,7 @@ def _fitness(script: Script) -> str:
     from pebble.services.autonomy_manager.interpreter import lacking
 
     is_asked = not script.own_program and _may_run(script.command[0])
-    missing = lacking(script.command, script.folder, environment(script.environment)) if is_asked else []
+    missing = lacking(script.command, script.folder, environment(script.environment, ours=False)) if is_asked else []
     return f"runs with {script.command[0]}" + (f", which lacks {', '.join(missing)}" if missing else "")
 
 

@@ -1,26 +1,41 @@
 """The Python that runs a script, and what a script that does not import pebble lacks there."""
 
 import ast
+import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pebble.services.autonomy_manager.describe import DescribeError, answer_of
 
 SYSTEM = Path("/usr/bin/python3")  # has what Debian's packages install, such as an OpenCV with GStreamer
 _PARENTS = 3  # folders above a script from which it may import: scripts of the original do from two above
+_MOST_FILES, _LONGEST = 20, 1 << 20  # of a script's folder that are read; bytes of one
 _GSTREAMER = "cv2 with GStreamer"
+_OLD_NUMPY = "numpy below 2.4 (float() of an array)"
+_ARRAYS = ("cv2", "numpy")  # whose names are looked for one by one: newer releases lack some
 _PROBE = """
 import sys
 del sys.path[0]  # the folder of the script: a check runs nothing of it
-import importlib.util
-for name in sys.argv[1:]:
-    there = importlib.util.find_spec(name.partition(" ")[0])
-    if there and " " in name:
-        import cv2
-        there = any("GStreamer" in line and "YES" in line for line in cv2.getBuildInformation().splitlines())
-    if not there:
-        print(name)
+import importlib, importlib.util
+def has(want):
+    name, _, more = want.partition(" ")
+    top, *parts = name.split(".")
+    if not importlib.util.find_spec(top):
+        return bool(parts or more)
+    if not parts and not more:
+        return True
+    found = importlib.import_module(top)
+    if "GStreamer" in more:
+        return any("GStreamer" in line and "YES" in line for line in found.getBuildInformation().splitlines())
+    if "below" in more:
+        return tuple(map(int, found.__version__.split(".")[:2])) < (2, 4)
+    for part in parts:
+        found = getattr(found, part, None)
+    return found is not None
+for want in sys.argv[1:]:
+    if not has(want):
+        print(want)
 """
 
 
@@ -32,23 +47,65 @@ def interpreter(configured: str | None, *, ours: bool) -> str:
 def lacking(command: Sequence[str], folder: Path, variables: Mapping[str, str]) -> list[str]:
     """Return the modules that a script imports at its beginning and its Python does not find. It is read, not run.
 
-    Nothing is known of what is no Python file. One that changes ``sys.path`` may find more.
+    So are the files beside it that it names. Of OpenCV and NumPy also the functions that it calls and newer releases
+    lack. Nothing is known of what is no Python file. One that changes ``sys.path`` may find more.
     """
-    entry = Path(command[-1])
-    try:
-        text = entry.read_bytes() if entry.suffix == ".py" else b""
-        names = {name.partition(".")[0]: None for node in ast.parse(text).body for name in _imported(node)}
-    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
+    entry = next((folder / word for word in command[1:] if word.endswith(".py")), None)
+    if entry is None:
         return []
+    names: dict[str, None] = {}
+    needs: dict[str, None] = {}
+    for text in _sources(entry):
+        try:
+            tree = ast.parse(text)
+            imported = dict.fromkeys(name.partition(".")[0] for node in tree.body for name in _imported(node))
+            needs |= dict.fromkeys(_needs(tree, text)) if not imported.keys().isdisjoint(_ARRAYS) else {}
+        except (SyntaxError, ValueError, RecursionError, MemoryError):
+            continue
+        names |= imported
     places = (entry.parent, *entry.parent.parents[:_PARENTS])
     wanted = [name for name in names if name not in sys.stdlib_module_names and not _is_in(places, name)]
-    if "cv2" in wanted and b"shmsrc" in text:
-        wanted.append(_GSTREAMER)
+    wanted += needs
     try:
         found = answer_of((command[0], "-c", _PROBE, *wanted), folder, variables) if wanted else b""
     except DescribeError as error:
         return [str(error)]
     return found.decode().splitlines()
+
+
+def _sources(entry: Path) -> Iterator[bytes]:
+    """Yield the text of a script, and of the files beside it of which it has the names."""
+    try:
+        text = _read(entry)
+        yield text
+        beside = [path for path in sorted(entry.parent.glob("*.py")) if path != entry and path.stem.encode() in text]
+        yield from map(_read, beside[:_MOST_FILES])
+    except OSError:
+        return
+
+
+def _read(path: Path) -> bytes:
+    return path.read_bytes() if path.is_file() and path.stat().st_size <= _LONGEST else b""
+
+
+def _needs(tree: ast.Module, text: bytes) -> Iterator[str]:
+    """Yield what it needs of OpenCV and NumPy beyond that they are there."""
+    if b"shmsrc" in text:
+        yield _GSTREAMER
+    if re.search(rb"\bfloat\((?!\s*[\"'\d])|\bmap\(float\b", text):
+        yield _OLD_NUMPY
+    if re.search(rb"\bhasattr\(|\bAttributeError\b", text):
+        return  # it looks for itself
+    modules: dict[str, str] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            modules |= {alias.asname or alias.name.partition(".")[0]: alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            modules |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    for node in ast.walk(tree):
+        first, _, rest = ast.unparse(node).partition(".") if isinstance(node, ast.Attribute) else ("", "", "")
+        if modules.get(first, "").partition(".")[0] in _ARRAYS:
+            yield f"{modules[first]}.{rest}"
 
 
 def _imported(node: ast.stmt) -> list[str]:

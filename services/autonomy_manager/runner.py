@@ -150,7 +150,7 @@ class Runner:
             file=script.file,
             command=(*script.command, "--config", path, *step.options),
             folder=script.folder,
-            environment=environment(script.environment, own),
+            environment=environment(script.environment, own, ours=script.ours),
             tie=signal.SIGTERM if script.ours else signal.SIGKILL,
         )
         part: Part

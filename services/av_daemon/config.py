@@ -31,6 +31,7 @@ class CameraCapture(Section, frozen=True, kw_only=True):
     """The camera."""
 
     retired: ClassVar = {**_SHMSINK, "io_mode": "OpenCV chooses by itself"}
+    other_names: ClassVar = {"controls": "camera_controls"}
 
     enabled: Annotated[bool, doc("Open the camera.")] = True
     backend: Annotated[

@@ -15,6 +15,7 @@ from pebble.runtime.notes import OFTEN
 from pebble.runtime.parent import Notifier, Reported
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.runtime.service import Service, every
+from pebble.services.serial_mcu_bridge.line.holders import holders
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
 from pebble.services.serial_mcu_bridge.line.silence import CHECK_S, Silence
 from pebble.services.serial_mcu_bridge.line.starts import Starts
@@ -23,6 +24,7 @@ from pebble.transports import Subscription
 
 _MISREAD = "what its board sends is not understood: another baud rate or firmware, or noise"
 _WARN_S = 60.0
+HOLDERS_S = 30.0  # between two looks for other programs at the device
 _INPUT_LIMIT = 65_536  # bytes waiting for the service's thread; 1.4 s of a full 460,800 baud line
 
 
@@ -48,6 +50,7 @@ class SerialService(Service, ABC):
         self.sensors = MovingSensors()
         self._still = ""  # what was logged of them
         self._warned_at = float("-inf")  # that the board starts again and again
+        self._holders: list[str] = []  # other programs at the device
         self._misread = False
         self._understood = (0, 0)  # which opening of the line, and how often its board was heard since
         self._reported = Reported(Notifier().mcu)
@@ -141,6 +144,19 @@ class SerialService(Service, ABC):
             text = "the board has started again %d times within a minute: its supply breaks down, or its cable is loose"
             self.log.warning(text, starts)
         self._misread = misread  # a line may be under way
+
+    @every(HOLDERS_S)
+    def name_holders(self) -> None:
+        """Warn of other programs at this device: they need not ask for it alone, as we do."""
+        if self.line.state in (LineState.BOOTING, LineState.READY):
+            threading.Thread(target=self._name_holders, name="holders", daemon=True).start()  # it takes a while
+
+    def _name_holders(self) -> None:
+        path, found = str(self.options.serial.port), holders(str(self.options.serial.port))
+        if found and found != self._holders:
+            text = "%s is open in another program, too: %s; two confuse the board: end that one"
+            self.log.warning(text, path, ", ".join(found))
+        self._holders = found
 
     def _queue_input(self, chunk: bytes) -> None:
         """Queue input on the reading thread, which also parses it if the service is idle.

@@ -8,7 +8,6 @@ EXTENSION = Extension(
     name="soundboard_handler",
     needs=("media",),
     sections={"services.soundboard_handler": f"{_MODULE}.config:SoundboardHandler"},
-    rules=f"{_MODULE}.config:RULES",
     program=Program("soundboard_handler", _MODULE, entry=f"{_MODULE}.service"),
     offers=f"{_MODULE}.config:offers",
     page="docs/ext/soundboard.md",

@@ -5,8 +5,6 @@ from typing import Annotated, ClassVar
 from msgspec.structs import replace
 
 from pebble.config import Config
-from pebble.config.problems import Path
-from pebble.config.reader import Reader, Rule
 from pebble.config.types import COMMAND, ONE_VALUE, Command, File, HandlerTopics, Section, ServiceSection, doc
 from pebble.contract.capabilities import CapabilitiesValue, offered
 
@@ -31,15 +29,6 @@ class SoundboardHandler(ServiceSection, frozen=True, kw_only=True):
 
     topics: Annotated[HandlerTopics, doc("Other names for topics.")] = HandlerTopics()
     playback: Annotated[Playback, doc("Sounds and player.")] = Playback()
-
-
-def _check(reader: Reader, section: SoundboardHandler, path: Path) -> SoundboardHandler:
-    if section.enabled and not section.playback.player_command:
-        reader.notes.doubt((*path, "playback", "player_command"), "is missing, write aplay")
-    return section
-
-
-RULES: tuple[Rule, ...] = ((SoundboardHandler, _check),)
 
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:

@@ -174,7 +174,7 @@ def test_check_names_services_that_have_settings_but_are_off(
 
 
 def test_check_reports_every_problem_of_every_file(run: Run, tmp_path: Path) -> None:
-    wrong = {"robot": {"id": "goob", "sistem": "x"}, "local_mqtt": {"port": "1883"}, "services": {"mqtt_brigde": {}}}
+    wrong = {"robot": {"id": "goob", "sistem": "x"}, "local_mqtt": {"port": "x"}, "services": {"mqtt_brigde": {}}}
     path = config_file(tmp_path, **wrong)
     assert run("check", path, ROOT / "configs" / "fred.json") == 1
     assert len(run.err.splitlines()) == 3

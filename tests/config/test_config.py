@@ -7,20 +7,26 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping
+from functools import reduce
 from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
 from pebble.config import LAUNCHER_LOCK, Config, load, parse, resolved
+from pebble.config.media import Media
+from pebble.config.transport import Tls
+from pebble.config.tree import Heartbeat
 from pebble.contract import channel_of
 from pebble.errors import ConfigError
 from pebble.extensions.page.config import WebHandler, WebInterface
 from pebble.extensions.recordings.config import Recorder
 from pebble.runtime.connections import hub_settings
+from pebble.services.av_daemon.config import AvDaemon
+from pebble.services.soundboard_handler.config import SoundboardHandler
 from pebble.services.video_stream.config import VideoStream
 from pebble.transports.topics import check_topic
 from tests.support import needs_root
@@ -36,7 +42,8 @@ def at(path: str, value: Any) -> dict[str, Any]:
     raw: Any = value
     for key in reversed(path.split(".")):
         raw = {key: raw}
-    return raw if path.startswith("robot.") else {"robot": {"id": "goob"}, **raw}
+    robot = raw.get("robot", {})
+    return {**raw, "robot": {"id": "goob", **robot} if isinstance(robot, dict) else robot}
 
 
 def read(raw: dict[str, Any], env: Mapping[str, str] | None = None, folder: Path = FOLDER) -> Config:
@@ -200,12 +207,112 @@ class TestOriginal:
         assert "`pebble cert init`" in warning
         assert (config.section(WebHandler).enabled, config.section(WebInterface).mqtt.host) == (True, "127.0.0.1")
 
-    def test_a_soundboard_needs_a_player(self) -> None:
-        """Else the sound itself would be run."""
-        section = {"enabled": True, "playback": {"player_command": []}}
-        problem = only_problem(at("services.soundboard_handler", section))
-        assert problem == "services.soundboard_handler.playback.player_command: is missing, write aplay"
-        assert read(at("services.soundboard_handler", {**section, "enabled": False}))
+    @pytest.mark.parametrize(
+        ("place", "written", "value"),
+        [
+            ("local_mqtt.port", "1883", 1883),
+            ("local_mqtt.port", 1883.0, 1883),
+            ("local_mqtt.username", 4711, "4711"),
+            ("local_mqtt.protocol", 5, "5"),
+            ("local_mqtt.tls", True, Tls(enabled=True)),
+            ("local_mqtt.tls", "false", Tls()),
+            ("log_level", "warn", "WARNING"),
+            ("robot.id", 7, "7"),
+            ("services.mqtt_bridge.heartbeat.enabled", 0, False),
+            ("services.mqtt_bridge.heartbeat.enabled", "yes", True),
+            ("services.mqtt_bridge.heartbeat", False, Heartbeat(enabled=False)),
+            ("services.mqtt_bridge.heartbeat.interval_seconds", "0.5", 0.5),
+            ("services.mqtt_bridge.reboot_control.command", ["sleep", 5], ("sleep", "5")),
+            ("services.mqtt_bridge.reboot_control.env", {"_A": 1}, {"_A": "1"}),
+            ("services.av_daemon.video.device", 0, "0"),
+            ("services.av_daemon.video.rotate_degrees", -90, 270),
+            ("services.av_daemon.video.rotate_degrees", "90", 90),
+            ("services.soundboard_handler.playback.player_command", [], ("aplay",)),
+            ("services.soundboard_handler", True, SoundboardHandler(enabled=True)),
+        ],
+    )
+    def test_other_forms_of_a_value_are_read_without_a_remark(self, place: str, written: Any, value: Any) -> None:
+        config = read(at(place, written))
+        assert (reduce(getattr, place.split("."), config), config.warnings) == (value, ())
+
+    @pytest.mark.parametrize(
+        ("place", "written", "value", "used"),
+        [
+            ("robot.battery_cells", 0, None, "not 0; it counts as not set"),
+            ("log_level", "LOUD", "INFO", '; "INFO" is used'),
+            ("local_mqtt.port", 0, 1883, "not 0; 1883 is used"),
+            ("local_mqtt.username", False, None, "not false; it counts as not set"),
+            ("local_mqtt.silence_seconds", 60, 5, "not 60; 5 is used"),
+            ("services.mqtt_bridge.heartbeat.interval_seconds", 0.049, 0.05, "not 0.049; 0.05 is used"),
+            ("services.mqtt_bridge.reboot_control.env", False, {}, "not false; it counts as not set"),
+            ("services.mqtt_bridge.media", False, Media(), "not false; it counts as not set"),
+            ("services.serial_mcu_bridge.safety.drive_timeout_seconds", 0, 0.75, "not 0; 0.75 is used"),
+            ("services.serial_mcu_bridge.safety.drive_timeout_seconds", -1, 0.75, "not -1; 0.75 is used"),
+            ("services.serial_mcu_bridge.safety.drive_timeout_seconds", "9", 5, 'not the text "9"; 5 is used'),
+            ("services.av_daemon.video.rotate_degrees", 45, 0, "not 45; 0 is used"),
+        ],
+    )
+    def test_what_the_original_accepts_and_ours_does_not_is_replaced_with_a_warning(
+        self, place: str, written: Any, value: Any, used: str
+    ) -> None:
+        config = read(at(place, written))
+        (warning,) = config.warnings
+        assert warning.startswith(f"{place}: must be ")
+        assert warning.endswith(used)
+        assert reduce(getattr, place.split("."), config) == value
+
+    def test_other_names_of_keys_are_read_and_names_that_begin_with_an_underscore_are_not(self, tmp_path: Path) -> None:
+        (tmp_path / "ca.pem").write_text("x")
+        raw = at("local_mqtt.tls", {"enabled": 1, "ca_certs": "ca.pem", "_why": "a\nb"})
+        raw["services"] = {"_old": {"enabled": True}, "av_daemon": {"video": {"controls": {"brightness": 3}}}}
+        config = read(raw, folder=tmp_path)
+        assert config.local_mqtt.tls.ca_cert == tmp_path / "ca.pem"
+        assert config.section(AvDaemon).video.camera_controls == {"brightness": 3}
+        assert config.warnings == ()
+
+    @pytest.mark.parametrize("place", ["charging", "services.mqtt_logger", "version", "services.web"])
+    def test_a_section_of_another_program_is_not_read(self, place: str) -> None:
+        (warning,) = read(at(place, {"port": 1})).warnings
+        assert warning == f"{place}: is not read: nothing that is installed has a section of this name"
+
+    def test_without_a_remote_host_operators_connect_to_the_robots_own_broker(self) -> None:
+        place = "services.mqtt_bridge.remote_mqtt.host"
+        bridge, own = {"enabled": True, "remote_mqtt": {"host": ""}}, {"host": "10.0.0.2", "port": 1884}
+        raw = at("services.mqtt_bridge", bridge)
+        config = read({**raw, "local_mqtt": own})
+        (warning,) = config.warnings
+        assert (
+            warning == f"{place}: is empty: there is no uplink, operators connect to the robot's own broker, 10.0.0.2"
+        )
+        assert asdict(config.services.mqtt_bridge.remote_mqtt) == {**asdict(config.local_mqtt), "client_id": None}
+        mirrored = read({**raw, "transport": {"kind": "zenoh", "mqtt_mirror": own}})
+        assert mirrored.services.mqtt_bridge.remote_mqtt.port == 1884
+        alone = read({**raw, "transport": {"kind": "zenoh"}})
+        assert [line.partition(",")[0] for line in alone.warnings] == [f"{place}: is empty: there is no uplink"]
+        assert not alone.services.mqtt_bridge.enabled
+        board = {**raw, "robot": {"id": "a", "platform": "esp32"}}
+        assert only_problem(board) == f"{place}: is missing, write the name of the remote broker"
+
+    @pytest.mark.parametrize(
+        ("section", "command", "expected"),
+        [
+            ("service_restart_control", ["sudo", "-n", "systemctl", "restart", "pebble-control.service"],
+             "starts the original, too, at the same serial port, and needs a right that our unit denies: "
+             "write `systemctl --no-block restart pebble.service`"),
+            ("service_restart_control", "service pebble-control restart", "starts the original, too"),
+            ("reboot_control", "/usr/bin/sudo -n /sbin/reboot", "needs a right that our unit denies: write"),
+            ("git_pull_control", "git -C /opt/pebble pull --ff-only", "updates Pebble only if it runs from"),
+            ("git_pull_control", ["sh", "-c", "cd /opt/pebble && git pull"], "updates Pebble only if"),
+            ("reboot_control", "systemctl --no-ask-password reboot", ""),
+            ("git_pull_control", "/opt/pseudo/digit pull", ""),
+        ],
+    )  # fmt: skip
+    def test_commands_of_the_original_are_pointed_out(self, section: str, command: Any, expected: str) -> None:
+        bridge = {"enabled": True, "remote_mqtt": {"host": "a"}, section: {"command": command}}
+        (warning,) = read(at("services.mqtt_bridge", bridge)).warnings or ("",)
+        assert warning.removeprefix(f"services.mqtt_bridge.{section}.command: ").startswith(expected)
+        assert bool(warning) == bool(expected)
+        assert read(at("services.mqtt_bridge", {**bridge, "enabled": False})).warnings == ()
 
     @pytest.mark.parametrize(
         ("place", "value", "way_out"),
@@ -305,8 +412,7 @@ class TestOverridePoints:
 
 class TestInheritance:
     def test_a_mistake_in_a_shared_value_is_reported_where_it_stands(self) -> None:
-        assert only_problem(at("log_level", "LOUD")).startswith("log_level: must be ")
-        serial = {"safety": {"drive_timeout_seconds": 0}, "typo": 1, "instances": {"a": {}, "b": {}}}
+        serial = {"safety": {"drive_timeout_seconds": "soon"}, "typo": 1, "instances": {"a": {}, "b": {}}}
         found = problems(at("services.serial_mcu_bridge", serial))
         assert [line.partition(":")[0] for line in found] == [
             "services.serial_mcu_bridge.safety.drive_timeout_seconds",
@@ -396,22 +502,18 @@ class TestMistakes:
             ("robot.description", "x" * 61, "must be one line, 60 characters at most"),
             ("robot.colour", "red", 'must be "blue", "amber", '),
             ("robot.picture", "me.png", 'must be "goob", "fred", '),
-            ("robot.battery_cells", 0, "must be a whole number from 1 to 14"),
-            ("robot", [], "must be an object {…}, not a list"),
-            ("log_level", "LOUD", 'must be "DEBUG", "INFO", "WARNING", "ERROR" or "CRITICAL"'),
-            ("local_mqtt.port", 0, "must be a whole number from 1 to 65535, not 0"),
+            ("robot", 5, "must be an object {…}, not 5"),
             ("local_mqtt.port", 65536, "must be a whole number from 1 to 65535"),
-            ("local_mqtt.port", "1883", 'must be a whole number from 1 to 65535, not the text "1883"'),
             ("local_mqtt.port", 1883.5, "must be a whole number"),
             ("local_mqtt.port", True, "must be a whole number"),
             ("local_mqtt.protocol", "4", 'must be "3.1.1" or "5"'),
-            ("local_mqtt.silence_seconds", 0, "must be a number above 0 and at most 5"),
-            ("local_mqtt.silence_seconds", 5.1, "must be a number above 0 and at most 5, not 5.1"),
-            ("services.mqtt_bridge.remote_mqtt.silence_seconds", 60, "must be a number above 0 and at most 5, not 60"),
-            ("transport.lease_ms", 99, "must be a whole number from 100 to 5000, not 99"),
-            ("transport.lease_ms", 5001, "must be a whole number from 100 to 5000, not 5001"),
-            ("services.mqtt_bridge.remote.lease_ms", 600_000, "must be a whole number from 100 to 5000, not 600000"),
-            ("local_mqtt.host", 5, "must be text, not 5"),
+            ("local_mqtt.host", 5, "must be a name or a whole address"),
+            ("local_mqtt.username", 1.5, "must be text, not 1.5"),
+            ("local_mqtt.tls.insecure", "maybe", "must be true or false, not text"),
+            ("security.level", False, 'must be "open", "login" or "named", not false'),
+            ("transport.allowed_names", False, "must be a list […], not false"),
+            ("transport.access", [], "must be a path, not a list"),
+            ("services.av_daemon.video.width", "nan", "must be a whole number from 1 to 16384, not text"),
             ("local_mqtt.tls.ca_cert", 5, "must be a path, not 5"),
             ("local_mqtt.password_file", "~nobody-at-all/x", "names a home folder that"),
             ("local_mqtt.password_file", "a\x00b", "holds U+0000, which is not shown: remove it"),
@@ -423,30 +525,20 @@ class TestMistakes:
             ("services.mqtt_bridge.git_pull_control.env", {"": "c"}, "must be the name of a variable, without ="),
             ("local_mqtt.username", "ü" * 40_000, "is longer than MQTT carries, 65535 bytes"),
             ("local_mqtt.password", "ü" * 40_000, "holds more than MQTT carries, 65535 bytes"),
-            ("transport.kind", 5, "must be text, not 5"),
-            ("services.defaults.retained_publish_interval_seconds", 0, "must be a number above 0"),
             ("services.defaults.retained_publish_interval_seconds", float("nan"), "must be a number, not nan"),
             ("services.launcher.restart_delay_seconds", float("-inf"), "must be a number, not -inf"),
             ("services.launcher.restart_delay_seconds", 10**400, "must be a number from 0"),
-            ("services.mqtt_bridge.heartbeat.interval_seconds", 0.049, "must be a number from 0.05 to 3600, not 0.049"),
-            ("services.mqtt_bridge.heartbeat.enabled", "true", 'must be true or false, not the text "true"'),
             ("services.mqtt_bridge.heartbeat.topic", "$SYS/x", "must be a topic"),
             ("services.mqtt_bridge.heartbeat.topic", "half \ud800", "holds U+D800"),
             ("services.mqtt_bridge.reboot_control.command", "sudo 'oops", "cannot be split into words: No closing quo"),
             ("services.mqtt_bridge.reboot_control.command", {"a": 1}, "must be a list […], not an object"),
-            ("services.mqtt_bridge.reboot_control.env", [], "must be an object {…}, not a list"),
-            ("services.serial_mcu_bridge.safety.drive_timeout_seconds", 0, "must be a number above 0 and at most 5"),
-            ("services.serial_mcu_bridge.safety.drive_timeout_seconds", 5.1, "must be a number above 0 and at most 5"),
             ("services.serial_mcu_bridge.odometry_shm.name", "../x", "must be a name without /"),
             ("services.serial_mcu_bridge.odometry_shm.name", "/..", "must be a name without /"),
             ("services.serial_mcu_bridge.protocol", "goob", 'must be "goob_base_v1", "imu_mpu6050_v1"'),
-            ("services.av_daemon.video.rotate_degrees", 45, "must be 0, 90, 180 or 270, not 45"),
         ],
     )
     def test_one_wrong_value(self, path: str, value: Any, expected: str) -> None:
-        raw = at(path, value)
-        raw["robot"] = {"id": "goob"} | raw["robot"] if isinstance(raw["robot"], dict) else raw["robot"]
-        found = problems(raw)
+        found = problems(at(path, value))
         assert found[0].startswith(f"{path}: {expected}"), found
 
     def test_items_of_lists_are_reported_by_number(self) -> None:
@@ -466,7 +558,8 @@ class TestMistakes:
             ("services.mqtt_bridge.remote_mqtt.hots", 'did you mean "host"?'),
             ("services.serial_mcu_bridge.serial.baudrate", 'did you mean "baud"?'),
             ("transports", 'did you mean "transport"?'),
-            ("services.web", 'the nearest is "web_handler" of autonomy_manager, '),
+            ("services.soundboard", 'did you mean "soundboard_handler"?'),
+            ("services.launcher.web", 'the nearest is "enabled" of capabilities, '),
         ],
     )
     def test_an_unknown_key_names_the_nearest_one(self, path: str, nearest: str) -> None:
@@ -478,7 +571,6 @@ class TestMistakes:
             ({}, "robot.id: is missing, write a topic level"),
             ({"robot": {"id": ""}}, "robot.id: is missing"),
             (at("transport", {"run_dir": "x"}), "transport.kind: is missing"),
-            (at("services.mqtt_bridge.enabled", True), "services.mqtt_bridge.remote_mqtt.host: is missing"),
             (at("transport.kind", "mqtt") | at("transport", {"kind": "mqtt", "mqtt_mirror": {}}),
              "transport.mqtt_mirror: only a Zenoh robot has a mirror"),
             (at("transport.kind", "zenoh") | {"robot": {"id": "a", "platform": "esp32"}},
@@ -490,8 +582,6 @@ class TestMistakes:
             (at("services.mqtt_bridge", {"link": {"profile": "auto"},
                                          "remote": {"kind": "zenoh", "connect": ["tcp/a:1"]}}),
              'services.mqtt_bridge.link.profile: cannot be "auto": only MQTT connections are measured'),
-            (at("services.mqtt_bridge.link", {"profile": "thin", "kbit": 0}),
-             "services.mqtt_bridge.link.kbit: must be a number above 0"),
         ],
     )  # fmt: skip
     def test_what_is_missing_or_does_not_fit_together(self, raw: dict[str, Any], expected: str) -> None:
@@ -583,19 +673,19 @@ class TestMistakes:
         raw = json.loads(ORIGINAL.read_text())
         services = raw["services"]
         del raw["robot"]["id"]
-        raw["log_level"] = "LOUD"
-        raw["local_mqtt"]["port"] = "1883"
-        services["launcher"]["restart_delay_seconds"] = -1
+        raw["log_levl"] = "INFO"
+        raw["local_mqtt"]["port"] = "mqtt"
+        services["launcher"]["restart_delay_seconds"] = "soon"
         services["mqtt_bridge"]["heartbeet"] = services["mqtt_bridge"].pop("heartbeat")
-        services["mqtt_bridge"]["remote_mqtt"]["host"] = ""
+        services["mqtt_bridge"]["remote_mqtt"]["host"] = "a b"
         services["mqtt_bridge"]["topics"]["reboot"] = "pebble/+/reboot"
-        services["serial_mcu_bridge"]["safety"]["drive_timeout_seconds"] = 0
+        services["serial_mcu_bridge"]["safety"]["drive_timeout_seconds"] = "soon"
         services["serial_mcu_bridge"]["serial"]["port"] = ""
-        services["av_daemon"]["video"]["rotate_degrees"] = 45
+        services["av_daemon"]["video"]["backend"] = "usb"
         with pytest.raises(ConfigError) as caught:
             load(written(tmp_path, json.dumps(raw)), env={})
         assert sorted(line.partition(":")[0] for line in caught.value.problems) == [
-            *("local_mqtt.port", "log_level", "robot.id", "services.av_daemon.video.rotate_degrees"),
+            *("local_mqtt.port", "log_levl", "robot.id", "services.av_daemon.video.backend"),
             *("services.launcher.restart_delay_seconds", "services.mqtt_bridge.heartbeet"),
             *("services.mqtt_bridge.remote_mqtt.host", "services.mqtt_bridge.topics.reboot"),
             *("services.serial_mcu_bridge.safety.drive_timeout_seconds", "services.serial_mcu_bridge.serial.port"),
@@ -678,7 +768,6 @@ class TestPasswords:
             ({"password_file": "."}, "password_file: "),
             ({"password_env": "NOT_SET"}, "password_env: the environment variable NOT_SET is not set"),
             ({"password": SECRET, "password_env": "X"}, "password_env: is a second password beside password"),
-            ({"password": 4711}, "password: must be text, not a value of another kind"),
         ],
     )
     def test_mistakes_do_not_show_the_password(self, folder: Path, keys: dict[str, Any], expected: str) -> None:
@@ -771,7 +860,6 @@ class TestWebInterface:
             ({"host": "http://x/"}, "host: must be a name or a whole address"),
             ({"names": ["fair.local", "a b"]}, "names[1]: must be a name or a whole address"),
             ({"server": "a/b"}, "server: must be a topic level"),
-            ({"port": 0}, "port: must be a whole number from 1 to 65535"),
         ],
     )
     def test_mistakes_name_the_key(self, keys: dict[str, Any], expected: str) -> None:
@@ -782,10 +870,8 @@ class TestWebInterface:
         [
             ({"mqtt": {"port": 8883}}, "mqtt: not used: it has no host"),
             ({"mqtt_history": {"enabled": True}}, "mqtt_history: no longer used, `services.recorder` records into"),
-            (
-                {"robots": [{"id": "goob", "name": "Goob"}]},
-                "robots: no longer used, robots are found by",
-            ),
+            ({"robots": [{"id": "goob", "video": {"controls": True}}]}, "robots[0].video: no longer used, robots say"),
+            ({"robots": [{"name": "Goob"}]}, "robots[0]: has no id, so it is none"),
         ],
     )
     def test_keys_without_an_effect_are_reported(self, keys: dict[str, Any], expected: str) -> None:

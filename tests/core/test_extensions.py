@@ -164,7 +164,7 @@ def test_a_package_runs_code_where_a_config_names_it(tmp_path: Path) -> None:
     named = pebble("check", str(write(tmp_path, {"lamp": {}}, {"hz": 2})), path=site)
     assert (named.returncode, "blinks 2 times a second" in named.stdout) == (0, True)
     done = pebble("check", str(write(tmp_path, {}, {"hz": 2})), path=site)
-    assert (done.returncode, "services.lamp: unknown key" in done.stderr) == (1, True)
+    assert (done.returncode, "services.lamp: is not read" in done.stdout) == (0, True)
     done = pebble("lamp", path=site)
     assert (done.returncode, done.stdout) == (0, "lamp is there\n")
     assert "lamp        blink" in pebble("--help", path=site).stdout
@@ -287,7 +287,7 @@ def test_a_section_that_is_nearly_one_of_ours_keeps_a_robot_from_starting(tmp_pa
 
 def test_of_a_refused_config_it_says_what_is_missing(tmp_path: Path) -> None:
     path = write(tmp_path, {"lamp": {}}, {"hz": 2})
-    with pytest.raises(ConfigError, match=r"(?s)extensions.lamp: no installed package.*services.lamp: unknown key"):
+    with pytest.raises(ConfigError, match=r"extensions.lamp: no installed package"):
         load(path)
 
 

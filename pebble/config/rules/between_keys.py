@@ -4,26 +4,39 @@ import os
 import re
 from pathlib import Path as FilePath
 
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
-from pebble.config.problems import Path
+from pebble.config.problems import Notes, Path
 from pebble.config.reader import Reader, Rule
 from pebble.config.rules.doors import check_doors
 from pebble.config.rules.exposure import warn_if_readable, warn_of_known_id, warn_of_logins_in_clear
 from pebble.config.rules.shared_topics import shared_topics
 from pebble.config.text_files import NotTextError, read_text
-from pebble.config.transport import Mqtt, Tls, TransportSection
+from pebble.config.transport import Mqtt, RemoteMqtt, Tls, TransportSection
 from pebble.config.tree import MqttBridge, Root, SerialBridge, Services
 from pebble.config.types import Secret
 from pebble.contract.identity import GATEWAYS, SERVERS
 
 _TLS = ("tls/", "quic/")  # endpoints of Zenoh that are encrypted
+#: Words of commands as the original's configs have them, and why they do harm, or nothing, here.
+_OF_ORIGINAL = (
+    (re.compile(r"\bpebble-control\b").search, "starts the original, too, at the same serial port"),
+    (re.compile(r"(?:^|[\s/])(?:sudo|doas|pkexec)\b").search, "needs a right that our unit denies"),
+    (re.compile(r"\bgit\b.*\b(?:pull|fetch|merge|reset)\b").search, "updates Pebble only if it runs from that folder"),
+)
+#: What belongs there, with our unit.
+_INSTEAD = {
+    "reboot_control": "systemctl --no-ask-password reboot",
+    "service_restart_control": "systemctl --no-block restart pebble.service",
+    "git_pull_control": "systemctl --no-ask-password start pebble-update.service",
+}
 _LONGEST_TEXT = 65535  # bytes of a user name or password (MQTT 3.1.1, section 1.5.3)
 _VARIABLE = re.compile("[A-Z_][A-Z0-9_]*").fullmatch  # as they are usually written; else it may be a password
 _INSTANCE_NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}").fullmatch  # it becomes part of a process's name and client id
 
 
 def _root(reader: Reader, root: Root, _path: Path) -> Root:
+    root = _without_uplink(reader.notes, root)
     kind, platform = root.transport.kind, root.robot.platform
     if root.transport.mqtt_mirror is not None and kind != "zenoh":
         reader.notes.doubt(
@@ -75,6 +88,10 @@ def _services(reader: Reader, services: Services, path: Path) -> Services:
 
 def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
     notes, remote, link = reader.notes, bridge.remote, bridge.link
+    for section, instead in _INSTEAD.items():
+        words = " ".join(getattr(bridge, section).command)
+        if bridge.enabled and (reasons := [reason for names, reason in _OF_ORIGINAL if names(words)]):
+            notes.warning((*path, section, "command"), f"{', and '.join(reasons)}: write `{instead}`")
     if link.kbit is not None and link.profile == "wide":
         notes.problem(
             (*path, "link", "kbit"), 'has no effect at profile "wide": write "thin" or "auto", or leave it out'
@@ -91,9 +108,29 @@ def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
             notes.problem((*path, "remote", "listen"), "an uplink only connects: leave it out")
         if remote.account and (not remote.tls.enabled or remote.tls.client_cert is None):
             notes.problem((*path, "remote", "account"), "needs tls.client_cert, in which it is the name")
-    elif bridge.enabled and not bridge.remote_mqtt.host:
-        notes.doubt((*path, "remote_mqtt", "host"), "is missing, write the name of the remote broker")
     return bridge
+
+
+def _without_uplink(notes: Notes, root: Root) -> Root:
+    """Let a bridge whose remote host is empty, as in the original's examples, serve the robot's own broker.
+
+    Operators connect to that; a Zenoh robot has none, and runs without a bridge.
+    """
+    bridge, transport = root.services.mqtt_bridge, root.transport
+    if not bridge.enabled or bridge.remote_mqtt.host or (bridge.remote is not None and bridge.remote.kind != "mqtt"):
+        return root
+    path = ("services", "mqtt_bridge", "remote_mqtt", "host")
+    if root.robot.platform != "linux":
+        notes.doubt(path, "is missing, write the name of the remote broker")
+        return root
+    own = root.local_mqtt if transport.kind == "mqtt" else transport.mqtt_mirror
+    if own is None:
+        notes.warning(path, "is empty: there is no uplink, so no operator sees or drives this robot")
+        bridge = replace(bridge, enabled=False)
+    else:
+        notes.warning(path, f"is empty: there is no uplink, operators connect to the robot's own broker, {own.host}")
+        bridge = replace(bridge, remote_mqtt=RemoteMqtt(**asdict(own), client_id=bridge.remote_mqtt.client_id))
+    return replace(root, services=replace(root.services, mqtt_bridge=bridge))
 
 
 def _serial(reader: Reader, serial: SerialBridge, path: Path) -> SerialBridge:

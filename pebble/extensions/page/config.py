@@ -19,6 +19,7 @@ from pebble.config.types import (
     ServiceSection,
     doc,
 )
+from pebble.extensions.operator.client.assumed import AXES, Axis
 
 
 class WebHandler(ServiceSection, frozen=True, kw_only=True):
@@ -37,11 +38,34 @@ class WebTls(Section, frozen=True, kw_only=True):
     )
 
 
+class ListedRobot(Section, frozen=True, kw_only=True):
+    """A robot that the page knows before it says what it can do; a board of the original never does."""
+
+    retired: ClassVar = dict.fromkeys(
+        ("model", "video", "audio", "autonomy", "reboot", "service_restart", "git_pull"), "robots say what they have"
+    )
+
+    id: Annotated[Level | None, doc("Its id.")] = None
+    system: Annotated[Level | None, doc("First level of its topics; unset: that of `robot`.")] = None
+    type: Annotated[Level | None, doc("Second level of its topics; unset: that of `robot`.")] = None
+    name: Annotated[str | None, doc("What people call it, if it does not say so itself.")] = None
+    drive: Annotated[
+        bool | None,
+        doc(
+            "Whether pages drive it although it does not say what it can do; unset: people may allow that on the page."
+        ),
+    ] = None
+    axes: Annotated[tuple[Axis, ...], doc("The axes by which it is driven then.")] = AXES
+    plain: Annotated[
+        bool, doc('At level named: its account in fleet.json has `"plain": true`, so it takes commands without a name.')
+    ] = False
+
+
 class WebInterface(Section, frozen=True, kw_only=True):
     """The operator page, of `pebble web CONFIG` and of `services.web_handler`."""
 
     retired: ClassVar = {
-        **dict.fromkeys(("robots", "robot_discovery"), "robots are found by their messages, and named by `robot.name`"),
+        "robot_discovery": "robots are found by their messages",
         "mqtt_history": "`services.recorder` records into files",
         "log_level": "the one of the file is for all services",
     }
@@ -63,6 +87,9 @@ class WebInterface(Section, frozen=True, kw_only=True):
     mqtt: Annotated[
         RemoteMqtt, doc("The broker that robots connect to; without host: services.mqtt_bridge.remote_mqtt.")
     ] = RemoteMqtt()
+    robots: Annotated[
+        tuple[ListedRobot, ...], doc("Names of robots, and whether boards that do not say what they can do are driven.")
+    ] = ()
     recordings: Annotated[
         File | None, doc("Folder of recordings to look at on the page; unset: that of services.recorder, if it runs.")
     ] = None
@@ -85,6 +112,9 @@ def _check(reader: Reader, web: WebInterface, path: Path) -> WebInterface:
             f"other machines reach {web.host}, so the page starts only with a certificate and a user: run "
             f"`pebble cert init` and `pebble web user add`, write web_interface.tls; or leave out host",
         )
+    for number, listed in enumerate(web.robots):
+        if listed.id is None:
+            reader.notes.warning((*path, "robots", number), "has no id, so it is none")
     if not web.mqtt.host and web.mqtt != RemoteMqtt():
         reader.notes.warning((*path, "mqtt"), "not used: it has no host, so the page connects to the robot's broker")
     if web.plain_http and web.tls.certificate is not None:

@@ -196,6 +196,8 @@ class Control:
             case m.PictureFromOp():
                 if self._may("drive", op):
                     self._server.sources.choose(op.ref, op.source)
+            case m.BoardOp():
+                self._board(op)
             case m.Hello():
                 raise Leave("hello comes only once")
             case _:
@@ -258,6 +260,15 @@ class Control:
         for message in reset.messages():
             self._server.broker.publish(message.topic, message.payload, qos=message.qos)
         self._audit("reset", op.ref)
+
+    def _board(self, op: m.BoardOp) -> None:
+        if not self._may("drive" if op.do == "clear" else "system", op):
+            return
+        if why := self._server.boards.ask(op, self._session.user):
+            self._refuse(op, why)
+            return
+        self._post(m.Done(cmd=_tag(op), ref=op.ref, n=op.n))
+        self._audit(f"{op.do} driving", op.ref)
 
     def _watch(self, ref: str) -> None:
         before = self._interest.watched

@@ -178,6 +178,14 @@ class ActionOp(_Asked, frozen=True, kw_only=True, tag="action"):
     name: Literal["reboot", "service-restart", "git-pull"]
 
 
+class BoardOp(_Asked, frozen=True, kw_only=True, tag="board"):
+    """Let pages drive a board that does not say what it can do, or no longer; or clear its retained drive command."""
+
+    ref: Ref
+    do: Literal["allow", "withdraw", "clear"]
+    extra: bool = False  # it has an axis besides turning and going
+
+
 class FlagOp(_Asked, frozen=True, kw_only=True, tag="flag"):
     """A switch whose last position the broker remembers."""
 
@@ -212,7 +220,7 @@ RobotOp: TypeAlias = LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | A
 
 FromPage: TypeAlias = (
     Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp
-    | PictureFromOp | RobotOp
+    | PictureFromOp | BoardOp | RobotOp
 )  # fmt: skip
 
 
@@ -413,6 +421,16 @@ class PictureFrom(Struct, frozen=True, kw_only=True):
     source: str
 
 
+class BoardView(Struct, frozen=True, kw_only=True):
+    """``web/board``: a component that sends heartbeats, and does not say what it can do."""
+
+    silent: bool  # False: it says so now
+    by: str = ""  # who lets pages drive it; "" nobody does
+    refused: str = ""  # why nobody can allow it, or withdraw that
+    parked: str = ""  # why it is not driven although that is allowed
+    risk: str = ""  # what people have to know who allow it
+
+
 class FlagsView(Struct, frozen=True, kw_only=True):
     """``web/flags``: the flags of the component that is open, as the broker has them; null: it has none.
 
@@ -432,5 +450,6 @@ SERVER_METRICS: dict[str, type] = {
     "web/sound": SoundView,
     "web/picture-from": PictureFrom,
     "web/flags": FlagsView,
+    "web/board": BoardView,
     "web/broker": BrokerView,
 }

@@ -6,7 +6,7 @@ No queue forms: a slow page receives the newest value less often. A page that co
 import logging
 import re
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from pebble.extensions.operator.client.robot_topics import FLEET, topic_of
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.page import messages as m
 from pebble.extensions.page.log_lines import LogLines
-from pebble.extensions.page.shown import shown
+from pebble.extensions.page.shown import shown, with_name
 from pebble.transports import Message
 
 log = logging.getLogger(__name__)
@@ -96,6 +96,7 @@ class Robots:
         #: Robots that get a place in any case, and those that lose it to none: they are open, driven or stopped.
         self.is_wanted: Callable[[str], bool] = lambda _ref: False
         self.is_kept: Callable[[str], bool] = lambda _ref: False
+        self.names: Mapping[str, str] = {}  # of components that may have none of their own
         self.omitted = 0  # messages of components, metrics and values beyond the limits
         self.interests: set[Interest] = set()
         self.on_forget: Callable[[str], object] = lambda _: None
@@ -293,6 +294,8 @@ class Robots:
             raw = shown(channel, message.payload, codec.plain(channel, message.payload))
         except PayloadError:
             return False
+        if channel is c.CAPABILITIES and component.ref in self.names:
+            raw = with_name(raw, self.names[component.ref])
         grows = len(raw) - (0 if old is None else len(bytes(old.raw)))
         if not self._has_room(component, metric, channel, grows):
             self.omitted += 1
@@ -317,12 +320,18 @@ class Robots:
         if channel is c.MCU_DESCRIBE and message.payload:
             component.aliases[metric] = _aliases(message.payload)
         if robot.capabilities is not before and "announced" in robot.capabilities:
-            # Pages get what it announces as its capabilities, until it publishes them.
-            payload = msgspec.json.encode({"t": int(1000 * time.time()), "value": robot.capabilities})
-            announced = Message(c.CAPABILITIES.topic(component.ref), payload)
-            self._store(component, c.CAPABILITIES.metric, c.CAPABILITIES, announced, now)
+            self.show_offer(component, now)
         if robot.liveness.reported_offline and component.sent_online is not False:
             self._refresh(component, now)  # it may be back before the next round
+
+    def show_offer(self, component: Component, now: float) -> None:
+        """Let pages have what it announces, or is assumed to offer, as its capabilities, until it publishes them."""
+        if not component.robot.capabilities:
+            self._remove_value(component, c.CAPABILITIES.metric)
+            return
+        payload = msgspec.json.encode({"t": int(1000 * time.time()), "value": component.robot.capabilities})
+        offer = Message(c.CAPABILITIES.topic(component.ref), payload)
+        self._store(component, c.CAPABILITIES.metric, c.CAPABILITIES, offer, now)
 
     def _log(self, component: Component, message: Message) -> None:
         lines = self.logs.get(component.ref)

@@ -31,6 +31,7 @@ from pebble.extensions.page.media.sound import SoundHub
 from pebble.extensions.page.open_components import OpenComponents
 from pebble.extensions.page.robots import Robots
 from pebble.extensions.page.setting import WebSettings
+from pebble.extensions.page.silent_boards import SilentBoards
 from pebble.extensions.page.stops import Stops
 from pebble.transports import Message, QoS, Subscription
 from pebble.transports.clock import since_boot as clock
@@ -64,6 +65,8 @@ class Server:
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
         # What is drawn over the picture comes from there.
         self.sources = ChosenSources(people, self.robots, self.open_components.update)
+        self.boards = SilentBoards(self.broker, self.robots, self.drivers, people, settings)
+        self.drivers.refusals.is_stopping = self.stops.holds
         self.robots.is_wanted = self._is_wanted
         self.robots.is_kept = lambda ref: self._is_wanted(ref) or self.stops.sends_to(ref)
         self.robots.on_forget = self._ask_anew
@@ -220,6 +223,7 @@ class Server:
                 if now >= refresh_at:
                     refresh_at = now + _REFRESH_S
                     self.robots.refresh(time.monotonic())
+                    self.boards.refresh(time.monotonic(), self.spawn)
                     self._show_broker()
             except (
                 Exception

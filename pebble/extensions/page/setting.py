@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import socket
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pebble.config import Config, Mqtt
 from pebble.config.security import SecurityLevel
+from pebble.contract.identity import Identity
 from pebble.errors import ConfigError
-from pebble.extensions.page.config import WebInterface
+from pebble.extensions.page.config import ListedRobot, WebInterface
 from pebble.extensions.recordings.config import Recorder
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.transports import MqttSettings
@@ -29,6 +30,7 @@ class WebSettings:
     server: str = ""  # its name; "": this machine's
     login: bool = False
     level: SecurityLevel = "open"  # of its robots
+    listed: dict[str, ListedRobot] = field(default_factory=dict)  # by base: robots that the config knows
     people: Path | None = None  # the database of users, sessions and settings; None: in memory
     certificate: Path | None = None
     key: Path | None = None
@@ -67,6 +69,7 @@ def settings_of(config: Config) -> WebSettings:
         key=web.tls.key,
         authority=web.tls.ca,
         level=config.security.level,
+        listed=_listed(config),
         plain_http_drive=web.plain_http_drive,
         recordings=_recordings(config),
     )
@@ -78,6 +81,15 @@ def has_login(web: WebInterface) -> bool:
 
 def people_of(config: Config) -> Path:
     return config.section(WebInterface).people or config.state_dir() / PEOPLE
+
+
+def _listed(config: Config) -> dict[str, ListedRobot]:
+    own = config.identity
+    return {
+        Identity(listed.system or own.system, listed.type or own.type, listed.id).base: listed
+        for listed in config.section(WebInterface).robots
+        if listed.id is not None
+    }
 
 
 def _recordings(config: Config) -> Path | None:

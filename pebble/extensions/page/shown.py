@@ -133,6 +133,15 @@ def shown(channel: c.Channel | None, raw: bytes, payload: Any) -> bytes:
     return msgspec.json.encode(relied)
 
 
+def with_name(raw: bytes, name: str) -> bytes:
+    """Return capabilities, as ``shown`` returns them, with this name of the robot if they have none."""
+    payload = msgspec.json.decode(raw)
+    value = _inner(payload)
+    if not isinstance(value, dict) or value.get("identity", {}).get("name"):
+        return raw
+    return msgspec.json.encode({"value": {**value, "identity": {**value.get("identity", {}), "name": name}}})
+
+
 def _inner(payload: Any) -> Any:
     return payload["value"] if isinstance(payload, dict) and "value" in payload else payload
 

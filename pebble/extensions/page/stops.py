@@ -94,6 +94,11 @@ class Stops:
         """True if there is a stop of this robot, or one of all that has a place for it."""
         return any(ref in sender.robots for sender, _ in self._senders.values())
 
+    def holds(self, ref: str) -> bool:
+        """True while a stop is repeated to a robot that cannot latch it: what drives it would end that."""
+        stop = self._newest(ref)[1]
+        return stop is not None and stop.sending and not stop.estop.available
+
     @property
     def collecting(self) -> bool:
         """True while a stop of all goes to further robots."""

@@ -11,6 +11,7 @@ from pathlib import Path
 import serial
 
 from pebble.errors import DeviceError
+from pebble.services.serial_mcu_bridge.line.holders import holders
 
 _CHUNK = 4096
 
@@ -27,7 +28,7 @@ class Port:
         try:
             self._serial = serial.Serial(path, baud, timeout=0, exclusive=True)
         except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
-            raise DeviceError(f"cannot open {path}: {_reason(error)}") from error
+            raise DeviceError(f"cannot open {path}: {_reason(error, path)}") from error
         self._fd = int(self._serial.fileno())  # -1 once it is closed: the number may then be another file's
 
     def fileno(self) -> int:
@@ -84,9 +85,9 @@ class Port:
             self._serial.close()
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: Exception, path: str) -> str:
     """Return the plain reason; pyserial nests the path and the error number in its text."""
     number = error.errno if isinstance(error, OSError) else None
     if number == errno.EAGAIN:  # from flock
-        return "another program has it open"
+        return ", ".join(["another program has it open", *holders(path)])
     return os.strerror(number) if number else str(error)

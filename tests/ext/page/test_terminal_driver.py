@@ -20,9 +20,11 @@ TICK = 0.05
 class Cab:
     """A driver at a terminal, and the robot, in virtual time."""
 
-    def __init__(self, *, heartbeat: bool = True, **more: Any) -> None:
+    def __init__(self, *, heartbeat: bool = True, assume: bool = False, **more: Any) -> None:
         self.robot = Robot(GOOB, "serial", **more)
-        self.driver = TerminalDriver(GOOB, by="ann@desk", device="terminal", speed=0.6, turn=0.8, heartbeat=heartbeat)
+        self.driver = TerminalDriver(
+            GOOB, by="ann@desk", device="terminal", speed=0.6, turn=0.8, heartbeat=heartbeat, assume=assume
+        )
         self.now, self.heartbeats = 0.0, heartbeat
         self.problem = ""
         self.sent: list[Message] = []
@@ -67,6 +69,18 @@ def test_a_held_key_drives_until_04_s_after_its_last_repetition(key: str, x: flo
     moving = [command for command in after if command["x"] or command["z"]]
     assert 6 <= len(moving) <= 8
     assert after[len(moving) :] == [{"x": 0, "z": 0, "y": 0}]
+
+
+def test_a_board_that_never_says_what_it_can_do_is_driven_if_a_person_says_that_it_drives() -> None:
+    assert not Cab().moves()
+    cab = Cab(assume=True)
+    assert cab.run(4.0, "w") == []
+    cab.run(2.0)
+    assert cab.run(0.2, "w")[-1] == {"x": 0.0, "z": 0.6, "y": 0.0}
+    assert cab.run(2.0)[-3:] == [{"x": 0.0, "z": 0.0, "y": 0.0}] * 3
+    cab.receive(Message(DRIVE, b'{"z": 1}', retain=True))
+    assert not cab.moves()
+    assert "retained on its topic" in cab.driver.status()
 
 
 def test_no_wheel_is_faster_than_1() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +13,9 @@ import pytest
 from pebble.config import parse
 from pebble.contract import CONTROL, CONTROL_TAKE, DRIVE, ESTOP, ESTOP_RESET
 from pebble.contract.payloads import Drive
+from pebble.errors import DeviceError
+from pebble.services.serial_mcu_bridge.line.holders import holders
+from pebble.services.serial_mcu_bridge.line.port import Port
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.services.serial_mcu_bridge.motor_rig import STOPPED, Bench
@@ -53,6 +58,27 @@ def test_after_a_pause_of_the_process_the_stop_is_sent_before_the_next_command(b
     bench.service.post(pause)
     assert bench.line("M 0.250 0.250")
     assert bench.lines[-3:] == ["M 0.500 0.500", STOPPED, "M 0.250 0.250"]
+
+
+def test_a_second_program_at_the_port_is_named_until_it_has_gone(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As the original, whose unit is still enabled: it asks for no lock."""
+    port = str(bench.service.options.serial.port)
+    program = (
+        "import os, sys, time; os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY); print(1, flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", program, port], stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"1\n"
+        for _ in range(2):
+            bench.service.name_holders()
+            assert until(lambda: f"{port} is open in another program, too: process {other.pid} (python" in caplog.text)
+        other.kill()
+    assert until(lambda: holders(port) == [])
+    assert caplog.text.count("is open in another program") == 1
+    with pytest.raises(DeviceError, match=r"another program has it open$"):  # the bridge itself is no other one
+        Port(port, 115200)
 
 
 @pytest.mark.parametrize("bench", [FRED], indirect=True)

@@ -54,7 +54,7 @@ class Situation(NamedTuple):
 #: Of a terminal, and as far as it has them of the page.
 ORDER = tuple(Code)
 #: Of the page's server, for what a page has asked of it.
-SERVER_ORDER = (Code.BROKER, Code.NO_DRIVE, Code.STOPPED, Code.RESET, Code.SILENT)
+SERVER_ORDER = (Code.BROKER, Code.NO_DRIVE, Code.STOPPED, Code.STOPPING, Code.RESET, Code.SILENT)
 #: Of the server, for scripts; a person and a script go together where the robot arbitrates.
 SCRIPT_ORDER = (Code.UNSEEN, Code.STOPPED, Code.LEASE)
 

@@ -1,14 +1,16 @@
 """The robot as an operator's program sees it: whether it is there, what it can do, and what holds it. Pure."""
 
 from collections import deque
+from collections.abc import Collection
 from contextlib import suppress
 from typing import Any
 
 from pebble import contract as c
 from pebble.contract import codec
 from pebble.contract.levels import link_of, silent_after
-from pebble.contract.payloads import AutonomyStatus, EstopState, LinkLevel, LinkState, Orientation
+from pebble.contract.payloads import AutonomyStatus, Drive, EstopState, LinkLevel, LinkState, Orientation
 from pebble.errors import PayloadError
+from pebble.extensions.operator.client import assumed
 from pebble.extensions.operator.client.announced import announced
 from pebble.extensions.operator.client.control import RobotControl
 from pebble.extensions.operator.client.drive_reasons import SILENT_S, Situation
@@ -99,6 +101,7 @@ class RobotView:
         self.reset_at = float("-inf")  # when its emergency stop ended, as far as it was seen
         self.remembered: dict[str, Message] = {}  # by topic: what an emergency stop that begins later needs to know
         self.capabilities: dict[str, Any] = {}
+        self.parked = False  # its broker retains a drive command: it moves a board whenever that connects
         self._status = b""  # the newest
         self.link: LinkState | None = None  # what the way to its broker carries; None: everything
         self.autonomy: AutonomyStatus | None = None
@@ -131,6 +134,8 @@ class RobotView:
         elif channel is c.STATUS:
             self._status = message.payload
             self._announce(message.payload)
+        elif channel is c.DRIVE:
+            self._park(message)
         elif channel in _DECODED:
             with suppress(PayloadError):
                 self._receive_decoded(channel, message, codec.decode(channel, message.payload), now, wall)
@@ -163,7 +168,15 @@ class RobotView:
             self.reset_at = now
         if channel is c.CAPABILITIES:
             with suppress(PayloadError):
-                self.capabilities = codec.decode(c.CAPABILITIES, message.payload).value or self.capabilities
+                before = {} if self.is_assumed else self.capabilities
+                self.capabilities = codec.decode(c.CAPABILITIES, message.payload).value or before
+
+    def _park(self, message: Message) -> None:
+        """Take note of a drive command that was retained. An empty message removes it, and is not retained itself."""
+        if message.retain or not message.payload:
+            self.parked = bool(message.payload)
+            with suppress(PayloadError):
+                self.parked = self.parked and codec.decode(c.DRIVE, message.payload).moves
 
     def _remember(self, message: Message) -> None:
         """Keep it for an emergency stop that begins later; invented owners keep no capabilities out."""
@@ -172,6 +185,30 @@ class RobotView:
             self.remembered.pop(message.topic, None)
         elif len(self.remembered) < MAX_REMEMBERED or message.topic in known:
             self.remembered[message.topic] = message
+
+    # -- what is assumed
+
+    @property
+    def silent(self) -> bool:
+        """True if it has not said what it can do: by no capabilities, and by no list of what it subscribes to."""
+        return not self.estop.has_capabilities and (not self.capabilities or self.is_assumed)
+
+    @property
+    def is_assumed(self) -> bool:
+        """Whether what it can do is what people say of it, until it says so itself."""
+        return "assumed" in self.capabilities
+
+    def assume(self, axes: Collection[str], name: str = "") -> bool:
+        """Take a silent board for one that drives by these axes, or by none; return whether that is new."""
+        before = self.capabilities
+        if self.silent:
+            self.capabilities = assumed.assumed(self.base, axes, name)
+        return self.capabilities != before
+
+    def encode(self, drive: Drive) -> bytes:
+        """Return a drive command in the form for this robot."""
+        axes = section_of(self.capabilities, "drive").get("axes") if self.is_assumed else None
+        return codec.encode(c.DRIVE, drive) if axes is None else assumed.encode(drive, axes)
 
     # -- what is known
 

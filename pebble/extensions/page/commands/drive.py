@@ -9,6 +9,7 @@ import typer
 
 from pebble.commands.options import RobotArgument
 from pebble.errors import PebbleError
+from pebble.extensions.operator.client.assumed import RISK
 from pebble.extensions.operator.client.broker import problem_of
 from pebble.extensions.operator.client.connection import Target, connected, put_names, target_of
 from pebble.extensions.operator.client.terminal.key_decoder import END
@@ -30,6 +31,9 @@ def drive(
     robot: RobotArgument,
     speed: Annotated[float, typer.Option(min=0.05, max=1, help="Throttle of a key, and speed of the grousers.")] = 0.6,
     turn: Annotated[float, typer.Option(min=0.05, max=1, help="Steering of a key.")] = 0.8,
+    assume: Annotated[
+        bool, typer.Option("--assume", help=f"It is a board that does not say that it drives. {RISK}")
+    ] = False,
     *,
     target: Target,
 ) -> int:
@@ -47,7 +51,9 @@ def drive(
     with connected(target) as (transport, names):
         by, device = me(names.account), f"terminal on {socket.gethostname()}"
         heartbeat = target.remote or str(target.url).startswith("mqtt")  # within a robot there is none
-        driver = TerminalDriver(names.base, by=by, device=device, speed=speed, turn=turn, heartbeat=heartbeat)
+        driver = TerminalDriver(
+            names.base, by=by, device=device, speed=speed, turn=turn, heartbeat=heartbeat, assume=assume
+        )
         put_names(transport, names, lambda base: base == names.base and driver.robot.named)
         typer.echo(_KEYS)
         with opened() as terminal:

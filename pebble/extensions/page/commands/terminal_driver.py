@@ -7,7 +7,8 @@ it and does not report its release: it counts as held for HELD_S after its last 
 from collections.abc import Sequence
 
 from pebble import contract as c
-from pebble.contract import channel_of, codec
+from pebble.contract import channel_of
+from pebble.extensions.operator.client.assumed import AXES, HEARD_S, PARKED
 from pebble.extensions.operator.client.drive_reasons import first_reason, words
 from pebble.extensions.operator.client.estop import StopSender, new_name
 from pebble.extensions.operator.client.names import id_of
@@ -30,15 +31,18 @@ _AXES = {
 class TerminalDriver:
     """One person at one terminal. Pass messages to :meth:`receive`, keys to :meth:`press`; publish what is returned.
 
-    ``heartbeat``: whether the robot sends one on this connection. Times are seconds of one monotonic clock that goes
-    on while the machine is suspended.
+    ``heartbeat``: whether the robot sends one on this connection. ``assume``: it is a board that drives, and does not
+    say so. Times are seconds of one monotonic clock that goes on while the machine is suspended.
     """
 
-    def __init__(self, base: str, *, by: str, device: str, speed: float, turn: float, heartbeat: bool) -> None:
+    def __init__(
+        self, base: str, *, by: str, device: str, speed: float, turn: float, heartbeat: bool, assume: bool = False
+    ) -> None:
         self.robot, self.name = RobotView(base), id_of(base)
         self.stop: StopSender | None = None
         self._driven, self._tab = DrivenRobot(base, lambda: self.robot, set()), Tab("", by.partition("@")[0], device)
         self._by, self._speed, self._turn, self._heartbeat = by, speed, turn, heartbeat
+        self._assumes, self._heard_at = assume, float("inf")
         self._willing = True  # to have control as soon as it is free
         self._held: dict[str, tuple[int, float]] = {}  # by axis: the direction, and when its key last arrived
         self._gesture, self._pressed, self._reason, self._note = 0, False, "", ""
@@ -49,7 +53,8 @@ class TerminalDriver:
     def filters(self) -> list[str]:
         """The topics that :meth:`receive` needs; within the robot there is no link."""
         channels = (c.ESTOP_STATE, c.CONTROL_STATE, c.CAPABILITIES, c.ONLINE, c.CHARGING_LEVEL, c.AUTONOMY_STATUS)
-        return [channel.filter(self.robot.base) for channel in (*channels, *([c.LINK] if self._heartbeat else []))]
+        more = [*([c.LINK] if self._heartbeat else []), *([c.DRIVE] if self._assumes else [])]
+        return [channel.filter(self.robot.base) for channel in (*channels, *more)]
 
     def receive(self, message: Message, now: float, wall: float) -> None:
         self.robot.receive(channel_of(message.topic.removeprefix(f"{self.robot.base}/")), message, now, wall)
@@ -80,6 +85,7 @@ class TerminalDriver:
         if now - self._ticked_at > SILENCE_S:  # this process stood still
             self.end(now)
         self._ticked_at = now
+        self._assume(now)
         self._tab.clock.echo(self._tab.clock.ping(now), 1000 * now, now)  # no network is between keys and driver
         view = self._driven.shown(self._tab, now)
         known = self._driven.published is not None if view.keeps else self.robot.situation(now).published
@@ -90,7 +96,7 @@ class TerminalDriver:
         self._drive(now)
         zeros, requests = self._driven.tick(now)
         topic, commands, self._out = self.robot.estop.drive_topic, [*self._out, *zeros], []
-        drives = [Message(topic, codec.encode(c.DRIVE, command.drive), command.qos) for command in commands]
+        drives = [Message(topic, self.robot.encode(command.drive), command.qos) for command in commands]
         return [*(self.stop.tick(now) if self.stop else []), *drives, *([] if problem else requests)]
 
     def end(self, now: float, *, leave: bool = False) -> None:
@@ -123,6 +129,13 @@ class TerminalDriver:
         )
         return " · ".join(filter(None, parts))
 
+    def _assume(self, now: float) -> None:
+        """Take it for a board that drives, if it is there for a while and has not said what it can do."""
+        if self._assumes:
+            self._heard_at = min(self._heard_at, now) if self.robot.online(now) else float("inf")
+            if now - self._heard_at >= HEARD_S:
+                self.robot.assume((*AXES, "y"))
+
     def _take(self, now: float, *, over: bool) -> None:
         self._willing, self._failures = False, []
         self._out += self._driven.take(self._tab, now, lambda: None, self._failures.append, over=over)
@@ -143,7 +156,8 @@ class TerminalDriver:
         situation = self.robot.situation(now)._replace(driven=view.by != "" and not view.you, listening=not view.you)
         situation = situation._replace(stopping=sends, online=situation.online if self._heartbeat else True)
         who = f"{view.by} ({view.device}{', ' * bool(view.device)}name {'' if view.checked else 'not '}checked)"
-        return words(first_reason(situation), self.name, stopped=self.robot.stopped_by, driven=who)
+        why = words(first_reason(situation), self.name, stopped=self.robot.stopped_by, driven=who)
+        return why or (PARKED if self.robot.parked else "")
 
     def _wanted(self, now: float) -> tuple[float, float, float]:
         """Return x, z and y by the keys that are held."""

@@ -13,6 +13,7 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from pebble.contract.payloads import ControlState, Drive
+from pebble.extensions.operator.client import assumed
 from pebble.extensions.operator.client.control import IDLE_S, ControlClient
 from pebble.extensions.operator.client.drive_reasons import WORDS, Code, words
 from pebble.extensions.operator.client.pace_of_link import WIDE, Pace
@@ -370,6 +371,8 @@ class DrivenRobot:
         if tab.moves is self and op.g >= tab.gesture:
             self._on(Event.LETS_GO, now)
         commands = tab.interrupt(op.g, now)  # what it moves elsewhere
+        if self._is_assumed:
+            self._repeat_zeros(now)
         if self.tab is not tab or op.final:
             return [Command(self.ref, FINAL_ZERO), *commands]
         return [Command(self.ref, self._signed(ZERO)), *commands]  # with the key it is a letting go
@@ -380,5 +383,13 @@ class DrivenRobot:
         return replace(drive, key=key) if key else drive
 
     def _final_zero(self, now: float) -> list[Command]:
-        self._repeats = [now + after for after in REPEATS_S]
+        self._repeat_zeros(now)
         return [Command(self.ref, FINAL_ZERO)]
+
+    def _repeat_zeros(self, now: float) -> None:
+        self._repeats = [now + after for after in (assumed.REPEATS_S if self._is_assumed else REPEATS_S)]
+
+    @property
+    def _is_assumed(self) -> bool:
+        robot = self._view()
+        return robot is not None and robot.is_assumed

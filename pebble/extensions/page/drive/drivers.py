@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 
-from pebble.contract import DRIVE, codec
+from pebble.contract import DRIVE
 from pebble.extensions.operator.client.broker import Broker
 from pebble.extensions.operator.client.estop import send
 from pebble.extensions.operator.client.robot_view import RobotView
@@ -134,8 +134,8 @@ class Drivers:
         """Publish drive commands of a person, each to the robot's own topic; False if one was not accepted."""
         accepted = True
         for ref, drive, qos in commands:
-            topic = self._robots.topic(ref, DRIVE)
-            accepted = self._broker.publish(topic, codec.encode(DRIVE, drive), qos=qos, by=by) and accepted
+            topic, view = self._robots.topic(ref, DRIVE), self._robots.view(ref) or RobotView(ref)
+            accepted = self._broker.publish(topic, view.encode(drive), qos=qos, by=by) and accepted
         if self._changed:
             self._robots.mark_drivers(set(self._changed))
             self._changed.clear()

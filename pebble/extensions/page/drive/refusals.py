@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 
+from pebble.extensions.operator.client.assumed import PARKED
 from pebble.extensions.operator.client.broker import Broker
 from pebble.extensions.operator.client.drive_reasons import (
     SCRIPT_ORDER,
@@ -25,11 +26,14 @@ class Refusals:
         self, broker: Broker, moved_by: Callable[[str], str], robot_of: Callable[[str], RobotView | None]
     ) -> None:
         self._broker, self._moved_by, self._robot_of = broker, moved_by, robot_of
+        #: Whether a stop is sent to a component that cannot latch it.
+        self.is_stopping: Callable[[str], bool] = lambda _ref: False
 
     def of_driving(self, ref: str) -> str:
         """Why this component may not be moved by any page."""
         robot = self._robot_of(ref) or RobotView(ref)
-        return self._words(robot, first_reason(self._situation(robot), SERVER_ORDER)) or self.nameless(robot)
+        why = self._words(robot, first_reason(self._situation(robot), SERVER_ORDER)) or self.nameless(robot)
+        return why or (PARKED if robot.parked else "")
 
     def nameless(self, robot: RobotView) -> str:
         """Why it takes no commands of this server, which has no name."""
@@ -55,7 +59,8 @@ class Refusals:
         return "Stopped: reset it first" if code is Code.STOPPED else words(code, robot.name, driven=by)
 
     def _situation(self, robot: RobotView) -> Situation:
-        return robot.situation(time.monotonic())._replace(problem=self._broker.problem)
+        stopping = self.is_stopping(robot.base)
+        return robot.situation(time.monotonic())._replace(problem=self._broker.problem, stopping=stopping)
 
     def _words(self, robot: RobotView, code: Code | None) -> str:
         return words(code, robot.name, stopped=robot.stopped_by, problem=self._broker.problem)

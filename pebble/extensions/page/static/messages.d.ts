@@ -74,6 +74,14 @@ export interface PictureFromOp {
   source: string;
 }
 
+export interface BoardOp {
+  op: "board";
+  n?: number;
+  ref: string;
+  do: "allow" | "clear" | "withdraw";
+  extra?: boolean;
+}
+
 export interface LightsOp {
   op: "lights";
   n?: number;
@@ -312,6 +320,14 @@ export interface FlagsView {
   mqtt_video?: boolean | null;
 }
 
+export interface BoardView {
+  silent: boolean;
+  by?: string;
+  refused?: string;
+  parked?: string;
+  risk?: string;
+}
+
 export interface BrokerView {
   connected: boolean;
   problem: string;
@@ -328,9 +344,10 @@ export interface Metrics {
   "web/sound": SoundView;
   "web/picture-from": PictureFrom;
   "web/flags": FlagsView;
+  "web/board": BoardView;
   "web/broker": BrokerView;
 }
 
-export type FromPage = Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | PictureFromOp | LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp;
+export type FromPage = Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | PictureFromOp | BoardOp | LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp;
 
 export type ToPage = Welcome | Ping | State | Logs | Refused | Done | Bye;

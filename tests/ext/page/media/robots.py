@@ -72,9 +72,9 @@ class MediaRobot(ABC):
         self.published: list[Message] = []  # by others, to the robot
         self.sent: list[bytes] = []
         self.mute = False
-        self._period_s, self._default = period_s, given.get("encoding", default)
+        self._period_s, self.default = period_s, given.get("encoding", default)
         self._requested = self._raised = self._keyframe = False
-        self._encoding = self._default
+        self._encoding = self.default
         self._ending = threading.Event()
         self.transport.subscribe("#", self.receive, echo=False, direct=True)
         self.announce(given)
@@ -114,7 +114,7 @@ class MediaRobot(ABC):
         elif message.topic == self.request:
             request = json.loads(message.payload)
             self._requested = request["enabled"]
-            self._encoding = request.get("encoding") or self._default
+            self._encoding = request.get("encoding") or self.default
             self._keyframe = self._keyframe or request.get("keyframe", False)
 
     def _run(self) -> None:

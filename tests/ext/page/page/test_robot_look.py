@@ -9,8 +9,8 @@ import pytest
 from playwright.sync_api import Page
 
 from tests.ext.page.browser import Size, Tab
-from tests.ext.page.canned import Show
-from tests.ext.page.states import FRED, GOOB, STATES, at, changed, driver, estop
+from tests.ext.page.canned import CannedServer, Show
+from tests.ext.page.states import FRED, GOOB, MAY_TAKE, STATES, at, changed, driver, estop
 
 pytestmark = pytest.mark.page
 
@@ -99,6 +99,25 @@ def test_cards_stay_in_their_places(show: Show) -> None:
             assert opened.page.evaluate("window.shifted") <= 0.02
             assert opened.page.evaluate(COVERED) == []
             opened.page.reload()
+
+
+def test_driving_of_a_board_that_says_nothing_is_allowed_and_withdrawn_on_its_page(
+    show: Show, server: CannedServer
+) -> None:
+    view = {"silent": True, "by": "", "refused": "", "parked": "", "risk": "It may roll on."}
+    with show(replace(STATES["free"], welcome=MAY_TAKE)) as opened:
+        _ready(opened)
+        opened.page.evaluate(SET, [GOOB, "capabilities", {"value": {"announced": True, "assumed": True}}])
+        opened.page.evaluate(SET, [GOOB, "web/board", view])
+        opened.test("board-extra").click()
+        opened.test("board-allow").click()
+        opened.page.evaluate(SET, [GOOB, "web/board", {**view, "by": "ann", "parked": "Clear it first"}])
+        opened.test("board-clear").click()
+        opened.test("board-withdraw").click()
+        asked = [(one["do"], one["extra"]) for one in server.received if one.get("op") == "board"]
+        assert asked == [("allow", True), ("clear", True), ("withdraw", True)]
+        opened.page.evaluate(SET, [GOOB, "web/board", {**view, "refused": "The config decides that"}])
+        opened.page.locator("[data-test=board-allow]:disabled").wait_for()
 
 
 def test_a_small_phone_shows_all_that_drives_at_once(show: Show) -> None:

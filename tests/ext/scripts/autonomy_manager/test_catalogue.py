@@ -16,6 +16,7 @@ from pebble.config import Config, parse
 from pebble.contract.forms import Setting, form
 from pebble.services.autonomy_manager import interpreter as interpreter_module
 from pebble.services.autonomy_manager.catalogue import MAX_SCRIPTS, Catalogue, files, roots
+from pebble.services.autonomy_manager.environment import environment
 from pebble.services.autonomy_manager.interpreter import interpreter, lacking
 from pebble.services.autonomy_manager.script import Script
 
@@ -223,6 +224,7 @@ def test_a_failure_is_logged_once_and_tried_again_after_a_minute(
     assert caplog.text.count("walk is offered without settings: its --describe: JSON is malformed") == 1
 
 
+OLD_NUMPY, CREATE = "numpy below 2.4 (float() of an array)", "cv2.aruco.DetectorParameters_create"
 SHMSRC = "import cv2\nPIPE = 'shmsrc socket-path=x ! appsink'\ncv2.VideoCapture(PIPE, cv2.CAP_GSTREAMER)"
 
 
@@ -236,6 +238,14 @@ SHMSRC = "import cv2\nPIPE = 'shmsrc socket-path=x ! appsink'\ncv2.VideoCapture(
         ("import cv2", []),
         (SHMSRC, ["cv2 with GStreamer"]),
         (SHMSRC.replace("cv2", "nocv"), ["nocv"]),
+        ("import cv2, json\nz = float(cv2.solvePnP()[2])", [OLD_NUMPY]),
+        ("import numpy\nmap(float, numpy.zeros(3))", [OLD_NUMPY]),
+        ("import json\nx = float(json.loads('1'))", []),
+        ("import cv2\ncv2.aruco.detectMarkers(0)", ["cv2.aruco.detectMarkers"]),
+        ("from cv2 import aruco as a\nimport cv2\na.DetectorParameters_create()", [CREATE]),
+        ("import numpy as np\nnp.zeros(3, np.float)\nnp.linalg.norm(0)", ["numpy.float"]),
+        ("import cv2\nif hasattr(cv2.aruco, 'detectMarkers'): cv2.aruco.detectMarkers(0)", []),
+        ("import subprocess, sys\nsubprocess.run([sys.executable, 'helper.py'])", ["nowhere"]),
         ("print 'of another Python'", []),
         ("raise SystemExit('it was run')", []),
     ],
@@ -244,6 +254,7 @@ def test_what_a_script_lacks_is_found_without_running_it(tmp_path: Path, text: s
     """The wheel's OpenCV has no GStreamer."""
     entry = write(tmp_path, "walk", text)
     write(tmp_path, "walk", "raise SystemExit('it was run')", "beside.py")
+    write(tmp_path, "walk", "import nowhere", "helper.py")
     (tmp_path / "above").mkdir()
     assert lacking((sys.executable, str(entry)), entry.parent, {}) == lacks
 
@@ -263,3 +274,14 @@ def test_the_python_of_a_script(
     monkeypatch.setattr(interpreter_module, "SYSTEM", tmp_path / "system")
     (tmp_path / there).touch()
     assert interpreter(configured, ours=ours).removeprefix(f"{tmp_path}/") == python
+
+
+def test_python3_of_a_script_of_others_is_the_systems(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = str(Path(sys.prefix, "bin"))
+    monkeypatch.setenv("PATH", f"{own}:/usr/bin")
+    monkeypatch.setenv("VIRTUAL_ENV", sys.prefix)
+    theirs, ours = environment(ours=False), environment()
+    assert (theirs["PATH"], "VIRTUAL_ENV" in theirs, ours["PATH"]) == ("/usr/bin", False, f"{own}:/usr/bin")
+    folder = write(tmp_path, "walk", "import json").parent
+    (folder / "script.json").write_text(json.dumps({"command": ["python3", "run.py"]}))
+    assert scanned(Catalogue(config(tmp_path)))["walk"].command == (interpreter(None, ours=False), "run.py")

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+import logging
 import subprocess
 import sys
 from functools import cache
+from pathlib import Path
+from runpy import run_path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from pebble.extensions.scripts.perception.odometry import OdometrySettings
 from tests.support import ROOT
 
 SCRIPTS = ROOT / "pebble/extensions/scripts/shipped"
@@ -57,6 +62,26 @@ def test_following_by_odometry_has_27_settings_and_needs_two_scripts() -> None:
     assert len(found["configs"]) == 27
     needs = {need["file"]: need["config"] for need in found["dependencies"]}
     assert needs == {"apriltag-locations": {}, "wheel-odometry": {"use_tune_state": False}}
+
+
+@pytest.mark.parametrize(
+    ("values", "track_mm", "remark"),
+    [
+        ({"left_mm_per_event": 10.1, "right_mm_per_event": 10.3, "track_width_mm": 128.0}, 128.0, "counts steps twice"),
+        ({"left_mm_per_event": 10.1}, 130.5, "counts steps twice"),
+        ({"track_width_mm": 128.0}, 128.0, ""),
+    ],
+)
+def test_of_the_originals_tuning_only_the_width_of_the_track_counts(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, values: dict[str, float], track_mm: float, remark: str
+) -> None:
+    (tmp_path / "auto_tune_state.json").write_text(json.dumps({"version": 1, "current_values": values}))
+    robot = SimpleNamespace(config=SimpleNamespace(folder=tmp_path), log=logging.getLogger("script"))
+    program = run_path(str(SCRIPTS / "wheel-odometry" / "run.py"))
+    tuned = program["tuned"](robot, OdometrySettings(use_tune_state=True, right_mm_per_event=19.0))
+    assert (tuned.track_width_mm, tuned.left_mm_per_event, tuned.right_mm_per_event) == (track_mm, 0, 19.0)
+    assert remark in caplog.text
+    assert bool(remark) == bool(caplog.text)
 
 
 @pytest.mark.parametrize("name", NAMES)

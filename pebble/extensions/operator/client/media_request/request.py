@@ -1,6 +1,7 @@
 """The request for a robot's pictures or sound: what it is sent for them, and what is taken back afterwards. Pure."""
 
 from collections import deque
+from contextlib import suppress
 from typing import Any, Final
 
 from pebble.contract import codec
@@ -12,7 +13,8 @@ from pebble.transports import Message, QoS, Transport
 
 _REPEAT_S: Final = 2.0  # without a payload before a request is repeated
 _FLAG_S: Final = 0.2  # a retained flag arrives within this time of subscribing
-_JOIN_S: Final = 0.4  # a stream that is already running delivers a payload within this time
+_JOIN_S: Final = 0.4  # a stream that is already running delivers a payload within this time,
+_SLOW_S: Final[dict[Medium, float]] = {"video": 1.2, "audio": _JOIN_S}  # also one of a picture a second
 _KEYFRAME_S: Final = 1.0
 _SENT: Final = 20
 
@@ -22,11 +24,14 @@ class ViewerRequest:
 
     Subscribe to ``flag_topic`` and ``media_topic``, pass what arrives to :meth:`receive`, and publish what the other
     methods return by :func:`send`. What was running before stays, and a flag that another operator lowers stays
-    lowered.
+    lowered. With ``shares``, subscribe to ``control_topic`` as well: a stream that others use keeps its encoding, and
+    is left to them at the end.
     """
 
-    def __init__(self, base: str, medium: Medium, capabilities: dict[str, Any]) -> None:
-        self.sent: deque[bytes] = deque(maxlen=_SENT)  # own requests: what else arrives on their topic is from others
+    def __init__(self, base: str, medium: Medium, capabilities: dict[str, Any], *, shares: bool = False) -> None:
+        self._shares = shares
+        self.sent: deque[bytes] = deque(maxlen=_SENT)  # own requests: what else arrives on their topic is of others
+        self._others: MediaRequest | None = None  # what others request; None: nothing, as far as is known
         self.settled = False  # it was sent, or nothing has to be: else call :meth:`tick` often
         topics = (topic_of(base, capabilities, channel) for channel in CHANNELS[medium])
         self.media_topic, self.control_topic, self.flag_topic = topics
@@ -49,6 +54,9 @@ class ViewerRequest:
 
     def receive(self, message: Message, now: float) -> bool:
         """Take a message of one of its topics; True if it is a payload of the medium."""
+        if message.topic == self.control_topic:
+            self._receive_request(message)
+            return False
         if message.topic != self.flag_topic:
             self._received_at = now
             return True
@@ -57,24 +65,44 @@ class ViewerRequest:
         except PayloadError:  # a malformed flag counts as lowered
             self._is_up = False
         self._raised = self._raised and self._is_up  # one that was lowered is another operator's to raise
+        self._others = self._others if self._is_up else None
         return False
+
+    def _receive_request(self, message: Message) -> None:
+        """Take a request: one's own, or the newest of others. One of a key frame is of who looks on, as this does."""
+        if message.payload in self.sent:
+            self.sent.remove(message.payload)
+        elif not message.retain:
+            with suppress(PayloadError):
+                request = codec.decode(self._control, message.payload)
+                if not request.keyframe:
+                    self._others = request if request.enabled else None
 
     def tick(self, now: float) -> list[Message]:
         """Return what to send now; without a payload the request is repeated."""
         if self.settled:
             is_quiet = now - max(self._sent_at, self._received_at) > _REPEAT_S
             return [self._ask(now)] if is_quiet else []
-        if self._encoding is None and self._received_at > float("-inf"):
+        if self._shares and not self._requested and self._others is None and self._received_at > float("-inf"):
+            self._others = MediaRequest(enabled=True)  # that was not seen
+        if self._others is not None or (self._encoding is None and self._received_at > float("-inf")):
             self.settled, self._sent_at = True, now  # another operator has requested it: change nothing
             return []
-        waits_s = 0.0 if self._is_up is not None else _FLAG_S
-        if now < self._began_at + (_JOIN_S if self._encoding is None else waits_s):
+        if now < self._began_at + self._waits_s():
             return []
         self.settled, asked = True, [self._ask(now)]
         if not self._is_up:
             self._is_up = self._raised = True
             asked.insert(0, self._flag_message(up=True))
         return asked
+
+    def _waits_s(self) -> float:
+        """How long a payload is awaited that shows that the medium is running."""
+        if self._encoding is None:
+            return _JOIN_S
+        if self._is_up is None:
+            return _FLAG_S
+        return _SLOW_S[self._medium] if self._shares and self._is_up and not self._requested else 0.0
 
     def keyframe(self, encoding: str | None, now: float) -> list[Message]:
         """Request a full picture in the encoding that arrives, at most once a second."""
@@ -89,7 +117,9 @@ class ViewerRequest:
         self._requested = self._raised = False
 
     def end(self) -> list[Message]:
-        """Withdraw the request, and lower the flag that was down before."""
+        """Withdraw the request, and lower the flag that was down before, unless others use the medium."""
+        if self._others is not None:
+            self.leave()
         messages = [self._message(MediaRequest(enabled=False))] if self._requested else []
         messages += [self._flag_message(up=False)] if self._raised else []
         self.leave()
@@ -99,6 +129,8 @@ class ViewerRequest:
         return offered({self._medium: self.section}, self._medium)
 
     def _ask(self, now: float) -> Message:
+        if self._others is not None:  # they have gone without a word, or come back and want what they had
+            self._encoding, self._others = self._others.encoding, None
         self._sent_at, self._requested = now, True
         return self._message(MediaRequest(enabled=True, encoding=self._encoding))
 

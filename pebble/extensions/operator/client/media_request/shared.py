@@ -107,9 +107,9 @@ class SharedRequest:
         try:
             if request is None or topics != self._topics:
                 await self._withdraw()
-                request, self._topics = ViewerRequest(self.ref, self.medium, capabilities), topics
+                request, self._topics = ViewerRequest(self.ref, self.medium, capabilities, shares=True), topics
                 self._request = request
-                for topic in (request.flag_topic, request.media_topic):
+                for topic in (request.control_topic, request.flag_topic, request.media_topic):
                     self._subscriptions.append(await self._broker.subscribe(topic, self._take))
             request.section = capabilities[self.medium]
             if encoding != self.encoding or self.requested_at == float("-inf"):

@@ -21,6 +21,8 @@ export function install(page) {
     commandMcu: (ref, uid, name, value) => ask({ op: "mcu", ref, uid, name, value }),
     /** @param {string} ref @param {"reboot" | "service-restart" | "git-pull"} name */
     act: (ref, name) => ask({ op: "action", ref, name }),
+    /** @param {string} ref @param {"allow" | "withdraw" | "clear"} what @param {boolean} extra */
+    askBoard: (ref, what, extra) => ask({ op: "board", ref, do: what, extra }),
     /** @param {string} ref @param {"remote-mirror" | "mqtt-audio" | "mqtt-video"} name @param {boolean} on */
     setFlag: (ref, name, on) => ask({ op: "flag", ref, name, on }),
     readLogs: (ref, on, origin = "", after = 0) => socket.send({ op: "read-logs", ref, on, origin, after }),

@@ -66,13 +66,13 @@ def main(robot: Robot, options: OdometrySettings) -> None:
 
 
 def tuned(robot: Robot, options: OdometrySettings) -> OdometrySettings:
-    """With use_tune_state, the values of the original's tuning program win over the geometry."""
-    state = tune_state(robot) if options.use_tune_state else {}
-    steps = {key: getattr(options, key) or state.get(key, 0.0) for key in ("left_mm_per_event", "right_mm_per_event")}
-    return replace(options, track_width_mm=state.get("track_width_mm", options.track_width_mm), **steps)
+    """With use_tune_state, the track width of the original's tuning program wins over the geometry."""
+    width = tune_state(robot).get("track_width_mm") if options.use_tune_state else None
+    return replace(options, track_width_mm=options.track_width_mm if width is None else width)
 
 
 def tune_state(robot: Robot) -> dict[str, float]:
+    """Return its numbers but for the lengths of a step: its counter counts steps twice, and no factor repairs that."""
     try:
         values = convert(
             json.loads((robot.config.folder / TUNE_STATE).read_text(encoding="utf-8"))["current_values"], dict[str, Any]
@@ -80,7 +80,11 @@ def tune_state(robot: Robot) -> dict[str, float]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         robot.log.warning("%s: %s; the geometry counts", TUNE_STATE, error)
         return {}
-    return {key: float(v) for key, v in values.items() if isinstance(v, int | float) and math.isfinite(v) and v > 0}
+    if wrong := [key for key in values if key.endswith("_mm_per_event")]:
+        text = "%s: %s: not used, they are 0.5 to 0.6 of the truth: the program that wrote them counts steps twice"
+        robot.log.warning(text, TUNE_STATE, " and ".join(wrong))
+    numbers = {key: float(v) for key, v in values.items() if isinstance(v, int | float) and math.isfinite(v) and v > 0}
+    return {key: number for key, number in numbers.items() if key not in wrong}
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import { html, useMetric, useOnline, useTick, useValue } from "../parts/hooks.js";
 import { Live } from "../parts/parts.js";
+import { Board } from "./board.js";
 import { poseOf, poseWords } from "../../core/trail.js";
 import { charging, plain } from "../parts/more-words.js";
 import { battery, inner, isObject, number, roughly, span, typeOf } from "../parts/words.js";
@@ -29,8 +30,10 @@ export function Telemetry({ at }) {
 /** For the maker of a robot that does not say what it can do. */
 function Hint({ at }) {
   const value = useValue(at, "capabilities")?.value;
+  const board = useValue(at, "web/board");
   const isKnown = value && value.announced !== true;
   if (isKnown || typeOf(at) !== "robots") return null;
+  if (board?.silent) return html`<${Board} at=${at} board=${board} />`;
   const offered = value ? "What is offered here, it lists as its subscriptions" : "So there is nothing to drive";
   return html`<p class="dim" data-test="hint">
     It publishes no capabilities. ${offered}. docs/your-robot.md tells its maker what to publish.

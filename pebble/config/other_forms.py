@@ -1,0 +1,73 @@
+"""Values as the original accepts them, in a form or beyond a limit that ours does not have. Pure."""
+
+import math
+from typing import Any, Literal, NamedTuple, get_origin
+
+import msgspec
+from msgspec import NODEFAULT, Meta
+
+_SWITCHES = {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False, "no": False, "off": False}
+
+
+class Reading(NamedTuple):
+    """What is used for a value that is not as expected; ``differs``: it is more than another form of the same."""
+
+    value: Any
+    differs: bool = True
+
+
+def switch(raw: Any) -> bool | None:
+    """Return what a number or a word says of something that is on or off; None: nothing."""
+    return _SWITCHES.get(str(raw).lower()) if isinstance(raw, str | int) else None
+
+
+def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default: Any) -> Reading | None:
+    """Return what to use for ``raw``, which is no value of this key; None: it is a mistake.
+
+    ``kind`` and ``metas`` are the parts of ``annotation``; ``default`` is that of the key, perhaps NODEFAULT. What is
+    empty, 0 or merely true is the default, and numbers are brought within their limits: with ``exact`` only 0. A key
+    with ``synonyms`` has other names of its values, one with ``circle`` starts anew there, and one with ``unlike``
+    takes that for any mistake.
+    """
+    extra = {key: value for meta in metas for key, value in (meta.extra or {}).items()}
+    number = _number(raw)
+    for form in _forms(kind, extra, raw, number):
+        try:
+            value = msgspec.convert(form, annotation, strict=False)
+        except (msgspec.ValidationError, TypeError):
+            continue
+        if not isinstance(value, float) or math.isfinite(value):
+            return Reading(value, differs=False)
+    if "unlike" in extra:
+        return Reading(extra["unlike"])
+    is_empty = not raw or (raw is True and kind not in (int, float))
+    if default is not NODEFAULT and (number == 0 or (is_empty and "exact" not in extra)):
+        return Reading(default)
+    if kind not in (int, float) or number is None or "exact" in extra:
+        return None
+    for meta in metas:
+        if meta.gt is not None and number <= meta.gt:
+            return None if default is NODEFAULT else Reading(default)
+        number = number if meta.ge is None else max(meta.ge, number)
+        number = number if meta.le is None else min(meta.le, number)
+    return Reading(int(number) if kind is int else number)
+
+
+def _forms(kind: Any, extra: dict[str, Any], raw: Any, number: float | None) -> list[Any]:
+    """Return what may be meant; msgspec reads numbers in texts."""
+    if kind is bool:
+        return [switch(raw)]
+    forms = [raw] if isinstance(raw, str | int | float) else []
+    if isinstance(raw, int) and number is not None and (kind is str or get_origin(kind) is Literal):
+        forms.append(str(raw))
+    if number is not None and "circle" in extra and number.is_integer():
+        forms.append(int(number % extra["circle"]))
+    return forms + [value for key, value in extra.get("synonyms", {}).items() if key == str(raw).upper()]
+
+
+def _number(raw: Any) -> float | None:
+    try:
+        number = math.nan if isinstance(raw, bool) else float(raw)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None

@@ -1,0 +1,36 @@
+"""What a silent board offers: one that obeys drive commands, as two of the original do, and never says so. Pure."""
+
+from collections.abc import Collection
+from typing import Any, Final, Literal
+
+import msgspec
+
+from pebble.contract import DRIVE
+from pebble.contract.payloads import Drive
+from pebble.extensions.operator.client.announced import announced
+
+Axis = Literal["x", "z", "y"]
+AXES: Final[tuple[Axis, ...]] = ("x", "z")  # unless more are known
+HEARD_S = 5.0  # so long it has sent heartbeats: a robot that starts has said by then what it can do
+#: After the zero at the end of a gesture: while such a board connects anew, nothing but a later zero stops it.
+REPEATS_S = (0.15, 0.45)
+#: What people have to know who let it be driven.
+RISK = "A stop cannot latch it, and it may roll on while its Wi-Fi is away."
+PARKED = "A drive command is retained on its topic, and moves it whenever it connects: clear it first"
+
+_LIST = msgspec.json.encode({"subscribes": [DRIVE.suffix]})
+
+
+def assumed(base: str, axes: Collection[str], name: str = "") -> dict[str, Any]:
+    """The value of capabilities that is taken for its own: that of its name, and of driving if it has any ``axes``."""
+    value = announced(base, _LIST) if axes else {}
+    if axes:
+        value["drive"]["axes"] = list(axes)
+    if name:
+        value["identity"] = {"name": name}
+    return value | {"announced": True, "assumed": True} if value else {}
+
+
+def encode(drive: Drive, axes: Collection[str]) -> bytes:
+    """Return a command of these axes alone: its client drops messages that are longer than 256 bytes."""
+    return msgspec.json.encode({axis: round(getattr(drive, axis), 3) for axis in axes})

@@ -1,0 +1,137 @@
+"""Boards that send heartbeats and never say what they can do, as the original's: whether pages drive them.
+
+The config says so, or a person with the right; that is remembered until it is withdrawn, or the board says itself what
+it can do.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from pebble.contract import DRIVE
+from pebble.errors import PebbleError
+from pebble.extensions.fleet.people import People
+from pebble.extensions.operator.client.assumed import AXES, HEARD_S, PARKED, RISK
+from pebble.extensions.operator.client.broker import Broker
+from pebble.extensions.page import messages as m
+from pebble.extensions.page.config import ListedRobot
+from pebble.extensions.page.drive.drivers import Drivers
+from pebble.extensions.page.robots import Component, Robots
+from pebble.extensions.page.setting import WebSettings
+from pebble.transports import Message, Subscription
+
+log = logging.getLogger(__name__)
+
+Spawn = Callable[[Coroutine[Any, Any, None]], None]
+
+_SETTING = "assumes "  # what a setting of the server begins with; then the component
+_METRIC = "web/board"
+_CONFIG = "web_interface.robots"
+_NAMED = f'At level named it is driven only with "plain": true, in fleet.json and in {_CONFIG}'
+
+
+class Permission(Struct, frozen=True):
+    """Who lets pages drive a board, and by which axes; no axes: nobody does."""
+
+    by: str = ""
+    axes: tuple[str, ...] = ()
+    at: float = 0.0
+
+
+class _Board(Struct):
+    """A silent one. Its drive topic is received before anything is sent there: what is retained there moves it."""
+
+    heard_at: float
+    permission: Permission | None = None  # it has not been heard for long enough
+    subscription: Subscription | None = None
+
+
+class SilentBoards:
+    """It belongs to one server. Only the event loop calls it."""
+
+    def __init__(self, broker: Broker, robots: Robots, drivers: Drivers, people: People, settings: WebSettings) -> None:
+        self._broker, self._robots, self._drivers, self._people = broker, robots, drivers, people
+        self._listed, self._is_named = settings.listed, settings.level == "named"
+        robots.names = {ref: listed.name[:32] for ref, listed in settings.listed.items() if listed.name}
+        self._boards: dict[str, _Board] = {}
+
+    def refresh(self, now: float, spawn: Spawn) -> None:
+        """Look for boards that are silent, or no longer; to be called a few times a second."""
+        silent = {ref: component for ref, component in self._robots.components.items() if component.robot.silent}
+        for ref in self._boards.keys() - silent:
+            if (subscription := self._boards.pop(ref).subscription) is not None:
+                spawn(self._broker.unsubscribe(subscription))
+            if ref in self._robots.components:
+                self._robots.set_server_metric(ref, _METRIC, m.BoardView(silent=False))
+        for ref, component in silent.items():
+            is_new = ref not in self._boards and ref.split("/")[1] == "robots" and not self._robots.omitted
+            if is_new and component.robot.online(now):
+                self._boards[ref] = _Board(now)
+            if ref in self._boards:
+                self._follow(component, self._boards[ref], now, spawn)
+
+    def ask(self, op: m.BoardOp, user: str) -> str:
+        """Do what a page asks; return why not. Raises DatabaseError."""
+        board = self._boards.get(op.ref)
+        if board is None or board.permission is None:
+            return "It is no board that does not say what it can do"
+        if op.do == "clear":
+            sent = self._broker.publish(DRIVE.topic(op.ref), b"", retain=True, remember=False)
+            return "" if sent else "The server cannot reach the broker"
+        if why := self._refusal(op.ref):
+            return why
+        axes = (*AXES, *["y"] * op.extra) if op.do == "allow" else ()
+        permission = Permission(user, axes, time.time())
+        self._people.set(_SETTING + op.ref, msgspec.json.encode(permission).decode())
+        board.permission = permission
+        if not axes:
+            self._drivers.stop(op.ref, user)
+        return ""
+
+    def _follow(self, component: Component, board: _Board, now: float, spawn: Spawn) -> None:
+        ref, robot = component.ref, component.robot
+        if board.permission is None:
+            if not robot.online(now):
+                del self._boards[ref]
+            elif now - board.heard_at >= HEARD_S:
+                board.permission = self._permission(ref)
+                spawn(self._subscribe(ref, board))
+        elif board.subscription is not None:
+            if robot.assume(board.permission.axes, self._robots.names.get(ref, "")):
+                self._robots.show_offer(component, now)
+            by, parked = board.permission.by if board.permission.axes else "", PARKED if robot.parked else ""
+            view = m.BoardView(silent=True, by=by, refused=self._refusal(ref), parked=parked, risk=RISK)
+            self._robots.set_server_metric(ref, _METRIC, view)
+
+    def _permission(self, ref: str) -> Permission:
+        """Return what the config says, else what a person has said."""
+        listed = self._listed.get(ref, ListedRobot())
+        if self._refusal(ref):
+            is_allowed = listed.drive and (listed.plain or not self._is_named)
+            return Permission("the config", listed.axes) if is_allowed else Permission()
+        try:
+            return msgspec.json.decode(self._people.get(_SETTING + ref) or "{}", type=Permission)
+        except (PebbleError, msgspec.MsgspecError) as error:
+            log.warning("whether pages may drive %s is not known: %s", ref, error)
+            return Permission()
+
+    def _refusal(self, ref: str) -> str:
+        """Why a person cannot change what counts."""
+        listed = self._listed.get(ref, ListedRobot())
+        if self._is_named and not listed.plain:
+            return _NAMED
+        return "" if listed.drive is None else f"{_CONFIG} decides that: change it there"
+
+    async def _subscribe(self, ref: str, board: _Board) -> None:
+        def take(message: Message, now: float) -> None:
+            if (robot := self._robots.view(ref)) is not None:
+                robot.receive(DRIVE, message, now, 0.0)
+
+        try:
+            board.subscription = await self._broker.subscribe(DRIVE.topic(ref), take)
+        except PebbleError as error:
+            log.warning("%s is not driven: %s", ref, error)

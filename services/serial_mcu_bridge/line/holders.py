@@ -1,0 +1,27 @@
+"""Who else has a serial device open: both read what the board sends, so each misses some, and both send."""
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+_OTHER_END = "/ptmx"  # of a pty: who has that is the board, a simulated one
+
+
+def holders(path: str) -> list[str]:
+    """Return the other processes that have this device open, as far as this user may see them.
+
+    Example: ``process 812 (python3) of pebble-control.service``.
+    """
+    device, found = os.path.realpath(path), []
+    for process in Path("/proc").glob("[1-9]*"):
+        files = set()
+        with suppress(OSError):  # it has ended, or is another user's
+            for number in os.listdir(process / "fd"):  # noqa: PTH208 - a Path for each is slow
+                with suppress(OSError):
+                    files.add(os.readlink(f"{process}/fd/{number}"))  # noqa: PTH115
+        if device in files and process.name != str(os.getpid()) and not any(one.endswith(_OTHER_END) for one in files):
+            with suppress(OSError):
+                name = (process / "comm").read_text(encoding="utf-8", errors="replace").strip()
+                unit = (process / "cgroup").read_text(encoding="utf-8").strip().rpartition("/")[2]
+                found.append(f"process {process.name} ({name})" + f" of {unit}" * unit.endswith(".service"))
+    return found

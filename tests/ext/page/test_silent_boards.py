@@ -1,0 +1,134 @@
+"""A stand-in of the original's boards, which never say what they can do: from no stick to driven, and back."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.contract.payloads import Drive
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.extensions.page import silent_boards
+from pebble.extensions.page.config import ListedRobot
+from pebble.transports import MqttSettings, QoS, create
+from tests.ext.page.attacker import Hall
+from tests.ext.page.served import Page, Served
+from tests.kit.played_robot import RecordingRobot
+from tests.support import Broker, until
+
+_NAMES = itertools.count(1)
+
+
+@pytest.fixture
+def board(broker: Broker, monkeypatch: pytest.MonkeyPatch) -> Iterator[RecordingRobot]:
+    """It obeys drive commands, and takes no stop."""
+    monkeypatch.setattr(silent_boards, "HEARD_S", 0.6)
+    with RecordingRobot(broker.port, f"pebble/robots/lamp{next(_NAMES)}", capabilities={}) as one:
+        one.deaf = True
+        yield one
+
+
+def view(page: Page, ref: str) -> dict[str, Any]:
+    return page.value(ref, "web/board") or {}
+
+
+def drives(page: Page, ref: str) -> bool:
+    return ((page.value(ref, "capabilities", "value") or {}).get("drive") or {}).get("available") is True
+
+
+def refusals(page: Page) -> list[str]:
+    return [one["why"] for one in page.refused]
+
+
+def test_a_maintainer_lets_it_be_driven_over_a_restart_until_it_says_what_it_can_do(
+    broker: Broker, board: RecordingRobot, tmp_path: Path
+) -> None:
+    ref = board.base
+    with Hall(broker.port, tmp_path) as hall, hall.page("driver") as driver, hall.page("maintainer") as maintainer:
+        assert until(lambda: view(driver, ref).get("silent") is True)
+        assert (view(driver, ref)["by"], drives(driver, ref)) == ("", False)
+        assert driver.ready()
+        driver.send("board", ref=ref, do="allow")
+        assert until(lambda: refusals(driver) == ["The role driver may not do this"])
+        driver.drive(ref, 1, z=1.0)
+        assert until(lambda: len(driver.refused) == 2)
+        maintainer.send("board", ref=ref, do="allow", n=7)
+        assert until(lambda: drives(driver, ref))
+        assert (view(driver, ref)["by"], [one["n"] for one in maintainer.done]) == ("maintainer", [7])
+        assert driver.take(ref)
+        driver.drive(ref, 2, x=0.123456789, z=-1.0, y=0.5)
+        driver.drive(ref, 2)
+        assert until(lambda: len(board.drives()) == 4)
+        moved, *zeros = board.drives()
+        assert (moved, zeros) == ({"x": 0.123, "z": -1.0}, [{"x": 0.0, "z": 0.0}] * 3)
+        driver.send("estop", ref=ref, stop="00000000000000ff")
+        assert until(lambda: board.drives()[4:])
+        driver.drive(ref, 3, z=1.0)
+        assert until(lambda: refusals(driver)[2:] == ["Emergency stop"])
+        noted = [(one.what, one.user) for one in hall.served.app.state.audit.read(100)]
+        assert ("allow driving", "maintainer") in noted
+    with Served(broker.port, people=tmp_path / "people.sqlite") as served, served.page() as page:
+        assert until(lambda: drives(page, ref))
+        board.publish_capabilities({"drive": {"available": False}})
+        assert until(lambda: view(page, ref)["silent"] is False and not drives(page, ref))
+
+
+@pytest.mark.parametrize(
+    ("listed", "level", "offered", "allowed", "why"),
+    [
+        ({"drive": True, "axes": ("x", "z", "y")}, "open", True, True, "decides that: change it there"),
+        ({"drive": False}, "open", True, False, "decides that: change it there"),
+        ({"name": "The lamp"}, "open", True, True, ""),
+        ({"drive": True}, "named", True, False, 'only with "plain": true'),
+        ({"drive": True, "plain": True}, "named", True, True, "decides that"),
+    ],
+)
+def test_the_config_allows_forbids_or_leaves_it_to_people(
+    broker: Broker, board: RecordingRobot, tmp_path: Path, listed: dict[str, Any], level: Any, offered: bool,
+    allowed: bool, why: str
+) -> None:  # fmt: skip
+    ref = board.base
+    with (
+        Hall(broker.port, tmp_path, level=level, listed={ref: ListedRobot(**listed)}) as hall,
+        hall.page("admin") as page,
+    ):
+        assert until(lambda: view(page, ref).get("silent") is offered)
+        page.send("board", ref=ref, do="allow")
+        assert until(lambda: page.refused or page.done)
+        assert why in "".join(refusals(page))
+        assert until(lambda: drives(page, ref) is allowed)
+        name = (page.value(ref, "capabilities", "value") or {}).get("identity", {}).get("name")
+        assert name == listed.get("name")
+        page.send("board", ref=ref, do="withdraw")
+        assert until(lambda: drives(page, ref) is (allowed and "drive" in listed))
+
+
+def test_a_retained_command_blocks_until_it_is_cleared(broker: Broker, board: RecordingRobot, tmp_path: Path) -> None:
+    ref = board.base
+    parked = create("mqtt", "parker", MqttSettings(host="127.0.0.1", port=broker.port))
+    parked.open(timeout=5)
+    assert parked.publish(f"{ref}/incoming/drive-values", b'{"z": 1.0}', qos=QoS.DELIVERED, retain=True)
+    parked.close()
+    with Hall(broker.port, tmp_path, listed={ref: ListedRobot(drive=True)}) as hall, hall.page("driver") as page:
+        assert until(lambda: "retained on its topic" in view(page, ref).get("parked", ""))
+        assert page.ready()
+        assert page.take(ref)
+        page.drive(ref, 1, z=0.5)
+        assert until(lambda: refusals(page) == [view(page, ref)["parked"]])
+        page.send("board", ref=ref, do="clear")
+        assert until(lambda: view(page, ref)["parked"] == "")
+        page.drive(ref, 2, z=0.5)
+        assert until(lambda: {"x": 0.0, "z": 0.5} in board.drives())
+
+
+def test_a_command_has_the_axes_of_the_board_and_little_room() -> None:
+    robot = RobotView("pebble/robots/lamp")
+    assert robot.assume(("x", "z", "y"), "Lamp")
+    assert not robot.assume(("x", "z", "y"), "Lamp")
+    assert robot.capabilities["identity"] == {"name": "Lamp"}
+    payload = robot.encode(Drive(x=-1 / 3, z=1 / 7, y=-2 / 3, valid_ms=400, key="k"))
+    assert (json.loads(payload), len(payload) <= 60) == ({"x": -0.333, "z": 0.143, "y": -0.667}, True)
