@@ -65,6 +65,7 @@ class _Answer(NamedTuple):
     ours: bool = False
     problem: str = ""
     broken: bool = False
+    measures: bool = False
 
 
 class Catalogue:
@@ -140,6 +141,7 @@ class Catalogue:
             environment={**self._login, **section.env},
             ours=answer.ours,
             broken=answer.problem if answer.broken else "",
+            drives=not answer.measures,
         )
 
     def _answer(
@@ -177,7 +179,8 @@ class Catalogue:
         before_asking()
         command = self._command(folder, entry, section, described, ours=True)
         try:
-            return _Answer(_merged(described, ask(command, folder, environment(section.env))), True, problem)
+            own = ask(command, folder, environment(section.env))
+            return _Answer(_merged(described, own), True, problem, measures=not own.drives)
         except DescribeError as error:
             return _Answer(described, True, str(error), isinstance(error, BrokenScriptError))
 

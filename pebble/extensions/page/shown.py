@@ -31,6 +31,9 @@ class _Dependency(Struct):
 class _Running(_Clip):
     running: bool = False
     overridden: bool = False
+    label: str = ""
+    drives: bool = True
+    stopped: bool = False
     dependencies: list[_Dependency] = []
     config: dict[str, Any] | None = None
 

@@ -369,7 +369,7 @@ def test_a_script_starts_beside_a_person_only_where_it_gives_way(
         page.send("drive", ref=base, g=1, t=now_ms(), z=0.5)
         ask(page, base, **START)
         assert until(lambda: asked_of(robot) or page.refused)
-        assert [one["why"] for one in page.refused] == ([] if arbitrates else ["local is driving"])
+        assert [one["why"] for one in page.refused] == ([] if arbitrates else ["somebody without a login is driving"])
         page.send("drive", ref=base, g=1, t=now_ms())
         ask(page, base, **START)
         assert until(lambda: len(asked_of(robot)) == (2 if arbitrates else 1), 3)
