@@ -24,6 +24,11 @@ export const microphone = {
 /** @returns {Promise<any>} what is printed on the keys; null: not in this browser, or in a frame of another site */
 export const keyboardLayout = async () => attempt(() => /** @type {any} */ (navigator).keyboard.getLayoutMap(), null);
 
+/** @param {string} host @returns {boolean} whether no other machine can reach it */
+export const isLoopback = (host) => /^(127\.[\d.]+|0\.0\.0\.0|\[::1?\]|localhost|.*\.localhost)$/.test(host);
+
+export const DEMO = "demo"; // what the server of `make demo` calls itself
+
 const nothing = () => {};
 const blind = /** @type {any} */ ({ observe: nothing, disconnect: nothing });
 

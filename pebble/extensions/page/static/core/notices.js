@@ -32,7 +32,7 @@ const EVENTS = {
   },
   script(_before, status) {
     if (!status) return null;
-    const state = status.error ? `script ${short(status.file) || "?"} failed: ${short(status.error)}` : "";
+    const state = status.error && !status.stopped ? `script failed: ${short(status.error)}` : "";
     return { state, text: state };
   },
   /** That it can no longer be driven, while a person or a script drives it; and then that it can again. */

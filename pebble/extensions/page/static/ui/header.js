@@ -4,7 +4,7 @@ import * as browser from "../core/browser.js";
 import { StopChip } from "./banner.js";
 import { Boundary, html, styled, useMetric, useModel, useOnline, usePage, usePart, useRefs, useTick, useValue } from "./parts/hooks.js";
 import { nameIn } from "./parts/looks.js";
-import { Button, Charge, Face, Icon, RouteLink, Select, StopButton, useName } from "./parts/parts.js";
+import { Button, Charge, Face, Icon, RouteLink, Select, StopButton, useItself, useName } from "./parts/parts.js";
 import { driverName, kindOf, roughly, span, typeOf } from "./parts/words.js";
 
 const LATE_MS = 300; // of the way to the server and back
@@ -79,7 +79,7 @@ function Picker({ at }) {
   return html`<label class=${`picker${name.length > 7 ? " long" : ""}`}>
     <${Face} at=${at} />
     <span class="picker-name"><b>${name}</b><${Icon} name="down" /></span>
-    <span class="picker-state"><${IsStopped} at=${at} /><${Liveness} at=${at} /><${Volts} at=${at} /></span>
+    <span class="picker-state"><${Moved} at=${at} /><${Liveness} at=${at} /><${Volts} at=${at} /></span>
     <${Select}
       test="picker"
       label="Choose a robot"
@@ -91,9 +91,11 @@ function Picker({ at }) {
 }
 
 /** Where there are no chips. */
-function IsStopped({ at }) {
+function Moved({ at }) {
   const stopped = useValue(at, "web/estop")?.latched === true && usePage().connection.isOpen;
-  return stopped && html`<b class="picker-stopped">Stopped</b>`;
+  const itself = useItself(at);
+  if (stopped) return html`<b class="picker-stopped">Stopped</b>`;
+  return itself && html`<b class="picker-itself">${itself}</b>`;
 }
 
 function Volts({ at }) {
@@ -130,16 +132,19 @@ function Vital({ at }) {
   const view = useValue(at, "web/driver");
   const stopped = useValue(at, "web/estop")?.latched === true;
   const online = useOnline(at);
+  const itself = useItself(at);
   return html`<div class="vital">
     ${level &&
-    html`<span class="chip"
+    html`<span class="chip battery"
       ><${Icon} name=${charging?.value === true ? "charging" : "battery"} /><${Charge} at=${at} level=${level} online=${online} /></span
     >`}
     ${connection.isOpen && stopped && html`<span class="chip stopped"><${Icon} name="stop" />Stopped</span>`}
+    ${itself && html`<span class="chip others" title=${itself}><${Icon} name="script" /><span>${itself}</span></span>`}
     ${connection.isOpen &&
     !stopped &&
+    !itself &&
     view?.by &&
-    html`<span class=${`chip ${view.you ? (rests ? "bad" : "mine") : "others"}`}><${Icon} name="wheel" />${view.you ? (rests ? "Not driving" : "You drive") : `${driverName(view)} drives`}</span>`}
+    html`<span class=${`chip ${view.you ? (rests ? "bad" : "mine") : "others"}`}><${Icon} name="wheel" /><span>${view.you ? (rests ? "Not driving" : "You drive") : `${driverName(view)} drives`}</span></span>`}
   </div>`;
 }
 

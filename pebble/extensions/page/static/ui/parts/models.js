@@ -56,6 +56,11 @@ export class Connection extends Model {
     return this.state === "open";
   }
 
+  /** States in the server's words, by their codes. */
+  get words() {
+    return this.you?.words ?? {};
+  }
+
   /** The page was loaded before the server was updated. */
   get isOld() {
     return this.you !== null && this.you.version !== this.version;
@@ -160,8 +165,9 @@ export class Settings extends Model {
     this.changed();
   }
 
-  /** @param {string} what of the first time was begun, or "hidden" */
+  /** @param {string} what of the first time was done, or "hidden" */
   begin(what) {
+    if (this.begun.includes(what)) return;
     this.begun = [...new Set([...this.begun, what])];
     write("begun", this.begun);
     this.changed();

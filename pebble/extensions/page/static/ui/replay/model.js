@@ -32,6 +32,10 @@ class Recorded extends Model {
     this.onLogs = null;
   }
 
+  get words() {
+    return this.live.words;
+  }
+
   may() {
     return false;
   }

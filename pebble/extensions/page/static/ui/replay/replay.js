@@ -61,10 +61,13 @@ function press(replay, event) {
 }
 
 function Shown({ at, replay }) {
-  const { panels } = usePage();
+  const { panels, settings } = usePage();
   const narrow = useMedia("(max-width: 760px)"); // as the page's own layout
   const name = useName(at);
   useModel(replay);
+  useEffect(() => {
+    if (replay.isHere) settings.begin("recordings");
+  }, [replay.isHere]);
   return html`<div class="replay">
     <${Boundary} what="The time"><${Badge} at=${at} replay=${replay} /><//>
     ${replay.isHere
