@@ -40,6 +40,7 @@ class Run:
     number: int
     plan: Plan
     baseline: Baseline
+    since: float = field(default_factory=time.time)  # epoch seconds
     main: Part | None = None
     dependencies: list[Part] = field(default_factory=list)
     ending: bool = False

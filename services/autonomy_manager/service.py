@@ -258,8 +258,7 @@ class AutonomyManager(Service):
             status = replace(status, stopped=True)
         if run is None or main is None:
             return status
-        if (label := run.plan.main.script.label) != main.file:
-            status = replace(status, label=label)
+        status = replace(status, label=run.plan.main.script.label, since=round(run.since, 3))
         if not run.plan.drives:
             return replace(status, drives=False)
         return replace(status, overridden=True) if self.clock() < self._overridden_until else status

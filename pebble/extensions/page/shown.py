@@ -32,6 +32,7 @@ class _Running(_Clip):
     running: bool = False
     overridden: bool = False
     label: str = ""
+    since: float = 0
     drives: bool = True
     stopped: bool = False
     dependencies: list[_Dependency] = []

@@ -106,7 +106,7 @@ COVERED = """(() => {
   return [texts.length, texts.filter(covers).length, texts.filter(leaves).length];
 })()"""
 #: Among them the settings below the stick, and a sheet of theirs.
-LATE = ("drive-settings.js", "key-hints.js", "telemetry.js", "map.js", "lights.js", "plots.js", "panels.css")
+LATE = ("drive-settings.js", "telemetry.js", "map.js", "lights.js", "plots.js", "panels.css")
 
 
 @pytest.mark.parametrize(("size", "theme"), [("desktop", "light"), ("phone", "dark")])

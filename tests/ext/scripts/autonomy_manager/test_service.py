@@ -68,7 +68,8 @@ def test_it_begins_idle_and_stops_what_a_predecessor_may_have_left(bench: Bench)
     assert walk.launch.command[3:] == ("--speed", "0.25")
     assert walk.launch.environment["PEBBLE_CONFIG"] == walk.launch.command[2]
     assert walk.launch.tie is TERM
-    assert bench.status == {**IDLE, "running": True, "file": "walk", "pid": walk.pid, "config": {"speed": 0.25}}
+    runs = {"running": True, "file": "walk", "label": "walk", "pid": walk.pid, "config": {"speed": 0.25}}
+    assert bench.status == IDLE | runs
     zero = {"x": 0.0, "z": 0.0, "y": 0.0, "source": "autonomy", "run": run_of(walk)}
     assert until(lambda: bench.drives[-1] == zero), "else a person who stops it before it drives would not end it"
 

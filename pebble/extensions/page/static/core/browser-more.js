@@ -5,14 +5,6 @@ import { attempt } from "./browser.js";
 /** @returns {WakeLock | undefined} */
 export const wakeLock = () => attempt(() => navigator.wakeLock, undefined);
 
-export const clipboard = {
-  get possible() {
-    return attempt(() => Boolean(navigator.clipboard), false);
-  },
-  /** @param {string} text @returns {Promise<void>} */
-  copy: async (text) => navigator.clipboard.writeText(text),
-};
-
 export const microphone = {
   get possible() {
     return attempt(() => Boolean(navigator.mediaDevices.getUserMedia) && "AudioWorkletNode" in globalThis, false);

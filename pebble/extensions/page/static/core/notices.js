@@ -4,7 +4,6 @@ import { isObject } from "./json.js";
 
 export const MOST = 50; // in the list
 const ALOUD = 4; // sentences at once
-const COMPONENTS = 2000; // whose last states are remembered, as many as the server has
 const LOW_PERCENT = 20;
 const LONGEST = 160; // characters of what a robot reports of itself
 
@@ -73,7 +72,8 @@ export class Notices {
 
   /** @param {string} ref @param {keyof EVENTS} event @param {number} at epoch ms @param {...any} given what EVENTS reads */
   see(ref, event, at, ...given) {
-    const states = this.statesOf(ref);
+    const states = this.states.get(ref) ?? new Map();
+    this.states.set(ref, states);
     const before = states.get(event);
     const seen = EVENTS[event](before, ...given);
     if (!seen) return;
@@ -83,15 +83,6 @@ export class Notices {
     const notice = { ref, kind, text, at, unread: true };
     this.list = [notice, ...this.list.filter((old) => old.ref !== ref)].slice(0, MOST);
     this.fresh = [...this.fresh, notice].slice(-MOST);
-  }
-
-  statesOf(ref) {
-    let states = this.states.get(ref);
-    if (!states) {
-      if (this.states.size >= COMPONENTS) this.states.delete(this.states.keys().next().value ?? "");
-      this.states.set(ref, (states = new Map()));
-    }
-    return states;
   }
 
   get unread() {

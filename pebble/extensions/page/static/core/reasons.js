@@ -12,36 +12,7 @@ const RESET_MS = 600; // after a reset robots refuse a driver who has not paused
 /** @typedef {{code: string, text: string, action?: Action, also?: Action}} Reason */
 /** @typedef {{label: string, kind: "take"|"ask"|"give-up"|"take-over"|"see"|"login"|"reload"|"stop-script"}} Action */
 
-/**
- * @typedef {object} Situation
- * @property {string} name of the component
- * @property {Record<string, string>} words of the server, by code
- * @property {boolean} open whether the control socket is
- * @property {boolean} [connecting] for the first time
- * @property {string} broker why the server cannot reach the broker; "" it can
- * @property {boolean} reload the page is older than the server
- * @property {boolean} drives false: not over this connection
- * @property {readonly string[]} rights
- * @property {boolean} loading what shows the picture and these reasons is not here yet
- * @property {boolean} hidden
- * @property {boolean} focus
- * @property {boolean} dialog whether one is open, or a panel
- * @property {boolean} fromKeys whether a key or the gamepad is used
- * @property {{online: boolean|null, silent_s: number|null}|undefined} liveness
- * @property {{latched: boolean, by: string}|undefined} estop
- * @property {number} freeForMs since it was seen stopped
- * @property {Record<string, any>} capabilities
- * @property {import("../messages.js").DriverView|undefined} driver
- * @property {number} driverIdleMs since the driver's last gesture; -1: it lasts, or is not known
- * @property {Script|undefined} script
- * @property {number|null} pictureAgeMs null: no picture is wanted here; NaN: its age is not known; -1: none comes while it is driven
- * @property {boolean} inSight the driver sees the robot itself
- * @property {number} roundTripMs
- * @property {string} failed a part of this page that does not work; ""
- * @property {boolean} padFrozen
- * @property {boolean} mustRelease
- * @property {string} refusal why the server has ended the last gesture; "" it has not
- */
+/** @typedef {ReturnType<import("./driver.js").Driver["situation"]>} Situation */
 
 /** Why nothing may be commanded at all. @param {Situation} s @returns {Reason|null} */
 export function offReason(s) {

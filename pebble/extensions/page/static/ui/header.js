@@ -7,10 +7,11 @@ import { nameIn } from "./parts/looks.js";
 import { Button, Charge, Face, Icon, RouteLink, Select, StopButton, useItself, useName } from "./parts/parts.js";
 import { driverName, kindOf, roughly, span, typeOf } from "./parts/words.js";
 
+const HELP = "Keys, and how stopping works";
 const LATE_MS = 300; // of the way to the server and back
 
 export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
-  const { commands, driver, route } = usePage();
+  const { commands, driver, panels, route } = usePage();
   const wide = layout === "desktop";
   const name = useName(at);
   return html`<header class="top">
@@ -22,7 +23,9 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     <div class="top-space"></div>
     ${!at && html`<${StopChip} />`} ${wide && html`<${ConnectionState} at=${at} />`}
     ${wide && at && html`<${AllButton} outlined /><span class="rule"></span>`}
-    ${wide && at && html`<${HelpButton} />`}
+    ${wide &&
+    at &&
+    html`<${Button} className="quiet round-icon" test="open-help" label=${HELP} icon="help" onPress=${() => panels.toggle("help")} />`}
     <${Boundary} what="Notices"><${Notices} at=${at} wide=${wide || (layout === "portrait" && at !== "")} room=${wide} /><//>
     ${layout === "immersive" &&
     html`<${Button} className="round" test="drawer" label="Everything else" aria-expanded=${drawer} icon="menu" onPress=${onDrawer} />
@@ -43,7 +46,7 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
 }
 
 /** ``outlined``: beside the filled one for the open robot. */
-function AllButton({ outlined = false }) {
+export function AllButton({ outlined = false }) {
   const { commands } = usePage();
   return html`<${StopButton}
     test="stop-all"
@@ -53,17 +56,6 @@ function AllButton({ outlined = false }) {
   >
     <${Icon} name="stop" />${outlined ? "Stop all" : "STOP ALL"}
   <//>`;
-}
-
-function HelpButton() {
-  const { panels } = usePage();
-  return html`<${Button}
-    className="quiet round-icon"
-    test="open-help"
-    label="Keys, and how stopping works"
-    icon="help"
-    onPress=${() => panels.toggle("help")}
-  />`;
 }
 
 const Brand = () => html`<span class="brand"><${Icon} name="logo" /><span>Pebble</span></span>`;
@@ -92,9 +84,10 @@ function Picker({ at }) {
 
 /** Where there are no chips. */
 function Moved({ at }) {
-  const stopped = useValue(at, "web/estop")?.latched === true && usePage().connection.isOpen;
+  const { connection } = usePage();
+  const stopped = useValue(at, "web/estop")?.latched === true;
   const itself = useItself(at);
-  if (stopped) return html`<b class="picker-stopped">Stopped</b>`;
+  if (stopped && connection.isOpen) return html`<b class="picker-stopped">Stopped</b>`;
   return itself && html`<b class="picker-itself">${itself}</b>`;
 }
 

@@ -2,10 +2,10 @@
 
 import { scriptName } from "../../core/reasons.js";
 import { useAnswer } from "../parts/asking.js";
-import { Since, handDriven, whyNotStarted } from "./autonomy-model.js";
+import { handDriven, whyNotStarted } from "./autonomy-model.js";
 import { filled, lastScript, moreWords, remember, remembered, scripts } from "./form-model.js";
 import { Form } from "./form.js";
-import { html, useEffect, useMetric, useOnline, useState, useTick, useValue } from "../parts/hooks.js";
+import { html, useEffect, useMetric, useOnline, useState, useValue } from "../parts/hooks.js";
 import { Nothing } from "../parts/nothing.js";
 import { Button, Icon, Why, useName } from "../parts/parts.js";
 import { refuses } from "../parts/typed.js";
@@ -14,7 +14,6 @@ import { plain } from "../parts/more-words.js";
 import { clockTime } from "../parts/words.js";
 import { useMemo } from "../../vendor/hooks.mjs";
 
-const ASKED_MS = 10_000; // so long the page says that it has asked
 const LONGEST_CONFIG = 14_000; // characters of JSON: the server reads messages of 16 KB
 
 export function Autonomy({ at }) {
@@ -72,8 +71,6 @@ function Running({ at, page, entry, status, running, find }) {
   const called = (file) => plain(find(file)?.label ?? file);
   const why = whyNotEnd(page);
   const label = (key) => script?.fields.find((one) => one.key === key)?.label ?? key;
-  const [seen] = useState(() => new Since()); // what runs while the card is closed may be another run
-  if (entry) seen.update(status, entry.at);
   const past = !useOnline(at);
   const { dependencies = [] } = status;
   const config = Object.entries(status.config ?? {});
@@ -81,8 +78,7 @@ function Running({ at, page, entry, status, running, find }) {
       <p role="status" data-test="script-state">
         ${status.running
           ? html`<b>${past ? "○" : "●"} ${running}</b>
-              ${how(status, past)},
-              ${" "}${since(seen)}`
+              ${how(status, past)}${status.since > 0 && `, since ${clockTime(1000 * status.since)}`}`
           : html`<span class="dim">No script runs.</span>`}
       </p>
       ${(status.running || !entry) &&
@@ -119,15 +115,12 @@ function Running({ at, page, entry, status, running, find }) {
     </details>`}`;
 }
 
-const since = ({ at, isExact }) => `since ${clockTime(at)}${isExact ? "" : " or before"}`;
-
 /** The form of one script, and its start. */
 function Starter({ at, page, entry, status, running, script }) {
   const [{ texts, version }, set] = useState(() => ({ texts: remembered(at, script.file), version: 0 }));
-  const [asked, setAsked] = useState(/** @type {{at: number, of: number | undefined, n: number} | null} */ (null));
+  const [asked, setAsked] = useState(/** @type {{of: number | undefined, n: number} | null} */ (null));
   const answer = useAnswer(asked?.n);
-  const isAsked = asked !== null && Date.now() - asked.at < ASKED_MS && entry?.receivedAt === asked.of;
-  useTick(isAsked ? 1000 : 0);
+  const isAsked = asked !== null && entry?.receivedAt === asked.of; // until it reports anything
   useEffect(() => {
     if (answer.op === "done") page.settings.begin("script");
   }, [answer.op]);
@@ -155,7 +148,7 @@ function Starter({ at, page, entry, status, running, script }) {
     if (JSON.stringify(config).length > LONGEST_CONFIG) return page.connection.show("Not done: the settings are too long together");
     const n = page.commands.startScript(at, script.file, config);
     remember(at, script.file, texts); // it is the last one now
-    return setAsked({ at: Date.now(), of: entry?.receivedAt, n });
+    return setAsked({ of: entry?.receivedAt, n });
   };
   return html`<form noValidate onSubmit=${start}>
     <${Form} key=${`main ${version}`} id="script-set" fields=${main} texts=${texts} onText=${onText} />

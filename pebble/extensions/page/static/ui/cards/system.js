@@ -164,7 +164,7 @@ const ECHO_MS = 5000;
 
 function Flags({ at, offers }) {
   const flags = useValue(at, "web/flags");
-  const has = { mqtt_video: offers.hasVideo, mqtt_audio: offers.has("audio"), remote_mirror: offers.transport !== "mcu" };
+  const has = { mqtt_video: offers.hasVideo, mqtt_audio: offers.has("audio"), remote_mirror: offers.section("transport").kind !== "mcu" };
   const shown = FLAGS.filter(([, field]) => has[field] || typeof flags?.[field] === "boolean");
   if (!shown.length) return null;
   return html`<section class="system" aria-labelledby="flags-title">

@@ -369,7 +369,8 @@ function DriverFact({ at, offers, online, estop, pictured }) {
 /** What runs beside who drives. */
 function ScriptFact({ at, online }) {
   const status = useValue(at, "autonomy-status");
-  if (!status?.running || useItself(at)) return null;
+  const itself = useItself(at);
+  if (!status?.running || itself) return null;
   if (!online) return html`<${Fact} icon="script">script: not known<//>`;
   return html`<${Fact} icon="script">${scriptName(status)} ${status.overridden ? "waits" : "runs"}<//>`;
 }

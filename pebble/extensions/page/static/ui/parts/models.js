@@ -172,15 +172,6 @@ export class Settings extends Model {
     write("begun", this.begun);
     this.changed();
   }
-
-  /** Whether pictures of this component are wanted. @param {string} ref */
-  wantsVideo(ref) {
-    return read(`video ${ref}`, true) !== false;
-  }
-
-  setVideo(ref, wanted) {
-    write(`video ${ref}`, wanted);
-  }
 }
 
 /** Which panel is open above the screen; "" none. */
@@ -289,16 +280,6 @@ export class Offers {
     return this.metrics.some((metric) => metric.startsWith(prefix));
   }
 
-  /** What it is called, and looks like: name, description, colour and picture, as far as it says so. */
-  get identity() {
-    return this.section("identity");
-  }
-
-  get hasLights() {
-    const lights = this.section("lights");
-    return lights.solid === true || lights.flash === true || lights.available === true;
-  }
-
   get drives() {
     return this.section("drive").available === true;
   }
@@ -316,9 +297,5 @@ export class Offers {
 
   get hasVideo() {
     return this.assumed || this.section("video").available === true;
-  }
-
-  get transport() {
-    return this.section("transport").kind ?? "";
   }
 }

@@ -83,59 +83,70 @@ export function StopButton({ onStop, label, children, className = "", describedB
   </span>`;
 }
 
+const isPress = ({ code, repeat }) => (code === "Space" || code === "Enter") && !repeat;
+
+/**
+ * Attributes of what works while a pointer holds it, wherever that goes; and, with ``keys``, while a key does.
+ * @param {(event: any) => void} begin @param {() => void} end @param {boolean} [keys]
+ */
+export const held = (begin, end, keys = false) => ({
+  onPointerDown(event) {
+    if (event.button) return;
+    browser.capture(event);
+    begin(event);
+  },
+  onPointerUp: end,
+  onPointerCancel: end,
+  onLostPointerCapture: end,
+  onContextMenu: (event) => event.preventDefault(), // a finger that stays
+  ...(keys && { onBlur: end, onKeyDown: (event) => isPress(event) && begin(event), onKeyUp: end }),
+});
+
 const HOLD_MS = 1000;
 const HINT_MS = 2500;
 
 /** A button that has to be held for a second, by pointer or key. */
 export function HoldButton({ onHeld, disabled = false, children, className = "", describedBy, test }) {
-  const [held, hold] = useState(false);
+  const [holds, hold] = useState(false);
   const [tapped, setTapped] = useState(false);
   const done = useRef(onHeld);
   done.current = disabled ? () => {} : onHeld;
   useEffect(() => {
     if (disabled) hold(false); // the end of a press on a button that is off is not reported
-    if (!held || disabled) return undefined;
+    if (!holds || disabled) return undefined;
     const timer = setTimeout(() => {
       hold(false);
       done.current();
     }, HOLD_MS);
     return () => clearTimeout(timer);
-  }, [held, disabled]);
+  }, [holds, disabled]);
   useEffect(() => {
     if (!tapped) return undefined;
     const timer = setTimeout(() => setTapped(false), HINT_MS);
     return () => clearTimeout(timer);
   }, [tapped]);
   const end = () => {
-    if (held) setTapped(true); // too early
+    if (holds) setTapped(true); // too early
     hold(false);
   };
-  const key = (event) => event.code === "Space" || event.code === "Enter";
+  const begin = () => {
+    setTapped(false);
+    hold(true);
+  };
   return html`<button
     type="button"
-    class=${`hold ${held ? "held" : ""} ${className}`}
+    class=${`hold ${holds ? "held" : ""} ${className}`}
     data-test=${test}
     disabled=${disabled}
     aria-describedby=${describedBy}
-    onPointerDown=${(event) => {
-      if (event.button) return;
-      browser.capture(event);
-      setTapped(false);
-      hold(true);
-    }}
-    onPointerUp=${end}
-    onPointerCancel=${end}
-    onLostPointerCapture=${end}
-    onBlur=${end}
-    onKeyDown=${(event) => key(event) && !event.repeat && hold(true)}
-    onKeyUp=${end}
+    ...${held(begin, end, true)}
     onContextMenu=${(event) => {
       event.preventDefault();
       end();
     }}
   >
     <span class="hold-fill" aria-hidden="true"></span><span class="hold-text"
-      >${tapped && !held ? "Keep it pressed for 1 s" : children}</span
+      >${tapped && !holds ? "Keep it pressed for 1 s" : children}</span
     >
   </button>`;
 }

@@ -49,7 +49,7 @@ export function Slot({ at }) {
   const words = itself ? [itself, why ?? "Drive, and it waits."] : slotWords(reason, why ?? "", view, driver.typing, script);
   const [title, detail] = asks ? [`${asks} asks to drive`, "Rest for 5 s, and it is theirs."] : [words[0], also || words[1]];
   const [more] = [driver.doubt, ...(driver.pads?.reasons() ?? [])].filter((one) => one && one !== reason);
-  const kind = !reason ? "on" : reason.code === "stopped" ? "stopped" : "off";
+  const kind = itself ? "off" : !reason ? "on" : reason.code === "stopped" ? "stopped" : "off";
   return html`<div class=${`slot why-line ${kind}`}>
     <div class="slot-words" id="why-drive" data-test="why" title=${text}>
       <i class="dot" aria-hidden="true"></i>
