@@ -189,7 +189,7 @@ def moves(robot: Robot) -> bool:
 def test_a_person_has_to_stop_the_script_and_to_press_again(driver: Tab, robot: Robot) -> None:
     robot.show("autonomy-status", running())
     driver.test("stop-script").wait_for()
-    assert text(driver, "stop-script") == "Stop april-follow"
+    assert text(driver, "stop-script") == "Stop script"
     assert "april-follow is driving: stop it first" in text(driver, "why")
     driver.page.keyboard.down("KeyW")
     driver.test("stop-script").click()

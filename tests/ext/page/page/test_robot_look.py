@@ -226,12 +226,12 @@ COVERED_BY_PANELS = """async () => {
       "[data-test=gear][aria-expanded=true]")) one.click();
   };
   const along = (from, length, count) =>
-    Array.from({ length: count }, (_, n) => from + 2 + ((length - 4) * n) / (count - 1));
+    Array.from({ length: count }, (_, n) => from + 5 + ((length - 10) * n) / (count - 1)); // within round corners
   const isCovered = (part) => {
     const { x, y, width, height } = part.getBoundingClientRect();
     return along(x, width, 9).some((px) => along(y, height, 5).some((py) => {
       const hit = document.elementFromPoint(px, py);
-      return hit && !part.contains(hit) && !hit.contains(part);
+      return hit && !part.contains(hit) && !hit.contains(part) && !hit.closest(".stop-area"); // around STOP
     }));
   };
   const found = [];

@@ -370,8 +370,7 @@ function DriverFact({ at, offers, online, estop, pictured }) {
 function ScriptFact({ at, online }) {
   const status = useValue(at, "autonomy-status");
   const itself = useItself(at);
-  if (!status?.running || itself) return null;
-  if (!online) return html`<${Fact} icon="script">script: not known<//>`;
+  if (!status?.running || itself || !online) return null;
   return html`<${Fact} icon="script">${scriptName(status)} ${status.overridden ? "waits" : "runs"}<//>`;
 }
 
