@@ -520,6 +520,10 @@ class AutonomyStatus(Payload, frozen=True, kw_only=True):
     config: dict[str, Any] | None = None  # the effective settings
     controls: bool = True
     overridden: bool | UnsetType = UNSET  # true while a person drives, and the script has to wait
+    label: str | UnsetType = UNSET  # what people call it
+    since: float | UnsetType = UNSET  # epoch seconds, of its start
+    drives: bool | UnsetType = UNSET  # false: it only measures, and an emergency stop does not end it
+    stopped: bool | UnsetType = UNSET  # true: the error is an emergency stop, and ends with the reset
 
 
 class MotorPower(Payload, frozen=True, kw_only=True):

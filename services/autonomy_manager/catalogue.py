@@ -66,6 +66,7 @@ class _Answer(NamedTuple):
     problem: str = ""
     broken: bool = False
     asked: bool = True  # False: what it says itself is not known yet
+    measures: bool = False
 
 
 class Catalogue:
@@ -147,6 +148,7 @@ class Catalogue:
             broken=answer.problem if answer.broken else "",
             asked=answer.asked,
             own_program=bool(described.command),
+            drives=not answer.measures,
         )
 
     def _answer(self, name: str, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
@@ -185,7 +187,8 @@ class Catalogue:
             return _Answer(described, True, problem, asked=False)
         command = self._command(folder, entry, section, described, ours=True)
         try:
-            return _Answer(_merged(described, ask(command, folder, environment(section.env))), True, problem)
+            own = ask(command, folder, environment(section.env))
+            return _Answer(_merged(described, own), True, problem, measures=not own.drives)
         except DescribeError as error:
             return _Answer(described, True, str(error), isinstance(error, BrokenScriptError))
 

@@ -27,6 +27,7 @@ class Description(Struct, frozen=True):
     """What a script publishes about itself; ``command`` only in a manifest.
 
     ``summary`` says in one sentence what it does; ``main`` are the keys of the settings that operators see first.
+    ``drives`` is False for one that only measures; it counts only where ``pebble.script`` refuses to drive then.
     """
 
     label: str | None = None
@@ -35,6 +36,7 @@ class Description(Struct, frozen=True):
     configs: list[Setting] = []
     dependencies: list[Dependency] = []
     command: list[str] = []
+    drives: bool = True
 
     def __post_init__(self) -> None:
         if len(self.configs) > MAX_SETTINGS:

@@ -15,7 +15,7 @@ from pebble.extensions.scripts.runs import CONFIG, RUN
 from pebble.services.autonomy_manager.child import Launch, Process, Spawn
 from pebble.services.autonomy_manager.environment import environment
 from pebble.services.autonomy_manager.motor_owners import Baseline
-from pebble.services.autonomy_manager.script import Plan, Step
+from pebble.services.autonomy_manager.script import Plan, Step, StoppedError
 
 if TYPE_CHECKING:
     from pebble.services.autonomy_manager.service import AutonomyManager
@@ -28,6 +28,7 @@ class Part:
     """A process of a run."""
 
     file: str
+    label: str
     child: Process
     ended: bool = False
 
@@ -39,6 +40,7 @@ class Run:
     number: int
     plan: Plan
     baseline: Baseline
+    since: float = field(default_factory=time.time)  # epoch seconds
     main: Part | None = None
     dependencies: list[Part] = field(default_factory=list)
     ending: bool = False
@@ -53,6 +55,7 @@ class Runner:
 
     def __init__(self, service: AutonomyManager, spawn: Spawn, stop_timeout_s: float) -> None:
         self.error: str | None = None
+        self.stopped = False  # the error is an emergency stop: no failure, and it ends with the reset
         self._service, self._spawn, self._stop_timeout_s = service, spawn, stop_timeout_s
         self._run: Run | None = None
         self._next: Plan | None = None
@@ -73,30 +76,36 @@ class Runner:
         return self._next is not None
 
     @property
-    def unfinished(self) -> Run | None:
-        """The present run, unless it is being ended and no other follows."""
-        return self._run if self._next is not None else self.active
+    def stoppable(self) -> Run | None:
+        """The present run, unless it is being ended and no other follows, or nothing of it may move the robot."""
+        return (self._run if self._next is not None else self.active) if self.drives else None
 
     @property
     def config(self) -> Mapping[str, Value] | None:
         return None if self._run is None or self._run.main is None or self._run.main.ended else self._run.plan.config
 
-    def refuse(self, error: str) -> None:
-        """A start is not possible; what runs goes on."""
-        self.error = error
+    @property
+    def drives(self) -> bool:
+        """True if what runs, or is to follow, may move the robot."""
+        plans = (self._next, None if self._run is None else self._run.plan)
+        return any(plan is not None and plan.drives for plan in plans)
+
+    def refuse(self, error: str | None, *, stopped: bool = False) -> None:
+        """A start is not possible, or, with None, it is again; what runs goes on."""
+        self.error, self.stopped = error, stopped
         self._service.changed()
 
     def start(self, plan: Plan) -> None:
         """Start ``plan`` once what runs has ended; only the newest one counts."""
-        self.error, self._next = None, plan
+        self.error, self.stopped, self._next = None, False, plan
         self._end()
         self._go_on()
 
-    def stop(self, error: str | None = None) -> None:
-        """End what runs, because of ``error``; None: on request."""
+    def stop(self, error: str | None = None, *, stopped: bool = False) -> None:
+        """End what runs, because of ``error``; None: on request. ``stopped``: by an emergency stop."""
         if error is not None:
             log.warning("%s", error)
-        self.error, self._next = error, None
+        self.error, self.stopped, self._next = error, stopped, None
         self._end()
         self._go_on()
 
@@ -136,7 +145,8 @@ class Runner:
                 run.dependencies.append(self._started(run, step))
             run.main = self._started(run, plan.main)
         except (OSError, ValueError, PebbleError) as error:
-            self.error = f"Failed to start {file}: {error}"
+            label = plan.main.script.label
+            self.error, self.stopped = f"Failed to start {label}: {error}", isinstance(error, StoppedError)
             log.warning("%s", self.error)
             self._end()
             return
@@ -158,7 +168,7 @@ class Runner:
         def on_end(code: int) -> None:
             self._service.post_first(lambda: self._on_end(run, part, code))
 
-        part = Part(script.file, self._spawn(launch, on_end))
+        part = Part(script.file, script.label, self._spawn(launch, on_end))
         return part
 
     # -- ending
@@ -202,11 +212,11 @@ class Runner:
             self._service.halt_repeatedly(run.number)
             if not run.ending:
                 run.ending = True
-                self.error = f"{part.file} {how}" if code else None
+                self.error, self.stopped = f"{part.label} {how}" if code else None, False
             self._end_dependencies(run)
         else:
             if not run.ending:
-                self.error = f"dependency {part.file} {how}"
+                self.error, self.stopped = f"dependency {part.label} {how}", False
                 self._end()
             self._forget_if_ended(run)
         self._go_on()

@@ -15,6 +15,10 @@ class StartError(PebbleError):
     """A start that is refused; the text is for the person who asked for it."""
 
 
+class StoppedError(StartError):
+    """A start that an emergency stop refuses, until the reset."""
+
+
 class UnknownScriptError(StartError):
     """It names a script that is not listed, or of which is not known yet what it needs."""
 
@@ -42,6 +46,7 @@ class Script(Struct, frozen=True, kw_only=True):
     broken: str = ""  # why it cannot be started
     asked: bool = True  # False: its settings and what it needs are not known yet
     own_program: bool = False  # its manifest names what runs it
+    drives: bool = True  # it may move the robot, so an emergency stop ends it
 
 
 class Step(Struct, frozen=True):
@@ -58,20 +63,25 @@ class Plan(Struct, frozen=True):
     dependencies: tuple[Step, ...]
     config: dict[str, Value]
 
+    @property
+    def drives(self) -> bool:
+        """True unless all of its processes only measure."""
+        return any(step.script.drives for step in (self.main, *self.dependencies))
+
 
 def plan(scripts: Mapping[str, Script], file: str, config: Mapping[str, Any]) -> Plan:
     """Check a start. Raises StartError."""
     script = scripts.get(meant(scripts, file))
     if script is None:
         raise UnknownScriptError(f"Unknown autonomy file: {shown(file)}")
-    _check(script, f"Failed to start {file}")
-    step, values = _step(script, config, f"Invalid config for {file}")
-    needed = tuple(_dependency(scripts, file, dependency) for dependency in script.dependencies)
+    _check(script, f"Failed to start {script.label}")
+    step, values = _step(script, config, f"Invalid config for {script.label}")
+    needed = tuple(_dependency(scripts, script.label, dependency) for dependency in script.dependencies)
     return Plan(step, needed, values)
 
 
-def _dependency(scripts: Mapping[str, Script], file: str, dependency: Dependency) -> Step:
-    failed = f"Failed to start {file}"
+def _dependency(scripts: Mapping[str, Script], label: str, dependency: Dependency) -> Step:
+    failed = f"Failed to start {label}"
     script = scripts.get(meant(scripts, dependency.file))
     if script is None:
         raise UnknownScriptError(f"{failed}: Dependency script not found: {shown(dependency.file)}")

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import msgspec
 from msgspec.structs import replace
 
 from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CONTROL_STATE, DRIVE, ESTOP_STATE
@@ -35,7 +34,7 @@ from pebble.services.autonomy_manager.child import Processes, Spawn
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, Baseline, MotorOwners
 from pebble.services.autonomy_manager.offer import Offer
 from pebble.services.autonomy_manager.runner import Runner
-from pebble.services.autonomy_manager.script import Plan, Script, StartError, UnknownScriptError, plan
+from pebble.services.autonomy_manager.script import Plan, Script, StartError, StoppedError, UnknownScriptError, plan
 
 _START = frozenset(("start", "run", "play", "enable", "enabled", "on"))
 _HALTS_S = (0.1, 0.3)  # after the first one
@@ -122,7 +121,7 @@ class AutonomyManager(Service):
                 return
             why = f"{error}: scripts are still being listed, try again" if listing else str(error)
             self.log_limited.log("refused", logging.WARNING, "%s", why)
-            self._runner.refuse(why)
+            self._runner.refuse(why, stopped=isinstance(error, StoppedError))
         else:
             self._runner.start(wanted)
 
@@ -138,11 +137,11 @@ class AutonomyManager(Service):
 
     def _check(self, wanted: Plan) -> None:
         """Raise StartError if this robot cannot run ``wanted`` at present."""
-        problem = self._owners.refusal
-        if not problem and self.clock() < self._refused_until:
-            problem = f"{OVERRIDDEN} just now: start it again in {_HOLD_S:g} s"
-        if problem:
-            raise StartError(f"Failed to start {wanted.main.script.file}: {problem}")
+        failed = f"Failed to start {wanted.main.script.label}"
+        if refusal := self._owners.refusal:
+            raise StoppedError(f"{failed}: {refusal}")
+        if self.clock() < self._refused_until:
+            raise StartError(f"{failed}: {OVERRIDDEN} just now: start it again in {_HOLD_S:g} s")
 
     # -- what the motors and people do
 
@@ -151,9 +150,11 @@ class AutonomyManager(Service):
         self._owners.receive(owner, state)
         if state.latched:
             self._waiting = None
-        run = self._runner.unfinished
+        run, stopped = self._runner.stoppable, bool(self._owners.refusal)
         if run is not None and (why := self._owners.ending(run.number, run.baseline, self._signs)):
-            self._runner.stop(why)
+            self._runner.stop(why, stopped=stopped)
+        if self._runner.stopped and not stopped:
+            self._runner.refuse(None)
 
     def _control(self, state: ControlState, owner: str) -> None:
         self._owners.receive_control(owner, state)
@@ -176,7 +177,7 @@ class AutonomyManager(Service):
 
     def _person_drives(self) -> None:
         now, self._waiting = self.clock(), None
-        if self._runner.active is not None and self._section.on_override == "stop":
+        if self._runner.active is not None and self._runner.drives and self._section.on_override == "stop":
             self._runner.stop(OVERRIDDEN)
         if now >= self._overridden_until:
             self.call_at(now + _HOLD_S, self._check_override)
@@ -210,7 +211,7 @@ class AutonomyManager(Service):
     def begin_run(self, plan: Plan) -> tuple[int, Baseline]:
         """Return the number of a new run. Raises PebbleError if none may start now."""
         if refusal := self._owners.refusal:
-            raise StartError(refusal)
+            raise StoppedError(refusal)
         self._local.hold()
         try:
             run = self._owners.newest_run = next_run(self.config, self._owners.barred, self._owners.newest_run)
@@ -267,8 +268,14 @@ class AutonomyManager(Service):
             error=self._runner.error,
             config=None if self._runner.config is None else dict(self._runner.config),
         )
-        overridden = main is not None and self.clock() < self._overridden_until
-        return replace(status, overridden=True if overridden else msgspec.UNSET)
+        if self._runner.stopped:
+            status = replace(status, stopped=True)
+        if run is None or main is None:
+            return status
+        status = replace(status, label=run.plan.main.script.label, since=round(run.since, 3))
+        if not run.plan.drives:
+            return replace(status, drives=False)
+        return replace(status, overridden=True) if self.clock() < self._overridden_until else status
 
     def _publish_files(self, found: list[dict[str, object]]) -> None:
         self.publish(AUTONOMY_FILES, AutonomyFiles(files=found, timestamp=time.time()))

@@ -5,7 +5,9 @@ import logging
 import time
 from typing import Final
 
-from pebble.contract import CAPABILITIES, STATUS, Channel
+import msgspec
+
+from pebble.contract import AUTONOMY_STATUS, CAPABILITIES, STATUS, Channel
 from pebble.contract.channels import channel_of
 from pebble.contract.identity import parse_topic
 from pebble.extensions.foxglove.json_channels import json_spec
@@ -64,13 +66,17 @@ class Robots:
             self._refused += 1
             return
         channel = channel_of(f"{address.direction}/{address.metric}")
-        if channel in (CAPABILITIES, STATUS):
+        if channel in (AUTONOMY_STATUS, CAPABILITIES, STATUS):
             robot.receive(channel, message, at, time.time())
         if channel is CAPABILITIES:
             for medium in _MEDIA:
                 feed = self._feed(robot, medium)
                 self._by_channel.update(dict.fromkeys(feed.update(), feed))
-        self._publish(channel, message, time.time_ns() - round((time.monotonic() - at) * 1e9))
+        at_ns = time.time_ns() - round((time.monotonic() - at) * 1e9)
+        self._publish(channel, message, at_ns)
+        if channel is AUTONOMY_STATUS:
+            words = msgspec.json.encode({"words": robot.itself})
+            self._publish(None, Message(f"{message.topic}/words", words, retain=True), at_ns)
 
     def wake(self, topic: str, *, subscribed: bool) -> None:
         """Note that a client has subscribed to this channel, or unsubscribed."""

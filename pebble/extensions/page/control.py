@@ -9,11 +9,12 @@ from contextlib import suppress
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from pebble.extensions.fleet.database import DatabaseError
 from pebble.extensions.fleet.roles import Session, page_rights
-from pebble.extensions.operator.client.drive_reasons import WORDS
+from pebble.extensions.operator.client.drive_reasons import WORDS, person
 from pebble.extensions.operator.client.estop_states import Reset
 from pebble.extensions.page import messages as m
 from pebble.extensions.page import robot_commands
@@ -356,12 +357,16 @@ class Control:
         self._large_due = self._large_due and not large
         if self._interest.more:
             self._wake.set()
-        seen, driven = clock(), self._server.drivers
-        values = found + tuple((ref, "web/driver", driven.robot(ref).shown(self._tab, seen), 0.0) for ref, _ in drivers)
+        values = found + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)
         gone, self._interest.gone = tuple(self._interest.gone), set()
         if values or gone:
             await self._websocket.send_text(encode(m.State(now=1000 * time.time(), set=values, gone=gone)))
         await self._send_logs()
+
+    def _driver(self, ref: str) -> m.DriverView:
+        view, login = self._server.drivers.robot(ref).shown(self._tab, clock()), self._server.settings.login
+        by = person(view.by, login=login)
+        return replace(view, by=by, device=view.device if by == view.by else "", asks=person(view.asks, login=login))
 
     async def _send_logs(self) -> None:
         """Send one part at each echo: on a slow connection pings never wait behind more than that."""

@@ -9,6 +9,7 @@ from contextlib import suppress
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
 from pebble.config.security import SecurityLevel
 from pebble.contract import CAPABILITIES, CONTROL_STATE, ONLINE, channel_of
@@ -20,6 +21,7 @@ from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.roles import Session
 from pebble.extensions.operator.client.broker import Broker
 from pebble.extensions.operator.client.connection import in_small_segments
+from pebble.extensions.operator.client.drive_reasons import person
 from pebble.extensions.operator.client.estop import send
 from pebble.extensions.operator.client.heartbeats import Heartbeats
 from pebble.extensions.operator.client.robot_topics import FLEET, SYNONYMS
@@ -242,7 +244,9 @@ class Server:
         changed, self.stops.changed = self.stops.changed, set()
         for ref in changed:
             if (robot := self.robots.view(ref)) is not None:
-                self.robots.set_server_metric(ref, _ESTOP_METRIC, self.stops.view(robot.estop))
+                view = self.stops.view(robot.estop)
+                by = person(view.by, login=self.settings.login)
+                self.robots.set_server_metric(ref, _ESTOP_METRIC, replace(view, by=by))
 
 
 def _is_base(ref: str) -> bool:

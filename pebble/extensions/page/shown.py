@@ -31,6 +31,10 @@ class _Dependency(Struct):
 class _Running(_Clip):
     running: bool = False
     overridden: bool = False
+    label: str = ""
+    since: float = 0
+    drives: bool = True
+    stopped: bool = False
     dependencies: list[_Dependency] = []
     config: dict[str, Any] | None = None
 

@@ -9,8 +9,16 @@ from collections.abc import Iterator
 
 import pytest
 
-from pebble.contract import APRILTAG_DATA, APRILTAG_LOCATIONS, CHARGING_LEVEL, LOGS, WHEEL_ODOMETRY
-from pebble.contract.payloads import ChargingLevel, LogRecord, TagData, TagDetection, TagLocations, WheelOdometry
+from pebble.contract import APRILTAG_DATA, APRILTAG_LOCATIONS, AUTONOMY_STATUS, CHARGING_LEVEL, LOGS, WHEEL_ODOMETRY
+from pebble.contract.payloads import (
+    AutonomyStatus,
+    ChargingLevel,
+    LogRecord,
+    TagData,
+    TagDetection,
+    TagLocations,
+    WheelOdometry,
+)
 from pebble.transports import Message, QoS, Transport
 from tests.ext.foxglove.live import FRED, GOOB, client, live, online, publish
 from tests.ext.foxglove.watcher import Watcher
@@ -38,9 +46,11 @@ def test_each_payload_gets_the_schema_that_foxglove_has_for_it(broker: Broker, r
     odometry = WheelOdometry(value={"x_mm": 1500.0, "y_mm": 0.0, "heading_rad": 0.0}, timestamp=t / 1e3, unit="mm")
     followed = TagData(detected=True, timestamp=t / 1e3, marker_id=7, distance_m=2.0, angle_rad=math.pi / 2)
     record = LogRecord(t=t, level="WARNING", service="bridge", message="careful")
+    runs = AutonomyStatus(running=True, timestamp=t / 1e3, file="apriltag-follow", label="Follow a tag")
     sent = {LOGS: record, WHEEL_ODOMETRY: odometry, APRILTAG_LOCATIONS: tags, APRILTAG_DATA: followed}
+    sent[AUTONOMY_STATUS] = runs
     names = ["logs/log", "wheel-odometry/pose", "apriltag-locations/annotations", "apriltag-data/scene"]
-    topics = [f"{GOOB}/outgoing/{name}" for name in (*names, "apriltag-data")]
+    topics = [f"{GOOB}/outgoing/{name}" for name in (*names, "apriltag-data", "autonomy-status/words")]
     with live(broker) as server:
         watcher = Watcher(server.address)
 
@@ -53,7 +63,7 @@ def test_each_payload_gets_the_schema_that_foxglove_has_for_it(broker: Broker, r
         for topic in topics:
             watcher.subscribe(topic)
         assert until(publish_all, 20, step=0.05)
-    log, pose, drawn, scene, data = (watcher.of(topic)[0] for topic in topics)
+    log, pose, drawn, scene, data, words = (watcher.of(topic)[0] for topic in topics)
     assert (log.level, log.name, log.message, log.timestamp.ToMilliseconds()) == (3, "bridge", "careful", t)
     assert (pose.frame_id, pose.pose.position.x) == ("goob/odom", 1.5)
     assert [(point.x, point.y) for point in drawn.points[0].points] == [(64, 96), (192, 96), (192, 192), (64, 192)]
@@ -62,6 +72,7 @@ def test_each_payload_gets_the_schema_that_foxglove_has_for_it(broker: Broker, r
     assert (entity.frame_id, place.x, place.y) == ("goob", pytest.approx(0, abs=1e-9), pytest.approx(-2))
     assert entity.timestamp.ToMilliseconds() == t
     assert data["distance_m"] == 2.0
+    assert words == {"words": "goob drives itself: Follow a tag"}
 
 
 def test_json_has_the_schema_of_the_contract_and_its_last_value_for_who_subscribes_later(

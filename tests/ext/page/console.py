@@ -105,12 +105,12 @@ class Console:
         match reason:
             case "stopped":
                 self.reset()
-            case "free" | "idle":
+            case "free" | "idle" | "itself":
                 self.test("take").click(timeout=500)
             case "lease":
                 self.test("take-over").hover(timeout=500)
                 self.page.mouse.down()
-                self.because("", "free", "idle", within=1.5)
+                self.because("", "free", "idle", "itself", within=1.5)
                 self.page.mouse.up()
 
     def hold_button(self, name: str, seconds: float = 1.15) -> None:

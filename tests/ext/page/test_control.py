@@ -85,11 +85,11 @@ def test_an_emergency_stop_is_repeated_until_the_robot_confirms_and_a_reset_name
     page.send("estop", ref=robot.base, stop="00000000000000aa", why="button")
     assert until(lambda: page.value(robot.base, "web/estop", "sending") == "confirmed")
     view = page.value(robot.base, "web/estop")
-    assert (view["latched"], view["by"], view["stop"]) == (True, "local on test", "00000000000000aa")
+    assert (view["latched"], view["by"], view["stop"]) == (True, "somebody at this computer", "00000000000000aa")
     assert page.take(robot.base)
     page.drive(robot.base, 1, z=0.5)
     assert until(lambda: page.refused)
-    assert page.refused[0]["why"] == "Stopped by local on test"
+    assert page.refused[0]["why"] == "Stopped by somebody without a login"
     (owner,) = view["owners"]
     shown = {key: owner[key] for key in ("owner", "boot", "count")}
     page.send("estop-reset", ref=robot.base, owners=[{**shown, "count": 99}])

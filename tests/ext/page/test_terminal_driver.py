@@ -139,6 +139,14 @@ def test_a_layout_without_latin_letters_is_named() -> None:
     assert cab.moves("up")
 
 
+def test_a_robot_that_drives_itself_is_said_to() -> None:
+    cab = Cab().ready()
+    cab.receive(
+        outgoing(GOOB, "autonomy-status", {"running": True, "timestamp": 1, "file": "x", "label": "Follow a tag"})
+    )
+    assert cab.driver.status().startswith("goob · goob drives itself: Follow a tag · ")
+
+
 def test_who_leaves_sends_a_last_zero_and_nothing_more_than_twice_after_it() -> None:
     cab = Cab().ready()
     cab.run(0.5, "w")

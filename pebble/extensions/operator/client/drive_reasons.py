@@ -103,6 +103,7 @@ WORDS = {
     "loading": "This screen is still loading",
     "dialog": "Close the panel first",
     "script": "{script} is driving: stop it first",
+    "itself": "{name} drives itself: {script}",
     "picture": "The picture is {age} s old",
     "picture-none": "There is no picture yet",
     "picture-waits": "Pictures wait while you drive",
@@ -115,9 +116,22 @@ WORDS = {
 
 
 def words(
-    code: str | None, name: str = "", *, stopped: EstopState | None = None, driven: str = "", problem: str = ""
+    code: str | None,
+    name: str = "",
+    *,
+    stopped: EstopState | None = None,
+    driven: str = "",
+    problem: str = "",
+    script: str = "",
 ) -> str:
     """Return the sentence of a state for people; "" for none. ``driven``: by whom."""
     by = stopped.by if stopped is not None and stopped.by else "unknown"
-    values = {"name": name, "by": by, "who": driven, "script": "A script", "problem": problem}
+    values = {"name": name, "by": person(by), "who": person(driven), "script": script or "A script", "problem": problem}
     return WORDS.get(code or "", "").format_map(defaultdict(str, values))
+
+
+def person(by: str, *, login: bool = True) -> str:
+    """Return ``by`` for people: who needs no login is called `local`, perhaps with a device. ``login``: one is here."""
+    if by.partition(" ")[0] != "local":
+        return by
+    return "somebody without a login" if login else "somebody at this computer"

@@ -13,7 +13,7 @@ from pebble.errors import PayloadError
 from pebble.extensions.operator.client import assumed
 from pebble.extensions.operator.client.announced import announced
 from pebble.extensions.operator.client.control import RobotControl
-from pebble.extensions.operator.client.drive_reasons import SILENT_S, Situation
+from pebble.extensions.operator.client.drive_reasons import SILENT_S, Situation, words
 from pebble.extensions.operator.client.driveable import Driveable, driveable_of, is_held
 from pebble.extensions.operator.client.pace_of_link import Pace, pace_of, way_s
 from pebble.extensions.operator.client.robot_estop import RobotEstop
@@ -288,9 +288,22 @@ class RobotView:
         """Whether people are told that it is there."""
         return self.liveness.online_to_people(now)
 
+    @property
+    def script(self) -> str:
+        """It is what people call the script that may move it; empty: none does."""
+        status = self.autonomy
+        if status is None or not status.running or status.drives is False:
+            return ""
+        return (status.label if isinstance(status.label, str) else status.file) or "A script"
+
+    @property
+    def itself(self) -> str:
+        """It is the sentence that says that it drives itself; empty: a person drives, or nobody."""
+        waits = self.latched or (self.autonomy is not None and self.autonomy.overridden is True)
+        return words("itself", self.name, script=self.script) if self.script and not waits else ""
+
     def situation(self, now: float) -> Situation:
         """What speaks for and against driving it, as far as it says so itself."""
-        script = self.autonomy
         return Situation(
             online=self.online(now),
             latched=self.latched,
@@ -298,7 +311,7 @@ class RobotView:
             published=bool(self.capabilities) or self.estop.has_capabilities,
             drives=self.drives,
             arbitrates=self.arbitrates,
-            script=script is not None and script.running,
+            script=bool(self.script),
         )
 
 

@@ -119,6 +119,7 @@ class TerminalDriver:
         idle = self._reason or ("let go first" if self._pressed else "ready")
         parts = (
             self.name,
+            robot.itself,
             f"driving x {x:+.2f} z {z:+.2f}" if self._driven.state is State.MOVING else idle,
             self.unconfirmed and f"EMERGENCY STOP NOT CONFIRMED: {self.unconfirmed}",
             f"{view.asks} asks for control: l lets {view.asks} drive" if view.you and view.asks else "",
@@ -156,7 +157,8 @@ class TerminalDriver:
         situation = self.robot.situation(now)._replace(driven=view.by != "" and not view.you, listening=not view.you)
         situation = situation._replace(stopping=sends, online=situation.online if self._heartbeat else True)
         who = f"{view.by} ({view.device}{', ' * bool(view.device)}name {'' if view.checked else 'not '}checked)"
-        why = words(first_reason(situation), self.name, stopped=self.robot.stopped_by, driven=who)
+        code, stopped = first_reason(situation), self.robot.stopped_by
+        why = words(code, self.name, stopped=stopped, driven=who, script=self.robot.script)
         return why or (PARKED if self.robot.parked else "")
 
     def _wanted(self, now: float) -> tuple[float, float, float]:

@@ -74,7 +74,6 @@ function commands(socket, driver, estop) {
     endStop: (stop) => estop.end(stop),
     reset: (ref, owners) => estop.reset(ref, owners),
     take: (over) => driver.take(over),
-    release: () => driver.release(),
     stopScript: (ref) => socket.send({ op: "autonomy", ref, file: "" }),
   };
 }

@@ -28,6 +28,7 @@ class Way(NamedTuple):
     wheels: Wheels
     latest: Callable[[Channel, float], Any]  # payload of the neighbour
     check: Callable[[], None]
+    check_drives: Callable[[], None]  # and where it may not drive
     clock: Callable[[], float]
 
 
@@ -62,7 +63,7 @@ class Neighbour:
         """Drive it, as :meth:`Robot.drive` does this one, for 0.3 s at most. False: that has no effect, as far as is
         known. Raises NotGrantedError if it does not let this robot drive it.
         """
-        self._way.check()
+        self._way.check_drives()
         command = Drive(x=float(x), z=float(z), y=float(y), source=SCRIPT, run=self._way.wheels.run)
         state, now = self._state, self._way.clock()
         if state is not None and DRIVE.metric not in state.commanded.get(self._me, ()):

@@ -34,24 +34,27 @@ def run(
     summary: str = "",
     main_options: Sequence[str] = (),
     needs: Mapping[str, Mapping[str, Any]] | None = None,
+    drives: bool = True,
 ) -> None:
     """Be the program of ``main(robot)`` or ``main(robot, options)``, ``options`` being a msgspec Struct of your own.
 
     ``label`` is its name for operators, ``summary`` the sentence that says what it does (else the first line of its
     docstring), ``main_options`` names up to three options that they see first (else the first three); ``needs`` lists
-    other scripts that must run, with their options. Returns when main has returned; raises SystemExit otherwise. The
+    other scripts that must run, with their options. ``drives`` False: it only measures, so an emergency stop does not
+    end it, and every command raises PebbleError. Returns when main has returned; raises SystemExit otherwise. The
     wheels are stopped in any case.
     """
     options = _options_of(main)
     name = _name()
     if sys.argv[1:] == ["--describe"]:
-        _describe({"label": label or name, "summary": summary or _first_line(main)}, options, main_options, needs or {})
+        words = {"label": label or name, "summary": summary or _first_line(main)}
+        _describe(words, options, main_options, needs or {}, drives=drives)
         return
     arguments = _arguments(main, label or name, options)
     set_up_logging("INFO")
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     try:
-        _Program(name).run(main, *arguments)
+        _Program(name, drives=drives).run(main, *arguments)
     except PebbleError as error:
         for line in str(error).splitlines():
             log.error("%s", line)
@@ -94,6 +97,8 @@ def _describe(
     options: type[msgspec.Struct] | None,
     first: Sequence[str],
     needs: Mapping[str, Mapping[str, Any]],
+    *,
+    drives: bool,
 ) -> None:
     settings = [] if options is None else form(options)
     keys = [setting.key for setting in settings]
@@ -105,6 +110,7 @@ def _describe(
         **{key: value for key, value in {**words, "main": list(first)}.items() if value},
         "configs": [setting.entry() for setting in settings],
         "dependencies": [{"file": file, "config": dict(config)} for file, config in needs.items()],
+        **({} if drives else {"drives": False}),
     }
     sys.stdout.write(msgspec.json.encode(description).decode() + "\n")
 
@@ -138,8 +144,8 @@ class _NoOptions(msgspec.Struct):
 class _Program:
     """The process of a script."""
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self, name: str, *, drives: bool) -> None:
+        self._name, self._drives = name, drives
         self._robot: Robot | None = None
 
     def run(self, main: Callable[..., None], config_path: Path, arguments: tuple[msgspec.Struct, ...]) -> None:
@@ -148,7 +154,8 @@ class _Program:
         local = LocalScripts(config)
         local.hold()
         transport = _connected(config, config_path)
-        robot = self._robot = Robot(config, transport, _numbered(config), name=self._name, on_ended=self._end_run)
+        options: dict[str, Any] = {"name": self._name, "on_ended": self._end_run, "drives": self._drives}
+        robot = self._robot = Robot(config, transport, _numbered(config), **options)
         try:
             main(robot, *arguments)
         finally:

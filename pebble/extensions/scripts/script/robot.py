@@ -22,6 +22,7 @@ from pebble.contract import (
     Kind,
     codec,
 )
+from pebble.contract.channels import INCOMING
 from pebble.contract.payloads import Drive
 from pebble.errors import PebbleError
 from pebble.extensions.scripts.script.neighbour import Neighbour, Way
@@ -94,8 +95,9 @@ class Robot:
         name: str = "script",
         on_ended: Callable[[str], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
+        drives: bool = True,
     ) -> None:
-        """``transport`` is open. ``number`` gives the run's number, above the given one."""
+        """``transport`` is open. ``number`` gives the run's number, above the given one. ``drives``: it may."""
         self.config = config
         self.log = logging.getLogger(f"pebble.script.{name}")
         self._refusals = Refusals(RateLimitedLog(self.log), Counters())
@@ -106,6 +108,7 @@ class Robot:
         self._pictures = Pictures(config.run_dir())
         self._publishing = threading.RLock()  # the last values are published after all others, before disconnecting
         self._stopped = threading.Event()
+        self._drives = drives
         self._exit_code = 0
         self._pid = os.getpid()
         self._wheels = Wheels(transport, self._addresses, number, on_ended or self._end_run, clock)
@@ -155,7 +158,7 @@ class Robot:
         person drives, the robot is stopped, or there is no connection. At most 50 commands a second are published: of
         more, the newest; a stop never waits. Numbers of NumPy will do. Raises ValueError or TypeError for no number.
         """
-        self._check()
+        self._check_drives()
         return self._wheels.drive(Drive(x=_axis("x", x), z=_axis("z", z), y=_axis("y", y)))
 
     def stop(self) -> bool:
@@ -176,14 +179,12 @@ class Robot:
         """Publish ``value`` on ``channel``; False: it was not accepted. ``names`` fill a pattern channel's levels."""
         topic = channel.topic(self.config.base, **names) if names else self._addresses[channel].topic
         with self._publishing:
-            self._check()
-            check_publish(topic, self._addresses)
+            self._check_publish(channel, topic)
             return self._publish(channel, value, topic)
 
     def publish_at_end(self, channel: Channel, value: Callable[[], Any]) -> None:
         """Publish what ``value()`` returns then, once the script ends, however it does; not if it is killed."""
-        self._check()
-        check_publish(self._addresses[channel].topic, self._addresses)
+        self._check_publish(channel, self._addresses[channel].topic)
         self._last_values[channel] = value
 
     def neighbour(self, name: str) -> Neighbour:
@@ -195,7 +196,7 @@ class Robot:
             if section is None or not section.enabled or name not in section.listens:
                 raise PebbleError(f'robot.neighbour: {name!r} is not in services.neighbours.listens: add "{name}": []')
             latest = _Latest(partial(self._subscribe_to, name), self._clock)
-            way = Way(self._transport, self._wheels, latest.of, self._check, self._clock)
+            way = Way(self._transport, self._wheels, latest.of, self._check, self._check_drives, self._clock)
             found = self._neighbours[name] = Neighbour(name, self.config.identity, way)
         return found
 
@@ -252,6 +253,15 @@ class Robot:
             raise PebbleError("a fork of a script has no robot: use a thread, or start a program with subprocess")
         if self._stopped.is_set():
             raise Stopped(self._exit_code)
+
+    def _check_drives(self) -> None:
+        self._check()
+        if not self._drives:
+            raise PebbleError("this script only measures, as its run(…, drives=False) says: it commands nothing")
+
+    def _check_publish(self, channel: Channel, topic: str) -> None:
+        (self._check_drives if channel.direction == INCOMING else self._check)()
+        check_publish(topic, self._addresses)
 
     def _subscribe(self, channel: Channel, handler: Callable[..., None]) -> None:
         self._receive(self._addresses[channel].topic, channel, handler)

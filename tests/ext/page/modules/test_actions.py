@@ -147,7 +147,7 @@ define("fetch", async () => ({ ok: healthy }));
 performance.now = () => now;
 let healthy = true;
 const { install } = await import(given.more);
-const driver = { ref: "pebble/robots/goob", lease: {} };
+const driver = { ref: "pebble/robots/goob", lease: {}, onChange() {} };
 const panels = { toggle: (name) => seen.push(name) };
 const page = { driver, connection: { show() {} }, store: { get: () => undefined }, panels, commands: {} };
 install(page);

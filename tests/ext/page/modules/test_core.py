@@ -192,14 +192,14 @@ def test_the_first_reason_counts() -> None:
     found = reasons("result = mends.map((mend) => driveReason(Object.assign(situation, mend)));")
     assert [None if one is None else one["code"] for one in found] == [
         "server", "broker", "reload", "plain", "role", "hidden", "silent", "stopped", "reset", "no-drive", "lease",
-        "free", "dialog", "script", "picture", "late", "pad", "focus", "release", "release", None,
+        "itself", "dialog", "script", "picture", "late", "pad", "focus", "release", "release", None,
     ]  # fmt: skip
     texts = {
         "server": "No connection to the server",
         "silent": "goob is silent for 12 s",
         "stopped": "Stopped by eve",
         "lease": "bob (phone) is driving",
-        "free": "april-follow runs. Take control to drive",
+        "itself": "Take control to drive",
         "picture": "The picture is 2.4 s old",
         "late": "Commands are late (640 ms)",
         "release": "Let go first",
@@ -207,7 +207,7 @@ def test_the_first_reason_counts() -> None:
     assert {one["code"]: one["text"] for one in reversed(found) if one and one["code"] in texts} == texts
     assert found[-2]["text"] == "Let go first. It was: Commands are late"
     actions = {one["code"]: one["action"]["kind"] for one in found if one is not None and "action" in one}
-    expected = {"reload": "reload", "role": "login", "lease": "take-over", "free": "take", "picture": "see"}
+    expected = {"reload": "reload", "role": "login", "lease": "take-over", "itself": "take", "picture": "see"}
     assert actions == expected | {"script": "stop-script"}
 
 
@@ -234,14 +234,19 @@ def test_without_server_or_broker_everything_is_off() -> None:
 
 
 @pytest.mark.parametrize(
-    ("file", "name"),
-    [('"april-follow"', "april-follow"), ('{ "x": 1 }', "the script"), ('"x".repeat(1000)', "x" * 40)],
+    ("script", "text"),
+    [
+        ({"file": "april-follow"}, "april-follow is driving: stop it first"),
+        ({"file": "april-follow", "label": "Follow a tag"}, "Follow a tag is driving: stop it first"),
+        ({"file": "x" * 1000}, f"{'x' * 40} is driving: stop it first"),
+        ({"file": None}, "A script is driving: stop it first"),
+        ({"file": "wheel-odometry", "drives": False}, None),
+    ],
 )
-def test_a_script_that_drives_can_be_stopped(file: str, name: str) -> None:
-    steps = f"{_GOOD} result = driveReason({{ ...situation, script: {{ running: true, file: {file} }} }});"
-    text = f"{name.replace('the script', 'A script')} is driving: stop it first"
-    action = {"label": f"Stop {name}", "kind": "stop-script"}
-    assert reasons(steps) == {"code": "script", "text": text, "action": action}
+def test_a_script_that_drives_can_be_stopped(script: dict[str, Any], text: str | None) -> None:
+    steps = f"{_GOOD} result = driveReason({{ ...situation, script: {{ running: true, ...{json.dumps(script)} }} }});"
+    action = {"label": "Stop script", "kind": "stop-script"}
+    assert reasons(steps) == (text and {"code": "script", "text": text, "action": action})
 
 
 _GOOD = "mends.forEach((mend) => Object.assign(situation, mend));"

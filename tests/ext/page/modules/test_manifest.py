@@ -1,4 +1,4 @@
-"""What the page makes of manifests, of what is entered into their forms, and of values of any shape; in Node.js."""
+"""What the page makes of manifests, of what is entered into their forms, and of capabilities; in Node.js."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from tests.ext.page.states import described
 
 _MODULES = {
     "ui/cards/manifest.js": "command, range, step, unsendable",
-    "ui/cards/lines.js": "linesOf",
     "ui/cards/outlets.js": "outletsOf, obstacle",
     "ui/parts/models.js": "Offers",
 }
@@ -56,34 +55,6 @@ RANGES: list[tuple[dict[str, Any], Any, str]] = [
     ({"type": "i16", "scale": -0.1, "offset": 10}, [-3266.7, 3286.8], "any"),
     ({"type": "f32"}, None, "any"),
 ]
-
-
-# -- values
-
-
-def lines(payload: Any) -> list[list[Any]]:
-    made = run("linesOf(v[0])", payload)
-    assert made["omitted"] == 0
-    return [[line["depth"], line["key"], line["text"]] for line in made["lines"]]
-
-
-def test_payloads_become_lines_nested_ones_farther_in() -> None:
-    nested = {"t": 1, "value": {"pose": {"x": 1.25, "y": [1, 2]}, "ok": True}, "seq": 9}
-    expected = [[0, "pose", ""], [1, "x", "1.25"], [1, "y", "[1, 2]"], [0, "ok", "true"], [0, "seq", "9"]]
-    assert lines(nested) == expected
-    assert lines({"value": 7.92, "unit": "v"}) == [[0, "", "7.92 v"]]
-    assert lines(7) == [[0, "", "7"]]
-    assert lines([]) == [[0, "", "[]"]]
-
-
-def test_values_of_any_depth_and_length_have_an_end() -> None:
-    deep: Any = 1
-    for _ in range(30):
-        deep = {"a": [deep, {"b": deep}]} if _ < 3 else {"a": deep}
-    assert max(line[0] for line in lines(deep)) <= 4
-    wide = run("linesOf(v[0])", {"value": {str(n): {"x": n} for n in range(5000)}})
-    assert len(wide["lines"]) <= 101
-    assert wide["omitted"] >= 4900
 
 
 # -- what a robot offers

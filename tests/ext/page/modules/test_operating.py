@@ -130,8 +130,10 @@ NOTICES: Rows = {
         ["c was stopped by an unknown sender", "b was stopped by eve on phone"]),
     "a script that fails": ("""
         see("a", "script", { error: "old" }); see("a", "script", { running: true, file: "follow", error: null });
-        see("a", "script", { running: false, file: "follow", error: { code: 1, toString: 1 } });""",
-        ['a script follow failed: {"code":1,"toString":1}']),
+        see("a", "script", { running: false, error: { code: 1, toString: 1 } });
+        see("b", "script", { running: true });
+        see("b", "script", { running: false, error: "emergency stop", stopped: true });""",
+        ['a script failed: {"code":1,"toString":1}']),
     "a battery that hovers around the limit is listed once, and again once it was charged": ("""
         level([50], [19.5], [20.5], [18]); result = [...texts(), notices.fresh.length];
         level([30], [12], [21], [19], [21], [19]); result.push(notices.fresh.length);

@@ -86,12 +86,12 @@ SHOWN: Rows = {
         }.items()},
     **{f"a part that fails ends what is driven, is reported and keeps no stop back: {part}": (f"""
         console.error = () => {{}}; key("KeyW"); driver.tick(); const z = driver.output.z;
-        const {{ {part} }} = driver; driver.{part} = () => {{ throw new Error("no"); }};
+        const {{ {part} }} = {owner}; {owner}.{part} = () => {{ throw new Error("no"); }};
         driver.tick(); result = [z, driver.output.z, driver.reason().code];
         driver.latch("button"); result.push(stops());
-        driver.{part} = {part}; driver.tick(); driver.keyUp({{ code: "KeyW", key: "w" }});
+        {owner}.{part} = {part}; driver.tick(); driver.keyUp({{ code: "KeyW", key: "w" }});
         driver.tick(); result.push(driver.reason());""", [0.6, 0, "failed", ["estop: button"], None])
-        for part in ("readPads", "update", "watchLease")},
+        for owner, part in (("driver", "readPads"), ("driver", "update"), ("driver.lease", "watch"))},
     "the emergency stop of each gamepad counts whichever drives": ("""
         show(pad(0), real(0)); show(pad(1), real(0)); done.length = 0;
         show(pad(1), real(0, 8, 9)); const z = driver.output.z;

@@ -140,4 +140,5 @@ def test_a_visitor_sees_drives_stops_starts_a_script_and_takes_a_film_home(demo:
         with av.open(download.value.path()) as film:
             assert sum(1 for _ in film.decode(video=0)) > 10
         visitor.did("a film is downloaded")
+        assert opened.page.evaluate("pebble.settings.begun.join()") == "drive,script,recordings"
         assert visitor.clock < LONGEST_S

@@ -15,12 +15,34 @@ def test_the_first_steps_are_ticked_and_can_be_hidden(show: Show) -> None:
         steps.get_by_text("Drive").click()
         assert opened.until("location.pathname !== '/'", 3)
         opened.page.go_back()
+        steps.wait_for()
+        assert steps.locator(".step.done").count() == 0, "it was not driven"
+        opened.page.evaluate("pebble.settings.begin('drive')")
         assert opened.until(lambda: steps.locator(".step.done").count() == 1)
         opened.test("hide-first-time").click()
         assert steps.count() == 0
         opened.page.reload()
         opened.test("card-goob").wait_for()
         assert steps.count() == 0
+
+
+@pytest.mark.parametrize(
+    ("state", "button", "words", "inside"),
+    [
+        ("fleet", "fleet-more", ["Thumbnails", "Sort by"], "thumbnails"),
+        ("fleet-stopped", "stopped", ["goob is stopped", "fred is stopped"], "reset"),
+        ("free", "gear", ["Picture from"], "picture-from"),
+    ],
+)
+def test_a_list_stays_open_while_its_words_are_pressed(
+    show: Show, state: str, button: str, words: list[str], inside: str
+) -> None:
+    with show(STATES[state]) as opened:
+        opened.test(button).click()
+        for text in words:
+            opened.page.get_by_text(text, exact=True).first.click()
+            assert opened.test(inside).first.is_visible()
+        assert opened.complaints() == []
 
 
 def shown(cards: Locator) -> list[str]:

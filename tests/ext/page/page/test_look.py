@@ -208,13 +208,13 @@ WHEN = {
     "plain-http": "not encrypted",
     "tower": "live",
     "other-camera": "seen from tower-1",
-    "script-drives": "Stop apriltag-follow",
+    "script-drives": "Stop script",
 }
 #: What browsers complain of where the server is meant to fail.
 MEANT = {"recordings-failed": "422"}
 _OUTLETS, _VALUES = (f'[data-card="{card}"]' for card in ("outlets", "values"))
 _SENSORS, _MORE = _press("[data-test=tab-sensors]"), _press("[data-test=tab-more]")
-_LAMP, _LUX = '[data-test="mcu-lamp-1"]', '[data-test="reading-lux"]'
+_LAMP = '[data-test="mcu-lamp-1"]'
 SCREENS = [
     *(
         Screen(name, name, sizes=ALL if name in WHOLE else ("desktop", "phone"))
@@ -244,8 +244,8 @@ SCREENS = [
     Screen("outlets", "devices", sizes=("desktop",), hold=_at(_OUTLETS)),
     Screen("outlets", "devices", _MORE, ("phone",), _at(_OUTLETS)),
     Screen("outlets-viewer", "devices-viewer", _MORE, ("phone",), _at(_OUTLETS)),
-    Screen("mcus", "devices", sizes=("desktop",), hold=_at(_LAMP, _LUX)),
-    Screen("mcus", "devices", _MORE, ("phone",), _at(_LAMP, _LUX)),
+    Screen("mcus", "devices", sizes=("desktop",), hold=_at(_LAMP)),
+    Screen("mcus", "devices", _MORE, ("phone",), _at(_LAMP)),
     Screen("values", "devices", sizes=("desktop",), hold=_at(_VALUES, f"{_VALUES} summary")),
     Screen("small", "driving", sizes=("small",)),
     Screen("lights", "asked", _press('[data-test="colour-blue"]'), ("desktop",), _at_card("lights")),

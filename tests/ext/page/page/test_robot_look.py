@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from playwright.sync_api import Page
 
 from tests.ext.page.browser import Size, Tab
 from tests.ext.page.canned import CannedServer, Show
-from tests.ext.page.states import FRED, GOOB, MAY_TAKE, STATES, at, changed, driver, estop
+from tests.ext.page.states import FRED, GOOB, LAMP, MAY_TAKE, STATES, at, changed, driver, estop, liveness
 
 pytestmark = pytest.mark.page
 
@@ -118,6 +119,110 @@ def test_driving_of_a_board_that_says_nothing_is_allowed_and_withdrawn_on_its_pa
         assert asked == [("allow", True), ("clear", True), ("withdraw", True)]
         opened.page.evaluate(SET, [GOOB, "web/board", {**view, "refused": "The config decides that"}])
         opened.page.locator("[data-test=board-allow]:disabled").wait_for()
+
+
+#: Whatever happens to a robot, as values of it.
+HAPPENS: dict[str, dict[str, Any]] = {
+    "nothing": {},
+    "it is taken": {"web/driver": driver("bob with a name of 32 characters", "phone", keeps=True)},
+    "it is driven": {"web/driver": driver("alice", you=True)},
+    "it drives itself": {"autonomy-status": {"running": True, "file": "x", "label": "Follow a tag, also out of sight"}},
+    "it is stopped": {"web/estop": estop(1_700_000_000_000, "eve on phone")},
+    "it is stopped and silent": {
+        "web/estop": estop(1_700_000_000_000, "eve on phone"),
+        "web/liveness": liveness(online=False, silent_s=4.0),
+    },
+}
+ASKED = "one is asked before its reset"
+HAPPENS[ASKED] = HAPPENS["it is stopped"]
+REST = {"web/driver": driver(), "autonomy-status": {}, "web/estop": estop(0), "web/liveness": liveness()}
+STILL = replace(STATES["free"], repeated={"online": 1.0}, welcome=MAY_TAKE)
+
+
+def _happens(page: Page, ref: str, what: str) -> None:
+    for metric, value in (REST | HAPPENS[what]).items():
+        page.evaluate(SET, [ref, metric, value])
+    page.wait_for_timeout(150)
+    page.evaluate("(asks) => asks && document.querySelector('[data-test=reset]')?.click()", what is ASKED)
+
+
+#: Places of all that the header has on each screen, and whether the robot's name is read whole.
+HEADER = """() => [...document.querySelectorAll(".top, .top .stop, .top .back, .picker, .top > button")]
+  .filter((one) => one.checkVisibility())
+  .map((one) => [one.className, one.getBoundingClientRect()])
+  .map(([name, { x, y, width, height }]) => [name, ...[x, y, width, height].map(Math.round)])
+  .concat([...document.querySelectorAll(".picker-name b")].map((name) => name.scrollWidth <= name.clientWidth))"""
+
+
+@pytest.mark.parametrize("size", ["desktop", "phone"])
+def test_the_header_never_moves_and_the_name_never_gives_way(show: Show, size: Size) -> None:
+    widths = {"desktop": (761, 800, 900, 1010, 1011, 1024, 1180, 1240, 1241, 1440), "phone": (320, 360, 390, 480, 760)}
+    with show(replace(STILL, path=f"/r/{LAMP}"), size) as opened:
+        _ready(opened)
+        for width in widths[size]:
+            opened.page.set_viewport_size({"width": width, "height": 800})
+            _happens(opened.page, LAMP, "nothing")
+            before = opened.page.evaluate(HEADER)
+            assert before[0][4] in (64, 65), f"{width} px: one line"
+            assert before[-1], f"{width} px: the name is cut"
+            for what in HAPPENS:
+                _happens(opened.page, LAMP, what)
+                assert opened.page.evaluate(HEADER) == before, f"{width} px, {what}"
+
+
+#: Parts of what stops a robot, or gives control over it, over which something lies while each of the panels is open.
+COVERED_BY_PANELS = """async () => {
+  const press = (selector) => () => document.querySelector(selector)?.click();
+  const panels = Object.fromEntries([
+    ...["settings", "help", "phone"].map((name) => [name, () => pebble.panels.show(name)]),
+    ...["bell", "gear", "drawer"].map((name) => [name, press(`[data-test=${name}]`)]),
+  ]);
+  const close = () => {
+    pebble.panels.show("");
+    for (const one of document.querySelectorAll(".panel [data-test^=close], [data-test=drawer][aria-expanded=true]," +
+      "[data-test=gear][aria-expanded=true]")) one.click();
+  };
+  const along = (from, length, count) =>
+    Array.from({ length: count }, (_, n) => from + 5 + ((length - 10) * n) / (count - 1)); // within round corners
+  const isCovered = (part) => {
+    const { x, y, width, height } = part.getBoundingClientRect();
+    return along(x, width, 9).some((px) => along(y, height, 5).some((py) => {
+      const hit = document.elementFromPoint(px, py);
+      return hit && !part.contains(hit) && !hit.contains(part) && !hit.closest(".stop-area"); // around STOP
+    }));
+  };
+  const found = [];
+  for (const [name, open] of Object.entries(panels)) {
+    open();
+    await new Promise((resolve) => setTimeout(resolve, 60));
+    const parts = [...document.querySelectorAll(".top .stop, .banner, [data-test^=reset], [data-test^=take]," +
+      "[data-test=ask], [data-test=stop-script]")].filter((one) => one.checkVisibility({ visibilityProperty: true }));
+    found.push(...parts.filter(isCovered).map((one) => `${name}: ${one.outerHTML.slice(0, 120)}`));
+    close();
+  }
+  return found;
+}"""
+
+
+@pytest.mark.parametrize("path", [STILL.path, f"/r/{LAMP}", "/"])
+@pytest.mark.parametrize(
+    ("size", "width", "height"),
+    [
+        ("desktop", 1440, 900), ("desktop", 1024, 768), ("desktop", 800, 900),
+        ("phone", 390, 844), ("phone", 320, 640), ("landscape", 844, 390),
+    ],
+)  # fmt: skip
+def test_no_panel_covers_a_part_of_what_stops_or_takes(
+    show: Show, size: Size, width: int, height: int, path: str
+) -> None:
+    with show(replace(STILL, path=path), size, viewport={"width": width, "height": height}) as opened:
+        assert opened.until("!!window.pebble?.connection.you && !document.querySelector('main .loading')", 60)
+        opened.page.evaluate(COVERED_BY_PANELS)  # what they are made of is here now
+        ref, problems = {"/": GOOB}.get(path, path.removeprefix("/r/")), {}
+        for what in HAPPENS:
+            _happens(opened.page, ref, what)
+            problems[what] = opened.page.evaluate(COVERED_BY_PANELS)
+        assert [(what, one) for what, found in problems.items() for one in found] == []
 
 
 def test_a_small_phone_shows_all_that_drives_at_once(show: Show) -> None:

@@ -91,6 +91,7 @@ class Bench:
     def status(self) -> dict[str, Any]:
         found: dict[str, Any] = self.world.newest("autonomy-status")
         found.pop("timestamp")
+        found.pop("since", None)
         return found
 
     def becomes(self, **fields: Any) -> bool:

@@ -130,7 +130,8 @@ def test_the_config_comes_first_but_one_of_ours_knows_its_options(
 
 def test_any_program_with_a_manifest_is_a_script(tmp_path: Path) -> None:
     write(tmp_path, "shell", "#!/bin/sh", file="go.sh")
-    write(tmp_path, "shell", '{"command": ["./go.sh", "-v"], "configs": [{"key": "n", "arg": "-n"}]}', "script.json")
+    manifest = '{"command": ["./go.sh", "-v"], "configs": [{"key": "n", "arg": "-n"}], "drives": false}'
+    write(tmp_path, "shell", manifest, "script.json")
     program = write(tmp_path, "plain", "#!/bin/sh", file="start")
     program.chmod(stat.S_IRWXU)
     write(tmp_path, "venv", "import pebble.script\nraise SystemExit(1)")
@@ -139,6 +140,7 @@ def test_any_program_with_a_manifest_is_a_script(tmp_path: Path) -> None:
     found = scripts(tmp_path, scripts=section)
     assert found["shell"].command == (str(tmp_path / "shell/go.sh"), "-v")
     assert [setting.key for setting in found["shell"].settings] == ["n"]
+    assert found["shell"].drives, "nothing keeps it from driving, whatever it declares"
     assert found["plain"].command == (str(program),)
     assert found["old"].broken == "", "what another Python runs may be written for that"
     assert found["venv"].command == (str(tmp_path / "venv/bin/python"), str(tmp_path / "venv/run.py"))

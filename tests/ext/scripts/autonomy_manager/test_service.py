@@ -22,8 +22,8 @@ TERM, KILL = signal.SIGTERM, signal.SIGKILL
 
 def script(file: str, *dependencies: str, **more: Any) -> Script:
     needs = tuple(map(Dependency, dependencies))
-    fields = {"settings": (SPEED,), "ours": True, **more}
-    return Script(file=file, label=file, command=(file,), folder=Path(), dependencies=needs, **fields)
+    fields = {"label": file, "settings": (SPEED,), "ours": True, **more}
+    return Script(file=file, command=(file,), folder=Path(), dependencies=needs, **fields)
 
 
 SCRIPTS = {
@@ -31,6 +31,9 @@ SCRIPTS = {
     for entry in (
         *(script("walk"), script("sing"), script("eyes"), script("wheel"), script("follow", "eyes", "wheel")),
         script("old", ours=False),
+        script("count", drives=False, label="Count steps"),
+        script("stride", "count", drives=False),
+        script("pace", "walk", drives=False),
     )
 }
 IDLE = {
@@ -65,7 +68,8 @@ def test_it_begins_idle_and_stops_what_a_predecessor_may_have_left(bench: Bench)
     assert walk.launch.command[3:] == ("--speed", "0.25")
     assert walk.launch.environment["PEBBLE_CONFIG"] == walk.launch.command[2]
     assert walk.launch.tie is TERM
-    assert bench.status == {**IDLE, "running": True, "file": "walk", "pid": walk.pid, "config": {"speed": 0.25}}
+    runs = {"running": True, "file": "walk", "label": "walk", "pid": walk.pid, "config": {"speed": 0.25}}
+    assert bench.status == IDLE | runs
     zero = {"x": 0.0, "z": 0.0, "y": 0.0, "source": "autonomy", "run": run_of(walk)}
     assert until(lambda: bench.drives[-1] == zero), "else a person who stops it before it drives would not end it"
 
@@ -241,11 +245,25 @@ def test_an_emergency_stop_ends_the_script_and_refuses_others_until_the_reset(be
     assert bench.becomes(error=error)
     assert walk.signals == [TERM]
     walk.end(0)
-    assert bench.becomes(**{**IDLE, "error": error})
+    assert bench.becomes(**{**IDLE, "error": error, "stopped": True})
     bench.command({"action": "start", "file": "sing"})
     assert bench.becomes(error=f"Failed to start sing: {error}")
     bench.owner(count=1, by="ann")
+    assert bench.becomes(**IDLE), "a stop is no failure, and it ends with the reset"
+    assert "stopped" not in bench.status
     bench.start("sing")
+
+
+@pytest.mark.parametrize(("file", "signals"), [("count", []), ("stride", []), ("pace", [TERM]), ("old", [TERM])])
+def test_only_what_declares_no_drive_with_all_that_it_needs_lives_through_a_stop(
+    bench: Bench, file: str, signals: list[signal.Signals]
+) -> None:
+    bench.owner()
+    child = bench.start(file)
+    bench.owner(latched=True, count=1, by="ann", barred=bench.drives[-1]["run"])
+    assert child.signals == signals
+    bench.owner(boot="bb")
+    assert child.signals == signals
 
 
 def test_a_stop_while_another_script_ends_cancels_the_next_one(bench: Bench) -> None:

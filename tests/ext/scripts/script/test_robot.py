@@ -6,6 +6,7 @@ import math
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ class Slow(MemoryTransport):
 class Setting:
     """A robot, another program on its transport, and a clock that is moved by hand."""
 
-    def __init__(self, run_dir: str) -> None:
+    def __init__(self, run_dir: str, **options: Any) -> None:
         hub = MemoryHub()
         self.other, transport = MemoryTransport("other", hub).open(), Slow("script", hub).open()
         transport.gate.set()
@@ -49,7 +50,7 @@ class Setting:
         config = parse(
             {"robot": {"id": "goob"}, "transport": {"kind": "mqtt", "run_dir": run_dir}}, folder=Path(run_dir), env={}
         )
-        self.robot = Robot(config, transport, lambda above: above + 1, clock=lambda: self.now)
+        self.robot = Robot(config, transport, lambda above: above + 1, clock=lambda: self.now, **options)
 
     def send(self, value: WheelOdometry, *, retain: bool = False) -> None:
         self.other.publish(WHEEL_ODOMETRY.topic(BASE), codec.encode(WHEEL_ODOMETRY, value), retain=retain)
@@ -120,6 +121,22 @@ def test_a_script_neither_drives_unsigned_nor_resets_nor_starts_scripts(
         setting.robot.publish(channel, {}, **names)
     with pytest.raises(PebbleError, match=why):
         setting.robot.publish_at_end(channel, dict)
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda robot: robot.drive(z=0.5),
+        lambda robot: robot.stop(),
+        lambda robot: robot.publish(Channel(metric="arm", kind=Kind.COMMAND, payload=dict), {}),
+        lambda robot: robot.publish_at_end(Channel(metric="arm", kind=Kind.COMMAND, payload=dict), dict),
+    ],
+)
+def test_a_script_that_declares_no_drive_commands_nothing(tmp_path: Path, act: Callable[[Robot], object]) -> None:
+    with closing(Setting(str(tmp_path), drives=False)) as setting:
+        assert setting.robot.publish(MOOD, {"mood": "fine"})
+        with pytest.raises(PebbleError, match="only measures"):
+            act(setting.robot)
 
 
 def test_a_last_value_that_fails_keeps_nothing_from_ending(setting: Setting, caplog: pytest.LogCaptureFixture) -> None:

@@ -42,6 +42,11 @@ def described(name: str) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_those_that_only_measure_say_so(name: str) -> None:
+    assert described(name).get("drives", True) is (name not in ("apriltag-locations", "wheel-odometry"))
+
+
 def test_these_are_all() -> None:
     assert sorted(path.name for path in SCRIPTS.iterdir() if path.name != "__pycache__") == sorted(NAMES)
 

@@ -5,14 +5,6 @@ import { attempt } from "./browser.js";
 /** @returns {WakeLock | undefined} */
 export const wakeLock = () => attempt(() => navigator.wakeLock, undefined);
 
-export const clipboard = {
-  get possible() {
-    return attempt(() => Boolean(navigator.clipboard), false);
-  },
-  /** @param {string} text @returns {Promise<void>} */
-  copy: async (text) => navigator.clipboard.writeText(text),
-};
-
 export const microphone = {
   get possible() {
     return attempt(() => Boolean(navigator.mediaDevices.getUserMedia) && "AudioWorkletNode" in globalThis, false);
@@ -23,6 +15,11 @@ export const microphone = {
 
 /** @returns {Promise<any>} what is printed on the keys; null: not in this browser, or in a frame of another site */
 export const keyboardLayout = async () => attempt(() => /** @type {any} */ (navigator).keyboard.getLayoutMap(), null);
+
+/** @param {string} host @returns {boolean} whether no other machine can reach it */
+export const isLoopback = (host) => /^(127\.[\d.]+|0\.0\.0\.0|\[::1?\]|localhost|.*\.localhost)$/.test(host);
+
+export const DEMO = "demo"; // what the server of `make demo` calls itself
 
 const nothing = () => {};
 const blind = /** @type {any} */ ({ observe: nothing, disconnect: nothing });

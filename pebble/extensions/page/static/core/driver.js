@@ -118,6 +118,7 @@ export class Driver {
     return this.ref ? driveReason(this.situation()) : { code: "none", text: "No robot is chosen" };
   }
 
+  /** All that counts for and against driving, at this moment. */
   situation() {
     const value = (metric) => this.store.get(this.ref, metric)?.value;
     const broker = this.store.get("", "web/broker")?.value;
@@ -125,24 +126,24 @@ export class Driver {
       name: this.page.nameOf(this.ref),
       open: this.socket.state === "open" && !this.socket.outdated, // what is known is of the last connection
       connecting: this.socket.state === "connecting" || (this.socket.state === "open" && this.socket.outdated),
-      broker: broker?.problem ?? "",
+      broker: broker?.problem ?? "", // why the server cannot reach it
       reload: this.page.isOld(),
-      drives: this.socket.you?.drives !== false,
+      drives: this.socket.you?.drives !== false, // false: not over this connection
       rights: this.socket.you?.rights ?? [],
-      words: this.socket.you?.words ?? {},
+      words: this.socket.you?.words ?? {}, // by code
       hidden: document.hidden,
       focus: document.hasFocus(),
       dialog: document.querySelector("dialog[open]") !== null,
       fromKeys: this.inputs.fromKeys,
       liveness: value("web/liveness"),
       estop: value("web/estop"),
-      freeForMs: performance.now() - this.latchedAt,
+      freeForMs: performance.now() - this.latchedAt, // since it was seen stopped
       capabilities: value("capabilities")?.value ?? {},
       driver: this.lease.view,
-      driverIdleMs: this.lease.idleMs(),
-      script: value("autonomy-status"),
+      driverIdleMs: this.lease.idleMs(), // since its last gesture; -1: that lasts, or is not known
+      script: /** @type {import("./reasons.js").Script | undefined} */ (value("autonomy-status")),
       loading: this.page.isLoading(),
-      pictureAgeMs: this.page.pictureAge(),
+      pictureAgeMs: this.page.pictureAge(), // -1: none comes while it is driven
       inSight: this.inSight,
       roundTripMs: this.socket.roundTripMs,
       failed: [...this.failed][0] ?? "",
@@ -293,13 +294,16 @@ export class Driver {
   }
 
   tick() {
-    for (const part of /** @type {const} */ (["readPads", "update", "watchLease", "watchLists"])) this.attempt(part);
+    this.attempt("gamepads", () => this.readPads());
+    this.attempt("update", () => this.update());
+    this.attempt("control", () => this.lease.watch());
+    this.attempt("lists", () => this.escapes.look());
   }
 
-  /** What fails ends the gesture and is said; the others go on. @param {"readPads" | "update" | "watchLease" | "watchLists"} part */
-  attempt(part) {
+  /** What fails ends the gesture and is said; the others go on. @param {string} part @param {() => void} run */
+  attempt(part, run) {
     try {
-      this[part]();
+      run();
       this.failed.delete(part);
     } catch (error) {
       if (!this.failed.has(part)) console.error(error);
@@ -317,14 +321,6 @@ export class Driver {
       this.output = { x: 0, z: 0, y: 0 };
     }
     queueMicrotask(() => this.changed());
-  }
-
-  watchLists() {
-    this.escapes.look();
-  }
-
-  watchLease() {
-    this.lease.watch();
   }
 
   readPads() {

@@ -1,7 +1,6 @@
 /** Log lines of one component as the page keeps and filters them. Pure. */
 
 export const MOST = 500;
-const SERVICES = 60; // in the list to choose from
 
 /** From the least to the most important. */
 export const LEVELS = ["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"];
@@ -47,7 +46,7 @@ export class LogBook {
       if (first + index <= this.last) return;
       const line = lineOf(raw, ++this.count);
       this.lines.push(line);
-      if (line.service && this.services.size < SERVICES) this.services.add(line.service);
+      if (line.service) this.services.add(line.service);
     });
     this.last = Math.max(this.last, first + lines.length - 1);
     const surplus = this.lines.length - MOST;

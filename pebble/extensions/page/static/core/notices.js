@@ -4,7 +4,6 @@ import { isObject } from "./json.js";
 
 export const MOST = 50; // in the list
 const ALOUD = 4; // sentences at once
-const COMPONENTS = 2000; // whose last states are remembered, as many as the server has
 const LOW_PERCENT = 20;
 const MARGIN = 5; // per cent, more than one step of what measures a battery: within it a reading counts for nothing
 const READINGS = 2; // below, of which the last one is told
@@ -35,7 +34,7 @@ const EVENTS = {
   },
   script(_before, status) {
     if (!status) return null;
-    const state = status.error ? `script ${short(status.file) || "?"} failed: ${short(status.error)}` : "";
+    const state = status.error && !status.stopped ? `script failed: ${short(status.error)}` : "";
     return { state, text: state };
   },
   /** That it can no longer be driven, while a person or a script drives it; and then that it can again. */
@@ -78,7 +77,8 @@ export class Notices {
 
   /** @param {string} ref @param {keyof EVENTS} event @param {number} at epoch ms @param {...any} given what EVENTS reads */
   see(ref, event, at, ...given) {
-    const states = this.statesOf(ref);
+    const states = this.states.get(ref) ?? new Map();
+    this.states.set(ref, states);
     const before = states.get(event);
     const seen = EVENTS[event](before, ...given);
     if (!seen) return;
@@ -88,15 +88,6 @@ export class Notices {
     const notice = { ref, kind, text, at, unread: true };
     this.list = [notice, ...this.list.filter((old) => old.ref !== ref)].slice(0, MOST);
     this.fresh = [...this.fresh, notice].slice(-MOST);
-  }
-
-  statesOf(ref) {
-    let states = this.states.get(ref);
-    if (!states) {
-      if (this.states.size >= COMPONENTS) this.states.delete(this.states.keys().next().value ?? "");
-      this.states.set(ref, (states = new Map()));
-    }
-    return states;
   }
 
   get unread() {

@@ -8,39 +8,11 @@ const LATE_MS = 600;
 export const SLOW_SPEED = 0.4;
 const RESET_MS = 600; // after a reset robots refuse a driver who has not paused for 0.5 s
 
+/** @typedef {{running?: boolean, file?: string|null, label?: string, drives?: boolean, overridden?: boolean}} Script autonomy-status */
 /** @typedef {{code: string, text: string, action?: Action, also?: Action}} Reason */
 /** @typedef {{label: string, kind: "take"|"ask"|"give-up"|"take-over"|"see"|"login"|"reload"|"stop-script"}} Action */
 
-/**
- * @typedef {object} Situation
- * @property {string} name of the component
- * @property {Record<string, string>} words of the server, by code
- * @property {boolean} open whether the control socket is
- * @property {boolean} [connecting] for the first time
- * @property {string} broker why the server cannot reach the broker; "" it can
- * @property {boolean} reload the page is older than the server
- * @property {boolean} drives false: not over this connection
- * @property {readonly string[]} rights
- * @property {boolean} loading what shows the picture and these reasons is not here yet
- * @property {boolean} hidden
- * @property {boolean} focus
- * @property {boolean} dialog whether one is open, or a panel
- * @property {boolean} fromKeys whether a key or the gamepad is used
- * @property {{online: boolean|null, silent_s: number|null}|undefined} liveness
- * @property {{latched: boolean, by: string}|undefined} estop
- * @property {number} freeForMs since it was seen stopped
- * @property {Record<string, any>} capabilities
- * @property {import("../messages.js").DriverView|undefined} driver
- * @property {number} driverIdleMs since the driver's last gesture; -1: it lasts, or is not known
- * @property {{running?: boolean, file?: string}|undefined} script
- * @property {number|null} pictureAgeMs null: no picture is wanted here; NaN: its age is not known; -1: none comes while it is driven
- * @property {boolean} inSight the driver sees the robot itself
- * @property {number} roundTripMs
- * @property {string} failed a part of this page that does not work; ""
- * @property {boolean} padFrozen
- * @property {boolean} mustRelease
- * @property {string} refusal why the server has ended the last gesture; "" it has not
- */
+/** @typedef {ReturnType<import("./driver.js").Driver["situation"]>} Situation */
 
 /** Why nothing may be commanded at all. @param {Situation} s @returns {Reason|null} */
 export function offReason(s) {
@@ -80,9 +52,8 @@ function silence(s) {
 function leaseReason(s) {
   if (s.driver?.you) return null;
   if (!s.driver?.by) {
-    const runs = s.script?.running ? `${scriptName(s) || "A script"} runs. ` : "";
-    const { code, text } = say(s, "free");
-    return { code, text: runs + text, action: TAKE };
+    const free = { ...say(s, "free"), action: TAKE };
+    return drivesItself(s.script) ? { ...free, code: "itself", also: STOP_SCRIPT } : free;
   }
   const who = s.driver.device ? `${s.driver.by} (${s.driver.device})` : s.driver.by;
   if (s.driver.keeps) return askReason(s, who);
@@ -95,6 +66,7 @@ function leaseReason(s) {
 const RELOAD = /** @type {const} */ ({ label: "Reload", kind: "reload" });
 const TAKE = /** @type {const} */ ({ label: "Take control", kind: "take" });
 const OVER = /** @type {const} */ ({ label: "Hold to take over", kind: "take-over" });
+export const STOP_SCRIPT = /** @type {const} */ ({ label: "Stop script", kind: "stop-script" });
 
 /** The robot itself decides: who drives it is asked, and who rests does not keep it. */
 function askReason(s, who) {
@@ -106,7 +78,9 @@ function askReason(s, who) {
 function momentReason(s) {
   if (s.loading) return say(s, "loading");
   if (s.dialog) return say(s, "dialog");
-  if (s.script?.running && s.capabilities.drive?.arbitrates !== true) return scriptReason(s, scriptName(s));
+  if (s.script?.running && s.script.drives !== false && s.capabilities.drive?.arbitrates !== true) {
+    return { ...say(s, "script", { script: scriptName(s.script) }), action: STOP_SCRIPT };
+  }
   if (s.pictureAgeMs !== null && !(s.pictureAgeMs >= 0 && s.pictureAgeMs <= PICTURE_OLD_MS) && !s.inSight) return { ...oldPicture(s), code: "picture", action: SEE };
   if (s.roundTripMs >= LATE_MS) return say(s, "late", { by_ms: ` (${Math.round(s.roundTripMs)} ms)` });
   if (s.padFrozen) return say(s, "pad");
@@ -115,15 +89,11 @@ function momentReason(s) {
   return null;
 }
 
-function scriptName(s) {
-  const { file } = s.script;
-  return typeof file === "string" ? file.slice(0, 40) : "";
-}
+/** What people call the script of a status. @param {Script} status @returns {string} */
+export const scriptName = ({ label, file }) => String(label || file || "A script").slice(0, 40);
 
-function scriptReason(s, name) {
-  const action = { label: `Stop ${name || "the script"}`, kind: "stop-script" };
-  return { ...say(s, "script", { script: name || "A script" }), action };
-}
+/** Whether a script moves the robot now, and no person. @param {Script|undefined} status @returns {boolean} */
+export const drivesItself = (status) => status?.running === true && status.drives !== false && status.overridden !== true;
 
 /** The server gives the same reason while a gesture that it has ended lasts. */
 function released(s) {
@@ -142,8 +112,11 @@ function oldPicture(s) {
 
 /** A state in the server's words, of which WORDS in pebble/extensions/operator/client/drive_reasons.py has the table. @returns {Reason} */
 function say(s, code, values = {}) {
-  return { code, text: (s.words[code] ?? code).replace(/{(\w+)}/g, (_, name) => values[name] ?? "") };
+  return { code, text: inWords(s.words, code, values) };
 }
+
+/** @param {Record<string, string>} words of the server @param {string} code @param {Record<string, any>} values @returns {string} */
+export const inWords = (words, code, values) => (words[code] ?? code).replace(/{(\w+)}/g, (_, name) => values[name] ?? "");
 
 export function reason(code, text) {
   return { code, text };

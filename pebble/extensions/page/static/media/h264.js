@@ -2,10 +2,12 @@
 
 import * as browser from "../core/browser.js";
 import { checkUnit } from "./access-unit.js";
-import { UnsupportedError } from "./errors.js";
 
 const HELD_MS = 150; // some decoders give a picture out only when the next one comes
 const FAILURES = 2; // key frames in a row that are whole and fail: this browser cannot decode them
+
+/** This browser lacks what it takes to decode; a key frame does not help. */
+export class UnsupportedError extends Error {}
 
 /** Like pebble.extensions.media.h264.H264Decoder; after an error the next unit has to be a key frame. */
 export class H264Decoder {

@@ -2,8 +2,7 @@
 
 import * as browser from "../core/browser.js";
 import { Sequence, inflate, readPayload } from "./decode.js";
-import { UnsupportedError } from "./errors.js";
-import { H264Decoder } from "./h264.js";
+import { H264Decoder, UnsupportedError } from "./h264.js";
 import { checked } from "./jpeg.js";
 
 const UNCHANGED = new Uint32Array(new Uint8Array([128, 128, 128, 255]).buffer)[0]; // most pixels of most differences

@@ -109,11 +109,12 @@ export class Pictures {
     this.wait = Math.min(LONGEST_WAIT_MS, 2 * this.wait);
   }
 
-  startWorker() {
+  /** @param {URL} [url] of the worker */
+  startWorker(url = new URL("./video-worker.js", import.meta.url)) {
     const fail = ({ message = "a part of this page is missing" }) =>
       this.change({ problem: `Pictures cannot be decoded here: ${message}` });
     try {
-      const worker = browser.worker(new URL("./video-worker.js", import.meta.url));
+      const worker = browser.worker(url);
       worker.onmessage = ({ data }) => this.take(data);
       worker.onerror = (event) => {
         fail(event);

@@ -15,7 +15,6 @@ export function install(page) {
     setLights: (ref, colour) => ask({ op: "lights", ref, ...colour }),
     playSound: (ref, file, repeat = false) => ask({ op: "soundboard", ref, file, repeat }),
     stopSound: (ref) => ask({ op: "soundboard", ref, file: "" }),
-    stopScript: (ref) => ask({ op: "autonomy", ref, file: "" }),
     startScript: (ref, file, config) => ask({ op: "autonomy", ref, file, config }),
     switchOutlet: (ref, outlet, on) => ask({ op: "outlet", ref, outlet, on }),
     commandMcu: (ref, uid, name, value) => ask({ op: "mcu", ref, uid, name, value }),

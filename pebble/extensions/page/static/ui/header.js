@@ -4,13 +4,14 @@ import * as browser from "../core/browser.js";
 import { StopChip } from "./banner.js";
 import { Boundary, html, styled, useMetric, useModel, useOnline, usePage, usePart, useRefs, useTick, useValue } from "./parts/hooks.js";
 import { nameIn } from "./parts/looks.js";
-import { Button, Charge, Face, Icon, RouteLink, Select, StopButton, useName } from "./parts/parts.js";
+import { Button, Charge, Face, Icon, RouteLink, Select, StopButton, useItself, useName } from "./parts/parts.js";
 import { driverName, kindOf, roughly, span, typeOf } from "./parts/words.js";
 
+const HELP = "Keys, and how stopping works";
 const LATE_MS = 300; // of the way to the server and back
 
 export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
-  const { commands, driver, route } = usePage();
+  const { commands, driver, panels, route } = usePage();
   const wide = layout === "desktop";
   const name = useName(at);
   return html`<header class="top">
@@ -22,7 +23,9 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     <div class="top-space"></div>
     ${!at && html`<${StopChip} />`} ${wide && html`<${ConnectionState} at=${at} />`}
     ${wide && at && html`<${AllButton} outlined /><span class="rule"></span>`}
-    ${wide && at && html`<${HelpButton} />`}
+    ${wide &&
+    at &&
+    html`<${Button} className="quiet round-icon" test="open-help" label=${HELP} icon="help" onPress=${() => panels.toggle("help")} />`}
     <${Boundary} what="Notices"><${Notices} at=${at} wide=${wide || (layout === "portrait" && at !== "")} room=${wide} /><//>
     ${layout === "immersive" &&
     html`<${Button} className="round" test="drawer" label="Everything else" aria-expanded=${drawer} icon="menu" onPress=${onDrawer} />
@@ -43,7 +46,7 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
 }
 
 /** ``outlined``: beside the filled one for the open robot. */
-function AllButton({ outlined = false }) {
+export function AllButton({ outlined = false }) {
   const { commands } = usePage();
   return html`<${StopButton}
     test="stop-all"
@@ -53,17 +56,6 @@ function AllButton({ outlined = false }) {
   >
     <${Icon} name="stop" />${outlined ? "Stop all" : "STOP ALL"}
   <//>`;
-}
-
-function HelpButton() {
-  const { panels } = usePage();
-  return html`<${Button}
-    className="quiet round-icon"
-    test="open-help"
-    label="Keys, and how stopping works"
-    icon="help"
-    onPress=${() => panels.toggle("help")}
-  />`;
 }
 
 const Brand = () => html`<span class="brand"><${Icon} name="logo" /><span>Pebble</span></span>`;
@@ -79,7 +71,7 @@ function Picker({ at }) {
   return html`<label class=${`picker${name.length > 7 ? " long" : ""}`}>
     <${Face} at=${at} />
     <span class="picker-name"><b>${name}</b><${Icon} name="down" /></span>
-    <span class="picker-state"><${IsStopped} at=${at} /><${Liveness} at=${at} /><${Volts} at=${at} /></span>
+    <span class="picker-state"><${Moved} at=${at} /><${Liveness} at=${at} /><${Volts} at=${at} /></span>
     <${Select}
       test="picker"
       label="Choose a robot"
@@ -91,9 +83,12 @@ function Picker({ at }) {
 }
 
 /** Where there are no chips. */
-function IsStopped({ at }) {
-  const stopped = useValue(at, "web/estop")?.latched === true && usePage().connection.isOpen;
-  return stopped && html`<b class="picker-stopped">Stopped</b>`;
+function Moved({ at }) {
+  const { connection } = usePage();
+  const stopped = useValue(at, "web/estop")?.latched === true;
+  const itself = useItself(at);
+  if (stopped && connection.isOpen) return html`<b class="picker-stopped">Stopped</b>`;
+  return itself && html`<b class="picker-itself">${itself}</b>`;
 }
 
 function Volts({ at }) {
@@ -130,16 +125,19 @@ function Vital({ at }) {
   const view = useValue(at, "web/driver");
   const stopped = useValue(at, "web/estop")?.latched === true;
   const online = useOnline(at);
+  const itself = useItself(at);
   return html`<div class="vital">
     ${level &&
-    html`<span class="chip"
+    html`<span class="chip battery"
       ><${Icon} name=${charging?.value === true ? "charging" : "battery"} /><${Charge} at=${at} level=${level} online=${online} /></span
     >`}
     ${connection.isOpen && stopped && html`<span class="chip stopped"><${Icon} name="stop" />Stopped</span>`}
+    ${itself && html`<span class="chip others" title=${itself}><${Icon} name="script" /><span>${itself}</span></span>`}
     ${connection.isOpen &&
     !stopped &&
+    !itself &&
     view?.by &&
-    html`<span class=${`chip ${view.you ? (rests ? "bad" : "mine") : "others"}`}><${Icon} name="wheel" />${view.you ? (rests ? "Not driving" : "You drive") : `${driverName(view)} drives`}</span>`}
+    html`<span class=${`chip ${view.you ? (rests ? "bad" : "mine") : "others"}`}><${Icon} name="wheel" /><span>${view.you ? (rests ? "Not driving" : "You drive") : `${driverName(view)} drives`}</span></span>`}
   </div>`;
 }
 

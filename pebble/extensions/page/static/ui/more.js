@@ -13,6 +13,7 @@ const STEP = 0.1; // of the speed, for each press
 const SLOWEST = 0.05; // as the slider's
 const CHECK_MS = 1000;
 const IDLE_MS = 55_000; // the server ends what is not used for a minute
+const RESTED_MS = 5000; // from then on control is given to who asks for it
 const RELOAD_MS = 5000; // where no person is there to press a button
 
 /** To be called once. @param {any} page */
@@ -25,6 +26,7 @@ export function install(page) {
   );
   installCommands(page);
   driver.lease.onLost = (by, idleMs) => page.connection.show(controlEnd(by, idleMs));
+  driver.onChange(() => driver.gestureActive && page.settings.begin("drive"));
   driver.pads = new Pads(driver);
   new Wall(page).start();
   const missing = lacks().join(" ");
@@ -34,7 +36,8 @@ export function install(page) {
 /** @param {string} by who has it now @param {number} idleMs since this page drove */
 function controlEnd(by, idleMs) {
   const why = idleMs > IDLE_MS ? "after a minute without driving" : "with the connection";
-  return by ? `${by} took over` : `Your control has ended ${why}: take it again`;
+  if (!by) return `Your control has ended ${why}: take it again`;
+  return idleMs < RESTED_MS ? `${by} took over` : `${by} has control now: you had rested`;
 }
 
 /** Do what an action means. What other modules do is fetched with the first press. @param {any} page @param {string} id @param {"down" | "up"} phase */

@@ -41,4 +41,5 @@ if __name__ == "__main__":
         label="Look for tags",
         summary="Outlines the printed tags that the camera sees, and moves nothing.",
         main_options=("control_rate_hz", "marker_dictionary"),
+        drives=False,
     )

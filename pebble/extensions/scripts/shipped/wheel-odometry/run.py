@@ -93,4 +93,5 @@ if __name__ == "__main__":
         label="Wheel odometry",
         summary="Works out where the robot is from its turning wheels, and draws it on the map.",
         main_options=("wheel_diameter_mm", "track_width_mm", "magnets"),
+        drives=False,
     )

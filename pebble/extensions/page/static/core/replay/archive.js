@@ -31,7 +31,7 @@ export class Archive {
    */
   async timeline(day, robot, onIndexing, signal, again = false) {
     for (;; again = false) {
-      const asked = query({ day, robot, ...(again ? { again: 1 } : {}) });
+      const asked = new URLSearchParams({ day, robot, ...(again && { again: "1" }) });
       const answer = await this.get(`${ROOT}archive/timeline?${asked}`, signal);
       const value = await answer.json();
       if (answer.status !== 202) return value;
@@ -72,9 +72,6 @@ export class Archive {
     return checked(await this.ask(url, { method: "POST", headers, body: JSON.stringify(body) }));
   }
 }
-
-/** @param {Record<string, any>} values @returns {string} */
-const query = (values) => new URLSearchParams(values).toString();
 
 /** @param {Response} answer */
 async function checked(answer) {

@@ -1,6 +1,5 @@
 // The pictures of a recording: as live ones, but the server's player sends them by another socket.
 
-import * as browser from "../../core/browser.js";
 import { Pictures } from "../pictures.js";
 
 const HEAD_BYTES = 5; // u32 number, u8 kind: as the messages of the server
@@ -34,14 +33,11 @@ export class ReplayPictures extends Pictures {
     message.set(payload, HEAD_BYTES);
     this.pending.set(number, receivedMs);
     this.worker ??= this.startWorker();
-    this.worker.postMessage({ connection: this.connection, message: message.buffer, quiet: !shown }, [message.buffer]);
+    this.worker?.postMessage({ connection: this.connection, message: message.buffer, quiet: !shown }, [message.buffer]);
   }
 
   startWorker() {
-    const worker = browser.worker(new URL("./video-worker.js", import.meta.url));
-    worker.onmessage = ({ data }) => this.take(data);
-    worker.onerror = ({ message }) => this.change({ problem: `Pictures cannot be decoded here: ${message}` });
-    return worker;
+    return super.startWorker(new URL("./video-worker.js", import.meta.url));
   }
 
   /** @param {any} made of the worker */

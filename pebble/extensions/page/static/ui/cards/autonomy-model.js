@@ -1,28 +1,7 @@
-// Since when a script of a robot runs, and why none can be started.
+// Why no script of a robot can be started.
 
 import { nameIn } from "../parts/looks.js";
 import { sectionOf, whyNotMoved } from "../parts/why-not.js";
-
-/** When the script of one robot was first seen running; robots report only that it runs. */
-export class Since {
-  constructor() {
-    /** @type {string | undefined} */
-    this.run = undefined;
-    this.at = 0;
-    this.isExact = false;
-  }
-
-  /** @param {{running?: boolean, file?: string, pid?: number}} status @param {number} receivedAt epoch ms @returns {Since} */
-  update({ running, file, pid }, receivedAt) {
-    const run = running ? JSON.stringify([file, pid]) : "";
-    if (run !== this.run) {
-      this.isExact = this.run !== undefined; // what ran when the page came may have begun at any time
-      this.at = receivedAt;
-      this.run = run;
-    }
-    return this;
-  }
-}
 
 /**
  * Who moves the robot by hand now, and whether scripts give way there: then one may be started, and waits.

@@ -1,10 +1,11 @@
 // The scripts of a robot: which one runs, and a form to start one.
 
+import { scriptName } from "../../core/reasons.js";
 import { useAnswer } from "../parts/asking.js";
-import { Since, handDriven, whyNotStarted } from "./autonomy-model.js";
+import { handDriven, whyNotStarted } from "./autonomy-model.js";
 import { filled, lastScript, moreWords, remember, remembered, scripts } from "./form-model.js";
 import { Form } from "./form.js";
-import { html, useMetric, useOnline, useState, useTick, useValue } from "../parts/hooks.js";
+import { html, useEffect, useMetric, useOnline, useState, useValue } from "../parts/hooks.js";
 import { Nothing } from "../parts/nothing.js";
 import { Button, Icon, Why, useName } from "../parts/parts.js";
 import { refuses } from "../parts/typed.js";
@@ -13,7 +14,6 @@ import { plain } from "../parts/more-words.js";
 import { clockTime } from "../parts/words.js";
 import { useMemo } from "../../vendor/hooks.mjs";
 
-const ASKED_MS = 10_000; // so long the page says that it has asked
 const LONGEST_CONFIG = 14_000; // characters of JSON: the server reads messages of 16 KB
 
 export function Autonomy({ at }) {
@@ -28,10 +28,11 @@ export function Autonomy({ at }) {
   const name = useName(at);
   const find = (file) => listed?.find((one) => one.file === file);
   const script = find(chosen);
-  const parts = { at, page, entry, status };
+  const running = plain(find(status.file)?.label ?? scriptName(status));
+  const parts = { at, page, entry, status, running };
   const open = (file) => choose(file === chosen ? "" : file);
   return html`<div class="autonomy">
-    <${Running} ...${parts} script=${find(status.file)} />
+    <${Running} ...${parts} find=${find} />
     ${!listed &&
     html`<${Nothing} icon="script" what="No list of scripts yet">Is autonomy_manager enabled in its config?<//>`}
     ${listed?.length === 0 &&
@@ -65,32 +66,34 @@ function how({ overridden }, past) {
 }
 
 /** What runs, and the end of it. */
-function Running({ at, page, entry, status, script }) {
+function Running({ at, page, entry, status, running, find }) {
+  const script = find(status.file);
+  const called = (file) => plain(find(file)?.label ?? file);
   const why = whyNotEnd(page);
   const label = (key) => script?.fields.find((one) => one.key === key)?.label ?? key;
-  const [seen] = useState(() => new Since()); // what runs while the card is closed may be another run
-  if (entry) seen.update(status, entry.at);
   const past = !useOnline(at);
   const { dependencies = [] } = status;
   const config = Object.entries(status.config ?? {});
   return html`<div class="ask-row ask-now">
       <p role="status" data-test="script-state">
         ${status.running
-          ? html`<b>${past ? "○" : "●"} ${plain(status.file ?? "A script")}</b>
-              ${how(status, past)},
-              ${" "}${since(seen)}`
+          ? html`<b>${past ? "○" : "●"} ${running}</b>
+              ${how(status, past)}${status.since > 0 && `, since ${clockTime(1000 * status.since)}`}`
           : html`<span class="dim">No script runs.</span>`}
       </p>
       ${(status.running || !entry) &&
       html`<${Button} test="end-script" why=${why} icon="halt" onPress=${() => page.commands.stopScript(at)}>Stop script<//>`}
     </div>
     ${why && (status.running || !entry) && html`<${Why} id="why-end-script">${why}<//>`}
-    ${status.error && html`<p class="bad" data-test="script-error">✖ ${plain(status.error)}</p>`}
+    ${status.error &&
+    (status.stopped
+      ? html`<p class="dim" data-test="script-error">The stop has ended it. Start it again after the reset.</p>`
+      : html`<p class="bad" data-test="script-error">✖ ${plain(status.error)}</p>`)}
     ${dependencies.length > 0 &&
     html`<ul class="dependencies" aria-label="Scripts that it needs">
       ${dependencies.map(
         ({ file, running }, index) => html`<li key=${index} class=${running ? "" : "bad"}>
-          ${running ? "●" : "✖"} ${plain(file)} ${running ? "runs" : "does not run"}
+          ${running ? "●" : "✖"} ${called(file)} ${running ? "runs" : "does not run"}
         </li>`,
       )}
     </ul>`}
@@ -98,6 +101,10 @@ function Running({ at, page, entry, status, script }) {
     html`<details class="effective">
       <summary data-test="effective">Its settings (${config.length})</summary>
       <dl class="values">
+        <div>
+          <dt>File</dt>
+          <dd>${plain(status.file)}</dd>
+        </div>
         ${config.map(
           ([key, value]) => html`<div key=${key}>
             <dt>${plain(label(key))}</dt>
@@ -108,15 +115,15 @@ function Running({ at, page, entry, status, script }) {
     </details>`}`;
 }
 
-const since = ({ at, isExact }) => `since ${clockTime(at)}${isExact ? "" : " or before"}`;
-
 /** The form of one script, and its start. */
-function Starter({ at, page, entry, status, script }) {
+function Starter({ at, page, entry, status, running, script }) {
   const [{ texts, version }, set] = useState(() => ({ texts: remembered(at, script.file), version: 0 }));
-  const [asked, setAsked] = useState(/** @type {{at: number, of: number | undefined, n: number} | null} */ (null));
+  const [asked, setAsked] = useState(/** @type {{of: number | undefined, n: number} | null} */ (null));
   const answer = useAnswer(asked?.n);
-  const isAsked = asked !== null && Date.now() - asked.at < ASKED_MS && entry?.receivedAt === asked.of;
-  useTick(isAsked ? 1000 : 0);
+  const isAsked = asked !== null && entry?.receivedAt === asked.of; // until it reports anything
+  useEffect(() => {
+    if (answer.op === "done") page.settings.begin("script");
+  }, [answer.op]);
   const { main, more } = script;
   const why = whyNotStarted(page, at);
   const { by, waits } = handDriven(page, at);
@@ -141,7 +148,7 @@ function Starter({ at, page, entry, status, script }) {
     if (JSON.stringify(config).length > LONGEST_CONFIG) return page.connection.show("Not done: the settings are too long together");
     const n = page.commands.startScript(at, script.file, config);
     remember(at, script.file, texts); // it is the last one now
-    return setAsked({ at: Date.now(), of: entry?.receivedAt, n });
+    return setAsked({ of: entry?.receivedAt, n });
   };
   return html`<form noValidate onSubmit=${start}>
     <${Form} key=${`main ${version}`} id="script-set" fields=${main} texts=${texts} onText=${onText} />
@@ -154,7 +161,7 @@ function Starter({ at, page, entry, status, script }) {
     </details>`}
     <div class="script-start">
       <button class=${why ? "" : "primary"} data-test="start-script" disabled=${Boolean(why)} aria-describedby="why-start">
-        <${Icon} name="play" />${startWords(status, script)}
+        <${Icon} name="play" />${startWords(status, script, running)}
       </button>
       <span role="status" class=${answer.op === "refused" ? "bad" : "dim"} data-test="asked"
         >${isAsked && startedWords(answer, name)}</span
@@ -175,7 +182,7 @@ function startedWords({ op, why }, name) {
   return op === "done" ? `${name} was asked to start it` : "asking…";
 }
 
-function startWords({ running, file }, script) {
+function startWords({ running, file }, script, other) {
   if (!running) return "Start";
-  return file === script.file ? "Start again" : `Start instead of ${(file ?? "it").slice(0, 40)}`;
+  return file === script.file ? "Start again" : `Start instead of ${other}`;
 }

@@ -13,7 +13,7 @@ import { styled } from "../parts/hooks.js";
  */
 
 /** Which keys drive. */
-export const KEYS = styled(async (again) => (await import("../robot/key-hints.js" + again)).KeyHints, "panels.css");
+export const KEYS = styled(async (again) => (await import("../robot/drive-settings.js" + again)).KeyHints, "panels.css");
 
 /** How the inputs are scaled, and the extra axis. */
 export const DRIVE = styled(async (again) => (await import("../robot/drive-settings.js" + again)).DriveSettings, "panels.css");
@@ -82,7 +82,7 @@ export const CARDS = [
     icon: "light",
     tab: "more",
     height: 210,
-    wants: (offers) => offers.hasLights,
+    wants: (offers) => ["solid", "flash", "available"].some((kind) => offers.section("lights")[kind] === true),
     part: styled(async (again) => (await import("./lights.js" + again)).Lights, "commands.css"),
   },
   {
@@ -131,7 +131,7 @@ export const CARDS = [
     icon: "chip",
     tab: "more",
     wants: (offers) => offers.metrics.some((metric) => metric.endsWith("/describe")),
-    part: styled(async (again) => (await import("./mcus.js" + again)).Mcus, "devices.css", "plots.css", "vendor/uPlot.css"),
+    part: styled(async (again) => (await import("./mcus.js" + again)).Mcus, "devices.css"),
   },
   {
     id: "logs",

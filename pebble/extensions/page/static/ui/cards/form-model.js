@@ -75,7 +75,6 @@ export const option = (type, value) => (type === "bool" ? (value === "true" ? "o
 // -- what was typed, in this browser
 
 const MOST_FORMS = 32;
-const LONGEST_FORMS = 60_000; // characters of JSON
 
 /** @param {string} ref @param {string} file @returns {Texts} */
 export function remembered(ref, file) {
@@ -89,9 +88,7 @@ export function remembered(ref, file) {
  */
 export function remember(ref, file, texts) {
   const others = forms().filter((one) => one[0] !== ref || one[1] !== file);
-  const newest = [[ref, file, [...texts]], ...others].slice(0, MOST_FORMS);
-  while (newest.length > 1 && JSON.stringify(newest).length > LONGEST_FORMS) newest.pop();
-  write("forms", newest);
+  write("forms", [[ref, file, [...texts]], ...others].slice(0, MOST_FORMS));
 }
 
 /** @param {string} ref @returns {string} the script whose form was used last; "" none */

@@ -3,7 +3,6 @@
 import { html, useModel } from "../parts/hooks.js";
 import { LONGEST_S, SHORTEST_S, lightsOf, toggleFlash, whyNotLights } from "./lights-model.js";
 import { Button, Why, useName } from "../parts/parts.js";
-import { Typed } from "../parts/typed.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 
 const COLOURS = {
@@ -77,24 +76,25 @@ const ModeButton = ({ lights, mode, ...more }) => html`<${Button}
 />`;
 
 function Period({ page, lights, why }) {
-  const done = (text) => {
-    const seconds = Number.parseFloat(text);
-    if (!(seconds >= SHORTEST_S && seconds <= LONGEST_S)) return;
-    if (lights.mode === "flash") lights.ask(page, { period: seconds });
+  const done = ({ currentTarget: input }) => {
+    const seconds = input.valueAsNumber;
+    if (!(seconds >= SHORTEST_S && seconds <= LONGEST_S)) input.value = lights.period;
+    else if (lights.mode === "flash") lights.ask(page, { period: seconds });
     else lights.setPeriod(seconds);
   };
   return html`<label class="field">
     <span>Period, s</span>
-    <${Typed}
+    <input
+      key=${lights.period}
       type="number"
       data-test="lights-period"
       min=${SHORTEST_S}
       max=${LONGEST_S}
       step="0.05"
-      value=${lights.period}
+      defaultValue=${lights.period}
       disabled=${Boolean(why)}
       aria-describedby=${why ? "why-lights" : undefined}
-      onDone=${done}
+      onChange=${done}
     />
   </label>`;
 }

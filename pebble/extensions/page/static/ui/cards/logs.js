@@ -1,17 +1,14 @@
 // The log lines of a robot's services as they come, filtered.
 
-import * as more from "../../core/browser-more.js";
 import { LEVELS } from "../../core/logs.js";
 import { html, useEffect, useModel, usePage, useRef, useState, useValue } from "../parts/hooks.js";
 import { logViewOf } from "../parts/log-view.js";
-import { Button, Check, Select, Why } from "../parts/parts.js";
+import { Button, Check, Select } from "../parts/parts.js";
 import { exactTime } from "../parts/more-words.js";
 import { inner, isObject } from "../parts/words.js";
 
 const SIGNS = { DEBUG: "·", INFO: "○", WARNING: "▲", ERROR: "✖", CRITICAL: "✖" };
 const END_PX = 24; // so near to the end the newest line is in sight
-const SAID_MS = 3000;
-const SERVICES = 64; // to choose from
 
 export function Logs({ at, view: cards }) {
   const { commands, connection, store } = usePage();
@@ -34,16 +31,16 @@ export function Logs({ at, view: cards }) {
   }, [cards?.wanted]);
   const lines = view.book.filtered(view.filter);
   return html`<div class="logs" ref=${card}>
-    <${Tools} at=${at} view=${view} lines=${lines} />
+    <${Tools} at=${at} view=${view} />
     <${Lines} view=${view} lines=${lines} />
     <${Foot} view=${view} lines=${lines} />
   </div>`;
 }
 
-function Tools({ at, view, lines }) {
+function Tools({ at, view }) {
   const { filter } = view;
   const listed = inner(useValue(at, "status"))?.services;
-  const known = isObject(listed) ? Object.keys(listed).slice(0, SERVICES) : [];
+  const known = isObject(listed) ? Object.keys(listed) : [];
   const services = [...new Set([...known, ...view.book.services, filter.service])].filter(Boolean).sort();
   return html`<div class="log-tools">
     <${Select}
@@ -68,33 +65,9 @@ function Tools({ at, view, lines }) {
       value=${filter.search}
       onInput=${(event) => view.choose({ search: event.currentTarget.value })}
     />
-    <span class="log-buttons">
-      <${CopyButton} lines=${lines} />
-      <${Button} test="log-clear" onPress=${() => view.clear()}>Clear<//>
-    </span>
+    <${Button} test="log-clear" onPress=${() => view.clear()}>Clear<//>
   </div>`;
 }
-
-function CopyButton({ lines }) {
-  const [done, show] = useState("");
-  useEffect(() => {
-    if (!done) return undefined;
-    const timer = setTimeout(() => show(""), SAID_MS);
-    return () => clearTimeout(timer);
-  }, [done]);
-  const copy = () =>
-    more.clipboard.copy(lines.map(textOf).join("\n")).then(
-      () => show(`${lines.length} lines copied`),
-      () => show("The browser refused it"),
-    );
-  const why = more.clipboard.possible ? "" : "Copying needs https";
-  return html`<${Button} test="log-copy" why=${why} onPress=${copy}>Copy<//>
-    ${why && html`<${Why} id="why-log-copy">${why}<//>`}
-    <span class="log-note" role="status">${done}</span>`;
-}
-
-const textOf = (line) =>
-  [line.t === null ? "" : new Date(line.t).toISOString(), line.level, line.service, line.text].filter(Boolean).join(" ");
 
 /** All of at most 500 are drawn, each once: the others are passed over. */
 function Lines({ view, lines }) {

@@ -2,11 +2,15 @@
 
 import * as browser from "../../core/browser.js";
 import * as more from "../../core/browser-more.js";
+import { scriptName } from "../../core/reasons.js";
 import { differs, pieces, poseOf, poseWords } from "../../core/trail.js";
-import { html, useEffect, useMetrics, useOnline, usePage, useRef, useState, useTick } from "../parts/hooks.js";
+import { html, useEffect, useMetrics, useOnline, usePage, useRef, useState, useTick, useValue } from "../parts/hooks.js";
 import { Nothing } from "../parts/nothing.js";
-import { Button, Gone, Icon, Select, isGone } from "../parts/parts.js";
+import { Button, Gone, Icon, Select, Why, isGone, useEnded } from "../parts/parts.js";
+import { plain } from "../parts/more-words.js";
 import { recorderOf } from "../parts/recorder.js";
+import { useReasons } from "../parts/why-not.js";
+import { whyNotStarted } from "./autonomy-model.js";
 
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 const ARROW_PX = 24;
@@ -40,14 +44,14 @@ export function Odometry({ at, offers }) {
   useTick(WORDS_MS);
   const online = useOnline(at);
   const age = page.store.clock() - series.newestAt;
-  const gone = isGone({ age, period: series.gapMs / 3 }, online);
+  const ended = useEnded(at, source);
+  const gone = isGone({ age, period: series.gapMs / 3 }, online) || Boolean(ended && age > series.gapMs);
   if (view.current) view.current.gone = gone;
   const words = poseWords(series.newest);
   return html`<div class="map">
     ${!series.newest &&
-    html`<${Nothing} icon="map" what="No trail yet"
-      >${offers.section("autonomy").available ? html`Start <b>Wheel odometry</b> in Scripts, and drive` : "It begins with the first position that is received"}<//
-    >`}
+    html`<${Nothing} icon="map" what="No trail yet">It begins with the first position that is received<//>`}
+    ${ended && (gone || !series.newest) && html`<${Ended} at=${at} script=${ended} />`}
     <canvas ref=${canvas} class=${series.newest ? "map-canvas" : "map-canvas unused"} role="img" tabindex="0" data-arrows data-test="map"
       aria-label="Trail of the odometry; arrow keys move it"></canvas>
     <p class="map-words" data-test="map-pose" hidden=${!series.newest}>
@@ -70,6 +74,20 @@ export function Odometry({ at, offers }) {
         onChoose=${choose}
       />`}
     </div>
+  </div>`;
+}
+
+/** What would find its position, and does not run. */
+function Ended({ at, script: { file, label = file } }) {
+  const page = useReasons(at);
+  const { running, ...status } = useValue(at, "autonomy-status") ?? {};
+  const why = whyNotStarted(page, at) || (running ? `One script runs at a time: stop ${scriptName(status)} first` : "");
+  const words = html`<span>${plain(label)} does not run.</span>`;
+  if (page.recording) return html`<p class="map-words">${words}</p>`;
+  return html`<div class="map-tools" data-test="map-ended">
+    ${words}
+    <${Button} test="map-start" why=${why} icon="play" onPress=${() => page.commands.startScript(at, file, {})}>Start ${plain(label)}<//>
+    ${why && html`<${Why} id="why-map-start">${why}<//>`}
   </div>`;
 }
 

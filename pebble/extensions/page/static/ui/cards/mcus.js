@@ -3,15 +3,11 @@
 import { isLevel, useAnswer } from "../parts/asking.js";
 import { html, useMetric, useOnline, usePage, useState, useTick, useValue } from "../parts/hooks.js";
 import { command, fieldOf, range, step, unsendable } from "./manifest.js";
-import { Button, Check, Icon, Why, isGone } from "../parts/parts.js";
-import { Lines } from "./plot.js";
-import { recorderOf } from "../parts/recorder.js";
+import { Check, Why, isGone } from "../parts/parts.js";
 import { refuses } from "../parts/typed.js";
 import { useReasons, whyNotMoved } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
-import { clockTime, inner, roughly } from "../parts/words.js";
-
-const MOST = 16;
+import { clockTime, roughly } from "../parts/words.js";
 
 export function Mcus({ at, offers }) {
   const why = whyNotMoved(useReasons(at), at);
@@ -19,10 +15,7 @@ export function Mcus({ at, offers }) {
     .map((metric) => /^mcu\/([^/]+)\/describe$/.exec(metric)?.[1])
     .filter(Boolean)
     .sort();
-  return html`${uids
-    .slice(0, MOST)
-    .map((uid, index) => html`<${Mcu} key=${uid} at=${at} uid=${uid} id=${`mcu-${index}`} whyNot=${why} />`)}
-  ${uids.length > MOST && html`<p class="dim">… ${uids.length - MOST} more</p>`}`;
+  return uids.map((uid, index) => html`<${Mcu} key=${uid} at=${at} uid=${uid} id=${`mcu-${index}`} whyNot=${why} />`);
 }
 
 function Mcu({ at, uid, id, whyNot }) {
@@ -45,19 +38,7 @@ function useReading(at, uid, one) {
   return own ?? alias;
 }
 
-const MINUTE_MS = 60_000;
-const LIMITS = { spanMs: MINUTE_MS, most: 300, differs: (_row, _last, ms) => ms >= 240 };
-
-/** What can be drawn of a payload: numbers, and switches as 0 and 1. @param {any} payload */
-function drawable(payload) {
-  const fields = Object.entries(inner(payload) ?? {}).filter(([, value]) => isDrawable(value));
-  return Object.fromEntries(fields.map(([name, value]) => [name, Number(value)]));
-}
-
-const isDrawable = (value) => typeof value === "number" || typeof value === "boolean";
-
 function Readings({ at, uid, one }) {
-  const page = usePage();
   useTick(1000);
   const entry = useReading(at, uid, one);
   const online = useOnline(at);
@@ -67,8 +48,6 @@ function Readings({ at, uid, one }) {
   const late = repeats && period > 0 && age > 2 * period + 250;
   const rate = period > 0 && repeats && !gone ? `${plain(Number((1000 / period).toPrecision(2)))}/s` : "";
   const since = entry ? `${roughly(age)} ago` : one.local_only ? "stays on the robot" : "nothing received yet";
-  const metric = page.store.get(at, `mcu/${uid}/${one.name}`) ? `mcu/${uid}/${one.name}` : one.channel;
-  const series = entry && recorderOf(page, at).follow("drawable", metric, drawable, LIMITS);
   return html`<div class="mcu-out" data-test=${`mcu-out-${one.name}`}>
     <h4>
       ${one.name}${" "}
@@ -77,38 +56,16 @@ function Readings({ at, uid, one }) {
     <ul>
       ${one.encoding.fields.map((field) => {
         const value = entry && fieldOf(entry.value, field.name);
-        return html`<${Reading} key=${field.name} field=${field} value=${value} gone=${gone} series=${series} />`;
+        return html`<${Reading} key=${field.name} field=${field} value=${value} gone=${gone} />`;
       })}
     </ul>
   </div>`;
 }
 
-/** One field; pressing it shows its last minute. */
-function Reading({ field, value, gone, series }) {
-  const [open, show] = useState(false);
+function Reading({ field, value, gone }) {
   const unit = field.unit ? ` ${field.unit}` : "";
   const words = value === undefined ? "–" : gone ? `– (was ${plain(value)}${unit})` : `${plain(value)}${unit}`;
-  const name = html`<span class="dim">${field.name}</span>`;
-  const shown = html`<span class=${gone ? "dim" : ""}>${words}</span>`;
-  if (!isDrawable(value)) return html`<li class="reading">${name}${shown}</li>`;
-  return html`<li>
-    <${Button} className="reading quiet" test=${`reading-${field.name}`} aria-expanded=${String(open)} onPress=${() => show(!open)}>
-      ${name}${shown}<${Icon} name=${open ? "up" : "plot"} />
-    <//>
-    ${open && html`<${Minute} series=${series} name=${field.name} unit=${unit} />`}
-  </li>`;
-}
-
-/** The last minute of a field. */
-function Minute({ series, name, unit }) {
-  const now = usePage().store.clock();
-  const [, column] = series.columns([name], now - MINUTE_MS, now);
-  const values = column.filter((value) => value !== null);
-  const words = values.length ? `${plain(Math.min(...values))} to ${plain(Math.max(...values))}${unit}` : "no values";
-  return html`<div class="plots" data-test="minute">
-    <${Lines} key=${series} series=${series} fields=${[name]} shownMs=${MINUTE_MS} paused=${false} />
-    <small>last minute: ${words}</small>
-  </div>`;
+  return html`<li class="reading"><span class="dim">${field.name}</span><span class=${gone ? "dim" : ""}>${words}</span></li>`;
 }
 
 function Form({ at, uid, one, id, whyNot }) {

@@ -5,7 +5,6 @@ import { html, useMetric, useOnline } from "../parts/hooks.js";
 import { Why } from "../parts/parts.js";
 import { useReasons, whyNotEnd, whyNotMoved } from "../parts/why-not.js";
 
-const MOST = 64;
 const CONFIRMED_MS = 3000;
 
 export function Outlets({ at, offers }) {
@@ -14,12 +13,9 @@ export function Outlets({ at, offers }) {
   const all = outletsOf(offers);
   return html`${why && html`<${Why} id="why-outlets">${why}<//>`}
     <ul class="outlets">
-      ${all
-        .slice(0, MOST)
-        .map((one, index) => html`<${Outlet} key=${one.name} ...${one} at=${at} id=${index} page=${page} />`)}
+      ${all.map((one, index) => html`<${Outlet} key=${one.name} ...${one} at=${at} id=${index} page=${page} />`)}
     </ul>
-    ${!all.length && html`<p class="dim">No outlet is connected.</p>`}
-    ${all.length > MOST && html`<p class="dim">… ${all.length - MOST} more</p>`}`;
+    ${!all.length && html`<p class="dim">No outlet is connected.</p>`}`;
 }
 
 /**

@@ -16,24 +16,6 @@ const HEIGHT = 132;
 /** Colour alone does not tell lines apart; plots.css has the same dashes. */
 const DASHES = [[], [7, 4], [2, 3], [10, 3, 2, 3], [12, 6], [1, 5]];
 
-/** @type {Set<() => void>} */
-const shown = new Set(); // what draws, for all plots of the page
-let timer = 0;
-
-function join(draw) {
-  shown.add(draw);
-  timer ||= setInterval(() => {
-    if (!document.hidden) for (const one of shown) one();
-  }, STEP_MS);
-}
-
-function leave(draw) {
-  shown.delete(draw);
-  if (shown.size) return;
-  clearInterval(timer);
-  timer = 0;
-}
-
 /** @param {{series: import("../../core/series.js").Series, fields: string[], shownMs: number, least?: number, paused: boolean}} props */
 export function Lines({ series, fields, shownMs, least, paused }) {
   const { store } = usePage();
@@ -61,9 +43,9 @@ export function Lines({ series, fields, shownMs, least, paused }) {
     sight.observe(element);
     draw();
     drawnAt = -Infinity; // what comes with the page's other messages is drawn with the next step
-    join(draw);
+    const timer = setInterval(() => document.hidden || draw(), STEP_MS);
     return () => {
-      leave(draw);
+      clearInterval(timer);
       sizes.disconnect();
       sight.disconnect();
       view.close();

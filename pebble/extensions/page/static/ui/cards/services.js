@@ -6,7 +6,6 @@ import { logViewOf } from "../parts/log-view.js";
 import { plain } from "../parts/more-words.js";
 import { inner, isObject } from "../parts/words.js";
 
-const MOST = 64;
 const SIGNS = { ready: "●", init: "○", restarting: "▲", failed: "✖", stopped: "■" };
 
 export function Services({ at, view }) {
@@ -14,24 +13,13 @@ export function Services({ at, view }) {
   const online = useOnline(at);
   const media = Object.entries(useValue(at, "media-status") ?? {});
   if (!isObject(services)) return html`<p class="dim">It reports no services.</p>`;
-  const names = Object.keys(services);
   return html`<ul class="services-list">
-    ${names
-      .slice(0, MOST)
-      .map(
-        (name) => html`<${Service}
-          key=${name}
-          at=${at}
-          view=${view}
-          name=${name}
-          online=${online}
-          one=${services[name]}
-        />`,
-      )}
-    ${names.length > MOST && html`<li class="dim">… ${names.length - MOST} more</li>`}
-    ${Object.entries(isObject(mcu) ? mcu : {})
-      .slice(0, MOST)
-      .map(([name, line]) => html`<${SerialLine} key=${`mcu ${name}`} name=${name} online=${online} line=${line} />`)}
+    ${Object.entries(services).map(
+      ([name, one]) => html`<${Service} key=${name} at=${at} view=${view} name=${name} online=${online} one=${one} />`,
+    )}
+    ${Object.entries(isObject(mcu) ? mcu : {}).map(
+      ([name, line]) => html`<${SerialLine} key=${`mcu ${name}`} name=${name} online=${online} line=${line} />`,
+    )}
     ${media.map(
       ([name, report]) => html`<li key=${`media ${name}`} class=${online ? "" : "dim"} data-test=${`media-${name}`}>
         <i aria-hidden="true">${report.running ? SIGNS.ready : SIGNS.init}</i>

@@ -1,12 +1,12 @@
 // What can be done to the whole robot: restart, reboot, update; and the flags that allow pictures and sound.
 
+import { scriptName } from "../../core/reasons.js";
 import { useAnswer, useWish } from "../parts/asking.js";
 import { html, useEffect, usePage, useState, useValue } from "../parts/hooks.js";
 import { logViewOf } from "../parts/log-view.js";
 import { Panel } from "../panels/panel.js";
 import { Button, Check, HoldButton, Why, useName } from "../parts/parts.js";
 import { useReasons, whyNot, whyNotEnd } from "../parts/why-not.js";
-import { plain } from "../parts/more-words.js";
 import { clockTime, driverName } from "../parts/words.js";
 
 /** @typedef {"reboot" | "service-restart" | "git-pull"} Action */
@@ -115,7 +115,7 @@ function Now({ at }) {
   const driver = useValue(at, "web/driver");
   const script = useValue(at, "autonomy-status");
   return html`${driver?.by && !driver.you && html`<li><b>${driverName(driver)} has control of it.</b></li>`}
-  ${script?.running === true && html`<li><b>The script ${plain(script.file)} is running.</b></li>`}`;
+  ${script?.running === true && html`<li><b>${scriptName(script)} runs.</b></li>`}`;
 }
 
 /** What became of the last action, which the robot does not acknowledge: its header and its log lines tell the rest. */
@@ -164,7 +164,7 @@ const ECHO_MS = 5000;
 
 function Flags({ at, offers }) {
   const flags = useValue(at, "web/flags");
-  const has = { mqtt_video: offers.hasVideo, mqtt_audio: offers.has("audio"), remote_mirror: offers.transport !== "mcu" };
+  const has = { mqtt_video: offers.hasVideo, mqtt_audio: offers.has("audio"), remote_mirror: offers.section("transport").kind !== "mcu" };
   const shown = FLAGS.filter(([, field]) => has[field] || typeof flags?.[field] === "boolean");
   if (!shown.length) return null;
   return html`<section class="system" aria-labelledby="flags-title">

@@ -1,7 +1,7 @@
 // What the component reports of itself, in words and numbers.
 
 import { html, useMetric, useOnline, useTick, useValue } from "../parts/hooks.js";
-import { Live } from "../parts/parts.js";
+import { Live, useEnded } from "../parts/parts.js";
 import { Board } from "./board.js";
 import { poseOf, poseWords } from "../../core/trail.js";
 import { charging, plain } from "../parts/more-words.js";
@@ -46,12 +46,12 @@ function Hint({ at }) {
  */
 function Row({ at, metric, name, online, streams = false, children: words }) {
   const received = useMetric(at, metric);
+  const ended = Boolean(useEnded(at, metric));
   const text = received && words(received.value);
   if (!text) return null;
-  const entry = streams ? { ...received, period: received.period || STREAM_MS } : received;
   return html`<div>
     <dt>${name}</dt>
-    <dd><${Live} entry=${entry} online=${online}>${text}<//></dd>
+    <dd><${Live} entry=${received} usual=${streams ? STREAM_MS : 0} online=${online} ended=${ended}>${text}<//></dd>
   </div>`;
 }
 

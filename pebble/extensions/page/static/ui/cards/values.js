@@ -1,12 +1,10 @@
-// Everything that was received of a component, whatever its type: a group of lines for each metric.
+// Everything that was received of a component, whatever its type, as it came.
 
 import { html, useMetric, useMetrics, useOnline, useState, useTick } from "../parts/hooks.js";
-import { linesOf } from "./lines.js";
 import { isGone } from "../parts/parts.js";
 import { plain } from "../parts/more-words.js";
 import { roughly } from "../parts/words.js";
 
-const MOST = 120;
 const SHORT = 6; // lines that are always shown
 
 export function Values({ at }) {
@@ -14,10 +12,7 @@ export function Values({ at }) {
     .filter((metric) => !metric.startsWith("web/"))
     .sort();
   if (!metrics.length) return html`<p class="dim">Nothing was received yet.</p>`;
-  return html`<dl class="all-values">
-      ${metrics.slice(0, MOST).map((metric) => html`<${Metric} key=${metric} at=${at} metric=${metric} />`)}
-    </dl>
-    ${metrics.length > MOST && html`<p class="dim">… ${metrics.length - MOST} more</p>`}`;
+  return html`<dl class="all-values">${metrics.map((metric) => html`<${Metric} key=${metric} at=${at} metric=${metric} />`)}</dl>`;
 }
 
 function Metric({ at, metric }) {
@@ -26,24 +21,16 @@ function Metric({ at, metric }) {
   const online = useOnline(at);
   const [open, show] = useState(false);
   if (!entry) return null;
-  const { lines, omitted } = linesOf(entry.value);
   const gone = isGone(entry, online);
   const rate = entry.period > 0 && !gone ? `${plain(Number((1000 / entry.period).toPrecision(2)))}/s · ` : "";
-  const count = lines.length + omitted;
-  const all = () => html`<ul>
-    ${lines.map(
-      ({ depth, key, text }, index) => html`<li key=${index} class=${`depth-${depth}`}>
-        ${key && html`<span class="dim">${key}</span> `}${text}
-      </li>`,
-    )}
-    ${omitted > 0 && html`<li class="dim">… ${omitted} more</li>`}
-  </ul>`;
+  const text = JSON.stringify(entry.value, null, 2);
+  const count = text.split("\n").length;
   const details = () => html`<details open=${open} onToggle=${(event) => show(event.currentTarget.open)}>
     <summary>${count} lines</summary>
-    ${open && all()}
+    ${open && html`<pre>${text}</pre>`}
   </details>`;
   return html`<div class=${gone ? "dim" : ""} data-test=${`value-${metric}`}>
     <dt>${metric} <small>${rate}${roughly(entry.age)} ago</small></dt>
-    <dd>${count > SHORT ? details() : all()}</dd>
+    <dd>${count > SHORT ? details() : html`<pre>${text}</pre>`}</dd>
   </div>`;
 }

@@ -2,6 +2,7 @@
 
 import { ROOT } from "../../core/browser.js";
 import * as more from "../../core/browser-more.js";
+import { scriptName } from "../../core/reasons.js";
 import { doubtOf } from "./doubt.js";
 import { Bands, progressOf } from "../banner.js";
 import { Liveness } from "../header.js";
@@ -21,7 +22,7 @@ import {
 import { Offers, Route, WATCHES } from "../parts/models.js";
 import { charge, hasFace, looksOf, nameIn } from "../parts/looks.js";
 import { plain, shortTime } from "../parts/more-words.js";
-import { Button, Charge, Check, Drawing, Drop, Icon, RouteLink, Select, StopButton } from "../parts/parts.js";
+import { Button, Charge, Check, Drawing, Drop, Icon, RouteLink, Select, StopButton, useItself } from "../parts/parts.js";
 import { RecordingsLink } from "./recordings-link.js";
 import { battery, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf } from "../parts/words.js";
 
@@ -183,22 +184,24 @@ function FleetTools({ filter, onFilter, many }) {
   </div>`;
 }
 
-/** What one can do in the first minutes; each is ticked when it was begun. */
+/** What one can do in the first minutes; each is ticked when it was done. */
 function FirstTime({ refs }) {
   const { connection, panels, settings, store } = usePage();
   useModel(settings);
   useModel(connection, (one) => one.you);
   if (settings.begun.includes("hidden")) return null;
-  const offers = (ref) => new Offers(ref, store.get(ref, "capabilities")?.value);
-  const named = (ref) => nameIn(store, ref);
-  const drives = refs.find((ref) => offers(ref).drives);
-  const scripts = refs.find((ref) => offers(ref).section("autonomy").available);
+  const robots = refs.map((ref) => ({ ref, name: nameIn(store, ref), offers: new Offers(ref, store.get(ref, "capabilities")?.value) }));
+  const runs = ({ offers }) => Boolean(offers.section("autonomy").available);
+  const worth = (robot) => 2 * Number(robot.offers.hasVideo) + Number(runs(robot));
+  const [drives] = robots.filter(({ offers }) => offers.drives).sort((a, b) => worth(b) - worth(a));
   if (!drives) return null;
+  const scripts = runs(drives) ? drives : robots.find(runs);
   const items = [
-    ["drive", `Drive ${named(drives)}`, "Take control, then W A S D", { to: drives }],
-    scripts && ["script", `Let ${named(scripts)} drive itself`, "Scripts, Start", { to: scripts }],
+    ["drive", `Drive ${drives.name}`, "Take control, then W A S D", { to: drives.ref }],
+    scripts && ["script", `Let ${scripts.name} drive itself`, "Scripts, Start", { to: scripts.ref }],
     connection.you?.recordings && ["recordings", "Watch what just happened", "Recordings", { path: `${ROOT}replay` }],
   ].filter(Boolean);
+  const code = more.isLoopback(location.hostname) && connection.you?.server === more.DEMO ? "make demo PHONE=1 shows a code" : "Scan one code";
   const number = (name, at) => html`<span class=${`step ${settings.begun.includes(name) ? "done" : ""}`}
     >${settings.begun.includes(name) ? html`<${Icon} name="check" />` : at}</span
   >`;
@@ -209,13 +212,13 @@ function FirstTime({ refs }) {
     </div>
     <ul>
       ${items.map(
-        ([name, title, how, target], at) => html`<li key=${name} onClick=${() => settings.begin(name)}>
+        ([name, title, how, target], at) => html`<li key=${name}>
           <${RouteLink} ...${target} className="try">${number(name, at + 1)}<span><b>${title}</b><small>${how}</small></span><//>
         </li>`,
       )}
       <li>
-        <${Button} className="try" onPress=${() => (settings.begin("phone"), panels.show("phone"))}>
-          ${number("phone", items.length + 1)}<span><b>Open it on your phone</b><small>Scan one code</small></span>
+        <${Button} className="try" onPress=${() => panels.show("phone")}>
+          ${number("phone", items.length + 1)}<span><b>Open it on your phone</b><small>${code}</small></span>
         <//>
       </li>
     </ul>
@@ -353,19 +356,22 @@ function BatteryFact({ at, online }) {
 function DriverFact({ at, offers, online, estop, pictured }) {
   const view = useValue(at, "web/driver");
   const doubt = doubtOf(useValue(at, "status")).text;
+  const itself = useItself(at);
   if (!offers.known && !offers.drives) return null;
   if (!online && offers.drives) return html`<${Fact} icon="wheel">who drives is not known<//>`;
   if (!offers.drives) return html`<${Fact} icon="wheel">does not drive<//>`;
   if (estop?.latched) return pictured && html`<${Fact} icon="stop">reset it to drive<//>`;
+  if (itself) return html`<${Fact} icon="script" className=""><b title=${itself}>${itself}</b><//>`;
   if (!view?.by) return doubt ? null : html`<${Fact} icon="wheel">nobody drives<//>`;
   return html`<${Fact} icon="wheel" className="">${view.you ? html`<b>driven by you</b>` : `driven by ${driverName(view)}`}<//>`;
 }
 
+/** What runs beside who drives. */
 function ScriptFact({ at, online }) {
   const status = useValue(at, "autonomy-status");
-  if (!status?.running) return null;
-  if (!online) return html`<${Fact} icon="script">script: not known<//>`;
-  return html`<${Fact} icon="script" className="">script: ${plain(status.file ?? "?")}<//>`;
+  const itself = useItself(at);
+  if (!status?.running || itself || !online) return null;
+  return html`<${Fact} icon="script">${scriptName(status)} ${status.overridden ? "waits" : "runs"}<//>`;
 }
 
 /** In a word or two, what a component reports that is no robot. */

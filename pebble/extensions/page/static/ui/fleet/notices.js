@@ -35,6 +35,7 @@ class NoticeModel extends Model {
       if (refs.has(ref)) continue;
       ends.forEach((end) => end());
       this.followed.delete(ref);
+      this.notices.states.delete(ref);
     }
     for (const ref of refs) {
       if (this.followed.has(ref)) continue;

@@ -2,9 +2,8 @@
 
 import { ACTIONS, buttonName, buttonOf } from "../../core/actions.js";
 import { USUAL, mappingOf } from "../../core/inputs.js";
-import { useExtraAxis } from "../parts/axes.js";
 import { html, useModel, usePage } from "../parts/hooks.js";
-import { useKeyNames } from "../parts/keyboard.js";
+import { useExtraAxis, useKeyNames } from "../parts/keyboard.js";
 import { Panel } from "./panel.js";
 import { Icon } from "../parts/parts.js";
 

@@ -1,8 +1,9 @@
 // The address of this screen as a QR code; or why a phone cannot open it.
 
 import { ROOT } from "../../core/browser.js";
+import * as more from "../../core/browser-more.js";
 import { generate } from "../../vendor/lean-qr.mjs";
-import { html, useModel, usePage } from "../parts/hooks.js";
+import { html, useEffect, useModel, usePage } from "../parts/hooks.js";
 import { Route } from "../parts/models.js";
 import { Panel } from "./panel.js";
 import { useName } from "../parts/parts.js";
@@ -12,15 +13,14 @@ const QUIET = 4; // modules around the code
 export function PhonePanel({ onClose }) {
   const { ref } = useModel(usePage().route);
   return html`<${Panel} id="phone" onClose=${onClose} title="Open on a phone">
-    ${isLoopback(location.hostname) ? html`<${OnlyHere} />` : html`<${Code} at=${ref} />`}
+    ${more.isLoopback(location.hostname) ? html`<${OnlyHere} />` : html`<${Code} at=${ref} />`}
   <//>`;
 }
 
-/** @param {string} host @returns {boolean} whether no other machine can reach it */
-export const isLoopback = (host) => /^(127\.[\d.]+|0\.0\.0\.0|\[::1?\]|localhost|.*\.localhost)$/.test(host);
-
 function Code({ at }) {
+  const { settings } = usePage();
   const name = useName(at);
+  useEffect(() => settings.begin("phone"), []);
   const address = location.origin + Route.path(at, false);
   return html`<div class="panel-text">
     <${Drawn} text=${address} />
@@ -62,7 +62,10 @@ function OnlyHere() {
     <p>
       <b>A phone cannot open ${location.host}:</b> on every machine, this is the address of that machine itself.
     </p>
-    ${location.protocol === "https:"
+    ${server === more.DEMO
+      ? html`<p>End the demo, and start it with a certificate, a login, and a code in its terminal:</p>
+          <pre>make demo PHONE=1</pre>`
+      : location.protocol === "https:"
       ? html`<p>Open this page by the name that is in its certificate, and come back here for the code.</p>`
       : html`<p>For other machines, the page needs https and a login. On this computer, type once:</p>
           <pre>

@@ -5,7 +5,6 @@ import { lacks } from "../parts/lacks.js";
 import { NoticeList } from "../fleet/notices.js";
 import { Panel } from "./panel.js";
 import { Button, Check, Icon, useName } from "../parts/parts.js";
-import { Typed } from "../parts/typed.js";
 import { RecordingsLink } from "../fleet/recordings-link.js";
 
 const THEMES = { auto: "as the system", light: "light", dark: "dark" };
@@ -121,14 +120,14 @@ function OwnName({ you }) {
   return html`<div class="own-name">
     <label
       >Your name on this page
-      <${Typed}
+      <input
         type="text"
         maxlength="32"
         autocomplete="nickname"
         data-test="own-name"
         aria-describedby="own-name-why"
-        value=${settings.name}
-        onDone=${change}
+        defaultValue=${settings.name}
+        onChange=${(event) => change(event.currentTarget.value)}
     /></label>
     <span class="why" id="own-name-why">Others see “${you.user}”. Nobody checks it: here is no login.</span>
   </div>`;

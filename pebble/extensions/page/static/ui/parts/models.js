@@ -56,6 +56,11 @@ export class Connection extends Model {
     return this.state === "open";
   }
 
+  /** States in the server's words, by their codes. */
+  get words() {
+    return this.you?.words ?? {};
+  }
+
   /** The page was loaded before the server was updated. */
   get isOld() {
     return this.you !== null && this.you.version !== this.version;
@@ -160,20 +165,12 @@ export class Settings extends Model {
     this.changed();
   }
 
-  /** @param {string} what of the first time was begun, or "hidden" */
+  /** @param {string} what of the first time was done, or "hidden" */
   begin(what) {
+    if (this.begun.includes(what)) return;
     this.begun = [...new Set([...this.begun, what])];
     write("begun", this.begun);
     this.changed();
-  }
-
-  /** Whether pictures of this component are wanted. @param {string} ref */
-  wantsVideo(ref) {
-    return read(`video ${ref}`, true) !== false;
-  }
-
-  setVideo(ref, wanted) {
-    write(`video ${ref}`, wanted);
   }
 }
 
@@ -283,16 +280,6 @@ export class Offers {
     return this.metrics.some((metric) => metric.startsWith(prefix));
   }
 
-  /** What it is called, and looks like: name, description, colour and picture, as far as it says so. */
-  get identity() {
-    return this.section("identity");
-  }
-
-  get hasLights() {
-    const lights = this.section("lights");
-    return lights.solid === true || lights.flash === true || lights.available === true;
-  }
-
   get drives() {
     return this.section("drive").available === true;
   }
@@ -310,9 +297,5 @@ export class Offers {
 
   get hasVideo() {
     return this.assumed || this.section("video").available === true;
-  }
-
-  get transport() {
-    return this.section("transport").kind ?? "";
   }
 }

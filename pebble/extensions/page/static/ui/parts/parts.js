@@ -1,7 +1,8 @@
 // Small parts of many widgets.
 
 import * as browser from "../../core/browser.js";
-import { Boundary, html, useEffect, useLater, usePage, usePart, useRef, useState, useTick, useValue } from "./hooks.js";
+import { drivesItself, inWords, scriptName } from "../../core/reasons.js";
+import { Boundary, html, useEffect, useLater, useOnline, usePage, usePart, useRef, useState, useTick, useValue } from "./hooks.js";
 import { Route, read } from "./models.js";
 import { chargeWords, drawing, hasFace, looksOf } from "./looks.js";
 import { reported, roughly } from "./words.js";
@@ -82,59 +83,70 @@ export function StopButton({ onStop, label, children, className = "", describedB
   </span>`;
 }
 
+const isPress = ({ code, repeat }) => (code === "Space" || code === "Enter") && !repeat;
+
+/**
+ * Attributes of what works while a pointer holds it, wherever that goes; and, with ``keys``, while a key does.
+ * @param {(event: any) => void} begin @param {() => void} end @param {boolean} [keys]
+ */
+export const held = (begin, end, keys = false) => ({
+  onPointerDown(event) {
+    if (event.button) return;
+    browser.capture(event);
+    begin(event);
+  },
+  onPointerUp: end,
+  onPointerCancel: end,
+  onLostPointerCapture: end,
+  onContextMenu: (event) => event.preventDefault(), // a finger that stays
+  ...(keys && { onBlur: end, onKeyDown: (event) => isPress(event) && begin(event), onKeyUp: end }),
+});
+
 const HOLD_MS = 1000;
 const HINT_MS = 2500;
 
 /** A button that has to be held for a second, by pointer or key. */
 export function HoldButton({ onHeld, disabled = false, children, className = "", describedBy, test }) {
-  const [held, hold] = useState(false);
+  const [holds, hold] = useState(false);
   const [tapped, setTapped] = useState(false);
   const done = useRef(onHeld);
   done.current = disabled ? () => {} : onHeld;
   useEffect(() => {
     if (disabled) hold(false); // the end of a press on a button that is off is not reported
-    if (!held || disabled) return undefined;
+    if (!holds || disabled) return undefined;
     const timer = setTimeout(() => {
       hold(false);
       done.current();
     }, HOLD_MS);
     return () => clearTimeout(timer);
-  }, [held, disabled]);
+  }, [holds, disabled]);
   useEffect(() => {
     if (!tapped) return undefined;
     const timer = setTimeout(() => setTapped(false), HINT_MS);
     return () => clearTimeout(timer);
   }, [tapped]);
   const end = () => {
-    if (held) setTapped(true); // too early
+    if (holds) setTapped(true); // too early
     hold(false);
   };
-  const key = (event) => event.code === "Space" || event.code === "Enter";
+  const begin = () => {
+    setTapped(false);
+    hold(true);
+  };
   return html`<button
     type="button"
-    class=${`hold ${held ? "held" : ""} ${className}`}
+    class=${`hold ${holds ? "held" : ""} ${className}`}
     data-test=${test}
     disabled=${disabled}
     aria-describedby=${describedBy}
-    onPointerDown=${(event) => {
-      if (event.button) return;
-      browser.capture(event);
-      setTapped(false);
-      hold(true);
-    }}
-    onPointerUp=${end}
-    onPointerCancel=${end}
-    onLostPointerCapture=${end}
-    onBlur=${end}
-    onKeyDown=${(event) => key(event) && !event.repeat && hold(true)}
-    onKeyUp=${end}
+    ...${held(begin, end, true)}
     onContextMenu=${(event) => {
       event.preventDefault();
       end();
     }}
   >
     <span class="hold-fill" aria-hidden="true"></span><span class="hold-text"
-      >${tapped && !held ? "Keep it pressed for 1 s" : children}</span
+      >${tapped && !holds ? "Keep it pressed for 1 s" : children}</span
     >
   </button>`;
 }
@@ -150,17 +162,19 @@ export const isGone = ({ age, period }, online) => !online || (period > 0 && age
 
 /**
  * A value and how old it is: of another colour after two periods; after ten seconds, or three periods if these are
- * longer, it is no longer shown as a value.
- * @param {{entry?: import("../../core/store.js").Value, online?: boolean, children: any}} props
+ * longer, or at once if its source has ``ended``, it is no longer shown as a value. ``usual``: ms of a period, until it
+ * is known.
+ * @param {{entry?: import("../../core/store.js").Value, online?: boolean, ended?: boolean, usual?: number, children: any}} props
  */
-export function Live({ entry, online = true, children }) {
-  const { age = 0, period = 0 } = entry ?? {};
+export function Live({ entry, online = true, ended = false, usual = 0, children }) {
+  const { age = 0, period: known = 0 } = entry ?? {};
+  const period = known || usual;
   const lateAt = period > 0 ? 2 * period + LATE_MS : Infinity;
   const late = age > lateAt;
   useTick(!online || late ? 1000 : 0); // its age is shown
   useLater(online && !late ? lateAt - age + 1 : Infinity);
   if (!entry) return html`<span class="dim">–</span>`;
-  if (isGone(entry, online)) return html`<${Gone} age=${age}>${children}<//>`;
+  if (isGone({ age, period }, online) || (late && ended)) return html`<${Gone} age=${age}>${children}<//>`;
   return html`<span class=${late ? "late" : ""}>${children}${late && html` <small>${roughly(age)} old</small>`}</span>`;
 }
 
@@ -196,7 +210,11 @@ export function Card({ title, id, icon, aside, view, isFirst = false, className 
   </section>`;
 }
 
-/** A list below a button, closed by Escape and when the focus leaves it. @param {any} props */
+/**
+ * A list below a button, closed by Escape and when the focus leaves it. It takes the focus itself: else a press on the
+ * words of a label would give it to the whole page.
+ * @param {any} props
+ */
 export function Drop({ summary, test, look = "", className = "", children }) {
   const place = useRef(/** @type {HTMLDetailsElement | null} */ (null));
   const close = () => (place.current.open = false);
@@ -211,7 +229,7 @@ export function Drop({ summary, test, look = "", className = "", children }) {
     onFocusOut=${(event) => event.relatedTarget && !event.currentTarget.contains(event.relatedTarget) && close()}
   >
     <summary class=${look} data-test=${test}>${summary}</summary>
-    <div class="drop-list">${children}</div>
+    <div class="drop-list" tabindex="-1">${children}</div>
   </details>`;
 }
 
@@ -248,6 +266,27 @@ export const useEntered = (at) => useValue(at, "web/entered") ?? read(`stream ${
 export function useStream(at) {
   const own = reported(useValue(at, "status"));
   return useEntered(at) || own;
+}
+
+/** That it drives itself, in the server's words; "" a person drives, or nobody. @param {string} at @returns {string} */
+export function useItself(at) {
+  const { words } = usePage().connection;
+  const status = useValue(at, "autonomy-status");
+  const name = useName(at);
+  const stopped = useValue(at, "web/estop")?.latched;
+  if (!useOnline(at) || stopped || !drivesItself(status)) return "";
+  return inWords(words, "itself", { name, script: scriptName(status) });
+}
+
+/**
+ * The script that publishes a metric of this robot, if it does not run.
+ * @param {string} at @param {string} metric @returns {{file: string, label?: string} | undefined}
+ */
+export function useEnded(at, metric) {
+  const script = useValue(at, "autonomy-files")?.files?.find(({ file }) => file === metric);
+  const status = useValue(at, "autonomy-status");
+  const all = status ? [status, ...(status.dependencies ?? [])] : [];
+  return all.some(({ file, running }) => running && file === metric) ? undefined : status && script;
 }
 
 /** What people call it. @param {string} at @returns {string} */

@@ -3,19 +3,12 @@
 import { Archive, delay } from "../../core/replay/archive.js";
 import { html, useEffect, useRef, useState } from "../parts/hooks.js";
 import { Button, Select, Why } from "../parts/parts.js";
-import { clockTime } from "../parts/words.js";
+import { clockTime, span } from "../parts/words.js";
 import { sizeWords } from "./choose.js";
 
 const POLL_MS = 500;
 const LONGEST_MS = 3_600_000;
 const FORMS = { mkv: "Film (MKV)", mp4: "Film (MP4)", mcap: "Raw (MCAP)" };
-
-/** @param {number} ms @returns {string} 3 min 20 s */
-export function long(ms) {
-  const s = Math.round(ms / 1000);
-  const parts = [[Math.floor(s / 3600), "h"], [Math.floor(s / 60) % 60, "min"], [s % 60, "s"]];
-  return parts.filter(([count]) => count).map(([count, unit]) => `${count} ${unit}`).join(" ") || "0 s";
-}
 
 /** One export at a time, from the request to its file. */
 function useExport(replay) {
@@ -54,7 +47,8 @@ function useExport(replay) {
 export function Download({ replay }) {
   const [as, choose] = useState("mkv");
   const { job, begin, end } = useExport(replay);
-  const { feed, stretch, marked } = replay;
+  const { feed, stretch } = replay;
+  const isMarked = Object.keys(replay.marked).length > 0;
   const lasts = stretch.until - stretch.since;
   const running = job?.state === "running";
   const why = feed.seeks ? (lasts > LONGEST_MS ? "At most one hour: mark a shorter stretch" : "") : "Nothing is open yet";
@@ -62,22 +56,12 @@ export function Download({ replay }) {
   return html`<div class="download">
     <p>
       <b data-test="stretch">${feed.seeks ? `${clockTime(stretch.since)} – ${clockTime(stretch.until)}` : "–"}</b>
-      <span class="dim"> ${feed.seeks && long(lasts)}</span>
+      <span class="dim"> ${feed.seeks && span(lasts)}</span>
     </p>
     <div class="download-marks">
-      <${Button} test="mark-in" onPress=${() => replay.mark("since", feed.position)}>Begin here<//>
-      <${Button} test="mark-out" onPress=${() => replay.mark("until", feed.position)}>End here<//>
-      ${marked.any &&
-      html`<${Button}
-        className="quiet"
-        test="mark-clear"
-        onPress=${() => {
-          replay.mark("since", null);
-          replay.mark("until", null);
-        }}
-      >
-        Clear
-      <//>`}
+      <${Button} test="mark-in" onPress=${() => replay.mark({ since: feed.position })}>Begin here<//>
+      <${Button} test="mark-out" onPress=${() => replay.mark({ until: feed.position })}>End here<//>
+      ${isMarked && html`<${Button} className="quiet" test="mark-clear" onPress=${() => replay.unmark()}>Clear<//>`}
     </div>
     <div class="download-marks">
       <${Select} test="download-as" label="Form of the download" value=${as} choices=${Object.entries(FORMS)} onChoose=${choose} />

@@ -32,6 +32,10 @@ class Recorded extends Model {
     this.onLogs = null;
   }
 
+  get words() {
+    return this.live.words;
+  }
+
   may() {
     return false;
   }
@@ -141,25 +145,6 @@ export class Day extends Model {
   }
 }
 
-/** What a person has marked for a download. */
-class Marked {
-  /** @type {number | null} */
-  since = null;
-  /** @type {number | null} */
-  until = null;
-
-  /** @param {"since" | "until"} name @param {number | null} at */
-  set(name, at) {
-    this[name] = at;
-    if (this.since === null || this.until === null || this.since < this.until) return;
-    this[name === "since" ? "until" : "since"] = null;
-  }
-
-  get any() {
-    return this.since !== null || this.until !== null;
-  }
-}
-
 export class Replay extends Model {
   /** @param {any} live the page's services @param {string} ref */
   constructor(live, ref) {
@@ -181,7 +166,8 @@ export class Replay extends Model {
     this.pictures = new ReplayPictures((bitmap, info) => this.video.draw(bitmap, info), () => this.changed());
     this.day = new Day(ref);
     this.day.onChange(() => this.changed());
-    this.marked = new Marked();
+    /** What a person has marked for a download. @type {{since?: number, until?: number}} */
+    this.marked = {};
     /** What widgets get instead of the page's own services. */
     this.page = {
       ...live,
@@ -249,15 +235,22 @@ export class Replay extends Model {
     this.feed.setSpeed(SPEEDS[SPEEDS.indexOf(this.feed.played.speed) + steps]);
   }
 
-  /** @param {"since" | "until"} name @param {number | null} at */
-  mark(name, at) {
-    this.marked.set(name, at);
+  /** Mark where a download begins or ends; what is before its begin ends nothing. @param {{since?: number, until?: number}} marks */
+  mark(marks) {
+    const { since = -Infinity, until = Infinity } = { ...this.marked, ...marks };
+    this.marked = since < until ? { ...this.marked, ...marks } : marks;
+    this.changed();
+  }
+
+  unmark() {
+    this.marked = {};
     this.changed();
   }
 
   /** What is downloaded. */
   get stretch() {
-    return stretchOf(this.marked.since, this.marked.until, this.day.sessions, this.feed.position);
+    const { since = null, until = null } = this.marked;
+    return stretchOf(since, until, this.day.sessions, this.feed.position);
   }
 
   // -- what the player sends
@@ -312,5 +305,4 @@ export class Replay extends Model {
     const old = feed.position - video.info.receivedMs;
     return old > OLD_MS ? `No picture was recorded here · this one is ${span(old)} older` : pictures.state.problem;
   }
-
 }

@@ -5,9 +5,9 @@ import { MARKS, extentOf, holding, stretchesOf, whyOf } from "../../core/replay/
 import { html, useMemo, useModel, useState, useTick } from "../parts/hooks.js";
 import { Button, Select } from "../parts/parts.js";
 import { exactTime, shortTime } from "../parts/more-words.js";
-import { clockTime } from "../parts/words.js";
+import { clockTime, span } from "../parts/words.js";
 import { Elsewhere, Sessions } from "./choose.js";
-import { Download, long } from "./download.js";
+import { Download } from "./download.js";
 
 const PANELS = { days: ["Days", "list"], download: ["Download", "save"] };
 
@@ -32,7 +32,7 @@ export function PlayerBar({ at, replay }) {
     ${open === "download" && html`<div class="player-panel"><${Download} replay=${replay} /></div>`}
     ${skipped &&
     html`<p class="player-note" role="status" data-test="skipped">
-      Skipped ${long(skipped.until - skipped.since)}: ${why || "nothing was recorded"}
+      Skipped ${span(skipped.until - skipped.since)}: ${why || "nothing was recorded"}
     </p>`}
     ${seen ? html`<${Marks} replay=${replay} marks=${marks} seen=${seen} />` : html`<${NoDay} replay=${replay} />`}
     <div class="player-keys" role="group" aria-label="Play">
@@ -67,7 +67,7 @@ export function PlayerBar({ at, replay }) {
 /** The day, or one session of it: a slider over what was going on. */
 function Marks({ replay, marks, seen }) {
   const { feed, marked } = replay;
-  const all = marked.any ? [...marks, { ...replay.stretch, id: "marked", title: "marked" }] : marks;
+  const all = Object.keys(marked).length ? [...marks, { ...replay.stretch, id: "marked", title: "marked" }] : marks;
   const place = ({ since, until }) => {
     const [from, to] = [since, until].map((ms) => Math.min(1, Math.max(0, (ms - seen.since) / (seen.until - seen.since))));
     return { left: `${(100 * from).toFixed(3)}%`, width: `max(2px, ${(100 * (to - from)).toFixed(3)}%)` };

@@ -2,12 +2,14 @@
 
 import { extentOf, firstOf } from "../../core/replay/timeline.js";
 import { Boundary, Page, html, useEffect, useMedia, useModel, usePage, useState, useTick } from "../parts/hooks.js";
-import { Icon, RouteLink, useName } from "../parts/parts.js";
+import { EXTRAS, VOICE } from "../cards/cards.js";
+import { exactTime } from "../parts/more-words.js";
+import { Extra, Icon, Part, RouteLink, useName } from "../parts/parts.js";
 import { Robot } from "../robot/robot.js";
+import { Frame, SnapshotButton } from "../robot/video.js";
 import { Choose, timeWords } from "./choose.js";
 import { Replay as Model } from "./model.js";
 import { PlayerBar } from "./player-bar.js";
-import { RecordedStage } from "./stage.js";
 
 export const Replay = ({ at }) => (at ? html`<${Opened} at=${at} />` : html`<${Choose} />`);
 
@@ -61,10 +63,13 @@ function press(replay, event) {
 }
 
 function Shown({ at, replay }) {
-  const { panels } = usePage();
+  const { panels, settings } = usePage();
   const narrow = useMedia("(max-width: 760px)"); // as the page's own layout
   const name = useName(at);
   useModel(replay);
+  useEffect(() => {
+    if (replay.isHere) settings.begin("recordings");
+  }, [replay.isHere]);
   return html`<div class="replay">
     <${Boundary} what="The time"><${Badge} at=${at} replay=${replay} /><//>
     ${replay.isHere
@@ -94,4 +99,27 @@ function Badge({ at, replay }) {
     </p>
     <${RouteLink} to=${at} className="replay-live" label=${`Live page of ${name}`}>Live page<//>
   </div>`;
+}
+
+/** When it was taken, by the robot's clock; else when it was received. @param {any} info */
+const takenAt = ({ capturedMs, receivedMs }) =>
+  capturedMs !== null && Math.abs(capturedMs - receivedMs) < 3_600_000 ? capturedMs : receivedMs;
+
+/** The picture of a recording, in the place of the live one. */
+function RecordedStage({ at, offers, layout }) {
+  const { recording, video } = usePage();
+  useModel(recording);
+  useTick(200);
+  const { cover } = recording;
+  const short = layout === "portrait";
+  const over =
+    video.info && html`<span class="tag tag-age" data-test="picture-time">recorded ${exactTime(takenAt(video.info))}</span>`;
+  return html`<${Frame} label="Recorded picture" alt=${`What ${useName(at)} saw`} part="Drawn" source=${at} cover=${cover} over=${over}>
+    <div class="picture-bar" role="group" aria-label="Picture and sound">
+      <${SnapshotButton} source=${at} short=${short} />
+      <${Extra} of=${EXTRAS} part="Marks" what="Marks of scripts" source=${at} />
+      ${offers.has("audio") &&
+      html`<${Boundary} what="Sound"><${Part} part=${VOICE} lines=${0} at=${at} place=${short ? "short" : "bar"} /><//>`}
+    </div>
+  <//>`;
 }

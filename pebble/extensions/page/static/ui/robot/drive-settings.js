@@ -1,9 +1,31 @@
-// How the inputs are scaled, and the extra axis of a robot that has one.
+// Which keys drive, how the inputs are scaled, and the extra axis of a robot that has one.
 
-import * as browser from "../../core/browser.js";
-import { useExtraAxis } from "../parts/axes.js";
+import { DOWN, UP } from "../../core/inputs.js";
 import { html, useEffect, useModel, usePage } from "../parts/hooks.js";
-import { Icon, Slider, set } from "../parts/parts.js";
+import { useExtraAxis, useKeyNames } from "../parts/keyboard.js";
+import { Button, Icon, Slider, held, set } from "../parts/parts.js";
+
+const GRID = ["KeyQ", "KeyW", "KeyE", "KeyA", "KeyS", "KeyD"];
+
+/** They light up while they are held. */
+export function KeyHints() {
+  const { driver, panels } = usePage();
+  useModel(driver);
+  const name = useKeyNames();
+  const extra = useExtraAxis();
+  const has = (code) => extra || ![...UP, ...DOWN].includes(code);
+  return html`<div class="keys">
+    <div class="key-grid" aria-hidden="true">
+      ${GRID.map((code) =>
+        has(code)
+          ? html`<kbd key=${code} class=${driver.inputs.keys.has(code) ? "on" : ""}>${name(code)}</kbd>`
+          : html`<i key=${code}></i>`,
+      )}
+    </div>
+    <p aria-hidden="true">or arrows drive,<br /><b>Space</b> halts,<br /><b>Esc Esc</b> is STOP</p>
+    <${Button} className="quiet" test="help" label="All keys, and how stopping works" icon="help" onPress=${() => panels.show("help")} />
+  </div>`;
+}
 
 /** ``open``: there is room for all of it. @param {{open?: boolean}} props */
 export function DriveSettings({ open = false }) {
@@ -42,14 +64,7 @@ function AuxButton({ driver, value, label, children }) {
     aria-label=${label}
     disabled=${Boolean(reason) && !driver.gestureActive}
     aria-describedby=${reason ? "why-drive" : undefined}
-    onPointerDown=${(event) => {
-      browser.capture(event);
-      driver.hold(`aux ${value}`, value, event.timeStamp);
-    }}
-    onPointerUp=${end}
-    onPointerCancel=${end}
-    onLostPointerCapture=${end}
-    onContextMenu=${(event) => event.preventDefault()}
+    ...${held((event) => driver.hold(`aux ${value}`, value, event.timeStamp), end)}
   >
     ${children}
   </button>`;

@@ -1,9 +1,10 @@
 // Driving: who may, why not, the stick, and how fast.
 
 import { ROOT } from "../../core/browser.js";
+import { STOP_SCRIPT, scriptName } from "../../core/reasons.js";
 import { DRIVE, KEYS } from "../cards/cards.js";
 import { html, useCalm, useLater, useModel, usePage, useValue } from "../parts/hooks.js";
-import { Button, Card, HoldButton, Part, Slider, set, useName } from "../parts/parts.js";
+import { Button, Card, HoldButton, Part, Slider, set, useItself, useName } from "../parts/parts.js";
 import { Stick } from "./stick.js";
 import { driverName } from "../parts/words.js";
 
@@ -42,11 +43,13 @@ export function Slot({ at }) {
   const asks = mine ? driver.lease.asks : "";
   const person = asks.slice(asks.lastIndexOf("/") + 1); // without the account of the server
   const also = view?.others && view.by ? "Someone else drives, too" : "";
-  const text = [why ?? (mine ? `You are driving ${name}` : ""), asks && `${asks} asks to drive`, also].filter(Boolean).join(". ");
-  const words = slotWords(reason, why ?? "", view, driver.typing, script?.running === true ? String(script.file).slice(0, 40) : "");
+  const itself = useItself(at);
+  const state = why ?? (mine && !itself ? `You are driving ${name}` : "");
+  const text = [itself, state, asks && `${asks} asks to drive`, also].filter(Boolean).join(". ");
+  const words = itself ? [itself, why ?? "Drive, and it waits."] : slotWords(reason, why ?? "", view, driver.typing, script);
   const [title, detail] = asks ? [`${asks} asks to drive`, "Rest for 5 s, and it is theirs."] : [words[0], also || words[1]];
   const [more] = [driver.doubt, ...(driver.pads?.reasons() ?? [])].filter((one) => one && one !== reason);
-  const kind = !reason ? "on" : reason.code === "stopped" ? "stopped" : "off";
+  const kind = itself ? "off" : !reason ? "on" : reason.code === "stopped" ? "stopped" : "off";
   return html`<div class=${`slot why-line ${kind}`}>
     <div class="slot-words" id="why-drive" data-test="why" title=${text}>
       <i class="dot" aria-hidden="true"></i>
@@ -57,6 +60,7 @@ export function Slot({ at }) {
       ${reason?.code === "connecting" && html`<button type="button" disabled aria-describedby="why-drive">Connecting…</button>`}
       <${ReasonAction} action=${reason?.action} />
       ${reason?.also && html`<${ReasonAction} action=${reason.also} />`}
+      ${mine && !reason && itself && html`<${ReasonAction} action=${STOP_SCRIPT} />`}
       ${asks
         ? html`<${Button} className="primary" test="let" title=${`Let ${asks} drive`} onPress=${() => driver.release()}>
               Let ${person.length > LONG ? "them" : person} drive
@@ -73,13 +77,14 @@ function slotWords(reason, text, view, typing, script) {
   switch (reason?.code) {
     case undefined:
       if (typing) return ["You drive", "Keys go to the field you have chosen: click beside it."];
+      if (script?.overridden) return ["You drive", `${scriptName(script)} goes on 2 s after you let go.`];
       return ["You drive", view?.keeps === false ? "It keeps no control: others may, too." : "Let go, and it stops."];
     case "connecting":
       return ["One moment", "Who drives is not known yet."];
     case "free":
       if (view?.others) return ["Nobody has control", "Someone drives all the same"];
       if (view?.keeps === false) return ["Nobody drives from here", "It keeps no control: others may drive it"];
-      return ["Nobody drives", script ? `${script} runs. Take control to drive` : "One person at a time"];
+      return ["Nobody drives", "One person at a time"];
     case "stopped":
       return ["Stopped", "Reset it at the picture to drive."];
     case "lease":

@@ -3,26 +3,18 @@
 import * as more from "../../core/browser-more.js";
 import { MIXED, refusal } from "../../core/stream.js";
 import { html, useEffect, useMetrics, useModel, usePage, useRef, useValue } from "../parts/hooks.js";
-import { Model, read, write } from "../parts/models.js";
+import { read, write } from "../parts/models.js";
 import { Button, Check, Why, useName, useStream } from "../parts/parts.js";
 import { NewestOverlays, STALE_MS, contained, drawOverlays } from "../../media/overlays.js";
 import { nameOf, visible } from "../parts/words.js";
 
 const OVERLAYS = "video-overlays";
 
-/** Whether overlays are drawn over the pictures of a component; remembered in this browser. */
-class Switches extends Model {
-  isOn(ref) {
-    return read(`overlays ${ref}`, true) !== false;
-  }
-
-  set(ref, on) {
-    write(`overlays ${ref}`, on);
-    this.changed();
-  }
+/** Whether overlays are drawn over the pictures of a component; remembered in this browser. @param {string} ref */
+function useOverlays(ref) {
+  useModel(usePage().settings);
+  return read(`overlays ${ref}`, true) !== false;
 }
-
-const switches = new Switches();
 
 /** What lies over the picture of ``source``. */
 export function Layer({ source }) {
@@ -47,10 +39,7 @@ export function Layer({ source }) {
 }
 
 /** Overlays, if they are switched on. */
-export function Drawn({ source }) {
-  useModel(switches);
-  return switches.isOn(source) && html`<${Overlays} source=${source} />`;
-}
+export const Drawn = ({ source }) => useOverlays(source) && html`<${Overlays} source=${source} />`;
 
 function Overlays({ source }) {
   const { store, video } = usePage();
@@ -103,10 +92,14 @@ export const Tools = ({ source, wanted }) => html`<${Marks} source=${source} />
 
 /** Whether what scripts mark is drawn over the picture. */
 export function Marks({ source }) {
-  useModel(switches);
+  const { settings } = usePage();
+  const isOn = useOverlays(source);
   if (!useMetrics(source).includes(OVERLAYS)) return null;
-  const set = (on) => switches.set(source, on);
-  return html`<${Check} className="overlay-switch" test="overlays" checked=${switches.isOn(source)} onChange=${set}>Marks of scripts<//>`;
+  const set = (on) => {
+    write(`overlays ${source}`, on);
+    settings.changed();
+  };
+  return html`<${Check} className="overlay-switch" test="overlays" checked=${isOn} onChange=${set}>Marks of scripts<//>`;
 }
 
 /** Save what is on the canvas, under the time at which it was taken; returns the file's name. */
@@ -124,11 +117,8 @@ export async function snapshot(video, store, source) {
 
 /** @param {string} source @param {number} ms epoch @returns {string} goob-2026-05-01T12-03-41.png, in local time */
 export function fileName(source, ms) {
-  const at = new Date(ms);
-  const two = (number) => String(number).padStart(2, "0");
-  const day = [at.getFullYear(), two(at.getMonth() + 1), two(at.getDate())].join("-");
-  const time = [at.getHours(), at.getMinutes(), at.getSeconds()].map(two).join("-");
-  return `${nameOf(source).replace(/[^\w.-]/g, "_")}-${day}T${time}.png`;
+  const at = new Date(ms).toLocaleString("sv").replace(" ", "T").replaceAll(":", "-"); // Swedish dates are ISO 8601
+  return `${nameOf(source).replace(/[^\w.-]/g, "_")}-${at}.png`;
 }
 
 /** Open the stream that the robot serves by itself, or that was entered for it, and what to know of it. */

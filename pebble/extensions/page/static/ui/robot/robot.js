@@ -2,6 +2,7 @@
 
 import * as browser from "../../core/browser.js";
 import { Bands } from "../banner.js";
+import { AllButton } from "../header.js";
 import { CARDS, DRIVE, EXTRAS, HUD, NO_CAMERA, PICTURE, TABS, VOICE, hasMap } from "../cards/cards.js";
 import { useColumns } from "./columns.js";
 import { DriveCard, DrivePad, Slot, Speed } from "./drive.js";
@@ -10,7 +11,7 @@ import {
 } from "../parts/hooks.js";
 import { CardView, Offers, WATCHES } from "../parts/models.js";
 import { hasFace } from "../parts/looks.js";
-import { Button, Card, Face, Icon, Part, StopButton, useName, useStream } from "../parts/parts.js";
+import { Button, Card, Face, Icon, Part, useName, useStream } from "../parts/parts.js";
 import { Stage, useVideo } from "./video.js";
 import { typeOf } from "../parts/words.js";
 
@@ -225,22 +226,7 @@ const MoreSettings = ({ onPanel }) => html`<${Button} className="wide" test="set
 <//>
   ${browser.fullScreen.on &&
   html`<${Button} className="wide" icon="small" onPress=${() => browser.fullScreen.toggle()}>Leave full screen<//>`}
-  <${StopAll} />`;
-
-/** Far from all else, as all that stops. */
-function StopAll() {
-  const { commands } = usePage();
-  return html`<div class="stop-all-place">
-    <${StopButton}
-      test="stop-all"
-      onStop=${() => commands.stop("")}
-      label="Stop all robots: emergency stop"
-      className="stop-all outlined"
-    >
-      <${Icon} name="stop" />Stop all robots
-    <//>
-  </div>`;
-}
+  <div class="stop-all-place"><${AllButton} outlined /></div>`;
 
 function SettingsWords() {
   const { unread } = useModel(usePage().connection, (one) => one.unread);

@@ -107,10 +107,6 @@ export class Sound extends Model {
     return this.speaker.context;
   }
 
-  get stats() {
-    return this.link.stats;
-  }
-
   get talking() {
     return this.voice.talk;
   }
@@ -140,10 +136,6 @@ export class Sound extends Model {
       this.problem = `Sound cannot be played: ${/** @type {Error} */ (error).message}`;
     }
     this.changed();
-  }
-
-  stopListening() {
-    this.leave();
   }
 
   toggleMute() {

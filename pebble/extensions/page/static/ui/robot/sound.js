@@ -1,17 +1,20 @@
 // Listen to a component, and talk to it: in the bar below its picture, or in a card.
 
-import * as browser from "../../core/browser.js";
 import { html, useCalm, useEffect, useModel, usePage, useValue } from "../parts/hooks.js";
-import { Button, Icon, useName } from "../parts/parts.js";
+import { Button, Icon, held, useName } from "../parts/parts.js";
 import { Sound } from "./sound-model.js";
+
+/** @returns {Sound} the page's */
+function useSound() {
+  const page = usePage();
+  return useModel((page.sound.model ??= new Sound(page)));
+}
 
 /** @param {{at: string, place?: "card" | "bar" | "short" | "over"}} props "short": in a bar with little room */
 export function SoundControls({ at, place = "card" }) {
   const page = usePage();
-  /** @type {Sound} */
-  const sound = (page.sound.model ??= new Sound(page));
+  const sound = useSound();
   useModel(page.connection);
-  useModel(sound);
   const view = useValue(at, "web/sound");
   useValue(at, "web/liveness");
   useValue(at, "link");
@@ -31,7 +34,7 @@ export function SoundControls({ at, place = "card" }) {
         test="listen"
         why=${noListening}
         icon=${listening ? "halt" : "sound"}
-        onPress=${() => (listening ? sound.stopListening() : sound.listen())}
+        onPress=${() => (listening ? sound.leave() : sound.listen())}
       >
         <span>${listening ? (inBar ? "Silence" : "Stop listening") : "Listen"}</span>
       <//>
@@ -59,10 +62,7 @@ const hides = (first) => (first ? "sr" : "");
 
 /** For engineers: how the sound comes now. @param {{at: string}} props */
 export function SoundFacts({ at }) {
-  const page = usePage();
-  /** @type {Sound} */
-  const sound = (page.sound.model ??= new Sound(page));
-  useModel(sound);
+  const sound = useSound();
   const view = useValue(at, "web/sound");
   const text = words(sound, view, useName(at));
   return html`<p class="facts" data-test="sound-state">${text === LISTENING ? numbers(sound) : text}</p>`;
@@ -75,7 +75,6 @@ function TalkButton({ sound, why, isSame, short }) {
   useEffect(() => {
     if (why) end(); // the end of a press on a button that is off is not reported
   }, [why]);
-  const isKey = (event) => event.code === "Space" || event.code === "Enter";
   return html`<button
     type="button"
     class=${`talk ${sound.talking?.on ? "on" : ""}`}
@@ -83,17 +82,7 @@ function TalkButton({ sound, why, isSame, short }) {
     disabled=${why !== ""}
     aria-pressed=${Boolean(sound.talking)}
     aria-describedby=${why ? (isSame ? "why-listen" : "why-talk") : undefined}
-    onPointerDown=${(event) => {
-      if (event.button) return;
-      browser.capture(event);
-      sound.talk(true);
-    }}
-    onPointerUp=${end}
-    onPointerCancel=${end}
-    onLostPointerCapture=${end}
-    onBlur=${end}
-    onKeyDown=${(event) => isKey(event) && !event.repeat && sound.talk(true)}
-    onKeyUp=${(event) => isKey(event) && end()}
+    ...${held(() => sound.talk(true), end, true)}
     onContextMenu=${(event) => {
       event.preventDefault(); // a finger that stays
       event.stopPropagation();
@@ -107,7 +96,7 @@ const LISTENING = "Listening";
 
 /** What is heard, or why nothing is. @param {Sound} sound @param {any} view @param {string} name */
 function words(sound, view, name) {
-  const { talking, listening, stats } = sound;
+  const { talking, listening, link: { stats } } = sound;
   if (talking) return talking.on ? `${name} plays your voice.` : "One moment…";
   if (sound.problem || !listening) return sound.problem;
   if (!sound.link.isOpen) return "Connecting…";
@@ -117,7 +106,7 @@ function words(sound, view, name) {
 }
 
 /** How it is heard. @param {Sound} sound */
-function numbers({ muted, stats }) {
+function numbers({ muted, link: { stats } }) {
   const lost = stats.lost + stats.refused;
   const words = [muted && "muted", `${stats.bufferedMs} ms buffered`, stats.encoding, lost ? `${lost} packets lost` : "nothing lost"];
   return words.filter(Boolean).join(" · ");

@@ -28,7 +28,7 @@ export function Stick({ driver }) {
     element.current.focus({ preventScroll: true });
     if (dragged) return driver.interrupt(); // a second finger
     if (event.pointerId === pointer) driver.stickEnd(); // its release was not reported
-    if (driver.reason()) return driver.isFree() ? driver.hint() : pointAt("why-drive");
+    if (driver.reason()) return driver.hint();
     if (event.button || !driver.stickStart(event.pointerId, event.timeStamp)) return undefined;
     browser.capture(event);
     place.current = element.current.getBoundingClientRect();
@@ -67,13 +67,6 @@ export function Stick({ driver }) {
     <span class="stick-arrow s"></span><span class="stick-arrow w"></span>
     <span class="knob" style=${{ transform: `translate(${120 * x}%, ${-120 * z}%)` }}></span>
   </div>`;
-}
-
-/** Move an element a little, to show where the answer is. @param {string} id */
-function pointAt(id) {
-  if (browser.media("(prefers-reduced-motion: reduce)").matches) return;
-  const there = [0, 6, -6, 0].map((x) => ({ transform: `translateX(${x}px)` }));
-  document.getElementById(id)?.animate(there, 300);
 }
 
 /** What keys and gamepad ask for, as a place of the knob. */

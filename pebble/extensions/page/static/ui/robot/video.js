@@ -4,13 +4,14 @@ import * as browser from "../../core/browser.js";
 import { Bands } from "../banner.js";
 import { EXTRAS, PICTURE, SOUND_FACTS, VOICE } from "../cards/cards.js";
 import { Boundary, html, useEffect, useLayoutEffect, useModel, usePage, useRef, useState, useTick, useValue } from "../parts/hooks.js";
+import { read, write } from "../parts/models.js";
 import { Button, Extra, Face, Icon, Part, useName } from "../parts/parts.js";
 import { span } from "../parts/words.js";
 
 /** Show pictures of ``source`` as long as this is on the page. @param {string} at @param {string} source "": none */
 export function useVideo(at, source) {
-  const { settings, video, driver } = usePage();
-  const [wanted, want] = useState(() => settings.wantsVideo(at));
+  const { video, driver } = usePage();
+  const [wanted, want] = useState(() => read(`video ${at}`, true) !== false);
   useEffect(() => {
     video.show(wanted ? source : "");
     driver.changed();
@@ -19,7 +20,7 @@ export function useVideo(at, source) {
   return {
     wanted,
     toggle() {
-      settings.setVideo(at, !wanted);
+      write(`video ${at}`, !wanted);
       want(!wanted);
     },
   };
