@@ -16,7 +16,8 @@ from paho.mqtt.enums import CallbackAPIVersion
 from pebble.config import Security
 from pebble.contract.identity import Identity
 from pebble.extensions.lab.simulation.fleet import Fleet
-from pebble.extensions.lab.simulation.wireless import KINDS, BrokerAddress, WirelessRobot
+from pebble.extensions.lab.simulation.wireless import KINDS, WirelessRobot
+from pebble.transports import MqttSettings
 from tests.support import until
 
 START_S = 10.0
@@ -28,7 +29,7 @@ class Robots:
     def __init__(
         self, host: str, port: int, *, kinds: Iterable[str] = KINDS, security: Security | None = None, **options: Any
     ) -> None:
-        self.fleet = Fleet(BrokerAddress(host=host, port=port, **options))
+        self.fleet = Fleet(MqttSettings(host=host, port=port, **options))
         self.moves: dict[str, list[tuple[float, tuple[float, float]]]] = {kind: [] for kind in kinds}
         self.robots: dict[str, WirelessRobot] = {}
         for kind, moves in self.moves.items():

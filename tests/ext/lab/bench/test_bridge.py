@@ -1,6 +1,5 @@
 """The bridge comparison without robots: matching of commands and reports, cells, turns."""
 
-import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,7 +13,6 @@ from pebble.extensions.lab.bench.bridge_operator import (
     arrivals,
     matched,
     wheels,
-    wheels_of,
 )
 from pebble.extensions.lab.bench.results import Cell, Results
 from pebble.extensions.lab.bench.rounds import add_round
@@ -23,15 +21,6 @@ from pebble.services.serial_mcu_bridge.text.goob_base import Touch
 
 MS = 1_000_000
 FORWARDER, SERIAL = PARTS = tuple(SERVICES)
-
-
-def test_every_command_makes_both_wheels_turn_and_is_identified_by_its_speeds() -> None:
-    assert len({wheels(number) for number in range(100_000)}) == 100_000, "none is like another for hours"
-    for number in range(0, 640_000, 997):
-        left, right = wheels(number)
-        assert 0.1 <= left < 0.9
-        assert 0.1 <= right < 0.9
-        assert wheels_of(json.dumps({"x": (left - right) / 2, "z": (left + right) / 2}).encode()) == (left, right)
 
 
 def test_a_command_counts_once_and_when_it_came_first() -> None:
@@ -67,12 +56,6 @@ def test_a_report_is_identified_by_values_that_occur_once() -> None:
     _, up, forwarded = cells_of("mqtt", UNLOADED, turn, Arrived({}, matched(trace, received), received))
     assert (up.samples, up.total("sent")) == ([2.0, 3.0], 3)
     assert forwarded.samples == [1000.0]  # us for each of the three that were received meanwhile
-
-
-def test_a_report_received_before_it_was_sent_is_another_one() -> None:
-    trace = [Entry(10 * MS, "said", "T a0=1 a1=2 a2=3")]
-    received = [(9 * MS, Touch(1, 2, 3)), (12 * MS, Touch(1, 2, 3)), (14 * MS, Touch(1, 2, 3))]
-    assert matched(trace, received) == [(10 * MS, 12 * MS)]
 
 
 # -- cells

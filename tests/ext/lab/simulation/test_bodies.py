@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from itertools import pairwise
-
 import pytest
 
 from pebble.extensions.lab.simulation.bodies import Benjr, Body, body_of
 from pebble.extensions.lab.simulation.micropython.board import Board
 from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
-from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, WHEEL_DIAMETER_MM, RobotMotion, hall
+from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S
 
 
 @pytest.fixture
@@ -83,14 +80,3 @@ def test_benjrs_shield(clock: VirtualClock) -> None:
         assert body.outputs() == (0.0, -1.0)
     i2c.writeto(body.pins.MOTOR_SHIELD, b"\x10\x02\x27")
     assert body.outputs() == (0.0, -1.0), "three bytes are no message"
-
-
-def test_the_hall_sensors_see_five_waves_in_a_turn_of_a_wheel() -> None:
-    """Ten magnets, whose poles alternate: 10 extremes, 19.16 mm apart."""
-    motion = RobotMotion()
-    levels = []
-    for step in range(2001):
-        motion.left_mm = math.pi * WHEEL_DIAMETER_MM * step / 2000
-        levels.append(hall(motion)[0])
-    falling = [before >= 0.5 > after for before, after in pairwise(levels[:-1])]
-    assert sum(falling) == 5

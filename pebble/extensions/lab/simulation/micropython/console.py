@@ -127,11 +127,9 @@ class Output:
         console = self._console
         return mask & POLLOUT if console.reading or console.writable() else 0
 
-    def write(self, data: Any, *span: int) -> int:
-        """``write(data)``, ``write(data, length)`` or ``write(data, offset, length)``; returns the size written."""
-        if span:
-            start, length = (0, *span)[-2:]
-            data = data[start : start + length]
+    def write(self, data: Any, start: int = 0, length: int | None = None) -> int:
+        """``write(data)`` or ``write(data, offset, length)``; returns the size written."""
+        data = data if length is None else data[start : start + length]
         if not self._text:
             return self._console.write(data)
         raw = data.encode() if isinstance(data, str) else bytes(data)

@@ -18,11 +18,8 @@ WALL = {"x1": 1.0, "y1": 1.0, "x2": 1.0, "y2": -1.0}
 TAG = {"id": 13, "x": 2.0, "y": 0.0, "yaw_deg": 180.0}
 CAMERAS = [
     (0.0, 0.0, 0.0),
-    (1.2, 0.1, 0.0),
     (0.0, 0.0, 0.35),
     (-0.5, -1.0, 0.5),
-    (1.0, -1.2, 0.9),
-    (-2.0, 0.5, -0.1),
     (3.2, 0.3, math.pi),  # of the other tag
 ]
 
@@ -32,13 +29,10 @@ def both_tags(**keys: Any) -> Any:
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("size", [(640, 480), (1280, 720)])
-def test_a_tag_is_where_the_pinhole_model_puts_it(camera: tuple[float, float, float], size: tuple[int, int]) -> None:
+def test_a_tag_is_where_the_pinhole_model_puts_it(camera: tuple[float, float, float]) -> None:
     world = both_tags()
-    found = tags_in(seen(world, size=size, goob=camera))
-    assert len(found) == 1
-    for number, corners in found.items():
-        assert np.abs(corners - projected(world, number, camera, size)).max() < 1.0
+    ((number, corners),) = tags_in(seen(world, size=(1280, 720), goob=camera)).items()
+    assert np.abs(corners - projected(world, number, camera, (1280, 720))).max() < 1.0
 
 
 NEAR = {**TAG, "y": 0.5, "size_m": 0.1}
@@ -66,11 +60,6 @@ SCENES: list[tuple[dict[str, Any], dict[str, Any], set[int]]] = [
 @pytest.mark.parametrize(("keys", "poses", "tags"), SCENES)
 def test_walls_and_robots_hide_what_is_behind_them(keys: dict[str, Any], poses: dict[str, Any], tags: set[int]) -> None:
     assert set(tags_in(seen(world_of(**keys), **poses))) == tags
-
-
-def test_a_robot_does_not_see_itself() -> None:
-    own = world_of(robots={"goob": {"x": 0.0, "y": 0.0, "tag": 2}}, camera=CLEAR)
-    assert (seen(own) == seen(world_of(camera=CLEAR))).all()
 
 
 @pytest.mark.parametrize("heading", np.linspace(0.0, math.tau, 9)[:-1])
@@ -113,8 +102,3 @@ def test_motion_blurs_what_moves_along_the_way_of_the_exposure() -> None:
     streak = 624 * 1.0 * 0.04  # pixels that the picture moved during the exposure
     assert cv2.mean(moving)[0] == pytest.approx(cv2.mean(still)[0], rel=0.02)
     assert dark[0].min() - streak - 2 < dark[1].min() < dark[0].min() + streak + 2
-
-
-def test_the_same_calls_give_the_same_pixels() -> None:
-    world = both_tags(camera={"jpeg_quality": 50})
-    assert (seen(world) == seen(world)).all()
