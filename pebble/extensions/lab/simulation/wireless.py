@@ -49,8 +49,6 @@ class WirelessRobot:
         moving_s: float = _MOVING_S,
         files: Path | None = None,
     ) -> None:
-        if kind not in KINDS:
-            raise ConfigError(f"unknown simulated robot with Wi-Fi {kind!r}; known: {', '.join(KINDS)}")
         self.kind, self.identity, self.broker, self.name = kind, identity, broker, name
         self._security = security.on_board()
         clock = RealClock()

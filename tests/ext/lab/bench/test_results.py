@@ -55,14 +55,6 @@ def test_what_is_no_file_of_results_is_named(tmp_path: Path, text: str, named: s
     assert "\n" not in str(error.value)
 
 
-def test_lost_is_what_was_sent_and_never_came() -> None:
-    cell = a_cell(figures={"sent": [3, 2]})
-    assert cell.lost == 2
-    assert cell.with_lost() == [[1.0, 2.0, math.inf], [30.0, math.inf]]
-    assert a_cell().lost is None
-    assert a_cell().with_lost() == a_cell().rounds
-
-
 @pytest.mark.parametrize(
     ("figures", "percent", "expected"),
     [([3.0, 1.0, 2.0], 50, 2.0), ([1.0, 2.0], 50, 1.0), (list(range(1, 101)), 99, 99), ([], 50, math.nan)],

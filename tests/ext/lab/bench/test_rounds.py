@@ -64,11 +64,6 @@ def test_what_never_arrived_is_infinitely_late() -> None:
     assert paired([*never[:1], *mostly[:9]], [*never[:2], *mostly[:8]]).rounds == 9
 
 
-@pytest.mark.parametrize(("ours", "theirs"), [([], []), ([[]], [[1.0]]), ([[1.0]], [[]]), ([[1.0]], [[0.0]])])
-def test_nothing_measured_is_nothing_claimed(ours: Rounds, theirs: Rounds) -> None:
-    assert str(paired(ours, theirs)) == "–"
-
-
 # -- turns
 
 

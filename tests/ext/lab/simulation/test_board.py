@@ -1,12 +1,11 @@
 """The firmware of Goob and Fred on simulated boards, without a real clock or a pty."""
 
-import math
 from itertools import pairwise
 
 import pytest
 
 from pebble.extensions.lab.simulation.board import SimulatedMcu
-from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
+from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import END, Type, decode
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch, parse
 
@@ -40,15 +39,6 @@ def test_driving_ahead_moves_both_wheels_and_the_magnets() -> None:
     for wave in zip(*((touch.a0, touch.a1, touch.a2) for touch in touches), strict=True):
         assert max(wave) > 750
         assert min(wave) < 270
-
-
-def test_more_left_than_right_turns_right() -> None:
-    mcu = SimulatedMcu("goob", 0.0)
-    run(mcu, 0.0, 0.5, b"M 0.2 -0.2\n")
-    state = mcu.state()
-    assert state.pose.heading_rad == pytest.approx(-0.4 * FULL_SPEED_MM_S * 0.44 / TRACK_MM, rel=0.05)
-    assert math.hypot(state.pose.x_mm, state.pose.y_mm) < 1e-6
-    assert state.motors == (0.2, 0.2), "Goob's right motor is mounted the other way round"
 
 
 def test_each_change_of_the_motors_is_reported_with_its_time() -> None:

@@ -52,18 +52,6 @@ def test_a_long_turn_reports_each_change_within_it(clock: VirtualClock) -> None:
     assert body.state().pose.x_mm == pytest.approx(2.0 * FULL_SPEED_MM_S, rel=0.01), "it rolled two seconds, not five"
 
 
-def test_a_reset_of_the_board_stops_bridges_but_not_a_shield(clock: VirtualClock) -> None:
-    lamp, walker = body_of("minilamp", Board(clock)), body_of("benjr", Board(clock))
-    assert isinstance(walker, Benjr)
-    drive(lamp, 1.0, 1.0)
-    walker.shield.write(b"\x10\x01\x27\x10")
-    walker.shield.write(b"\x00\x00\x03\xe8")
-    for body in (lamp, walker):
-        body.board.boot()
-    assert lamp.state().drive == (0.0, 0.0)
-    assert walker.state().drive == (1.0, 0.0)
-
-
 def test_benjrs_shield(clock: VirtualClock) -> None:
     body = body_of("benjr", Board(clock))
     assert isinstance(body, Benjr)

@@ -39,16 +39,6 @@ def words(imu: Mpu6050) -> list[float]:
     return [ax / 16384, ay / 16384, az / 16384, temperature / 340 + 36.53, gx / 131, gy / 131, gz / 131]
 
 
-def test_registers_follow_each_other(clock: VirtualClock) -> None:
-    imu = awake(clock)
-    imu.write(b"\x19\x09\x03\x08\x10")
-    imu.write(b"\x19")
-    assert imu.read(2) + imu.read(2) == b"\x09\x03\x08\x10"
-    imu.write(b"\x75\x00")
-    imu.write(b"\x75")
-    assert imu.read(1) == b"\x68", "who it is cannot be written"
-
-
 def test_at_rest_it_feels_gravity_and_its_bias(clock: VirtualClock) -> None:
     imu = awake(clock)
     ax, ay, az, _, gx, gy, gz = mean(imu, clock)

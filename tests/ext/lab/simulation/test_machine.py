@@ -42,12 +42,6 @@ def test_pins_have_the_names_of_their_port(clock: VirtualClock, port: Any, wrong
         board.duty(wrong)
 
 
-@pytest.mark.parametrize("name", ["D0", "D6", "D7"])
-def test_not_every_pin_of_a_xiao_has_pwm(clock: VirtualClock, name: str) -> None:
-    with pytest.raises(ValueError, match="not a PWM Pin"):
-        machine(Board(clock)).PWM(name, freq=1000)
-
-
 def test_two_pins_on_one_pwm_channel_of_a_xiao_are_a_fault(clock: VirtualClock) -> None:
     board = Board(clock)
     first = machine(board).PWM("D1", freq=1000)

@@ -56,16 +56,6 @@ def test_the_line_is_raw_before_the_host_configures_it(tmp_path: Path) -> None:
         assert mcu.trace.lines() == ["\x03\x04\x7fM 1 1"]
 
 
-def test_bytes_written_just_before_the_host_closes_are_not_lost(tmp_path: Path) -> None:
-    with PtyMcu("fred", tmp_path / "port") as mcu:
-        for number in range(50):
-            host = os.open(mcu.symlink, os.O_RDWR | os.O_NOCTTY)
-            os.write(host, b"M 0 0.%03d\n" % number)
-            os.close(host)
-            assert until(lambda n=number: mcu.trace.lines()[-1:] == [f"M 0 0.{n:03d}"])  # type: ignore[misc]
-        assert len(mcu.trace.lines()) == 50
-
-
 def test_a_host_that_does_not_read_loses_reports_and_stops_nothing(tmp_path: Path) -> None:
     with PtyMcu("goob", tmp_path / "port") as mcu, serial.Serial(str(mcu.symlink), 460800) as port:
         assert until(lambda: mcu.host)
@@ -114,11 +104,3 @@ def test_it_never_takes_a_file_away(tmp_path: Path) -> None:
     with pytest.raises(DeviceError, match=r"notes\.txt: the path exists and is not a symlink"):
         PtyMcu("goob", notes).open()
     assert notes.read_text() == "precious"
-
-
-def test_who_takes_over_a_link_keeps_it(tmp_path: Path) -> None:
-    first = PtyMcu("goob", tmp_path / "port").open()
-    with PtyMcu("goob", tmp_path / "port") as second:
-        first.close()
-        with serial.Serial(str(second.symlink), 460800):
-            assert until(lambda: second.host)

@@ -100,15 +100,9 @@ class Input:
         data = self._take(count)
         return data.decode() if self._text else bytes(data)
 
-    def readinto(self, buffer: bytearray | memoryview, count: int = -1) -> int:
-        wanted = len(buffer) if count < 0 else min(count, len(buffer))
-        typed = self._console.typed
-        if self._text or len(typed) < wanted:
-            buffer[:wanted] = self._take(wanted)
-        else:  # the common case: single bytes
-            buffer[:wanted] = typed[:wanted]
-            del typed[:wanted]
-        return wanted
+    def readinto(self, buffer: bytearray | memoryview) -> int:
+        buffer[:] = self._take(len(buffer))
+        return len(buffer)
 
     def _take(self, count: int) -> bytearray:
         data = self._console.take(count)

@@ -1,6 +1,5 @@
 """Impaired networks of namespaces, where the machine permits them."""
 
-import os
 import re
 import subprocess
 import sys
@@ -11,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from pebble.errors import PebbleError
 from pebble.extensions.lab.bench.impair.network import (
     REMOTE_HOST,
     ROBOT_HOST,
@@ -99,18 +97,6 @@ def test_loss_drops_the_configured_share_of_packets(network: NamespaceNetwork) -
     counters = network.on_remote(["nft", "list", "chain", "ip", "impair", "arriving"])
     printed = subprocess.check_output(counters, text=True)
     assert sum(map(int, re.findall(r"packets (\d+)", printed))) in _BAND
-
-
-def test_close_leaves_nothing_and_may_be_repeated() -> None:
-    before = set(children(os.getpid()))
-    network = NamespaceNetwork()
-    (process,) = set(children(os.getpid())) - before
-    network.close()
-    network.close()
-    assert gone(process)
-    assert not (Path("/sys/class/net") / "wire").exists()
-    with pytest.raises(PebbleError, match="No such file"):
-        network.apply(Condition("late"))
 
 
 @pytest.mark.usefixtures("_permitted")

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from pebble.errors import ConfigError, DeviceError
-from pebble.extensions.lab.simulation.world.world_file import open_world, parse_world, split_device
+from pebble.extensions.lab.simulation.world.world_file import open_world, parse_world
 
 GOOB = {"x": 0.0, "y": 0.0}
 
@@ -63,12 +63,6 @@ def test_values_that_contradict_each_other_are_refused(keys: dict[str, Any], pro
 @pytest.mark.parametrize("name", ["a/b", "", "x" * 65, "ü" * 40])
 def test_a_robots_name_must_fit_into_a_topic_and_the_page(name: str) -> None:
     assert "the name must be a topic level" in problems(robots={name: GOOB})[0]
-
-
-@pytest.mark.parametrize("device", ["", "#", "world.json", "world.json#", "#goob"])
-def test_a_device_names_a_file_and_a_robot(device: str) -> None:
-    with pytest.raises(DeviceError, match=r"write for example /path/world.json#goob"):
-        split_device(device)
 
 
 def test_a_missing_or_wrong_file_is_one_line(tmp_path: Path) -> None:
