@@ -18,7 +18,7 @@ help:
 	@echo "make docs              write build/docs: tables of all topics, config keys, web messages, words and bounds; schemas"
 	@echo "make site              write build/site: the documents and the API as a web site, its links checked; a minute"
 	@echo "make long PART=stops   one of the parts that take long; make long lists them"
-	@echo "make report            run every comparison, 95 minutes; writes build/report; QUICK=1: fewer cases, six minutes"
+	@echo "make report            run every comparison, 65 minutes; writes build/report; QUICK=1: fewer cases, six minutes"
 	@echo "make lock              write requirements.txt anew from pyproject.toml; UPGRADE=1: with the newest versions"
 	@echo "make release           write build/release: wheel, sdist, Debian package, SBOM, checksums; a minute"
 	@echo "make clean             remove what the other targets created"

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterable
 from functools import partial
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -16,7 +17,8 @@ from paho.mqtt.enums import CallbackAPIVersion
 from pebble.config import Security
 from pebble.contract.identity import Identity
 from pebble.extensions.lab.simulation.fleet import Fleet
-from pebble.extensions.lab.simulation.wireless import KINDS, BrokerAddress, WirelessRobot
+from pebble.extensions.lab.simulation.wireless import KINDS, WirelessRobot
+from pebble.transports import MqttSettings, TlsSettings
 from tests.support import until
 
 START_S = 10.0
@@ -26,9 +28,16 @@ class Robots:
     """One of each of these kinds, running. ``moves[kind]`` has each change of its motors, with its time.monotonic()."""
 
     def __init__(
-        self, host: str, port: int, *, kinds: Iterable[str] = KINDS, security: Security | None = None, **options: Any
+        self,
+        host: str,
+        port: int,
+        *,
+        kinds: Iterable[str] = KINDS,
+        security: Security | None = None,
+        ca: Path | None = None,
+        **login: Any,
     ) -> None:
-        self.fleet = Fleet(BrokerAddress(host=host, port=port, **options))
+        self.fleet = Fleet(MqttSettings(host=host, port=port, tls=ca and TlsSettings(ca_cert=ca), **login))
         self.moves: dict[str, list[tuple[float, tuple[float, float]]]] = {kind: [] for kind in kinds}
         self.robots: dict[str, WirelessRobot] = {}
         for kind, moves in self.moves.items():

@@ -2,17 +2,16 @@
 
 A robot of each kind, with a stock broker between it and the operator, and ``stand-in``, two programs of plain paho in
 place of the original. ``down``: from the operator's publish call to the last byte of the command's line at the MCU's
-pty; ``up``: from the MCU's report to the operator. ``one hop`` is a stock client one broker away: the lower bound.
-Under ``commands`` robots forward no reports; with ``media`` a 1080p camera is read on the robot, and 360p and sound go
-to an operator. CPU is that of the process that bridges and of the one that owns the serial line, for each command and
-report that they forwarded. Each round starts fresh robots and drives them in turns of a second, backwards every other
-time. Commands and reports that take longer than a second are lost, and commands that a newer one overtook.
+pty; ``up``: from the MCU's report to the operator. Under ``commands`` robots forward no reports. CPU is that of the
+process that bridges and of the one that owns the serial line, for each command and report that they forwarded. Each
+round starts fresh robots and drives them in turns of a second, backwards every other time. Commands and reports that
+take longer than a second are lost, and commands that a newer one overtook.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Final
@@ -21,27 +20,24 @@ from rich.console import Console
 from rich.table import Table
 
 from pebble.extensions.lab.bench import plots
-from pebble.extensions.lab.bench.bridge_operator import ALL, HOP, Arrived, DrivenRobot, Turn, driven_robot
+from pebble.extensions.lab.bench.bridge_operator import ALL, Arrived, DrivenRobot, Turn, driven_robot
 from pebble.extensions.lab.bench.results import STAND_IN, Cell, Results, begin, grouped, round_cell
 from pebble.extensions.lab.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.extensions.lab.bench.show import RATIOS, Picture, Shown, compared, percentiles, plain_table, spread
 from pebble.extensions.lab.rig.robot import KINDS
 
-UNLOADED, COMMANDS, LOADED = "none", "commands", "media"  # unloaded: 20 commands and 50 reports a second
+UNLOADED, COMMANDS = "none", "commands"  # unloaded: 20 commands and 50 reports a second
+VARIANTS = (STAND_IN, *KINDS)
 DOWN, UP, CPU = MEASURES = ("down", "up", "CPU per message")
 STARTUP_S = 1.0  # for start-up work to finish
-_LOADED_S = 2.0  # at most, of driving each robot while media flow
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The robots, and how they are driven: ``seconds`` in each round and under each load, in turns of ``turn_s``."""
+    """How the robots are driven: ``seconds`` in each round and under each load, in turns of a second."""
 
-    variants: Sequence[str] = (STAND_IN, *KINDS)
-    with_media: bool = False
     seconds: float = 12.5
     rounds: int = 20
-    turn_s: float = 1.0
 
 
 FULL: Final = Settings()
@@ -52,11 +48,6 @@ def run(settings: Settings, console: Console) -> Shown:
     """Measure all variants. Raises PebbleError."""
     results = begin("bridge", settings)
     measure_rounds(results, settings.rounds, lambda number, progress: measure(settings, number, progress), console)
-    return shown(results)
-
-
-def shown(results: Results) -> Shown:
-    """Return the tables and pictures of results."""
     results.cells.sort(key=lambda cell: MEASURES.index(cell.measure))
     latencies, cpu = ([cell for cell in results.cells if (cell.measure == CPU) == is_cpu] for is_cpu in (False, True))
     pictures = list[Picture]()
@@ -67,10 +58,10 @@ def shown(results: Results) -> Shown:
 
 
 @contextmanager
-def running(kinds: Iterable[str], *, media: bool = False, reports: bool = True) -> Iterator[dict[str, DrivenRobot]]:
+def running(*, reports: bool) -> Iterator[dict[str, DrivenRobot]]:
     """Start fresh robots, which are ready; with ``reports`` they forward those of their MCUs."""
     with ExitStack() as stack:
-        driven = {kind: stack.enter_context(driven_robot(kind, media=media, reports=reports)) for kind in kinds}
+        driven = {kind: stack.enter_context(driven_robot(kind, reports=reports)) for kind in VARIANTS}
         for robot in driven.values():
             robot.wait_until_ready()
         time.sleep(STARTUP_S)
@@ -78,32 +69,20 @@ def running(kinds: Iterable[str], *, media: bool = False, reports: bool = True) 
 
 
 def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cell]:
-    """Measure fresh robots that forward reports, also with media; and fresh ones that do not."""
+    """Measure fresh robots that forward reports, and fresh ones that do not, each in turns of a second."""
+    passes = max(1, round(settings.seconds))
     for load in in_turn((UNLOADED, COMMANDS), number):
-        reports, media = load == UNLOADED, load == UNLOADED and settings.with_media
+        reports, turns = load == UNLOADED, list[tuple[str, Turn]]()
         progress("starting the robots")
-        with running([*settings.variants, *([HOP] if reports else [])], media=media, reports=reports) as driven:
-            yield from _in_turns(settings, number, progress, load, driven)
-            for variant in in_turn(list(driven), number) if media else ():
-                if variant in KINDS:  # the stand-in has no media
-                    progress(f"{variant}, {LOADED}")
-                    turn = driven[variant].drive_with_media(min(settings.seconds, _LOADED_S))
-                    yield from cells_of(variant, LOADED, turn, driven[variant].arrived([turn]))
-
-
-def _in_turns(
-    settings: Settings, number: int, progress: Progress, load: str, driven: Mapping[str, DrivenRobot]
-) -> Iterator[Cell]:
-    """Drive each of them for the seconds of a round, in turns."""
-    turns, passes = [], max(1, round(settings.seconds / settings.turn_s))
-    for pass_ in range(passes):
-        for variant in in_turn(list(driven), number + pass_):
-            progress(f"{variant}, {load}")
-            turns.append((variant, driven[variant].drive(settings.seconds / passes)))
-    for variant, own in grouped(turns, lambda turn: turn[0]).items():
-        arrived = driven[variant].arrived([turn for _, turn in own])
-        for _, turn in own:
-            yield from cells_of(variant, load, turn, arrived)
+        with running(reports=reports) as driven:
+            for pass_ in range(passes):
+                for variant in in_turn(list(driven), number + pass_):
+                    progress(f"{variant}, {load}")
+                    turns.append((variant, driven[variant].drive(settings.seconds / passes)))
+            for variant, own in grouped(turns, lambda turn: turn[0]).items():
+                arrived = driven[variant].arrived([turn for _, turn in own])
+                for _, turn in own:
+                    yield from cells_of(variant, load, turn, arrived)
 
 
 def cells_of(variant: str, load: str, turn: Turn, arrived: Arrived) -> Iterator[Cell]:
@@ -111,14 +90,14 @@ def cells_of(variant: str, load: str, turn: Turn, arrived: Arrived) -> Iterator[
     figures = {"cpu_percent": 100 * turn.cpu_s[ALL] / took_s} if ALL in turn.cpu_s else {}
     down = [(arrived.commands[wheels] - ns) / 1e6 for wheels, ns in turn.sent.items() if wheels in arrived.commands]
     yield round_cell(variant, DOWN, "ms", down, params, sent=len(turn.sent), **figures)
-    if load != COMMANDS and variant != HOP:
+    if load != COMMANDS:
         own = [(sent, ns) for sent, ns in arrived.reports if turn.began <= sent <= turn.ended]
         yield round_cell(
             variant, UP, "ms", [(ns - sent) / 1e6 for sent, ns in own if ns is not None], params, sent=len(own)
         )
     forwarded = len(down) + sum(turn.began <= ns <= turn.ended for ns, _ in arrived.received)
     for process, cpu_s in turn.cpu_s.items():
-        if process != ALL and load != LOADED:
+        if process != ALL:
             each = [1e6 * cpu_s / forwarded] if forwarded else []
             yield round_cell(variant, CPU, "us", each, {**params, "process": process})
 
@@ -135,7 +114,7 @@ def latency_table(results: Results, cells: Sequence[Cell]) -> Table:
         grid.add_section()
         for ours in some:
             base = results.find(STAND_IN, way, load=load)
-            cpu = f"{ours.middle('cpu_percent'):.1f}" if "cpu_percent" in ours.figures else ""
+            cpu = f"{ours.middle('cpu_percent'):.1f}" if way == DOWN else ""
             place = (way, load) if ours is some[0] else ("", "")
             counts = (str(len(ours.samples)), str(ours.lost))
             grid.add_row(

@@ -9,7 +9,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
-from itertools import zip_longest
 from typing import Any, Final, Self
 
 from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
@@ -91,11 +90,11 @@ class StockClient:
         """Return an operator of a robot of which it knows nothing, as the original page: without control."""
         return ScriptedOperator(RobotView(base), self.publish, by="bench", wait=wait)
 
-    def request_media(self, base: str, enabled: bool = True, *encodings: str) -> None:
-        """Allows and requests a robot's pictures and sound, by default as it is configured; or ends both."""
-        for (flag, request), encoding in zip_longest(_MEDIA_CHANNELS, encodings):
-            self.send(flag, base, enabled)
-            self.send(request, base, {"enabled": enabled} | ({"encoding": encoding} if encoding else {}))
+    def request_media(self, base: str, *encodings: str) -> None:
+        """Allow and request a robot's pictures and sound."""
+        for (flag, request), encoding in zip(_MEDIA_CHANNELS, encodings, strict=True):
+            self.send(flag, base, True)
+            self.send(request, base, {"enabled": True, "encoding": encoding})
 
     def _on_connect(self, *_: Any) -> None:
         if self._subscriptions:

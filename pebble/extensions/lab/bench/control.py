@@ -5,7 +5,7 @@ use their QoS. One-way is from just before the publish call until the receiver's
 sender's. Every round starts new processes, and a broker or hub for each variant; a slice of each variant under the same
 condition runs directly after the other, in either order. Messages of the first 0.1 s do not count, those that do not
 return within a second of the last one are lost. ``media``: pictures of 640x480 flow at 30 Hz through the same broker or
-shared memory; ``hog``: a process uses a whole core.
+shared memory.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -26,13 +25,12 @@ from pebble.extensions.lab.bench.control_ends import Slice, SliceSpec
 from pebble.extensions.lab.bench.results import STAND_IN, Cell, Params, Results, begin, grouped, round_cell
 from pebble.extensions.lab.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.extensions.lab.bench.show import RATIOS, Shown, compared, percentiles, plain_table
-from pebble.extensions.lab.rig.processes import BROKERS, OPERATORS, Processes, Program, Worker, python
+from pebble.extensions.lab.rig.processes import BROKERS, Processes, Program, Worker, python
 from pebble.transports import MqttSettings, ZenohSettings
 
-NONE, MEDIA, HOG = LOADS = ("none", "media", "hog")
+NONE, MEDIA = "none", "media"  # loads
 ONE_WAY, ROUND_TRIP = "one-way", "round trip"
 BASELINE: Final = "mqtt"
-_LOADED_RATES = 2  # the first ones
 _READY_S = 40.0
 _ANSWER_S = 30.0  # in addition to the slice itself
 
@@ -56,69 +54,53 @@ VARIANTS: Final = {
 }
 
 
+class Case(NamedTuple):
+    """Messages of a size at a rate, beside a load."""
+
+    size: int  # bytes
+    rate: int  # Hz
+    load: str = NONE
+
+    def params(self) -> Params:
+        return {"size": f"{self.size} B", "rate": f"{self.rate} Hz", "load": self.load}
+
+
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The variants and conditions: ``seconds`` of each condition in each of the ``passes`` of a round."""
+    """The variants and cases: ``seconds`` of each case in each of the ``passes`` of a round."""
 
     variants: Sequence[str] = tuple(VARIANTS)
-    sizes: Sequence[int] = (40, 1024)  # bytes
-    rates: Sequence[float] = (20, 200, 1000)  # Hz
-    loads: Sequence[str] = LOADS
+    cases: Sequence[Case] = (Case(40, 20), Case(40, 200), Case(40, 1000), Case(1024, 200), Case(40, 200, MEDIA))
     seconds: float = 0.35
     rounds: int = 10
     passes: int = 2
 
 
 FULL: Final = Settings()
-QUICK: Final = Settings(sizes=(40,), rates=(200,), loads=(NONE, MEDIA), seconds=0.3, rounds=3, passes=1)
+QUICK: Final = Settings(cases=(Case(40, 200), Case(40, 200, MEDIA)), seconds=0.3, rounds=3, passes=1)
 
 
 def run(settings: Settings, console: Console) -> Shown:
     """Measure all variants. Raises PebbleError."""
     results = begin("control", settings)
     measure_rounds(results, settings.rounds, lambda number, progress: measure(settings, number, progress), console)
-    return shown(results)
-
-
-def shown(results: Results) -> Shown:
-    """Return the tables and pictures of results."""
     one_way = [cell for cell in results.cells if cell.measure == ONE_WAY]
     return Shown(results, [table(results)], plots.curves("control-one-way", "Service to service, one way", one_way))
-
-
-def conditions(settings: Settings) -> list[Params]:
-    """Return all conditions; with a load only the first size and the first rates are measured."""
-    return [
-        {"size": _bytes(size), "rate": f"{rate:g} Hz", "load": load}
-        for load, size, rate in product(settings.loads, settings.sizes, settings.rates)
-        if load == NONE or (size == settings.sizes[0] and rate in settings.rates[:_LOADED_RATES])
-    ]
-
-
-def _bytes(size: int) -> str:
-    return f"{size // 1024} KB" if size % 1024 == 0 else f"{size} B"
-
-
-def spec_of(condition: Params, seconds: float) -> SliceSpec:
-    (number, unit), (rate, _) = (str(condition[name]).split() for name in ("size", "rate"))
-    return SliceSpec(int(number) * (1024 if unit == "KB" else 1), float(rate), seconds)
 
 
 def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cell]:
     """Measure one round; in every other pass backwards."""
     with Participants(settings.variants) as participants:
         for pass_ in range(settings.passes):
-            for condition in in_turn(conditions(settings), number + pass_):
+            for case in in_turn(settings.cases, number + pass_):
                 for variant in in_turn(settings.variants, number + pass_):
-                    progress(f"{variant}, {', '.join(map(str, condition.values()))}")
-                    done, pictures_hz = participants.run(
-                        variant, spec_of(condition, settings.seconds), str(condition["load"])
-                    )
+                    progress(f"{variant}, {', '.join(map(str, case.params().values()))}")
+                    done, pictures_hz = participants.run(variant, case, settings.seconds)
                     figures = {"sent": done.sent, "late": done.late, "pictures_hz": pictures_hz}
-                    one_way = [(one.echoed_ns - one.sent_ns) / 1000 for one in done.exchanges]
-                    round_trip = [(one.received_ns - one.sent_ns) / 1000 for one in done.exchanges]
-                    yield round_cell(variant, ONE_WAY, "us", one_way, condition, **figures)
-                    yield round_cell(variant, ROUND_TRIP, "us", round_trip, condition, **figures)
+                    one_way = [(each.echoed_ns - each.sent_ns) / 1000 for each in done.exchanges]
+                    round_trip = [(each.received_ns - each.sent_ns) / 1000 for each in done.exchanges]
+                    yield round_cell(variant, ONE_WAY, "us", one_way, case.params(), **figures)
+                    yield round_cell(variant, ROUND_TRIP, "us", round_trip, case.params(), **figures)
 
 
 def table(results: Results) -> Table:
@@ -176,41 +158,31 @@ class Participants(Processes):
         for worker in self.workers:
             worker.answer(_READY_S)
 
-    def run(self, variant: str, spec: SliceSpec, load: str) -> tuple[Slice, float]:
+    def run(self, variant: str, case: Case, seconds: float) -> tuple[Slice, float]:
         """Run one slice; returns its results, and the pictures per second meanwhile.
 
         Raises PebbleError if a process ended, or no pictures flow.
         """
         stream, sender = self._parts[variant]
-        beside = self._begin(load, *stream)
+        ends = [
+            self.worker(name, "pebble.extensions.lab.bench.frames_worker", stream[0], name, stream[1], "640x480")
+            for name in (("reader", "writer") if case.load == MEDIA else ())
+        ]
+        for end in ends:
+            end.answer(_READY_S)
         began_ns, pictures_hz = time.monotonic_ns(), 0.0
-        if load == MEDIA:
-            beside[0].send(f"{began_ns} {1 << 62}")
-        done = msgspec.convert(sender.ask(_json(spec), spec.seconds + _ANSWER_S), Slice)
-        if load == MEDIA:
-            pictures = beside[0].ask("", _ANSWER_S)["latencies_us"]
-            pictures_hz = 1e9 * len(pictures) / (time.monotonic_ns() - began_ns)
+        spec = _json(SliceSpec(case.size, case.rate, seconds))
+        done = msgspec.convert(sender.ask(spec, seconds + _ANSWER_S), Slice)
+        for reader in ends[:1]:
+            pictures = sum(ns > began_ns for _, ns in reader.ask("", _ANSWER_S)["arrived"])
+            pictures_hz = 1e9 * pictures / (time.monotonic_ns() - began_ns)
             if not pictures:
                 raise PebbleError(f"{variant}: no pictures flow")
         if problems := self.unexpected_exits():
             raise PebbleError(f"{variant}: {'; '.join(problems)}")
-        for program in beside:
-            self.end(program)
-        return done, pictures_hz
-
-    def _begin(self, load: str, kind: str, where: object) -> Sequence[Any]:
-        """Start the load: nothing, a busy loop, or a reader and a writer of pictures, which flow afterwards."""
-        if load == HOG:
-            loop = ["sh", "-c", "while :; do :; done"]
-            return [self.add(Program("hog", loop, self.folder / "hog.log"), OPERATORS)]
-        names = ("reader", "writer") if load == MEDIA else ()
-        ends = [
-            self.worker(name, "pebble.extensions.lab.bench.frames_worker", kind, name, where, "640x480")
-            for name in names
-        ]
         for end in ends:
-            end.answer(_READY_S)
-        return ends
+            self.end(end)
+        return done, pictures_hz
 
 
 def _json(settings: MqttSettings | ZenohSettings | SliceSpec) -> str:

@@ -1,7 +1,7 @@
 """The two ends of the control comparison, which use a transport as services do.
 
-A service handles a drive command on the transport's thread that brings it, if it is idle; else its inbox keeps the
-command for its own thread (decision 24). The ends do the same. Stock paho calls its handler on its network thread.
+Both handle a message on the transport's thread that brings it, as an idle service does with a drive command, and as
+stock paho does.
 
 ``python -m pebble.extensions.lab.bench.control_ends echo|sender stand-in|mqtt|zenoh SETTINGS`` (JSON, of the
 transport). A sender receives slices as JSON and answers each.
@@ -24,10 +24,8 @@ import msgspec
 from pebble.contract import DRIVE
 from pebble.errors import PebbleError
 from pebble.extensions.lab.bench.results import STAND_IN
-from pebble.extensions.lab.rig.worker_end import answer, serve, serve_on_thread
-from pebble.runtime.inbox import Inbox
-from pebble.runtime.work_lock import WorkLock
-from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
+from pebble.extensions.lab.rig.worker_end import answer, serve
+from pebble.transports import MqttSettings, QoS, State, Transport, ZenohSettings, create
 
 REQUESTS, REPLIES = "pebble/bench/echo", "pebble/bench/echoed"
 _QOS = QoS(DRIVE.default_qos)
@@ -37,9 +35,8 @@ _POLL_S = 0.01
 _CONNECT_S = 10.0
 _WARM_UP, _WARM_UP_S = 20, 15.0  # messages
 
-_FORM = struct.Struct(
-    "<Qqq"
-)  # of a message: its number, when it was sent (ns), and when it was echoed; padding follows
+#: Of a message: its number, when it was sent (ns), and when it was echoed; padding follows.
+_FORM = struct.Struct("<Qqq")
 _ECHOED, _ECHOED_AT = struct.Struct("<q"), 16
 SMALLEST = _FORM.size
 
@@ -81,32 +78,7 @@ class Connection(NamedTuple):
     close: Callable[[], object]
 
 
-class EndInbox:
-    """The inbox of one end, and the lock under which it works."""
-
-    def __init__(self) -> None:
-        self.inbox, self.lock = Inbox(), WorkLock()
-
-    def bring(self, job: Callable[[], None]) -> None:
-        """Do the job at once, as Service.run_if_idle; post it if the end is busy."""
-        if self.lock.try_enter():
-            try:
-                if not self.inbox:
-                    return job()
-            finally:
-                self.lock.leave()
-        return self.inbox.post(job)
-
-    def turn(self, timeout: float | None = None) -> None:
-        """Do the next job that waits, waiting up to ``timeout`` seconds for one."""
-        self.inbox.wait(timeout)
-        with self.lock:
-            job = self.inbox.take()
-            if job is not None:
-                job()
-
-
-def opened(transport: Transport, inbox: EndInbox) -> Connection:
+def opened(transport: Transport) -> Connection:
     """Open any of Pebble's transports, used through the same calls as in pebble.service.Service. Raises PebbleError."""
     transport.open(_CONNECT_S)
     if transport.state is not State.CONNECTED:
@@ -115,10 +87,7 @@ def opened(transport: Transport, inbox: EndInbox) -> Connection:
         raise PebbleError(f"no connection: {problem or 'no answer'}")
 
     def subscribe(topic: str, handler: Handler) -> None:
-        def on_message(message: Message) -> None:
-            inbox.bring(lambda: handler(message.payload))
-
-        transport.subscribe(topic, on_message, qos=_QOS, direct=True)
+        transport.subscribe(topic, lambda message: handler(message.payload), qos=_QOS, direct=True)
 
     return Connection(subscribe, partial(transport.publish, qos=_QOS), transport.close)
 
@@ -149,10 +118,10 @@ def echo(connection: Connection) -> None:
 
 
 class Sender:
-    """Sends slices and collects the replies; what collects on another thread fills entries that the slice has made."""
+    """Sends slices and collects the replies; the transport's thread fills entries that the slice has made."""
 
-    def __init__(self, connection: Connection, inbox: EndInbox) -> None:
-        self._connection, self._inbox = connection, inbox
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
         self._first = 0  # the number of the first message
         self._received: list[Exchange | None] = []
         connection.subscribe(REPLIES, self._on_message)
@@ -162,8 +131,7 @@ class Sender:
         end, returned = time.monotonic() + timeout, 0
         while returned < count and time.monotonic() < end:
             self._expect(1)
-            with self._inbox.lock:
-                self._send(self._first, SMALLEST)
+            self._send(self._first, SMALLEST)
             self._collect(0.1)
             returned += None not in self._received
         return returned >= count
@@ -172,16 +140,12 @@ class Sender:
         lead, period = max(1, math.ceil(_LEAD_S * spec.rate)), 1 / spec.rate
         counting = max(1, round(spec.seconds * spec.rate))
         self._expect(lead + counting)
-        sent = late = 0
-        due = time.monotonic() + period
-        while sent < lead + counting:
-            self._inbox.turn(max(0.0, due - time.monotonic()))
-            behind = time.monotonic() - due
-            if behind >= 0:
-                late += sent >= lead and behind > period / 2
-                with self._inbox.lock:
-                    self._send(self._first + sent, spec.size)
-                sent, due = sent + 1, due + period
+        late, due = 0, time.monotonic() + period
+        for number in range(lead + counting):
+            time.sleep(max(0.0, due - time.monotonic()))
+            late += number >= lead and time.monotonic() - due > period / 2
+            self._send(self._first + number, spec.size)
+            due += period
         self._collect(_LAST_S)
         exchanges = [exchange for exchange in self._received[lead:] if exchange is not None]
         return Slice(sent=counting, late=late, exchanges=exchanges)
@@ -196,7 +160,7 @@ class Sender:
     def _collect(self, timeout: float) -> None:
         end = time.monotonic() + timeout
         while None in self._received and time.monotonic() < end:
-            self._inbox.turn(_POLL_S)
+            time.sleep(_POLL_S)
 
     def _on_message(self, payload: bytes) -> None:
         received = time.monotonic_ns()
@@ -207,17 +171,15 @@ class Sender:
 
 
 def run_end(role: str, kind: str, settings: str) -> None:
-    inbox, form = EndInbox(), ZenohSettings if kind == "zenoh" else MqttSettings
+    form = ZenohSettings if kind == "zenoh" else MqttSettings
     where: Any = msgspec.json.decode(settings, type=form, dec_hook=lambda _kind, text: Path(text))
-    with closing(stock(where.port) if kind == STAND_IN else opened(create(kind, role, where), inbox)) as connection:
+    with closing(stock(where.port) if kind == STAND_IN else opened(create(kind, role, where))) as connection:
         if role == "echo":
             echo(connection)
-            ended = serve_on_thread(lambda _line: None, inbox.inbox.wake)
             answer({"ready": True})
-            while not ended.is_set():
-                inbox.turn()
+            serve(lambda _line: None)
         else:
-            sender = Sender(connection, inbox)
+            sender = Sender(connection)
             if not sender.warm_up(_WARM_UP, _WARM_UP_S):
                 raise PebbleError("the echo does not answer")
             answer({"ready": True})

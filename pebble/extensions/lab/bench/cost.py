@@ -21,7 +21,7 @@ from rich.table import Table
 
 from pebble.errors import PebbleError
 from pebble.extensions.lab.bench.clients import RobotSubscriber, driving, ready_robot
-from pebble.extensions.lab.bench.results import Cell, Results, begin, round_cell
+from pebble.extensions.lab.bench.results import Cell, Results, begin, grouped, round_cell
 from pebble.extensions.lab.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.extensions.lab.bench.show import RATIOS, Shown, compared, middle, plain_table
 from pebble.extensions.lab.bench.usage import cpu_s, pss_mb
@@ -29,7 +29,6 @@ from pebble.extensions.lab.rig.robot import BASE, KINDS, Robot
 
 ALL: Final = "all"  # the processes of a robot together
 MEMORY, CPU, THREADS = "PSS", "CPU", "threads"
-PICTURES, PER_PICTURE = "pictures", "CPU per picture"
 IDLE, DRIVING = "idle", "driving"
 _UNITS = {MEMORY: "MB", CPU: "%", THREADS: ""}
 #: The encodings requested in each media phase, by the name of the phase.
@@ -43,7 +42,6 @@ _FIRST = 5  # pictures and sound packets until a stream counts as flowing
 class Settings:
     """Robots of each variant, one in each round, and seconds of each phase."""
 
-    variants: Sequence[str] = KINDS
     seconds: float = 1.5
     rounds: int = 8
 
@@ -59,94 +57,70 @@ def run(settings: Settings, console: Console) -> Shown:
         results.notes.append("h264+opus is left out: there is no PyAV")
 
     def measure_round(number: int, progress: Progress) -> Iterator[Cell]:
-        for variant in in_turn(settings.variants, number):
+        for variant in in_turn(KINDS, number):
             progress(variant)
             yield from measure(variant, settings.seconds)
 
     measure_rounds(results, settings.rounds, measure_round, console)
-    return shown(results)
-
-
-def shown(results: Results) -> Shown:
-    """Return results with their tables."""
-    return Shown(results, [table(results), whole(results)])
+    return Shown(results, [table(results)])
 
 
 def measure(variant: str, seconds: float) -> Iterator[Cell]:
     """Measure all phases of a fresh robot. Raises PebbleError with its log if a phase does not start."""
     with ready_robot(variant) as (robot, subscriber):
-        yield from _phase(robot, subscriber, IDLE, seconds)
+        yield from _phase(robot, IDLE, seconds)
         with driving(robot.remote_port, BASE):
-            yield from _phase(robot, subscriber, DRIVING, seconds)
+            yield from _phase(robot, DRIVING, seconds)
         for name, forms in STREAMS.items():
             if "h264" in forms and find_spec("av") is None:
                 continue
-            subscriber.request_media(BASE, True, *forms)
+            subscriber.request_media(BASE, *forms)
             robot.expect(partial(_flow, robot, subscriber, forms), f"{name} does not flow", _FLOW_S)
-            yield from _phase(robot, subscriber, name, seconds)
+            yield from _phase(robot, name, seconds)
 
 
 def _flow(robot: Robot, subscriber: RobotSubscriber, forms: Sequence[str]) -> bool:
     return all(subscriber.arrived[form] >= _FIRST for form in forms) and robot.complete()
 
 
-def _phase(robot: Robot, subscriber: RobotSubscriber, phase: str, seconds: float) -> Iterator[Cell]:
+def _phase(robot: Robot, phase: str, seconds: float) -> Iterator[Cell]:
     """Measure the robot's processes for some seconds; memory is read afterwards."""
     time.sleep(_STARTUP_S)
-    processes, form = robot.processes(), STREAMS.get(phase, ("no pictures",))[0]
+    processes, began = robot.processes(), time.monotonic()
     before = {name: cpu_s([pid]) for name, pid in processes.items()}
-    pictures, began = subscriber.arrived[form], time.monotonic()
     time.sleep(seconds)
     took = time.monotonic() - began
     cpu = {name: 100 * (cpu_s([pid]) - before[name]) / took for name, pid in processes.items()}
-    rate = (subscriber.arrived[form] - pictures) / took if phase in STREAMS else None
     if robot.processes() != processes:
         raise PebbleError(f"{phase}: processes of the robot ended or started meanwhile\n{robot.log()}")
     memory = {name: pss_mb(pid) for name, pid in processes.items()}
     threads = {name: len(list(Path(f"/proc/{pid}/task").iterdir())) for name, pid in processes.items()}
-    yield from cells_of(robot.kind, phase, {MEMORY: memory, CPU: cpu, THREADS: threads}, rate)
+    yield from cells_of(robot.kind, phase, {MEMORY: memory, CPU: cpu, THREADS: threads})
 
 
-def cells_of(
-    variant: str, phase: str, used: Mapping[str, Mapping[str, float]], pictures_hz: float | None = None
-) -> Iterator[Cell]:
-    """Yield what was ``used``, by measure and process; and the CPU time of the robot and its sound by picture."""
-    params = {"phase": phase, "process": ALL}
+def cells_of(variant: str, phase: str, used: Mapping[str, Mapping[str, float]]) -> Iterator[Cell]:
+    """Yield what was ``used``, by measure and process, and by the whole robot."""
     for name, values in used.items():
-        for process, value in values.items():
-            yield round_cell(variant, name, _UNITS[name], [value], {**params, "process": process})
-        yield round_cell(variant, name, _UNITS[name], [sum(values.values())], params)
-    if pictures_hz is not None:
-        per_picture = [10 * sum(used[CPU].values()) / pictures_hz] if pictures_hz else []
-        yield round_cell(variant, PICTURES, "1/s", [pictures_hz], params)
-        yield round_cell(variant, PER_PICTURE, "ms", per_picture, params)
+        for process, value in (*values.items(), (ALL, sum(values.values()))):
+            yield round_cell(variant, name, _UNITS[name], [value], {"phase": phase, "process": process})
 
 
 def table(results: Results) -> Table:
-    """Return what each process needs, by phase; the whole robot last, in bold."""
+    """Return what each process needs, by phase, and the ratios; the whole robot last, in bold."""
     heads = [f"{variant} {unit}" for variant in KINDS for unit in ("MB", "%", "thr.")]
-    grid = plain_table("Memory (PSS), CPU (of one core), threads; medians", ["phase", "process", *heads], left=2)
-    for phase in dict.fromkeys(str(cell.params["phase"]) for cell in results.cells):
+    ratios = [f"{measure_}, zenoh / mqtt" for measure_ in (MEMORY, CPU)]
+    grid = plain_table("Memory (PSS), CPU (of one core), threads; medians", ["phase", "process", *heads, *ratios],
+                        left=2, caption=RATIOS)  # fmt: skip
+    for phase, cells in grouped(results.cells, lambda cell: cell.params["phase"]).items():
         grid.add_section()
-        found = dict.fromkeys(str(cell.params["process"]) for cell in results.cells if cell.params["phase"] == phase)
-        for number, process in enumerate(sorted(found, key=lambda name: name == ALL)):
-            of_all = [
-                middle(results.find(variant, measure_, phase=phase, process=process))
+        processes = sorted({str(cell.params["process"]) for cell in cells}, key=lambda name: (name == ALL, name))
+        for number, process in enumerate(processes):
+            used = {
+                (variant, measure_): results.find(variant, measure_, phase=phase, process=process)
                 for variant in KINDS
                 for measure_ in (MEMORY, CPU, THREADS)
-            ]
-            grid.add_row("" if number else phase, process, *of_all, style="bold" if process == ALL else None)
-    return grid
-
-
-def whole(results: Results) -> Table:
-    """Return what the whole robots need, as ratios."""
-    ours, theirs = "zenoh", "mqtt"
-    grid = plain_table("Whole robots", ["phase", "", "unit", theirs, ours, f"{ours} / {theirs}"], left=3,
-                        caption=RATIOS)  # fmt: skip
-    for mqtt in (cell for cell in results.cells if (cell.variant, cell.params["process"]) == (theirs, ALL)):
-        zenoh = results.find(ours, mqtt.measure, **mqtt.params)
-        grid.add_row(
-            str(mqtt.params["phase"]), mqtt.measure, mqtt.unit, middle(mqtt), middle(zenoh), compared(zenoh, mqtt)
-        )
+            }
+            own = [compared(used["zenoh", measure_], used["mqtt", measure_]) for measure_ in (MEMORY, CPU)]
+            place, style = "" if number else str(phase), "bold" if process == ALL else None
+            grid.add_row(place, process, *map(middle, used.values()), *own, style=style)
     return grid

@@ -5,7 +5,7 @@ a reader has a whole numpy array. Every case starts new processes in every round
 frames of one process, so many short rounds are better than a few long ones. The first frames do not count.
 
 ``zenoh-shm``: created in the shared segment and read as a view. ``mqtt``: mosquitto and paho, QoS 0. ``gstreamer-shm``:
-shmsink to shmsrc, as in the original, with the system's Python. ``memcpy``: no transport, a copy of as many bytes.
+shmsink to shmsrc, as in the original, with the system's Python.
 """
 
 from __future__ import annotations
@@ -31,8 +31,7 @@ from pebble.extensions.lab.bench.usage import cpu_s, pss_mb
 from pebble.extensions.lab.rig.processes import Processes, python
 from pebble.extensions.operator.places import mosquitto_path
 
-VARIANTS: Final = ("zenoh-shm", "mqtt", "gstreamer-shm", "memcpy")
-SIZES: Final = ("640x480", "1280x720", "1920x1080")
+VARIANTS: Final = ("zenoh-shm", "mqtt", "gstreamer-shm")
 BASELINE: Final = "mqtt"
 INSTALL_GSTREAMER: Final = (
     "apt-get install -y --no-install-recommends gstreamer1.0-plugins-base gstreamer1.0-plugins-bad"
@@ -81,12 +80,7 @@ def run(settings: Settings, console: Console) -> Shown:
             yield measure(variant, condition, settings.seconds)
 
     measure_rounds(results, settings.rounds, measure_round, console)
-    return shown(results)
-
-
-def shown(results: Results) -> Shown:
-    """Return the tables and pictures of results."""
-    return Shown(results, tables(results), plots.curves("frames", "Frames between processes", results.cells))
+    return Shown(results, [table(results)], plots.curves("frames", "Frames between processes", results.cells))
 
 
 def missing(variant: str) -> str | None:
@@ -121,56 +115,44 @@ def measure(variant: str, condition: Params, seconds: float) -> Cell:
         workers = processes.workers
         for worker in workers[is_gstreamer:]:
             worker.answer(_READY_S)
-        begin_ns = time.monotonic_ns() + int(_STARTUP_S * 1e9)
-        for worker in workers:
-            worker.send(f"{begin_ns} {begin_ns + int(seconds * 1e9)}")
         pids = [process.pid for process in (*workers, *([broker] if broker else []))]
         time.sleep(_STARTUP_S)
-        before = [cpu_s([pid]) for pid in pids]
+        before, began_ns = [cpu_s([pid]) for pid in pids], time.monotonic_ns()
         time.sleep(seconds)
+        window = range(began_ns, time.monotonic_ns())
         cpu = [100 * (cpu_s([pid]) - so_far) / seconds for pid, so_far in zip(pids, before, strict=True)]
         time.sleep(_LATE_S)
         writer, *readers = (worker.ask("", _ANSWER_S) for worker in workers)
         memory_mb = [pss_mb(worker.pid) for worker in workers]
-    latencies_us = [latency for reader in readers for latency in reader["latencies_us"]]
-    torn, fallbacks = sum(reader["torn"] for reader in readers), writer["fallbacks"]
-    if variant == "memcpy":  # copies are timed, not what was sent
-        own = sum(latencies_us) / 1e4 / seconds / len(readers)
-        return round_cell(
-            variant, "frame", "us", latencies_us, condition, cpu_reader=own, torn=torn, fallbacks=fallbacks
-        )
+    latencies_us = [(ns - stamp) / 1000 for reader in readers for stamp, ns in reader["arrived"] if stamp in window]
     return round_cell(
-        variant, "frame", "us", latencies_us, condition, torn=torn, fallbacks=fallbacks,
-        sent=writer["sent"] * len(readers),  # each frame to each reader
+        variant, "frame", "us", latencies_us, condition,
+        sent=sum(stamp in window for stamp in writer["stamps"]) * len(readers),  # each frame to each reader
+        torn=sum(reader["torn"] for reader in readers),
         cpu_writer=cpu[0], cpu_reader=fmean(cpu[1 : len(workers)]), memory_writer_mb=memory_mb[0],
         memory_reader_mb=fmean(memory_mb[1:]), **({} if broker is None else {"cpu_broker": cpu[-1]}),
     )  # fmt: skip
 
 
-def tables(results: Results) -> list[Table]:
-    """Return a table for each size and number of readers."""
-    grids = []
-    for (size, readers), cells in grouped(results.cells, lambda cell: tuple(cell.params.values())).items():
-        grid = plain_table(
-            f"{size} BGR at 30 Hz, readers: {readers}",
-            ["variant", "p50 µs", "p99 µs", "max µs", "CPU %", "PSS MB", "n", "lost", "torn", "copied",
-             f"to {BASELINE}"],
-        )  # fmt: skip
+def table(results: Results) -> Table:
+    """Return the latency, CPU and memory of each variant, for each size and number of readers."""
+    grid = plain_table(
+        "BGR at 30 Hz",
+        ["size", "readers", "variant", "p50 µs", "p99 µs", "max µs", "CPU %", "PSS MB", "n", "lost", "torn",
+         f"to {BASELINE}"],
+        left=3, caption=f"CPU: writer / each reader / broker; PSS: writer / each reader. {RATIOS}",
+    )  # fmt: skip
+    for place, cells in grouped(results.cells, lambda cell: tuple(cell.params.values())).items():
+        grid.add_section()
         for ours in sorted(cells, key=lambda cell: VARIANTS.index(cell.variant)):
             base = results.find(BASELINE, "frame", **ours.params)
             grid.add_row(
-                ours.variant, *percentiles(ours, 50, 99, 100),
+                *map(str, place), ours.variant, *percentiles(ours, 50, 99, 100),
                 _beside(ours, "cpu_writer", "cpu_reader", "cpu_broker"),
-                _beside(ours, "memory_writer_mb", "memory_reader_mb"), str(len(ours.samples)),
-                "" if ours.lost is None else str(ours.lost), str(ours.total("torn")), str(ours.total("fallbacks")),
-                compared(ours, base),
+                _beside(ours, "memory_writer_mb", "memory_reader_mb"), str(len(ours.samples)), str(ours.lost),
+                str(ours.total("torn")), compared(ours, base),
             )  # fmt: skip
-        grids.append(grid)
-    grids[-1].caption = (
-        "CPU: writer / each reader / broker; PSS: writer / each reader; copied: frames for which the shared segment had"
-        f" no room. {RATIOS}"
-    )
-    return grids
+    return grid
 
 
 def _beside(cell: Cell, *names: str) -> str:

@@ -1,4 +1,4 @@
-"""One end of a transfer of time-stamped frames, 30 a second, as a process that measures during a given window.
+"""One end of a transfer of time-stamped frames, 30 a second, as a process.
 
 ``python -m pebble.extensions.lab.bench.frames_worker VARIANT ROLE WHERE SIZE``: ``WHERE`` is a folder for sockets, or a
 broker's port; ``SIZE`` is ``640x480``. One end of GStreamer's is this file in the system's Python, where gi and Gst are
@@ -6,8 +6,7 @@ installed; without arguments it fails if it could not be. So a plain file import
 the other end of a worker.
 
 A frame begins with the time it was complete (CLOCK_MONOTONIC, ns) and its number, and ends with its number again. The
-time is written last. A process writes ``{"ready": true}``, receives ``FROM UNTIL`` (CLOCK_MONOTONIC, ns), and answers
-an empty line with what it measured in that window.
+time is written last. A process writes ``{"ready": true}``, and answers each line with what it has measured so far.
 """
 
 from __future__ import annotations
@@ -34,7 +33,6 @@ else:  # the system's Python runs plain files
 RATE_HZ = 30.0
 _WARM_UP = 8  # frames: the first ones create pools and fill caches
 _READ_S = 0.2
-_GAP_S = 0.010  # between a frame and the bare copy after it
 _FRAMES_IN_SEGMENT = 8
 _STREAM, _TOPIC = "bench", "pebble/bench/frames"
 
@@ -42,22 +40,8 @@ Gst: Any = None  # loaded by main(): other Pythons have no gi
 Fill = Callable[[np.ndarray], None]  # writes the pixels of a frame (uint8, 1-D)
 
 
-class Window:
-    """The time in which is measured (``ns``), and the end of standard input, which names it."""
-
-    def __init__(self, results: Callable[[], dict[str, Any]]) -> None:
-        self.ns, self._results = range(0), results
-        self.ended = worker_end.serve_on_thread(self._handle)
-
-    def _handle(self, line: str) -> dict[str, Any] | None:
-        if not line:
-            return self._results()
-        self.ns = range(*map(int, line.split()))
-        return None
-
-
 def write(writer: Writer, size: int) -> None:
-    """Write a frame of ``size`` bytes 30 times a second until standard input closes; answer how many of the window."""
+    """Write a frame of ``size`` bytes 30 times a second until standard input closes; answer with their times."""
     picture = np.random.default_rng(1).integers(0, 256, size, dtype=np.uint8)
     stamps: list[int] = []  # of the frames, also of those that could not be sent
 
@@ -69,44 +53,32 @@ def write(writer: Writer, size: int) -> None:
         stamps.append(time.monotonic_ns())
         struct.pack_into("<q", frame.data, 0, stamps[-1])
 
-    window = Window(lambda: {"sent": sum(one in window.ns for one in stamps), "fallbacks": writer.fallbacks})
+    ended = worker_end.serve_on_thread(lambda _line: {"stamps": stamps})
     worker_end.answer({"ready": True})
     due = time.monotonic()
-    while not window.ended.is_set():
+    while not ended.is_set():
         due += 1 / RATE_HZ
-        window.ended.wait(max(0.0, due - time.monotonic()))
+        ended.wait(max(0.0, due - time.monotonic()))
         if not writer.write(fill):
             stamps.append(time.monotonic_ns())
     writer.close()
 
 
-def read(reader: Reader, bare_copy: int) -> None:
-    """Reads until standard input closes; answers with every latency of the window in µs.
-
-    With ``bare_copy``, measures instead the time of a copy of that many bytes between two frames, when the caches hold
-    other data.
-    """
-    source = np.random.default_rng(2).integers(0, 256, bare_copy, dtype=np.uint8)
-    target = np.zeros(bare_copy, np.uint8)
-    latencies_us: list[float] = []
-    frames = torn = 0
-    window = Window(lambda: {"latencies_us": latencies_us, "torn": torn})
-    while not window.ended.is_set():
+def read(reader: Reader) -> None:
+    """Read until standard input closes; answer with the time of every frame and of its arrival."""
+    arrived: list[tuple[int, int]] = []
+    torn = 0
+    ended = worker_end.serve_on_thread(lambda _line: {"arrived": arrived, "torn": torn})
+    while not ended.is_set():
         frame = reader.read(_READ_S)
         if frame is None:
             continue
-        now, frames = time.monotonic_ns(), frames + 1
+        now = time.monotonic_ns()
         stamp, number = struct.unpack_from("<qq", frame.data)
         torn += struct.unpack_from("<q", frame.data, len(frame) - 8) != (number,)
         del frame
-        if stamp in window.ns:
-            if bare_copy:
-                window.ended.wait(_GAP_S)
-                stamp = time.monotonic_ns()
-                np.copyto(target, source)
-                now = time.monotonic_ns()
-            latencies_us.append((now - stamp) / 1000)
-        if frames == _WARM_UP:
+        arrived.append((stamp, now))
+        if len(arrived) == _WARM_UP:
             worker_end.answer({"ready": True})
     reader.close()
 
@@ -117,8 +89,6 @@ def read(reader: Reader, bare_copy: int) -> None:
 
 class ZenohWriter:
     """Frames are created in the shared segment, as services do."""
-
-    fallbacks = 0  # frames that did not go through shared memory
 
     def __init__(self, folder: Path, size: int) -> None:
         self._info, self._frame = FrameInfo(format="bgr24"), np.zeros(size, np.uint8)
@@ -135,7 +105,6 @@ class ZenohWriter:
             self._writer.write(self._frame, self._info)
         else:
             slot.send(self._info)
-        self.fallbacks = self._writer.counters["fallbacks"]
         return True
 
 
@@ -163,8 +132,6 @@ def _refuse(problem: str) -> None:
 
 class MqttWriter:
     """The next frame is not begun before the last one is sent."""
-
-    fallbacks = 0
 
     def __init__(self, port: int, size: int) -> None:
         self._client, self._frame, self._leaving = _mqtt(port), bytearray(size), None
@@ -215,8 +182,6 @@ def _mqtt(port: int) -> Any:
 
 class GstWriter:
     """appsrc into shmsink. As in the original Pebble, pictures are created in the shared segment: no copy is made."""
-
-    fallbacks = 0
 
     def __init__(self, socket: str, caps: str, size: int) -> None:
         self._size = size
@@ -312,7 +277,7 @@ def main(arguments: list[str]) -> None:
     if role == "writer":
         write(writer(variant, where, count, caps), count)
     else:
-        read(reader(variant, where, caps), count if variant == "memcpy" else 0)
+        read(reader(variant, where, caps))
 
 
 if __name__ == "__main__":

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import math
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,11 +15,9 @@ from pebble.extensions.lab.bench.show import Picture, digits
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
 
 _DPI = 150
 _WIDEST = 13.0  # inches
-_DARK = "#222"
 _LEAST = 20  # samples for a distribution
 _SETTINGS: dict[Any, Any] = {
     "font.size": 9, "axes.titlesize": 9, "figure.titlesize": 11, "xtick.labelsize": 8, "ytick.labelsize": 8,
@@ -50,12 +46,12 @@ def _curves(cells: Sequence[Cell], title: str) -> Figure:
             times, style = sorted(cell.samples), style_of[cell.variant]
             step = 100 / (len(times) + (cell.lost or 0))
             shares = [step * count for count in range(1, len(times) + 1)]
-            axes.plot(times, shares, color=style.colour, linestyle=style.dash)
+            axes.plot(times, shares, **{**style, "marker": ""})
         log_axis(axes, "x", f"latency, {_unit(cells[0])}", *ends)
-        axes.set(ylim=(0, 101), title=short(place, 44))
+        axes.set(ylim=(0, 101), title=place)
         for percent in (50, 99):
             guide(axes, percent, f"p{percent}")
-    legend(figure, {variant: replace(style, marker="") for variant, style in style_of.items()})
+    legend(figure, style_of)
     return figure
 
 
@@ -66,14 +62,13 @@ def lines(name: str, caption: str, cells: Sequence[Cell], *, over: str) -> list[
 
 
 def _lines(cells: Sequence[Cell], title: str, over: str) -> Figure:
-    by_measure, style_of = grouped(cells, lambda cell: cell.measure), styles(unique([cell.variant for cell in cells]))
+    by_measure, style_of = grouped(cells, lambda cell: cell.measure), styles([cell.variant for cell in cells])
     figure, every = panels(len(by_measure), 3, (3.9, 3.0), title)
     for axes, (measure, some) in zip(every, by_measure.items(), strict=True):
         for variant, points in grouped(some, lambda cell: cell.variant).items():
             along = sorted((float(str(cell.params[over])), cell.percentile(50)) for cell in points)
-            style, last = style_of[variant], along[-1]
-            axes.plot(*zip(*along, strict=True), color=style.colour, linestyle=style.dash, marker=style.marker)
-            axes.annotate(f"  {digits(last[1])}", last, fontsize=8, va="center", annotation_clip=False)
+            axes.plot(*zip(*along, strict=True), **style_of[variant])
+            axes.annotate(f"  {digits(along[-1][1])}", along[-1], fontsize=8, va="center", annotation_clip=False)
         at = [float(str(cell.params[over])) for cell in some]
         log_axis(axes, "x", over, 0.8 * min(at), 2.5 * max(at))
         top = 1.15 * max(cell.percentile(50) for cell in some) or 1.0
@@ -88,49 +83,24 @@ def _unit(cell: Cell) -> str:
 
 # -- the common style of all pictures: colours of the variants, panels, axes, legends
 
+Style = dict[str, Any]  # keywords of a line
 
-@dataclass(frozen=True, slots=True)
-class Style:
-    """The style of a variant in every picture. Dash and marker differ as well, for colour-blind readers."""
-
-    colour: str
-    dash: Any = "-"
-    marker: str = "o"
-    hollow: bool = False
-
-
-#: The variants of each colour, in several comparisons.
-_VARIANTS: dict[str, tuple[str, ...]] = {
-    "#0072B2": ("zenoh", "zenoh-p2p", "zenoh-shm", "zenoh h264 opus", "hub"),
-    "#2AA198": ("zenoh-hub",),
-    "#56B4E9": ("zenoh original",),
-    "#D55E00": ("mqtt", "mqtt h264 opus"),
-    "#E69F00": ("mqtt-nodelay", "mqtt original"),
-    "#A4133C": ("mqtt5",),
-    "#8C510A": (STAND_IN,),
-    "#4D4D4D": ("one hop", "memcpy"),
-    "#8A8A8A": ("gstreamer-shm", "page"),
-}
-_STYLES = {
-    name: Style(colour, ("-", "--", "-.", ":")[at % 4], "os^DvPX"[at % 7], hollow="original" in name)
-    for at, (colour, names) in enumerate(_VARIANTS.items())
-    for name in names
-}
+#: Blue is Zenoh, red MQTT, brown the stand-in.
+_COLOURS: dict[str, str] = {
+    "zenoh": "#0072B2", "zenoh-p2p": "#0072B2", "zenoh-shm": "#0072B2", "zenoh h264 opus": "#0072B2",
+    "zenoh-hub": "#2AA198", "zenoh original": "#56B4E9", "mqtt": "#D55E00", "mqtt h264 opus": "#D55E00",
+    "mqtt-nodelay": "#E69F00", "mqtt original": "#E69F00", "mqtt5": "#A4133C", STAND_IN: "#8C510A",
+    "gstreamer-shm": "#8A8A8A", "page": "#8A8A8A",
+}  # fmt: skip
 
 
 def styles(variants: Sequence[str]) -> dict[str, Style]:
-    """Return the style of each variant, which is the same in every picture."""
-    return {name: _STYLES[name] for name in variants}
-
-
-def unique(values: Sequence[str]) -> list[str]:
-    """Return the values in the order of their first appearance."""
-    return list(dict.fromkeys(values))
-
-
-def short(text: str, width: int = 30) -> str:
-    """Wrap long names to two lines and truncate them."""
-    return "\n".join(textwrap.wrap(text, width, max_lines=2, placeholder="…")) or text
+    """Return the style of each variant. Dash and marker differ as well, for colour-blind readers."""
+    return {
+        name: {"color": _COLOURS[name], "linestyle": ("-", "--", "-.", ":")[at % 4], "marker": "os^DvP"[at % 6],
+               "markersize": 5, "markerfacecolor": "white" if "original" in name else _COLOURS[name]}
+        for at, name in enumerate(dict.fromkeys(variants))
+    }  # fmt: skip
 
 
 def panels(count: int, columns: int, size: tuple[float, float], title: str) -> tuple[Figure, list[Axes]]:
@@ -145,17 +115,11 @@ def panels(count: int, columns: int, size: tuple[float, float], title: str) -> t
     return figure, [figure.add_subplot(rows, columns, number + 1) for number in range(count)]
 
 
-def legend(figure: Figure, entries: dict[str, Style], *, more: Sequence[Line2D] = ()) -> None:
+def legend(figure: Figure, entries: dict[str, Style]) -> None:
     """Add a legend below the panels."""
     from matplotlib.lines import Line2D
 
-    handles = [
-        Line2D(
-            [], [], color=style.colour, label=short(name, 40), linestyle=style.dash,
-            marker=style.marker, markersize=5, markerfacecolor="white" if style.hollow else style.colour,
-        )
-        for name, style in entries.items()
-    ] + list(more)  # fmt: skip
+    handles = [Line2D([], [], label=name, **style) for name, style in entries.items()]
     columns = max(1, min(len(handles), int(figure.get_figwidth() // 1.8)))
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False)
 
@@ -163,32 +127,21 @@ def legend(figure: Figure, entries: dict[str, Style], *, more: Sequence[Line2D] 
 def save(picture: Picture, folder: Path, *, quick: bool) -> Path:
     """Draw a PNG; a quick run is marked in the corner. Raises PebbleError if it cannot be written."""
     import matplotlib as mpl
-    from PIL import Image
 
-    buffer, path = io.BytesIO(), folder / f"{picture.name}.png"
-    with mpl.rc_context(_SETTINGS):
+    path = folder / f"{picture.name}.png"
+    with mpl.rc_context(_SETTINGS), named(path):
         figure = picture.make()
         if quick:
             figure.text(0.995, 0.993, "quick run", ha="right", va="top", color="#A4133C", weight="bold")
-        figure.savefig(buffer, format="png", dpi="figure")
-    drawn = Image.open(buffer).convert("RGB")  # with a palette, a file is a third as large
-    image = drawn.quantize(255, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    with named(path):
-        image.save(path, optimize=True, dpi=(_DPI, _DPI))
+        figure.savefig(path, dpi="figure")
     return path
 
 
 def log_axis(axes: Axes, which: str, label: str, low: float, high: float) -> None:
-    """Set a logarithmic axis from ``low`` to ``high``, with written-out numbers for any number of decades."""
-    from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
-
+    """Set a logarithmic axis from ``low`` to ``high``, with written-out numbers."""
     limits: dict[str, Any] = {f"{which}scale": "log", f"{which}lim": (low, high), f"{which}label": label}
     axes.set(**limits)
-    axis, decades = axes.xaxis if which == "x" else axes.yaxis, math.log10(high / low)
-    steps = LogLocator(subs=(1.0,) if decades > 2.5 else (1.0, 2.0, 5.0), numticks=20)
-    axis.set_major_locator(steps if decades > 0.5 else MaxNLocator(6, steps=(1, 2, 5, 10)))
-    axis.set_major_formatter("{x:,.12g}")
-    axis.set_minor_locator(NullLocator())
+    (axes.xaxis if which == "x" else axes.yaxis).set_major_formatter("{x:,.12g}")
 
 
 def around(values: Sequence[float]) -> tuple[float, float]:

@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -16,7 +15,7 @@ from rich.console import Console
 
 from pebble.errors import PebbleError
 from pebble.extensions.lab.bench.results import STAND_IN, Results, Value, check_folder, load, named
-from pebble.extensions.lab.bench.show import RATIOS, compared, digits, middle
+from pebble.extensions.lab.bench.show import RATIOS, compared, middle
 from pebble.extensions.lab.rig.processes import Program, end_all, python
 from pebble.runtime.signals import interrupted_by_signals
 
@@ -27,7 +26,6 @@ _PLAIN = ("env", "-u", "FORCE_COLOR", "-u", "TTY_COMPATIBLE", "COLUMNS=120", "NO
 _POLL_S = 0.2
 _TIMEOUT_FACTOR, _TIMEOUT_EXTRA_S = 4, 60.0  # of the expected time: a comparison that takes longer is ended
 _END_S = 20.0  # for a comparison to end its processes
-_NOT_THE_TABLE = ("Written:", "No plots:")  # what a command prints about its files
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,20 +36,24 @@ class Section:
     title: str
     full_s: int
     quick_s: int
-    options: Sequence[str] = ()  # of the full run
     needs_root: bool = False
 
+    def expected_s(self, quick: bool) -> int:
+        return self.quick_s if quick else self.full_s
 
-_MODULES: Final = {"impair": "impair.trials"}  # that are not in the module of their name
+    def command(self, quick: bool) -> list[str]:
+        return ["bench", self.name, *(["--quick"] if quick else [])]
+
+
 SECTIONS: Final = (
-    Section("control", "Service to service", 700, 40),
-    Section("bridge", "Operator to wheels, and back", 2100, 22, ("--with-media",)),
-    Section("startup", "Start-up", 100, 23),
+    Section("control", "Service to service", 500, 40),
+    Section("bridge", "Operator to wheels, and back", 1700, 22),
+    Section("startup", "Start-up", 80, 18),
     Section("cost", "Memory and CPU", 180, 20),
-    Section("frames", "Camera frames inside the robot", 240, 14),
-    Section("scale", "Many boards", 240, 40),
+    Section("frames", "Camera frames inside the robot", 200, 12),
+    Section("scale", "Many boards", 150, 25),
     Section("traffic", "Traffic of robots, as in the paper", 140, 19),
-    Section("impair", "On an impaired network", 900, 85, needs_root=True),
+    Section("impair", "On an impaired network", 900, 150, needs_root=True),
 )
 
 
@@ -64,12 +66,10 @@ class Headline:
     measure: str
     params: Mapping[str, Value] = field(default_factory=dict)
     variants: Sequence[str] = (STAND_IN, "mqtt", "zenoh")
-    figure: str = ""  # that is shown instead of the median
 
 
 _SLICE: Final = {"size": "40 B", "rate": "200 Hz"}
 _P2P: Final = (STAND_IN, "mqtt", "zenoh-p2p")
-_WORST: Final = {"trial": "64k+5%"}
 HEADLINES: Final = (
     Headline("message between two services", "control", "one-way", {**_SLICE, "load": "none"}, _P2P),
     Headline("the same, beside pictures", "control", "one-way", {**_SLICE, "load": "media"}, _P2P),
@@ -85,8 +85,8 @@ HEADLINES: Final = (
              {"size": "640x480", "readers": 1}, ("gstreamer-shm", "mqtt", "zenoh-shm")),
     Headline("frame of 1920x1080 to one reader; the original's GStreamer", "frames", "frame",
              {"size": "1920x1080", "readers": 1}, ("gstreamer-shm", "mqtt", "zenoh-shm")),
-    Headline("sound within 1 s at 64 kbit/s and 5 % loss, %; the original's encodings", "impair", "audio latency",
-             _WORST, ("mqtt original", "mqtt h264 opus", "zenoh h264 opus"), "on_time_percent"),
+    Headline("sound within 1 s at 64 kbit/s and 5 % loss; the original's encodings", "impair", "audio within 1 s",
+             {"trial": "64k+5%"}, ("mqtt original", "mqtt h264 opus", "zenoh h264 opus")),
 )  # fmt: skip
 
 
@@ -96,12 +96,12 @@ def run(names: Sequence[str], folder: Path, *, quick: bool, console: Console) ->
     Without names all that this user may run. Raises PebbleError if the folder cannot be written.
     """
     path, sections, failed = _checked(folder), _chosen(names), 0
-    console.print(f"{len(sections)} comparisons: about {_span(sum(_expected_s(one, quick) for one in sections))}")
+    console.print(f"{len(sections)} comparisons: about {_span(sum(one.expected_s(quick) for one in sections))}")
     try:
         with interrupted_by_signals():
             for section in sections:
                 began = time.monotonic()
-                with console.status(f"{section.name}, about {_expected_s(section, quick)} s"):
+                with console.status(f"{section.name}, about {section.expected_s(quick)} s"):
                     problem = run_one(section, folder, quick)
                 line = f"{section.name} {problem}: see {folder / section.name}.txt" if problem else section.name
                 console.print(f"{line}, {_span(time.monotonic() - began)}", soft_wrap=True)
@@ -134,8 +134,8 @@ def run_one(section: Section, folder: Path, quick: bool) -> str:
     results, output = (folder / f"{section.name}.{ending}" for ending in ("json", "txt"))
     for path in (results, output, *folder.glob(f"{section.name}*.png")):  # of an earlier run: they would hide a failure
         path.unlink(missing_ok=True)
-    words = python("pebble.cli", *_command(section, quick), "--output", folder)
-    until = time.monotonic() + _TIMEOUT_FACTOR * _expected_s(section, quick) + _TIMEOUT_EXTRA_S
+    words = python("pebble.cli", *section.command(quick), "--output", folder)
+    until = time.monotonic() + _TIMEOUT_FACTOR * section.expected_s(quick) + _TIMEOUT_EXTRA_S
     program = Program(section.name, [*_PLAIN, *words], output)
     try:
         while (code := program.code) is None and time.monotonic() < until:
@@ -147,14 +147,6 @@ def run_one(section: Section, folder: Path, quick: bool) -> str:
     return f"ended with code {code}" if code else "" if results.exists() else "measured nothing"
 
 
-def _command(section: Section, quick: bool) -> list[str]:
-    return ["bench", section.name, *(["--quick"] if quick else section.options)]
-
-
-def _expected_s(section: Section, quick: bool) -> int:
-    return section.quick_s if quick else section.full_s
-
-
 def _span(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds >= 600 else f"{seconds:.0f} s"
 
@@ -163,19 +155,29 @@ def _span(seconds: float) -> str:
 
 
 def text(folder: Path) -> str:
-    """Return the whole report as Markdown, of what is in the folder."""
+    """Return the whole report as Markdown, of what is in the folder: the first table, and what each command printed."""
     measured = dict[str, Results]()
     for section in SECTIONS:
         with suppress(PebbleError):  # it failed, or was not measured
             measured[section.name] = load(folder / f"{section.name}.json")
     quick = any(results.quick for results in measured.values())
     parts = [f"{_HEADING} of a quick run" if quick else _HEADING, *_headlines(measured)]
-    for results in list(measured.values())[:1]:
-        machine = {**results.machine, "pebble": results.pebble}
-        parts.append(_table(("the machine", ""), [(name, str(value or "–")) for name, value in machine.items()]))
     for section in SECTIONS:
-        parts += _section(section, folder, measured.get(section.name))
-    return "\n\n".join([*parts, "## What these numbers do not show", "\n".join(f"* {line}" for line in _LIMITS)]) + "\n"
+        if (output := folder / f"{section.name}.txt").exists():
+            parts += [f"## {section.title}", *_about(section, measured.get(section.name))]
+            parts += [f"![{path.stem}]({path.name})" for path in sorted(folder.glob(f"{section.name}*.png"))]
+            parts.append("\n".join(["```text", output.read_text(errors="replace").rstrip(), "```"]))
+    return "\n\n".join(parts) + "\n"
+
+
+def _about(section: Section, results: Results | None) -> Iterator[str]:
+    if results is None:
+        yield "**It failed, and left no results.**"
+        return
+    yield f"    pebble {' '.join(section.command(results.quick))}"
+    incomplete = "" if results.complete else " **Something could not be measured.**"
+    machine = ", ".join(f"{name} {value}" for name, value in results.machine.items() if value)
+    yield f"Started {results.began}, {_span(results.took_s)}, by pebble {results.pebble}; {machine}.{incomplete}"
 
 
 def _headlines(measured: Mapping[str, Results]) -> Iterator[str]:
@@ -188,48 +190,10 @@ def _headlines(measured: Mapping[str, Results]) -> Iterator[str]:
         cells = [results.find(variant, headline.measure, **headline.params) for variant in headline.variants]
         if not any(cells):
             continue
-        shown = [
-            middle(one) if not headline.figure or one is None else digits(one.middle(headline.figure)) for one in cells
-        ]
         _, mqtt, zenoh = cells
-        unit = "%" if headline.figure else next((one.unit for one in cells if one), "")
-        rows.append((headline.what, unit.replace("us", "µs"), *shown, "" if headline.figure else compared(zenoh, mqtt)))
+        unit = next(cell.unit for cell in cells if cell).replace("us", "µs")
+        rows.append((headline.what, unit, *map(middle, cells), compared(zenoh, mqtt)))
     if rows:
-        yield _table(("median", "unit", STAND_IN, "mqtt", "zenoh", "zenoh / mqtt"), rows)
+        heads = ("median", "unit", STAND_IN, "mqtt", "zenoh", "zenoh / mqtt")
+        yield "\n".join(f"| {' | '.join(line)} |" for line in (heads, ["---"] * len(heads), *rows))
         yield f"The {STAND_IN} is plain paho in place of the original, or as the row says. {RATIOS}"
-
-
-def _section(section: Section, folder: Path, results: Results | None) -> Iterator[str]:
-    output = folder / f"{section.name}.txt"
-    if not output.exists():
-        return
-    lines = output.read_text(errors="replace").rstrip().splitlines()
-    yield f"## {section.title}"
-    yield (
-        import_module(f"pebble.extensions.lab.bench.{_MODULES.get(section.name, section.name)}").__doc__ or ""
-    ).strip()
-    if results is None:
-        yield "**It failed, and left no results.**"
-    else:
-        yield f"    pebble {' '.join(_command(section, results.quick))}"
-        incomplete = "" if results.complete else " **Something could not be measured.**"
-        yield f"Started {results.began[:10]} {results.began[11:16]} UTC, {_span(results.took_s)}.{incomplete}"
-    yield from (f"![{path.stem}]({path.name})" for path in sorted(folder.glob(f"{section.name}*.png")))
-    shown = [line.rstrip() for line in lines if not line.startswith(_NOT_THE_TABLE)]
-    yield "\n".join(["```text", *shown, "```"])
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = (" | ".join(line) for line in (heads, ["---"] * len(heads), *rows))
-    return "\n".join(f"| {line} |" for line in lines)
-
-
-_LIMITS: Final = (
-    "One machine. Intervals are over the rounds of one run; another run, kernel or load changes medians by more.",
-    "No radio: all went over loopback and veth pairs.",
-    "No second machine: brokers, operators and the measuring programs compete with the robot for the same cores.",
-    "No Raspberry Pi: its cores are slower, and throttle when hot. Ratios between variants transfer better than times.",
-    "No camera, microphone and hardware encoder: real pictures and sounds are noisier than ours, which costs bytes.",
-    "No MCU: its serial line is a pty without a baud rate; at 115,200 baud a command takes another 1.3 ms.",
-    "No other language than Python, no TLS, no large network, and no long run.",
-)

@@ -25,7 +25,6 @@ from pebble.version import __version__
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-FORMAT: Final = 2
 STAND_IN: Final = "stand-in"  # for the original: plain programs with stock paho, see stand_in.py
 _PACKAGES = ("eclipse-zenoh", "paho-mqtt", "numpy", "opencv-python-headless", "av", "msgspec")
 _DIGITS = 3  # decimal places of a sample
@@ -100,7 +99,6 @@ class Results(msgspec.Struct, kw_only=True):
     """One run of one comparison."""
 
     bench: str
-    format: int = FORMAT
     pebble: str = __version__
     options: dict[str, object] = {}
     machine: dict[str, Value] = {}
@@ -128,12 +126,9 @@ def load(path: Path) -> Results:
     """Read results. Raises PebbleError if the file holds none."""
     try:
         with named(path):
-            results = msgspec.json.decode(path.read_bytes(), type=Results)
+            return msgspec.json.decode(path.read_bytes(), type=Results)
     except msgspec.DecodeError as error:
         raise PebbleError(f"{path} holds no results of pebble bench: {error}") from None
-    if results.format != FORMAT:
-        raise PebbleError(f"{path} has format {results.format}, this pebble reads {FORMAT}: measure again")
-    return results
 
 
 def begin(bench: str, settings: DataclassInstance) -> Results:

@@ -14,13 +14,12 @@ import itertools
 import json
 import sys
 import time
-from typing import Any
 
 import serial
-from paho.mqtt.client import Client, MQTTMessage
-from paho.mqtt.enums import CallbackAPIVersion
+from paho.mqtt.client import MQTTMessage
 
 from pebble.contract import DRIVE, INCOMING, ONLINE, OUTGOING, STATUS, TOUCH_SENSORS
+from pebble.extensions.lab.bench.clients import StockClient
 
 _BAUD = 460_800
 _HEARTBEAT_S = 0.25  # as a robot of ours, so that both carry the same
@@ -30,29 +29,23 @@ _PIECE = 4096  # bytes
 _TOUCH = ("a0", "a1", "a2")
 
 
-def client(port: int, *filters: str) -> Any:
-    """Connected, on a thread of its own, and subscribed to ``filters`` with QoS 1."""
-    made: Any = Client(CallbackAPIVersion.VERSION2)
-    made.on_connect = lambda *_: made.subscribe([(filter_, 1) for filter_ in filters])
-    made.connect("127.0.0.1", port)
-    return made
-
-
 def bridge(remote_port: int, local_port: int, base: str) -> None:
     """Forwards commands to the local broker, everything else to the remote one; publishes heartbeats."""
-    remote, local = client(remote_port, f"{base}/{INCOMING}/#"), client(local_port, f"{base}/{OUTGOING}/#")
 
-    def forward(to: Client) -> Any:
-        return lambda _client, _data, one: to.publish(one.topic, one.payload, one.qos, one.retain)
+    def to_local(message: MQTTMessage) -> None:
+        local.paho.publish(message.topic, message.payload, message.qos, message.retain)
 
-    remote.on_message, local.on_message = forward(local), forward(remote)
-    for one in (remote, local):
-        one.loop_start()
-    state = {"value": {"services": {"bridge": {"state": "ready"}}}}
+    def to_remote(message: MQTTMessage) -> None:
+        remote.paho.publish(message.topic, message.payload, message.qos, message.retain)
+
+    remote = StockClient(to_local, [(f"{base}/{INCOMING}/#", 1)], at_once=False)
+    local = StockClient(to_remote, [(f"{base}/{OUTGOING}/#", 1)], at_once=False)
+    remote.open(remote_port)
+    local.open(local_port)
     for number in itertools.count():
         if number % _STATUS_EVERY == 0:
-            remote.publish(STATUS.topic(base), json.dumps(state), 1, True)
-        remote.publish(ONLINE.topic(base), json.dumps({"t": round(1000 * time.time())}), 1, True)
+            remote.send(STATUS, base, {"value": {"services": {"bridge": {"state": "ready"}}}})
+        remote.send(ONLINE, base, {"t": round(1000 * time.time())})
         time.sleep(_HEARTBEAT_S)
 
 
@@ -60,22 +53,19 @@ def serial_bridge(local_port: int, base: str, device: str, *, reports: bool) -> 
     """Writes a line for each drive command, and with ``reports`` publishes each one of the touch sensors."""
     port = serial.Serial(device, _BAUD, timeout=_READ_S)
 
-    def drive(_client: Client, _data: Any, message: MQTTMessage) -> None:
+    def drive(message: MQTTMessage) -> None:
         wanted = json.loads(message.payload)
         left, right = (max(-1.0, min(1.0, wanted["z"] + side * wanted["x"])) for side in (1, -1))
         port.write(b"M %.3f %.3f\n" % (left, right))
 
-    local = client(local_port, DRIVE.topic(base))
-    local.on_message = drive
-    local.loop_start()
+    local = StockClient(drive, [(DRIVE.topic(base), 1)], at_once=False).open(local_port)
     rest = b""
     while True:  # without pyserial's own readline, which reads byte by byte
         *lines, rest = (rest + port.read(max(1, min(port.in_waiting, _PIECE)))).split(b"\n")
         for line in lines if reports else ():
             fields = dict(token.split("=", 1) for token in line.decode().split() if "=" in token)
             if all(name in fields for name in _TOUCH):
-                touch = {name: int(fields[name]) for name in _TOUCH}
-                local.publish(TOUCH_SENSORS.topic(base), json.dumps({"value": touch}), TOUCH_SENSORS.default_qos)
+                local.send(TOUCH_SENSORS, base, {"value": {name: int(fields[name]) for name in _TOUCH}})
 
 
 if __name__ == "__main__":

@@ -84,7 +84,7 @@ def run(settings: Settings, console: Console) -> Shown:
     measure_rounds(results, 1, measure, console)
     results.complete = bool(robots)  # a robot without outages is no failure
     results.notes += _DIFFERENCES
-    return Shown(results, [media_table(robots), heartbeat_table(robots)], figures(robots))
+    return Shown(results, [media_table(robots)], figures(robots))
 
 
 def analysed(settings: Settings) -> Analysed:
@@ -165,17 +165,6 @@ def media_table(robots: Analysed) -> Table:
         shown = [("–", "–") if one is None else (f"{one.median_kbps:.2f}", f"{one.p95_kbps:.2f}") for one in here]
         table.add_row(name, "paper", *(f"{value:.2f}" for value in paper))
         table.add_row("", "here", *chain(*shown))
-    return table
-
-
-def heartbeat_table(robots: Analysed) -> Table:
-    """Return what the paper shows as distributions of heartbeats."""
-    table = plain_table("Heartbeats", ["robot", "heartbeats", "every ms", "outages", "latency p50", "p95 ms"])
-    for name, robot in robots.items():
-        if robot.interval_ms is not None and robot.latency is not None:
-            counts = (robot.latency.count, round(robot.interval_ms), len(robot.outages))
-            times = (robot.latency.median_ms, robot.latency.p95_ms)
-            table.add_row(name, *map(str, counts), *(f"{time_ms:.1f}" for time_ms in times))
     return table
 
 

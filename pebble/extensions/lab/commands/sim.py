@@ -13,7 +13,7 @@ from pebble.extensions.operator.commands.target import broker_of
 
 if TYPE_CHECKING:
     from pebble.config import Config
-    from pebble.extensions.lab.simulation.wireless import BrokerAddress
+    from pebble.transports import MqttSettings
 
 _SERIAL = ("goob", "fred", "goob_imu")
 _WIFI = ("minilamp", "benjr")
@@ -21,15 +21,12 @@ _NAMED = (*_WIFI, "world")
 #: The kinds that each option is for.
 _OF = {
     "link": _SERIAL,
-    "charging": ("goob", "fred"),
     "broker": (*_WIFI, "fleet"),
     "password_file": (*_WIFI, "fleet"),
     "ca_cert": (*_WIFI, "fleet"),
     "called": _WIFI,
     "files": _WIFI,
     "robots": ("fleet",),
-    "kinds": ("fleet",),
-    "seconds": ("fleet",),
     "folder": ("world",),
     "trace": (*_SERIAL, *_WIFI, "world"),
     "trace_output": _SERIAL,
@@ -50,7 +47,6 @@ def sim(
     link: Annotated[
         Path | None, typer.Option(help="Path of the serial port. [default: /tmp/pebble-KIND]", metavar="PATH")
     ] = None,
-    charging: Annotated[bool, typer.Option("--charging", help="Start with the charger connected.")] = False,
     broker: Annotated[
         str | None,
         typer.Option(
@@ -62,11 +58,6 @@ def sim(
         Path | None, typer.Option(help="Folder for the files of the board, which survive it.", metavar="FOLDER")
     ] = None,
     robots: Annotated[int, typer.Option("--robots", "-n", min=1, help="How many robots a fleet has.")] = 10,
-    kinds: Annotated[
-        list[str] | None,
-        typer.Option("--kind", help="Of the robots of a fleet; repeatable. [default: minilamp, benjr]"),
-    ] = None,
-    seconds: Annotated[float | None, typer.Option("--seconds", "-s", min=1, help="End a fleet after this.")] = None,
     folder: Annotated[
         Path | None, typer.Option(help="For a world's serial ports. [default: /tmp/pebble-world-…]", metavar="FOLDER")
     ] = None,
@@ -113,16 +104,14 @@ def sim(
         path = link or Path(tempfile.gettempdir(), f"pebble-{kind}")
         if not report:
             typer.echo(f"{kind} is at {path}; Ctrl-C ends it")
-        return run_mcu(
-            kind, path, trace=trace, trace_output=trace_output, charging=charging, report=report, control=control
-        )
+        return run_mcu(kind, path, trace=trace, trace_output=trace_output, report=report, control=control)
     if broker is None:
         raise typer.BadParameter(f"{kind} needs --broker URL")
-    address, config = _address(broker, password_file, ca_cert)
+    address, config = _broker(broker, password_file, ca_cert)
     if kind == "fleet":
-        from pebble.extensions.lab.simulation.fleet_program import run as run_fleet
+        from pebble.extensions.lab.simulation.networked import run_fleet
 
-        return run_fleet(address, robots, kinds, seconds=seconds)
+        return run_fleet(address, robots)
     return _wireless(kind, name, address, config, called, trace=trace, report=report, files=files)
 
 
@@ -169,7 +158,7 @@ def _check_words(kind: str, words: list[str]) -> None:
 def _wireless(
     kind: str,
     id_: str | None,
-    broker: BrokerAddress,
+    broker: MqttSettings,
     config: Config | None,
     called: str,
     *,
@@ -185,34 +174,19 @@ def _wireless(
         identity, security = Identity(config.robot.system, config.robot.type, id_ or config.robot.id), config.security
         called = called or config.robot.name or ""
     if not report:
-        typer.echo(f"{identity} connects to the broker at {broker}; Ctrl-C ends it")
+        typer.echo(f"{identity} connects to the broker at {broker.host}:{broker.port}; Ctrl-C ends it")
     return run(kind, identity, broker, name=called, security=security, trace=trace, report=report, files=files)
 
 
-def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> tuple[BrokerAddress, Config | None]:
+def _broker(broker: str, password_file: Path | None, ca_cert: Path | None) -> tuple[MqttSettings, Config | None]:
     """The broker that a URL or a config file names, and the config. Raises PebbleError."""
     from pebble.config import load
-    from pebble.extensions.lab.simulation.wireless import BrokerAddress
     from pebble.runtime.connections import LOCAL_RECONNECT_S, mqtt_settings
 
-    config = None
-    if "://" not in broker and not broker.startswith("zenoh:"):
-        config = load(Path(broker))
-        settings = mqtt_settings(config.local_mqtt, reconnect_max_s=LOCAL_RECONNECT_S)
-    else:
-        settings = broker_of("--broker", broker, password_file, ca_cert)
-    tls = settings.tls
-    return (
-        BrokerAddress(
-            host=settings.host,
-            port=settings.port,
-            username=settings.username,
-            password=settings.password,
-            tls=tls is not None,
-            ca=None if tls is None else tls.ca_cert,
-        ),
-        config,
-    )
+    if "://" in broker or broker.startswith("zenoh:"):
+        return broker_of("--broker", broker, password_file, ca_cert), None
+    config = load(Path(broker))
+    return mqtt_settings(config.local_mqtt, reconnect_max_s=LOCAL_RECONNECT_S), config
 
 
 def register(app: typer.Typer) -> None:

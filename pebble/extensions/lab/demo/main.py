@@ -98,12 +98,11 @@ class Demo:
     def play(self) -> list[str]:
         """Drive until the end; returns a line for each robot and each process that failed."""
         robots = list(self._testbed.robots.values())
-        addresses = f"Operator page: {self._page_url}   Broker: {self._broker_url}"
+        view = View(self._console, self._operator, robots, self._ending)
         try:
-            with View(self._console, self._operator, self._media, robots, self._ending, addresses) as view:
-                missing = self._wait_until_ready(view)
-                if not missing:
-                    self._drive(view)
+            missing = self._wait_until_ready(view)
+            if not missing:
+                self._drive(view)
             problems = self._testbed.unexpected_exits()
         finally:
             self._media.end()
@@ -165,8 +164,8 @@ class Demo:
         """Drive for the given time, and until the first round is complete; without a time once, then wait."""
         for_visitors = self._seconds is None
         self._operator.begin(f"the robots are yours: {self._page_url}" if for_visitors else "")
-        filmed = [robot.base for robot in self._testbed.robots.values() if robot.has_media]
-        self._media.begin(filmed, once=for_visitors)
+        if not for_visitors:  # a robot has one encoding for everybody: people choose theirs in the page
+            self._media.begin([robot.base for robot in self._testbed.robots.values() if robot.has_media])
         end = math.inf if self._seconds is None else time.monotonic() + self._seconds
         while not self._ending.wait(_POLL_S) and not self._testbed.unexpected_exits():
             if time.monotonic() > (end if self._operator.rounds else end + _SLOW_S):

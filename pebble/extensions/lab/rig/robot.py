@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
@@ -25,7 +25,6 @@ from pebble.extensions.lab.rig.processes import (
     MCUS,
     ROBOTS,
     Broker,
-    Each,
     Processes,
     Program,
     Wrap,
@@ -35,9 +34,6 @@ from pebble.extensions.lab.rig.processes import (
 )
 from pebble.extensions.lab.simulation.trace import Entry, complete_lines, read_trace
 from pebble.launcher.programs import programs
-
-if TYPE_CHECKING:
-    from pebble.extensions.lab.simulation.mcu import Snapshot
 
 KINDS = ("mqtt", "zenoh")
 NAME = "rover"
@@ -50,17 +46,16 @@ Config = Mapping[str, Any]
 class SimulatedRobot:
     """A robot on this machine, whose processes are among ``running``, and end with them.
 
-    ``entries()`` and ``mcu_reports`` are what its MCU measured, independent of telemetry.
+    ``entries()`` are what its MCU measured, independent of telemetry.
     """
 
     runs_on: str
-    has_media = has_imu = has_scripts = False
+    has_media = has_scripts = False
 
     def __init__(self, running: Processes, name: str, folder: Path) -> None:
         self.running, self.name, self.folder = running, name, folder
         self.base = Identity("pebble", "robots", name).base
         self.folder.mkdir(exist_ok=True)
-        self.mcu_reports: deque[Snapshot] = deque(maxlen=600)  # a minute
         self.programs: list[Program] = []  # all that were started for it
         self._trace, self._trace_read = folder / "trace.jsonl", 0
         self._entries: deque[Entry] = deque(maxlen=5_000)  # minutes of commands
@@ -71,22 +66,17 @@ class SimulatedRobot:
         self._entries.extend(msgspec.json.decode(line, type=Entry) for line in lines)
         return list(self._entries)
 
-    def _add(self, name: str, command: Sequence[str], kind: int, log: str, each: Each | None = None) -> Program:
-        self.programs.append(self.running.add(Program(name, command, self.folder / log, each), kind))
+    def _add(self, name: str, command: Sequence[str], kind: int, log: str) -> Program:
+        self.programs.append(self.running.add(Program(name, command, self.folder / log), kind))
         return self.programs[-1]
 
-    def _start_mcu(self, kind: str, *options: object, name: str = "MCU", each: Each | None = None) -> Program:
+    def _start_mcu(self, kind: str, *options: object, name: str = "MCU") -> Program:
         command = python("pebble.cli", "sim", kind, *options)
-        return self._add(f"{self.name}'s {name}", command, MCUS, f"{name}.log", each)
+        return self._add(f"{self.name}'s {name}", command, MCUS, f"{name}.log")
 
-    def _start_board(self, kind: str, port: Path, trace: Path, *options: object, **more: Any) -> Program:
+    def _start_board(self, kind: str, port: Path, trace: Path, *options: object, name: str = "MCU") -> Program:
         """An MCU on a pty."""
-        return self._start_mcu(kind, "--link", port, "--trace", trace, *options, **more)
-
-    def _collect(self, line: bytes) -> None:
-        from pebble.extensions.lab.simulation.mcu import Snapshot
-
-        self.mcu_reports.append(msgspec.json.decode(line, type=Snapshot))
+        return self._start_mcu(kind, "--link", port, "--trace", trace, *options, name=name)
 
 
 class Robot(SimulatedRobot):
@@ -172,13 +162,8 @@ class Robot(SimulatedRobot):
         """The end of the robot's log."""
         return self.launcher.tail()
 
-    def pids(self) -> list[int]:
-        """The process ids of the launcher, its children (including a hub), and the local broker, if there is one."""
-        own = [pid for program in self._started for pid in (program.pid, *children(program.pid))]
-        return own if self.local_broker is None else [*own, self.local_broker.pid]
-
     def processes(self) -> dict[str, int]:
-        """The same by name."""
+        """The process ids of the launcher, its children (including a hub), and the local broker, by their names."""
         names = {name[:15]: name for name in self._programs()}  # as long as they are in the kernel
         found = {"launcher": self.launcher.pid}
         for pid in children(self.launcher.pid):
@@ -202,17 +187,14 @@ class Robot(SimulatedRobot):
             raise PebbleError(f"{what}: {error}\n{self.log()}") from None
 
 
-def synthetic_media(camera: tuple[int, int, int], published: tuple[int, int, int]) -> dict[str, Config]:
-    """Services of a robot with a camera and a microphone; width, height and rate of what is captured and published."""
-    names = ("width", "height", "fps")
-    video = {"backend": "synthetic", **dict(zip(names, camera, strict=True))}
-    sizes = {f"publish_{name}": value for name, value in zip(names, published, strict=True)}
-    bridge = {"media": {"video_publisher": sizes}}
-    return {"mqtt_bridge": bridge, "av_daemon": {"video": video, "audio": {"source": "synthetic"}}}
-
-
-#: What most comparisons use.
-MEDIA = synthetic_media((640, 480, 15), (640, 480, 15))
+#: Services of a robot with a camera and a microphone.
+MEDIA: dict[str, Config] = {
+    "mqtt_bridge": {"media": {"video_publisher": {"publish_width": 640, "publish_height": 480, "publish_fps": 15}}},
+    "av_daemon": {
+        "video": {"backend": "synthetic", "width": 640, "height": 480, "fps": 15},
+        "audio": {"source": "synthetic"},
+    },
+}
 
 
 @contextmanager

@@ -17,8 +17,6 @@ from pebble.config.raw import deep_merge
 from pebble.errors import PebbleError
 from pebble.extensions.lab.rig.processes import HOST, OPERATORS, Processes, Program, python
 from pebble.extensions.lab.rig.robot import MEDIA, START_S, Config, Robot, SimulatedRobot
-from pebble.extensions.lab.simulation.mcu import Snapshot
-from pebble.extensions.lab.simulation.world.program import Snapshot as WorldSnapshot
 from pebble.extensions.lab.simulation.world.program import port_path, trace_path
 from pebble.extensions.media.sound_file import write_wav
 from pebble.extensions.operator.client.discovery import ALL_OUTGOING, Discovery
@@ -51,11 +49,11 @@ class LinuxRobot(Robot):
         own = _config(name)
         remote, folder = (HOST, running.broker_port), running.folder / name
         super().__init__(running, own["transport"]["kind"], remote, name=name, folder=folder)
-        self.has_imu, self.local_port = name == "goob", running.local_broker.port
+        self.local_port = running.local_broker.port
         self.voice = folder / "voice"  # where its loudspeaker records what it plays of operators' voices
         self._imu = folder / "imu"  # a serial port
         self.instances: dict[str, Config] = {}
-        if self.has_imu:
+        if name == "goob":
             self.instances["imu"] = {"protocol": "pebble_serial_v1", "serial": {"port": str(self._imu)}}
         self._own = own | {"services": own["services"] | {"av_daemon": {}}}
         raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
@@ -73,14 +71,14 @@ class LinuxRobot(Robot):
 
     def bring_up(self, ending: threading.Event) -> None:
         """Start the MCUs first, so that their ports exist, then the robot."""
-        if self.has_imu:
+        if "imu" in self.instances:
             mcu = self._start_board("goob_imu", self._imu, self.folder / "imu.jsonl", name="imu")
             mcu.wait_until(self._imu.exists, START_S, ending)
         self.prepare(ending)
         self.start(self.name, python("pebble.cli", "up", self.config))
 
     def _start_motors(self) -> Program:
-        return self._start_board(self.name, self.port, self._trace, "--report", each=self._collect)
+        return self._start_board(self.name, self.port, self._trace)
 
 
 class RoomRobot(LinuxRobot):
@@ -108,12 +106,7 @@ class RoomRobot(LinuxRobot):
         }
 
     def _start_motors(self) -> Program:
-        options = (self.room, "--folder", self.folder, "--trace", self.folder, "--report")
-        return self._start_mcu("world", *options, each=self._collect)
-
-    def _collect(self, line: bytes) -> None:
-        seen = msgspec.json.decode(line, type=WorldSnapshot)
-        self.mcu_reports.append(Snapshot(seen.ns, True, True, seen.robots[self.name]))
+        return self._start_mcu("world", self.room, "--folder", self.folder, "--trace", self.folder)
 
 
 def _config(name: str) -> Any:
@@ -132,10 +125,10 @@ class McuRobot(SimulatedRobot):
         self.runs_on, self._broker = _BOARDS[name], f"mqtt://{HOST}:{running.broker_port}"
         self._called = _config(name)["robot"]["name"]
 
-    def bring_up(self, ending: threading.Event) -> None:
+    def bring_up(self, _ending: threading.Event) -> None:
+        self._trace.touch()
         options = ("--name", self._called, "--broker", self._broker, "--trace", self._trace)
-        mcu = self._start_mcu(self.name, *options, "--report", each=self._collect)
-        mcu.wait_until(lambda: bool(self.mcu_reports), START_S, ending)
+        self._start_mcu(self.name, *options)
 
 
 class PageServer(Program):

@@ -35,7 +35,7 @@ DARK = Light(0.0, 0.0, 0.0)
 class BoardState:
     """State of a robot: wheel speeds in mm/s, and how far the wheels have turned in mm.
 
-    ``drive`` is −1..1 as commanded, ``motors`` as the pins drive them.
+    ``drive`` is −1..1, + = forward of the robot, ``motors`` as the pins drive them.
     """
 
     kind: str
@@ -49,8 +49,6 @@ class BoardState:
     light: Light
     volts: float
     charging: bool
-    commands: int
-    last_command: str
 
 
 class Body:
@@ -111,8 +109,7 @@ class Body:
             self._stale = False
             self._motors = self.forward(*self.outputs())
 
-    def state(self, drive: Pair | None = None, commands: int = 0, last_command: str = "") -> BoardState:
-        """Return the present state; without ``drive``, the motors' speeds count as commanded."""
+    def state(self) -> BoardState:
         self.advance()
         self._read_outputs()
         return BoardState(
@@ -122,13 +119,11 @@ class Body:
             right_mm_s=self.motion.right_mm_s,
             left_mm=self.motion.left_mm,
             right_mm=self.motion.right_mm,
-            drive=self._motors if drive is None else drive,
+            drive=self._motors,
             motors=self.outputs(),
             light=self.light(),
             volts=self.battery.volts,
             charging=self.battery.charging,
-            commands=commands,
-            last_command=last_command,
         )
 
     def outputs(self) -> Pair:
@@ -206,7 +201,7 @@ class Fred(TwoWheeled):
 
 
 class Minilamp(TwoWheeled):
-    """Two wheels and a pair of grousers, one cell."""
+    """Two wheels, one cell; what its grousers do is not simulated."""
 
     kind = "minilamp"
     cells = 1
@@ -214,10 +209,6 @@ class Minilamp(TwoWheeled):
     def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
         super().__init__(board, motion)
         self.measure_battery()
-
-    @property
-    def grousers(self) -> float:
-        return self.half_bridge(self.pins.GROUSERS)
 
 
 class Benjr(Body):

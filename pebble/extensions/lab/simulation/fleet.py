@@ -1,7 +1,11 @@
-"""Many simulated robots with Wi-Fi in one process and thread, each with its own board, firmware and connection."""
+"""Many simulated robots with Wi-Fi in one process and thread, each with its own board, firmware and connection.
+
+A robot has a turn at once when one of its sockets is ready, otherwise periodically.
+"""
 
 from __future__ import annotations
 
+import select
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -11,36 +15,44 @@ from typing import Any, Self
 from pebble.contract.identity import Identity
 from pebble.errors import ConfigError
 from pebble.extensions.lab.simulation.micropython.servers import LoopbackServers
-from pebble.extensions.lab.simulation.scheduler import Scheduler
-from pebble.extensions.lab.simulation.wireless import KINDS, BrokerAddress, WirelessRobot
+from pebble.extensions.lab.simulation.wireless import KINDS, WirelessRobot
+from pebble.transports import MqttSettings
 
 MOST = 1000
 _JOB_S = 0.1
 _OFFLINE_S = 2.0  # a robot that is offline for longer is reported
 _MOVING_S = 0.05  # period of a robot's turns while its motors run and its sockets are idle
+_EVENTS = select.EPOLLIN | select.EPOLLOUT | select.EPOLLET
+_GRAIN_S = 0.0005  # robots that are due within this time run now
+_LONGEST_S = 0.05
 
 
 class Fleet:
     """``add`` robots, then ``run`` them; leaving the context stops all motors and closes all connections."""
 
-    def __init__(self, broker: BrokerAddress) -> None:
+    def __init__(self, broker: MqttSettings) -> None:
         self.broker = broker
         self.robots: list[WirelessRobot] = []
-        self.servers = LoopbackServers()
-        self.scheduler = Scheduler(self.servers)
+        self._servers = LoopbackServers()
+        self._epoll = select.epoll()
+        self._due: list[float] = []  # by the robots' numbers
+        self._of: dict[int, int] = {}  # file descriptor to the number of its robot
+        self._servers_of = {sock.fileno(): sock for sock in self._servers.sockets}
+        for sock in self._servers.sockets:
+            self._epoll.register(sock, select.EPOLLIN)
 
     def add(self, kind: str, identity: Identity, *, moving_s: float = _MOVING_S, **options: Any) -> WirelessRobot:
         """Add a robot; its first turn is when the fleet runs."""
-        robot = WirelessRobot(kind, identity, self.broker, self.servers, moving_s=moving_s, **options)
+        robot = WirelessRobot(kind, identity, self.broker, self._servers, moving_s=moving_s, **options)
         self.robots.append(robot)
-        self.scheduler.add(robot)
+        self._due.append(0.0)
         return robot
 
     def run(self, keep_running: Callable[[], bool], job: Callable[[], None] = lambda: None) -> None:
         """Run while ``keep_running`` returns True; ``job`` is called ten times a second."""
         due = time.monotonic()
         while keep_running():
-            self.scheduler.run_once()
+            self._turn()
             if time.monotonic() >= due:
                 due = time.monotonic() + _JOB_S
                 job()
@@ -48,14 +60,38 @@ class Fleet:
     def close(self) -> None:
         for robot in self.robots:
             robot.stop()
-        self.scheduler.close()
-        self.servers.close()
+        self._epoll.close()
+        self._servers.close()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
+
+    def _turn(self) -> None:
+        """Wait for a ready socket or for the next robot that is due, and step those robots."""
+        wait = min(self._due, default=0.0) - time.monotonic()
+        for descriptor, _ in self._epoll.poll(min(_LONGEST_S, max(0.0, wait))):
+            if descriptor in self._servers_of:
+                self._servers.serve(self._servers_of[descriptor])
+            elif descriptor in self._of:
+                self._due[self._of[descriptor]] = 0.0
+        now = time.monotonic() + _GRAIN_S
+        for number, due in enumerate(self._due):
+            if due <= now:
+                self._step(number)
+
+    def _step(self, number: int) -> None:
+        robot, network = self.robots[number], self.robots[number].network
+        network.unread = False
+        robot.step()
+        for sock in network.new_sockets:  # closing a descriptor removes it from epoll; its number may be used again
+            if sock.fileno() >= 0:
+                self._of[sock.fileno()] = number
+                self._epoll.register(sock, _EVENTS)
+        network.new_sockets.clear()
+        self._due[number] = time.monotonic() + (0.0 if network.unread else robot.pause_s)
 
 
 class ConnectionReporter:
@@ -81,19 +117,17 @@ class ConnectionReporter:
             return
         self._reported = what
         who = whose[0].identity.id if len(whose) == 1 else f"{len(whose)} robots"
-        where = f"the broker at {whose[0].broker}"
+        where = f"the broker at {whose[0].broker.host}:{whose[0].broker.port}"
         goes_on = "it keeps trying" if len(whose) == 1 else "they keep trying"
         self._report(
             f"{who}: connected to {where}" if what == "online" else f"{who}: cannot reach {where}: {what}; {goes_on}"
         )
 
 
-def members(count: int, kinds: Sequence[str] = KINDS) -> Iterator[tuple[str, Identity]]:
+def members(count: int) -> Iterator[tuple[str, Identity]]:
     """Kind and identity of each robot of a fleet, alternating the kinds: minilamp-001, benjr-001, minilamp-002, …"""
     if not 1 <= count <= MOST:
         raise ConfigError(f"a fleet has 1 to {MOST} robots, not {count}")
-    if unknown := [kind for kind in kinds if kind not in KINDS]:
-        raise ConfigError(f"unknown simulated robot with Wi-Fi {unknown[0]!r}; known: {', '.join(KINDS)}")
     for number in range(count):
-        kind = kinds[number % len(kinds)]
-        yield kind, Identity("pebble", "robots", f"{kind}-{number // len(kinds) + 1:03d}")
+        kind = KINDS[number % len(KINDS)]
+        yield kind, Identity("pebble", "robots", f"{kind}-{number // len(KINDS) + 1:03d}")

@@ -12,13 +12,12 @@ from typing import Final
 
 from pebble.extensions.lab.simulation.motion import TRACK_MM, RobotMotion
 
-_SMPLRT_DIV, _GYRO_CONFIG, _ACCEL_CONFIG = 0x19, 0x1B, 0x1C
-_INT_STATUS, _ACCEL_XOUT_H, _PWR_MGMT_1, _WHO_AM_I = 0x3A, 0x3B, 0x6B, 0x75
-_SLEEP, _RESET, _DATA_READY = 0x40, 0x80, 0x01
+_GYRO_CONFIG, _ACCEL_CONFIG, _ACCEL_XOUT_H, _PWR_MGMT_1, _WHO_AM_I = 0x1B, 0x1C, 0x3B, 0x6B, 0x75
+_SLEEP = 0x40
 _G_MM_S2: Final = 9806.65
 _ACCEL_LSB_PER_G, _GYRO_LSB_PER_DPS = 16_384.0, 131.0  # at the smallest range; each further range halves them
 _ACCEL_NOISE_G, _GYRO_NOISE_DPS = 0.004, 0.05  # rms with the low-pass filter at 94 Hz
-_WARM_C, _WARMING_C, _WARMING_S = 31.0, 7.0, 120.0  # it heats itself
+_CELSIUS = 31.0  # it heats itself
 
 Vector = tuple[float, float, float]
 
@@ -41,15 +40,9 @@ class Mpu6050:
         self.bias_dps = bias_dps
         self._now, self._motion = now, motion
         self._noise = random.Random(seed)  # noqa: S311 - repeatable
-        self._powered_at = now()
         self._moved_at, self._speed_mm_s = now(), 0.0
         self._pointer = 0
-        self._registers = bytearray()
-        self.reset()
-
-    def reset(self) -> None:
-        """Return to the state after power on: asleep, at the smallest ranges."""
-        self._registers = bytearray(128)
+        self._registers = bytearray(128)  # asleep, at the smallest ranges
         self._registers[_PWR_MGMT_1] = _SLEEP
         self._registers[_WHO_AM_I] = 0x68
 
@@ -60,15 +53,11 @@ class Mpu6050:
             return
         self._pointer = data[0]
         for offset, value in enumerate(data[1:]):
-            register = (data[0] + offset) % 128
-            if register == _PWR_MGMT_1 and value & _RESET:
-                self.reset()
-            elif register != _WHO_AM_I:
+            if (register := (data[0] + offset) % 128) != _WHO_AM_I:
                 self._registers[register] = value
 
     def read(self, count: int) -> bytes:
         if not self._registers[_PWR_MGMT_1] & _SLEEP:
-            self._registers[_INT_STATUS] = _DATA_READY
             self._registers[_ACCEL_XOUT_H : _ACCEL_XOUT_H + 14] = self._sample()
         got = bytes(self._registers[(self._pointer + offset) % 128] for offset in range(count))
         self._pointer = (self._pointer + count) % 128
@@ -84,7 +73,7 @@ class Mpu6050:
         return struct.pack(
             ">7h",
             *(_int16((part + self._noise.gauss(0.0, _ACCEL_NOISE_G)) * per_g) for part in accel),
-            _int16((self._celsius() - 36.53) * 340.0),
+            _int16((_CELSIUS - 36.53) * 340.0),
             *(_int16((part + self._noise.gauss(0.0, _GYRO_NOISE_DPS)) * per_dps) for part in gyro),
         )
 
@@ -111,9 +100,6 @@ class Mpu6050:
         ahead = (speed - self._speed_mm_s) / seconds / _G_MM_S2 if seconds > 0.0 else 0.0
         self._moved_at, self._speed_mm_s = now, speed
         return ahead, speed * turn_rad_s / _G_MM_S2, math.degrees(turn_rad_s)
-
-    def _celsius(self) -> float:
-        return _WARM_C - _WARMING_C * math.exp(-(self._now() - self._powered_at) / _WARMING_S)
 
 
 def _int16(value: float) -> int:

@@ -1,7 +1,8 @@
 """A loudspeaker in software: takes aplay's arguments, plays in real time, and records what was played.
 
 ``python -m pebble.simulation.loudspeaker FILE.wav`` plays a file, ``… -t raw -f S16_LE -c CHANNELS -r RATE -`` what
-comes from standard input. Each playback adds a ``begin`` and an ``end`` to FOLDER/events.jsonl, and a WAV file.
+comes from standard input. With ``--record FOLDER`` each playback is a WAV file there, and two lines of events.jsonl: as
+it began, and as it ended.
 """
 
 import argparse
@@ -14,7 +15,7 @@ import wave
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import BinaryIO
 
 import msgspec
 
@@ -26,39 +27,26 @@ _EVENTS = "events.jsonl"
 _BUSY = "loudspeaker: audio open error: Device or resource busy"
 
 
-class Event(msgspec.Struct, frozen=True, omit_defaults=True):
-    """``ns`` is time.monotonic_ns() when the first sample was played, or the last one. ``file`` is ``-`` for raw sound.
+class Playback(msgspec.Struct, omit_defaults=True):
+    """One sound that was played; times are those of time.monotonic_ns(), of the first sample and the last.
 
-    ``recording`` is the WAV file in the same folder; ``seconds`` were played until the end; ``stopped``: by a signal.
+    ``file`` is ``-`` for raw sound, ``recording`` the path of the WAV file. ``ended_ns`` is None while it plays, and
+    if its player was killed; ``stopped``: by a signal.
     """
 
-    ns: int
-    event: Literal["begin", "end"]
     pid: int
     file: str
     rate: int
     channels: int
     recording: str
+    began_ns: int
+    ended_ns: int | None = None
     seconds: float = 0.0
     stopped: bool = False
 
-
-class Playback(msgspec.Struct, frozen=True):
-    """One sound that was played. ``ended_ns`` is None while it plays, and if its player was killed."""
-
-    file: str
-    began_ns: int
-    ended_ns: int | None
-    seconds: float
-    stopped: bool
-    rate: int
-    channels: int
-    recording: Path
-    pid: int
-
     def frames(self) -> bytes:
         """The samples that were played so far, interleaved as in a WAV file."""
-        with wave.open(str(self.recording), "rb") as file:
+        with wave.open(self.recording, "rb") as file:
             return file.readframes(file.getnframes())
 
 
@@ -66,23 +54,8 @@ def playbacks(folder: Path) -> list[Playback]:
     """The playbacks that a loudspeaker recorded in ``folder``, oldest first."""
     path = folder / _EVENTS
     lines = complete_lines(path)[0] if path.exists() else []
-    events = [msgspec.json.decode(line, type=Event) for line in lines]
-    ends = {event.recording: event for event in events if event.event == "end"}
-    return [_playback(folder, event, ends.get(event.recording)) for event in events if event.event == "begin"]
-
-
-def _playback(folder: Path, begin: Event, end: Event | None) -> Playback:
-    return Playback(
-        file=begin.file,
-        began_ns=begin.ns,
-        ended_ns=None if end is None else end.ns,
-        seconds=0.0 if end is None else end.seconds,
-        stopped=end is not None and end.stopped,
-        rate=begin.rate,
-        channels=begin.channels,
-        recording=folder / begin.recording,
-        pid=begin.pid,
-    )
+    events = [msgspec.json.decode(line, type=Playback) for line in lines]
+    return list({event.recording: event for event in events}.values())  # the newest event of each, in its first place
 
 
 class _StoppedError(Exception):
@@ -105,58 +78,46 @@ class _Sound(msgspec.Struct):
 
 
 class _Recorder:
-    """Writes events and samples; without a folder, events to standard output."""
+    """Writes events and samples into a folder; without one nothing."""
 
     def __init__(self, sound: _Sound, folder: Path | None, resources: ExitStack) -> None:
-        self._sound, self._folder = sound, folder
-        self._name = f"{time.monotonic_ns():020}-{os.getpid()}.wav"
+        self._sound, self._folder, self._resources = sound, folder, resources
+        self._playback: Playback | None = None
         self._out: wave.Wave_write | None = None
-        self._resources = resources
-        self._begun = False
 
     def begin(self) -> None:
-        if self._folder is not None:
-            raw: BinaryIO = self._resources.enter_context((self._folder / self._name).open("wb", buffering=0))
-            self._out = self._resources.enter_context(wave.open(raw, "wb"))  # noqa: SIM115 - so it is
-            self._out.setnchannels(self._sound.channels)
-            self._out.setsampwidth(self._sound.width)
-            self._out.setframerate(self._sound.rate)
-            self._out.writeframes(b"")  # the header: the file can be read from now on
-        self._begun = True  # before it is written: a signal may come at any time
-        self._write("begin")
+        if self._folder is None:
+            return
+        sound, now = self._sound, time.monotonic_ns()
+        path = self._folder / f"{now:020}-{os.getpid()}.wav"
+        raw: BinaryIO = self._resources.enter_context(path.open("wb", buffering=0))
+        self._out = self._resources.enter_context(wave.open(raw, "wb"))  # noqa: SIM115 - so it is
+        self._out.setnchannels(sound.channels)
+        self._out.setsampwidth(sound.width)
+        self._out.setframerate(sound.rate)
+        self._out.writeframes(b"")  # the header: the file can be read from now on
+        self._playback = Playback(os.getpid(), sound.file, sound.rate, sound.channels, str(path), now)
+        self._write()
 
     def add(self, chunk: bytes) -> None:
         if self._out is not None:
             self._out.writeframes(chunk)
 
     def end(self, frames: int, *, stopped: bool) -> None:
-        if self._begun:
-            self._write("end", seconds=round(frames / self._sound.rate, 4), stopped=stopped)
+        if self._playback is not None:
+            self._playback.ended_ns, self._playback.stopped = time.monotonic_ns(), stopped
+            self._playback.seconds = round(frames / self._sound.rate, 4)
+            self._write()
 
-    def _write(self, event: Literal["begin", "end"], *, seconds: float = 0.0, stopped: bool = False) -> None:
-        sound = self._sound
-        written = Event(
-            time.monotonic_ns(),
-            event,
-            os.getpid(),
-            sound.file,
-            sound.rate,
-            sound.channels,
-            self._name,
-            seconds,
-            stopped,
-        )
-        line = msgspec.json.encode(written) + b"\n"
-        if self._folder is None:
-            os.write(sys.stdout.fileno(), line)
-            return
-        with (self._folder / _EVENTS).open("ab", buffering=0) as file:  # one write: players share the file
-            file.write(line)
+    def _write(self) -> None:
+        if self._folder is not None:
+            with (self._folder / _EVENTS).open("ab", buffering=0) as file:  # one write: players share the file
+                file.write(msgspec.json.encode(self._playback) + b"\n")
 
 
 def _play(sound: _Sound, recorder: _Recorder) -> bool:
     """Play in real time until the end or a signal; False if it was stopped."""
-    due, frames, size = 0.0, 0, sound.channels * sound.width
+    due, frames, size, stopped = 0.0, 0, sound.channels * sound.width, False
     try:
         for number, chunk in enumerate(sound.chunks()):
             if number == 0:
@@ -167,25 +128,26 @@ def _play(sound: _Sound, recorder: _Recorder) -> bool:
             due = max(due, time.monotonic() - _DELAY_LIMIT_S) + len(chunk) / size / sound.rate
             time.sleep(max(0.0, due - time.monotonic()))
     except _StoppedError:
-        _ignore_signals()
-        recorder.end(frames, stopped=True)
-        return False
-    _ignore_signals()
-    recorder.end(frames, stopped=False)
-    return True
+        stopped = True
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
+    recorder.end(frames, stopped=stopped)
+    return not stopped
 
 
 def main(arguments: list[str]) -> int:
     """Play as aplay would with these ``arguments``; the exit codes are aplay's, 1 after a signal, too."""
     options = _parser().parse_args(arguments)
-    signal.signal(signal.SIGTERM, _stop)
-    signal.signal(signal.SIGINT, _stop)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, _stop)
     folder: Path | None = options.record
     with ExitStack() as resources:
         try:
             if folder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
-                _lock(folder, exclusive=options.exclusive, resources=resources)
+            if folder is not None and options.exclusive:
+                device = resources.enter_context((folder / "device").open("ab"))
+                fcntl.flock(device, fcntl.LOCK_EX | fcntl.LOCK_NB)
             sound = _open(options, resources)
             complete = _play(sound, _Recorder(sound, folder, resources))
         except _StoppedError:
@@ -202,12 +164,8 @@ def main(arguments: list[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="pebble sim loudspeaker", description=__doc__)
     parser.add_argument("file", help="a WAV file, or - for standard input")
-    parser.add_argument(
-        "--record", type=Path, metavar="FOLDER", help="for events.jsonl and WAV files of what is played"
-    )
-    parser.add_argument(
-        "--exclusive", action="store_true", help="play one sound at a time, as a sound card without a mixer does"
-    )
+    parser.add_argument("--record", type=Path, metavar="FOLDER", help="for events.jsonl, and a WAV file of each sound")
+    parser.add_argument("--exclusive", action="store_true", help="play one sound at a time, as without a mixer")
     parser.add_argument("-t", "--file-type", choices=("wav", "raw"), default="wav")
     parser.add_argument("-f", "--format", choices=("S16_LE",), default="S16_LE")
     parser.add_argument("-c", "--channels", type=int, default=1)
@@ -228,20 +186,8 @@ def _open(options: argparse.Namespace, resources: ExitStack) -> _Sound:
     return _Sound(options.file, source.getframerate(), source.getnchannels(), source.getsampwidth(), source.readframes)
 
 
-def _lock(folder: Path, *, exclusive: bool, resources: ExitStack) -> None:
-    """Raises BlockingIOError while another player has an exclusive loudspeaker."""
-    file = resources.enter_context((folder / "device").open("ab"))
-    if exclusive:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
 def _stop(_number: int, _frame: object) -> None:
     raise _StoppedError
-
-
-def _ignore_signals() -> None:
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """A simulated serial MCU as a program, ``pebble sim goob --link /tmp/goob``."""
 
 import os
-import signal
 import sys
 import threading
 import time
@@ -13,9 +12,9 @@ import msgspec
 
 from pebble.extensions.lab.simulation.board import BoardState
 from pebble.extensions.lab.simulation.pty import PtyMcu
+from pebble.runtime.signals import EndSignal
 
 _REPORT_PERIOD_S = 0.1
-_SIGNALS = {signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +33,6 @@ def run(
     *,
     trace: Path | None = None,
     trace_output: bool = False,
-    charging: bool = False,
     report: bool = False,
     control: bool = False,
 ) -> int:
@@ -42,30 +40,20 @@ def run(
 
     ``report``: write a :class:`Snapshot` to standard output ten times a second. Raises PebbleError.
     """
-    signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # also in later threads; sigtimedwait below receives them
-    with PtyMcu(
-        kind,
-        link,
-        trace=trace,
-        trace_output=trace_output,
-        charging=charging,
-    ) as mcu:
+    end = EndSignal()
+    with PtyMcu(kind, link, trace=trace, trace_output=trace_output) as mcu:
         if control:
-            threading.Thread(target=_run_commands, args=(mcu,), name="pebble-sim control", daemon=True).start()
-        while signal.sigtimedwait(_SIGNALS, _REPORT_PERIOD_S) is None:
-            if report and not _report(mcu):
+            threading.Thread(target=_run_commands, args=(mcu, end), name="pebble-sim control", daemon=True).start()
+        while not end.wait(_REPORT_PERIOD_S):
+            if report and not write_line(Snapshot(time.monotonic_ns(), mcu.plugged, mcu.host, mcu.state())):
                 break
     return 0
 
 
-def _report(mcu: PtyMcu) -> bool:
-    return _write(msgspec.json.encode(Snapshot(time.monotonic_ns(), mcu.plugged, mcu.host, mcu.state())))
-
-
-def _write(line: bytes) -> bool:
-    """False if the reader of standard output has closed it."""
+def write_line(what: object) -> bool:
+    """Write a line of JSON to standard output; False if its reader has closed it."""
     try:
-        os.write(sys.stdout.fileno(), line + b"\n")
+        os.write(sys.stdout.fileno(), msgspec.json.encode(what) + b"\n")
     except BrokenPipeError:
         return False
     return True
@@ -79,12 +67,10 @@ def actions(mcu: PtyMcu) -> dict[str, Callable[[], None]]:
         "reset": mcu.reset,
         "charge": lambda: mcu.charge(True),
         "discharge": lambda: mcu.charge(False),
-        "disturb": lambda: mcu.disturb(True),
-        "undisturb": lambda: mcu.disturb(False),
     }
 
 
-def _run_commands(mcu: PtyMcu) -> None:
+def _run_commands(mcu: PtyMcu, end: EndSignal) -> None:
     known = actions(mcu)
     for line in sys.stdin:
         action = known.get(line.strip())
@@ -92,4 +78,4 @@ def _run_commands(mcu: PtyMcu) -> None:
             sys.stderr.write(f"unknown command {line.strip()}; known: {', '.join(known)}\n")
         else:
             action()
-    os.kill(os.getpid(), signal.SIGTERM)
+    end.set()

@@ -28,31 +28,22 @@ class Ground(Protocol):
         """The robot has been lifted, and put down there."""
 
 
-class EmptyGround:
-    """Nothing is in the way."""
-
-    def move(self, start: Pose, end: Pose) -> Pose:  # noqa: ARG002 - of the protocol
-        return end
-
-    def place(self, pose: Pose) -> None:
-        """Every place is free."""
-
-
 class RobotMotion:
     """Two wheels that follow their commanded speeds with a lag, and the resulting pose.
 
-    Where ``ground`` stops the robot, its wheels slip.
+    Where ``ground`` stops the robot, its wheels slip; without one nothing is in the way.
     """
 
     def __init__(self, pose: Pose | None = None, ground: Ground | None = None) -> None:
-        self.pose, self.ground = pose or Pose(), ground or EmptyGround()
+        self.pose, self.ground = pose or Pose(), ground
         self.left_mm_s = self.right_mm_s = 0.0
         self.left_mm = self.right_mm = 0.0  # distance of each wheel; reverse is negative
 
     def place(self, pose: Pose) -> None:
         """Lift the robot and put it down at ``pose``; its wheels do not notice."""
         self.pose = pose
-        self.ground.place(pose)
+        if self.ground is not None:
+            self.ground.place(pose)
 
     def advance(self, left: float, right: float, seconds: float) -> None:
         """Drive the motors at ``left`` and ``right`` (−1..1 of full speed) for ``seconds``."""
@@ -71,7 +62,7 @@ class RobotMotion:
             math.remainder(self.pose.heading_rad + turn, math.tau),
         )
         if end != self.pose:
-            self.pose = self.ground.move(self.pose, end)
+            self.pose = end if self.ground is None else self.ground.move(self.pose, end)
 
 
 def _follow(speed: float, wanted: float, seconds: float) -> tuple[float, float]:

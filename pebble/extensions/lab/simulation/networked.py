@@ -1,42 +1,28 @@
-"""A simulated MiniLAMP or BenJr as a program, ``pebble sim benjr --broker mqtt://HOST``."""
+"""Simulated robots with Wi-Fi as a program: ``pebble sim benjr --broker mqtt://HOST``, ``pebble sim fleet …``."""
 
 from __future__ import annotations
 
-import os
-import signal
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-
-import msgspec
 
 from pebble.config.security import Security
 from pebble.contract.identity import Identity
-from pebble.extensions.lab.simulation.fleet import ConnectionReporter, Fleet
-from pebble.extensions.lab.simulation.mcu import Snapshot
+from pebble.extensions.lab.simulation.fleet import ConnectionReporter, Fleet, members
+from pebble.extensions.lab.simulation.mcu import Snapshot, write_line
 from pebble.extensions.lab.simulation.trace import Trace, motors_entry
-from pebble.extensions.lab.simulation.wireless import BrokerAddress, Motors, WirelessRobot
+from pebble.extensions.lab.simulation.wireless import Motors
+from pebble.runtime.signals import EndSignal
+from pebble.transports import MqttSettings
 
 _MOVING_S = 0.01  # period of turns while motors run and sockets are idle
-
-
-class StopSignal:
-    """Records SIGTERM, SIGINT or SIGHUP, which interrupt nothing."""
-
-    def __init__(self) -> None:
-        self.received = False
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-            signal.signal(number, self._receive)
-
-    def _receive(self, *_: object) -> None:
-        self.received = True
+_STATUS_S = 10.0  # between lines of a fleet's status
 
 
 def run(
     kind: str,
     identity: Identity,
-    broker: BrokerAddress,
+    broker: MqttSettings,
     *,
     name: str = "",
     security: Security | None = None,
@@ -48,31 +34,53 @@ def run(
 
     ``name``: what people call it. ``security``: of its config; None: open.
     """
-    stop_signal = StopSignal()
-    record = Trace(trace)
+    end, record = EndSignal(), Trace(trace)
+
+    def on_motors(now: float, motors: Motors) -> None:
+        record.add(motors_entry(int(now * 1e9), motors))
+
     with Fleet(broker) as fleet:
         options = {"name": name, "security": security or Security(), "files": files}
-        robot = fleet.add(kind, identity, moving_s=_MOVING_S, on_motors=_recorder(record), **options)
+        robot = fleet.add(kind, identity, moving_s=_MOVING_S, on_motors=on_motors, **options)
         reporter = ConnectionReporter([robot], lambda line: print(line, file=sys.stderr, flush=True))  # noqa: T201
 
         def job() -> None:
             reporter.poll()
-            if report and not _report(robot):
-                stop_signal.received = True
+            where = robot.network.radio.connected, robot.online
+            if report and not write_line(Snapshot(time.monotonic_ns(), *where, robot.state())):
+                end.set()
 
-        fleet.run(lambda: not stop_signal.received, job)
+        fleet.run(lambda: not end.wait(0.0), job)
     record.close()
     return 0
 
 
-def _recorder(trace: Trace) -> Callable[[float, Motors], None]:
-    return lambda now, motors: trace.add(motors_entry(int(now * 1e9), motors))
+def run_fleet(broker: MqttSettings, robots: int) -> int:
+    """Run a fleet until a signal, and print its status. Raises PebbleError.
 
+    Returns 0 if all robots are online at the end.
+    """
+    end, due = EndSignal(), time.monotonic() + _STATUS_S
 
-def _report(robot: WirelessRobot) -> bool:
-    snapshot = Snapshot(time.monotonic_ns(), robot.network.radio.connected, robot.online, robot.state())
-    try:
-        os.write(sys.stdout.fileno(), msgspec.json.encode(snapshot) + b"\n")
-    except BrokenPipeError:  # the reader has closed the pipe
-        return False
-    return True
+    def show(line: str) -> None:
+        print(line, flush=True)  # noqa: T201
+
+    def status() -> str:
+        moving = sum(robot.moving for robot in fleet.robots)
+        return f"{sum(robot.online for robot in fleet.robots)} of {robots} online, {moving} moving"
+
+    def job() -> None:
+        nonlocal due
+        reporter.poll()
+        if time.monotonic() >= due:
+            due = time.monotonic() + _STATUS_S
+            show(status())
+
+    with Fleet(broker) as fleet:
+        for kind, identity in members(robots):
+            fleet.add(kind, identity)
+        reporter = ConnectionReporter(fleet.robots, show)
+        show(f"{robots} robots, {fleet.robots[0].identity.id} and so on; Ctrl-C ends it")
+        fleet.run(lambda: not end.wait(0.0), job)
+        show(status())
+        return int(not all(robot.online for robot in fleet.robots))

@@ -2,34 +2,27 @@
 
 import errno
 import os
-import queue
 import select
 import threading
 import time
 import tty
-from collections.abc import Callable
-from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Self
 
 from pebble.errors import DeviceError
 from pebble.extensions.lab.simulation.board import BoardState, SimulatedMcu
 from pebble.extensions.lab.simulation.bodies import Pair
-from pebble.extensions.lab.simulation.micropython.board import UID
 from pebble.extensions.lab.simulation.motion import Pose, RobotMotion
 from pebble.extensions.lab.simulation.trace import Entry, Event, Trace, motors_entry
 from pebble.runtime.lines import LineSplitter
-from pebble.transports.wakeup import WakeupPipe
 
 _NO_HOST_S = 0.005  # a master whose slave is closed is always "ready", so it is polled with this period
 _LATE_S = 0.03  # that a turn of the MCU may come after its time
-_ANSWER_S = 5.0
+_END_S = 5.0
 _CHUNK = 65_536
 _TRACED_LINE = 4096  # bytes; far longer than any line that the MCU accepts
-
-T = TypeVar("T")
 
 
 class _Recorder:
@@ -65,7 +58,7 @@ class PtyMcu:
 
     The symlink's folder must exist; only a symlink is replaced. Unplugging closes the pty but leaves the MCU powered:
     its motors stop by failsafe, as on a robot whose MCU is powered by the battery. Each replug makes a new pty behind
-    the same symlink. ``motion`` is where the robot stands, used by that thread alone. The file ``trace`` also has when
+    the same symlink. ``motion`` is where the robot stands, used by this object alone. The file ``trace`` also has when
     the MCU was late, and with ``trace_output`` the trace has the MCU's own lines that the host received.
     """
 
@@ -76,53 +69,38 @@ class PtyMcu:
         *,
         trace: Path | None = None,
         trace_output: bool = False,
-        failsafe_s: float | None = None,
-        charging: bool = False,
-        uid: bytes = UID,
         motion: RobotMotion | None = None,
     ) -> None:
         self.symlink = symlink
         self.trace = Trace(trace)
         self.dropped = 0  # bytes of the MCU that no host received
         self._traces_late = trace is not None
-        self._mcu = SimulatedMcu(
-            kind,
-            time.monotonic(),
-            failsafe_s=failsafe_s,
-            charging=charging,
-            uid=uid,
-            motion=motion,
-            on_motors=self._moved,
-        )
+        self._lock = threading.RLock()  # of everything below
+        self._mcu = SimulatedMcu(kind, time.monotonic(), motion=motion, on_motors=self._moved)
         self._tick_s = self._mcu.profile.tick_s
         self._recorder = _Recorder(self.trace, is_text=self._mcu.profile.is_text, output=trace_output)
         self._master: int | None = None
         self._tty = ""
         self._host = False
-        self._stopping = False
-        self._requests: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = queue.SimpleQueue()
-        self._wakeup = WakeupPipe()
+        self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"pebble-sim {kind}", daemon=True)
 
     def open(self) -> Self:
         """Power on and plug in; the port exists when this returns. Raises DeviceError if it cannot be created."""
-        self._thread.start()
         try:
             self.replug()
         except OSError as error:
-            self.close()
             raise DeviceError(f"cannot create a serial port at {self.symlink}: {error.strerror}") from None
+        self._thread.start()
         return self
 
     def close(self) -> None:
         """Unplug, remove the symlink and end the thread. The trace stays readable."""
-        if self._stopping:
-            return
         self.unplug()
-        self._call(self._stop)
-        self._thread.join(_ANSWER_S)
+        self._ending.set()
+        if self._thread.is_alive():
+            self._thread.join(_END_S)
         self.trace.close()
-        self._wakeup.close()
 
     def __enter__(self) -> Self:
         return self.open()
@@ -132,29 +110,51 @@ class PtyMcu:
 
     def unplug(self) -> None:
         """Close the pty and remove the symlink, as pulling the USB plug does."""
-        self._call(self._unplug)
+        with self._lock:
+            if self._master is None:
+                return
+            # another simulation may have replaced it
+            if self.symlink.is_symlink() and self.symlink.readlink() == Path(self._tty):
+                self.symlink.unlink()
+            os.close(self._master)
+            self._master, self._host = None, False
+            self._recorder.event("unplugged")
 
     def replug(self) -> None:
-        self._call(self._replug)
+        with self._lock:
+            if self._master is not None:
+                return
+            if self.symlink.exists() and not self.symlink.is_symlink():
+                raise FileExistsError(errno.EEXIST, "the path exists and is not a symlink")
+            new = self.symlink.with_name(self.symlink.name + ".new")
+            new.unlink(missing_ok=True)
+            master, slave = os.openpty()
+            tty.setraw(slave)  # at once: the terminal's echo would send the MCU its own reports as commands
+            os.set_blocking(master, False)
+            self._master, self._tty = master, os.ttyname(slave)
+            os.close(slave)
+            new.symlink_to(self._tty)
+            self._recorder.event("plugged")
+            new.replace(self.symlink)
 
     def reset(self) -> None:
         """Reboot the MCU, as its reset button does."""
-        self._call(lambda: self._mcu.boot(time.monotonic()))
+        with self._lock:
+            self._mcu.boot(time.monotonic())
 
     def charge(self, on: bool) -> None:
         """Put the robot on its charger, or take it off."""
-        self._call(lambda: setattr(self._mcu.battery, "charging", on))
-
-    def disturb(self, on: bool) -> None:
-        """Make the devices on the board's I2C bus fail, or work again."""
-        self._call(lambda: self._mcu.disturb(on))
+        with self._lock:
+            self._mcu.battery.charging = on
 
     def place(self, pose: Pose) -> None:
         """Lift the robot and put it down at ``pose``."""
-        self._call(lambda: self._mcu.motion.place(pose))
+        with self._lock:
+            self._mcu.motion.place(pose)
 
     def state(self) -> BoardState:
-        return self._call(self._mcu.state)
+        with self._lock:
+            return self._mcu.state()
 
     @property
     def plugged(self) -> bool:
@@ -165,38 +165,27 @@ class PtyMcu:
         """Whether a program has the port open."""
         return self._host
 
-    def _call(self, job: Callable[[], T]) -> T:
-        """Run ``job`` on the MCU's thread, the only one that uses the pty, and return its result."""
-        if not self._thread.is_alive():
-            raise DeviceError(f"the simulated MCU at {self.symlink} is not running")
-        answer: Future[T] = Future()
-        self._requests.put((answer, job))
-        self._wakeup.set()
-        return answer.result(_ANSWER_S)
-
     # -- the MCU's thread
 
     def _run(self) -> None:
         looked = time.monotonic()
-        while not self._stopping:
+        while not self._ending.is_set():
             self._wait()
-            before, looked = looked, time.monotonic()
-            if self._traces_late and looked - before > self._tick_s + _LATE_S:
-                self.trace.add(Entry(round(looked * 1e9), "late", f"{looked - before:.3f}"))
-            if self._master is not None:
-                self._poll_host(self._master)
-            self._transmit(self._mcu.tick(time.monotonic()))
-            self._run_requests()
+            with self._lock:
+                before, looked = looked, time.monotonic()
+                if self._traces_late and looked - before > self._tick_s + _LATE_S:
+                    self.trace.add(Entry(round(looked * 1e9), "late", f"{looked - before:.3f}"))
+                if self._master is not None:
+                    self._poll_host(self._master)
+                self._transmit(self._mcu.tick(time.monotonic()))
 
     def _wait(self) -> None:
-        """Wait for data from the host, for a request, or for the next tick."""
-        watched = [self._wakeup.fileno()]
+        """Wait for data from the host, or for the next tick."""
         if self._host and self._master is not None:
-            watched.append(self._master)
-        unasked = self._master is not None and not self._host
-        ready, _, _ = select.select(watched, [], [], min(self._tick_s, _NO_HOST_S) if unasked else self._tick_s)
-        if self._wakeup.fileno() in ready:
-            self._wakeup.clear()
+            with suppress(OSError, ValueError):  # it is unplugged meanwhile
+                select.select([self._master], [], [], self._tick_s)
+        else:
+            time.sleep(self._tick_s if self._master is None else min(self._tick_s, _NO_HOST_S))
 
     def _poll_host(self, master: int) -> None:
         poller = select.poll()
@@ -232,44 +221,6 @@ class PtyMcu:
                 sent = os.write(self._master, data)
         self.dropped += len(data) - sent
         self._recorder.sent(began, data[:sent], whole=sent == len(data))
-
-    def _run_requests(self) -> None:
-        with suppress(queue.Empty):
-            while True:
-                answer, job = self._requests.get_nowait()
-                try:
-                    answer.set_result(job())
-                except OSError as error:
-                    answer.set_exception(error)
-
-    def _replug(self) -> None:
-        if self._master is not None:
-            return
-        if self.symlink.exists() and not self.symlink.is_symlink():
-            raise FileExistsError(errno.EEXIST, "the path exists and is not a symlink")
-        new = self.symlink.with_name(self.symlink.name + ".new")
-        new.unlink(missing_ok=True)
-        master, slave = os.openpty()
-        tty.setraw(slave)  # at once: the terminal's echo would send the MCU its own reports as commands
-        os.set_blocking(master, False)
-        self._master, self._tty = master, os.ttyname(slave)
-        os.close(slave)
-        new.symlink_to(self._tty)
-        self._recorder.event("plugged")
-        new.replace(self.symlink)
-
-    def _unplug(self) -> None:
-        if self._master is None:
-            return
-        # another simulation may have replaced it
-        if self.symlink.is_symlink() and self.symlink.readlink() == Path(self._tty):
-            self.symlink.unlink()
-        os.close(self._master)
-        self._master, self._host = None, False
-        self._recorder.event("unplugged")
-
-    def _stop(self) -> None:
-        self._stopping = True
 
     def _moved(self, now: float, motors: Pair) -> None:
         self.trace.add(motors_entry(round(now * 1e9), motors))

@@ -3,7 +3,6 @@
 import hashlib
 import secrets
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +17,7 @@ from pebble.extensions.lab.simulation.micropython.modules.sockets import HostNet
 from pebble.extensions.lab.simulation.micropython.ports import OF_ROBOT
 from pebble.extensions.lab.simulation.micropython.runner import Runner
 from pebble.extensions.lab.simulation.micropython.servers import LoopbackServers
+from pebble.transports import MqttSettings
 
 KINDS: Final = ("minilamp", "benjr")
 
@@ -26,27 +26,6 @@ _CA_FILE = "/ca.der"
 _OPEN = Security()
 
 Motors = tuple[float, float]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BrokerAddress:
-    """Address and login of a robot's broker; ``ca`` (DER) or ``tls`` enables TLS."""
-
-    host: str
-    port: int
-    username: str | None = None
-    password: str | None = None
-    tls: bool = False
-    ca: Path | None = None
-
-    def __str__(self) -> str:
-        return f"{self.host}:{self.port}"
-
-    def settings(self) -> dict[str, Any]:
-        """Return the section ``mqtt`` of a private_config.json."""
-        login = {"username": self.username, "password": self.password}
-        tls: Any = {"ca": _CA_FILE} if self.ca is not None else self.tls
-        return {"host": self.host, "port": self.port, "tls": tls, **{k: v for k, v in login.items() if v is not None}}
 
 
 class WirelessRobot:
@@ -61,7 +40,7 @@ class WirelessRobot:
         self,
         kind: str,
         identity: Identity,
-        broker: BrokerAddress,
+        broker: MqttSettings,
         servers: LoopbackServers,
         *,
         name: str = "",
@@ -70,22 +49,19 @@ class WirelessRobot:
         moving_s: float = _MOVING_S,
         files: Path | None = None,
     ) -> None:
-        if kind not in KINDS:
-            raise ConfigError(f"unknown simulated robot with Wi-Fi {kind!r}; known: {', '.join(KINDS)}")
         self.kind, self.identity, self.broker, self.name = kind, identity, broker, name
         self._security = security.on_board()
         clock = RealClock()
         uid = hashlib.sha256(identity.base.encode()).digest()[:6]
-        self.network = HostNetwork(clock, platform=OF_ROBOT[kind].platform, routes=servers.routes, uid=uid)
+        self.network = HostNetwork(clock, platform=OF_ROBOT[kind].platform, routes=servers.routes)
         self.board = Board(clock, self.network, uid, seed=secrets.randbits(64))  # another one at each start
         self.board.files = Files(files)
         self.body = body_of(kind, self.board)
         self.body.on_motors = self._moved
         self._on_motors, self._moving_s = on_motors, moving_s
         self._motors: Motors = (0.0, 0.0)
-        self._power_is_cut = False
-        if broker.ca is not None:
-            self.board.files[_CA_FILE] = _read(broker.ca)
+        if broker.tls is not None and broker.tls.ca_cert is not None:
+            self.board.files[_CA_FILE] = _read(broker.tls.ca_cert)
         try:
             self._runner = Runner(self.board, kind, self._settings())
         except ValueError as error:  # settings that this firmware does not support
@@ -117,15 +93,8 @@ class WirelessRobot:
 
     def step(self) -> None:
         """Run one turn of the loop."""
-        if self._power_is_cut:
-            self._power_is_cut = False
-            self._runner.boot()
         self._runner.step()
         self.body.end_turn()
-
-    def cut_power(self) -> None:
-        """Switch the board off, and on again at its next turn: only its files survive. May be called in any thread."""
-        self._power_is_cut = True
 
     def stop(self) -> None:
         """Stop the motors and power off."""
@@ -140,7 +109,14 @@ class WirelessRobot:
         robot = {"system": self.identity.system, "type": self.identity.type, "id": self.identity.id, "name": self.name}
         wifi = {"ssid": "simulated", "password": "simulated"}
         security = {"security": self._security} if self._security else {}
-        return {"robot": robot, "wifi": wifi, "mqtt": self.broker.settings(), **security}
+        return {"robot": robot, "wifi": wifi, "mqtt": self._mqtt(), **security}
+
+    def _mqtt(self) -> dict[str, Any]:
+        """Return the section ``mqtt`` of a private_config.json."""
+        broker, tls = self.broker, self.broker.tls
+        login = {"username": broker.username, "password": broker.password} if broker.username is not None else {}
+        ca: Any = {"ca": _CA_FILE} if tls is not None and tls.ca_cert is not None else tls is not None
+        return {"host": broker.host, "port": broker.port, "tls": ca, **login}
 
     def _moved(self, now: float, motors: Motors) -> None:
         self._motors = motors

@@ -1,37 +1,18 @@
 """The bridge comparison without robots: matching of commands and reports, cells, turns."""
 
-import json
-from collections.abc import Sequence
-from typing import Any
-
-import pytest
-
-from pebble.extensions.lab.bench.bridge import COMMANDS, CPU, UNLOADED, cells_of
+from pebble.extensions.lab.bench.bridge import COMMANDS, UNLOADED, cells_of
 from pebble.extensions.lab.bench.bridge_operator import (
     SERVICES,
     Arrived,
     Turn,
     arrivals,
     matched,
-    wheels,
-    wheels_of,
 )
-from pebble.extensions.lab.bench.results import Cell, Results
-from pebble.extensions.lab.bench.rounds import add_round
 from pebble.extensions.lab.simulation.trace import Entry
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch
 
 MS = 1_000_000
 FORWARDER, SERIAL = PARTS = tuple(SERVICES)
-
-
-def test_every_command_makes_both_wheels_turn_and_is_identified_by_its_speeds() -> None:
-    assert len({wheels(number) for number in range(100_000)}) == 100_000, "none is like another for hours"
-    for number in range(0, 640_000, 997):
-        left, right = wheels(number)
-        assert 0.1 <= left < 0.9
-        assert 0.1 <= right < 0.9
-        assert wheels_of(json.dumps({"x": (left - right) / 2, "z": (left + right) / 2}).encode()) == (left, right)
 
 
 def test_a_command_counts_once_and_when_it_came_first() -> None:
@@ -67,39 +48,3 @@ def test_a_report_is_identified_by_values_that_occur_once() -> None:
     _, up, forwarded = cells_of("mqtt", UNLOADED, turn, Arrived({}, matched(trace, received), received))
     assert (up.samples, up.total("sent")) == ([2.0, 3.0], 3)
     assert forwarded.samples == [1000.0]  # us for each of the three that were received meanwhile
-
-
-def test_a_report_received_before_it_was_sent_is_another_one() -> None:
-    trace = [Entry(10 * MS, "said", "T a0=1 a1=2 a2=3")]
-    received = [(9 * MS, Touch(1, 2, 3)), (12 * MS, Touch(1, 2, 3)), (14 * MS, Touch(1, 2, 3))]
-    assert matched(trace, received) == [(10 * MS, 12 * MS)]
-
-
-# -- cells
-
-
-def joined(rounds: Sequence[Sequence[Cell]]) -> list[Cell]:
-    results = Results(bench="bridge")
-    for cells in rounds:
-        add_round(results, cells)
-    return results.cells
-
-
-def turn_of(down: Sequence[float] = (), up: Sequence[float] = (), sent: int = 1, **known: Any) -> tuple[Turn, Arrived]:
-    """A result with latencies in ms."""
-    turn = Turn(
-        **{"began": 0, "ended": MS, "sent": {wheels(number): 0 for number in range(sent)}, "cpu_s": {}, **known}
-    )
-    commands = {wheels(number): round(ms * MS) for number, ms in enumerate(down)}
-    reports: list[tuple[int, int | None]] = [(0, None)] if not up else [(0, round(ms * MS)) for ms in up]
-    return turn, Arrived(commands, reports, [])
-
-
-def test_cpu_is_divided_by_what_was_forwarded_in_each_turn() -> None:
-    parts = {FORWARDER: 0.007, SERIAL: 0.014}
-    all_, half, none = (
-        [*cells_of("mqtt", UNLOADED, *turn_of(count * [1.0], sent=count, cpu_s=parts))] for count in (70, 35, 0)
-    )
-    *_, bridge_, serial = joined([all_ + half, none])
-    assert (bridge_.measure, bridge_.unit, bridge_.params) == (CPU, "us", {"load": "none", "process": "bridge"})
-    assert [*bridge_.rounds, *serial.rounds] == [pytest.approx([100, 200]), [], pytest.approx([200, 400]), []]

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pebble.extensions.lab.bench.control_ends import (
     REPLIES,
     Connection,
-    EndInbox,
     Handler,
     Sender,
     Slice,
@@ -31,7 +30,7 @@ class Loop:
 
 def exchanged(loop: Loop, spec: SliceSpec) -> Slice:
     echo(loop.connection)
-    sender = Sender(loop.connection, EndInbox())
+    sender = Sender(loop.connection)
     assert sender.warm_up(2, 5.0)
     done = sender.run(spec)
     assert all(one.sent_ns <= one.echoed_ns <= one.received_ns for one in done.exchanges)

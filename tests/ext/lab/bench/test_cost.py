@@ -4,18 +4,18 @@ import pytest
 
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.lab.bench.clients import encoding_of
-from pebble.extensions.lab.bench.cost import ALL, CPU, IDLE, MEMORY, PER_PICTURE, THREADS, cells_of
+from pebble.extensions.lab.bench.cost import ALL, CPU, IDLE, MEMORY, THREADS, cells_of
 from pebble.extensions.lab.bench.results import Results
 from pebble.extensions.lab.bench.rounds import add_round
 
 
-def measured(*scales: float, pictures_hz: float | None = None) -> Results:
+def measured(*scales: float) -> Results:
     """One robot of three processes in each round."""
     results = Results(bench="cost")
     for scale in scales:
         each = {MEMORY: 10.0 * scale, CPU: 1.0 * scale, THREADS: 2.0}
         used = {name: dict.fromkeys(("launcher", "mqtt_bridge", "mosquitto"), value) for name, value in each.items()}
-        add_round(results, cells_of("mqtt", IDLE, used, pictures_hz))
+        add_round(results, cells_of("mqtt", IDLE, used))
     return results
 
 
@@ -30,11 +30,6 @@ def test_each_round_is_one_figure_of_one_robot_and_the_sum_is_over_its_processes
     assert rounds_of(results, MEMORY, "launcher") == [[10.0], [11.0]]
     assert rounds_of(results, MEMORY) == [[30.0], [pytest.approx(33.0)]]
     assert rounds_of(results, THREADS) == [[6], [6]]
-
-
-def test_a_picture_costs_the_cpu_time_of_the_whole_robot() -> None:
-    assert rounds_of(measured(2.0, pictures_hz=15.0), PER_PICTURE) == [[pytest.approx(60 / 15)]]
-    assert rounds_of(measured(2.0, pictures_hz=0.0), PER_PICTURE) == [[]]
 
 
 def test_encodings_are_distinguished() -> None:

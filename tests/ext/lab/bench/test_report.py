@@ -27,7 +27,7 @@ def test_a_foreign_document_is_not_overwritten(tmp_path: Path) -> None:
 def test_a_comparison_that_fails_does_not_stop_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both command lines are invalid; results of an earlier run must not hide that."""
     monkeypatch.setattr(report, "SECTIONS", PLAN)
-    monkeypatch.setattr(report, "_command", lambda section, _quick: ["bench", "nonsense", section.name])
+    monkeypatch.setattr(Section, "command", lambda section, _quick: ["bench", "nonsense", section.name])
     Results(bench="control").save(tmp_path / "control.json")
     console = Console(record=True, width=100)
     assert report.run(["control", "startup"], tmp_path, quick=True, console=console) == 1
@@ -39,7 +39,7 @@ def test_a_comparison_that_fails_does_not_stop_the_others(tmp_path: Path, monkey
 
 @pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.name)
 def test_every_command_line_is_one_that_exists(section: Section) -> None:
-    group, name, *options = report._command(section, quick=False)
+    group, name, *options = section.command(quick=False)
     assert group == "bench"
     command = typer.main.get_command(bench.app).commands[name]  # type: ignore[attr-defined]
     command.make_context(name, [*options, "--output", "somewhere"])

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import pytest
-
-from pebble.errors import PebbleError
-from pebble.extensions.lab.rig.processes import BROKERS, MCUS, OPERATORS, ROBOTS, Processes, Program, children
+from pebble.extensions.lab.rig.processes import BROKERS, MCUS, OPERATORS, ROBOTS, Processes, Program
 from tests.support import until
 
 ON_THREAD = """
@@ -53,20 +49,6 @@ def test_one_that_ended_by_itself_is_named_and_one_that_was_ended_is_not(tmp_pat
         assert processes.unexpected_exits() == [f"the hub ended unexpectedly: see {ended.log}"]
         processes.end(ended)
         assert processes.unexpected_exits() == []
-
-
-def test_what_cannot_be_started_leaves_no_process_and_no_folder() -> None:
-    class Broken(Processes):
-        def start(self) -> None:
-            self.worker("worker", "pebble.extensions.lab.rig.no_such_module")
-            self.broker()
-            raise PebbleError("no robot")
-
-    broken, before = Broken(), children(os.getpid())
-    with pytest.raises(PebbleError, match="no robot"), broken:
-        pass
-    assert not broken.folder.exists()
-    assert set(children(os.getpid())) <= set(before)
 
 
 def test_a_worker_on_a_thread_learns_that_its_input_has_closed() -> None:

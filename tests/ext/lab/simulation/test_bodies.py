@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from itertools import pairwise
-
 import pytest
 
 from pebble.extensions.lab.simulation.bodies import Benjr, Body, body_of
 from pebble.extensions.lab.simulation.micropython.board import Board
 from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
-from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, WHEEL_DIAMETER_MM, RobotMotion, hall
+from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S
 
 
 @pytest.fixture
@@ -55,18 +52,6 @@ def test_a_long_turn_reports_each_change_within_it(clock: VirtualClock) -> None:
     assert body.state().pose.x_mm == pytest.approx(2.0 * FULL_SPEED_MM_S, rel=0.01), "it rolled two seconds, not five"
 
 
-def test_a_reset_of_the_board_stops_bridges_but_not_a_shield(clock: VirtualClock) -> None:
-    lamp, walker = body_of("minilamp", Board(clock)), body_of("benjr", Board(clock))
-    assert isinstance(walker, Benjr)
-    drive(lamp, 1.0, 1.0)
-    walker.shield.write(b"\x10\x01\x27\x10")
-    walker.shield.write(b"\x00\x00\x03\xe8")
-    for body in (lamp, walker):
-        body.board.boot()
-    assert lamp.state().drive == (0.0, 0.0)
-    assert walker.state().drive == (1.0, 0.0)
-
-
 def test_benjrs_shield(clock: VirtualClock) -> None:
     body = body_of("benjr", Board(clock))
     assert isinstance(body, Benjr)
@@ -83,14 +68,3 @@ def test_benjrs_shield(clock: VirtualClock) -> None:
         assert body.outputs() == (0.0, -1.0)
     i2c.writeto(body.pins.MOTOR_SHIELD, b"\x10\x02\x27")
     assert body.outputs() == (0.0, -1.0), "three bytes are no message"
-
-
-def test_the_hall_sensors_see_five_waves_in_a_turn_of_a_wheel() -> None:
-    """Ten magnets, whose poles alternate: 10 extremes, 19.16 mm apart."""
-    motion = RobotMotion()
-    levels = []
-    for step in range(2001):
-        motion.left_mm = math.pi * WHEEL_DIAMETER_MM * step / 2000
-        levels.append(hall(motion)[0])
-    falling = [before >= 0.5 > after for before, after in pairwise(levels[:-1])]
-    assert sum(falling) == 5

@@ -22,7 +22,7 @@ def test_reading_more_than_there_is_would_hang(board: Board) -> None:
     with pytest.raises(WouldHang, match="waits for input"):
         sys.stdin.buffer.read(3)
     with pytest.raises(WouldHang):
-        board.firmware.module("select").poll().poll()
+        board.firmware.module("select").poll().poll(20)
 
 
 def test_timers_do_not_feed_the_watchdog(board: Board, clock: VirtualClock) -> None:
@@ -54,8 +54,5 @@ def test_a_host_that_does_not_read_costs_half_a_second_per_write(board: Board, c
     assert sys.stdout.buffer.write(bytes(300)) == 256
     assert (clock.now(), board.console.lost) == (1000.5, 44)
     assert poll.poll(0) == []
-    poll.poll(20)
-    assert clock.now() == pytest.approx(1000.52)
     assert board.take_output() == bytes(256)
-    assert poll.poll(20) == [(sys.stdout, select.POLLOUT)]
-    assert clock.now() == pytest.approx(1000.52)
+    assert poll.poll(0) == [(sys.stdout, select.POLLOUT)]

@@ -57,7 +57,6 @@ class VirtualNetwork:
         *,
         platform: Platform = "esp32",
         hosts: Mapping[str, str | Sequence[str]] = HOSTS,
-        uid: bytes = b"",
     ) -> None:
         self.clock, self.broker = clock, broker
         self.radio = Radio(clock.now, platform)
@@ -66,15 +65,14 @@ class VirtualNetwork:
         self.reads: list[Command] = []
         self.open: list[VirtualTcp | VirtualUdp] = []
         self.hosts: Mapping[str, str | Sequence[str]] = hosts
-        self._uid = uid
         self._wires: list[Wire] = []
 
     def modules(self) -> dict[str, Any]:
         """What a board has after power on or a reset: no socket, a radio that is off."""
         self.power_off()
         return {
-            "network": network_module(self.radio, self._uid),
-            "socket": socket_module(self.clock, self._socket),
+            "network": network_module(self.radio),
+            "socket": socket_module(self._socket),
             "ssl": ssl_module(),
         }
 
@@ -136,9 +134,6 @@ class _Virtual:
     def setblocking(self, blocking: bool) -> None:
         if blocking:
             raise WouldHang("a socket that waits: setblocking(False)")
-
-    def setsockopt(self, _level: int, _option: int, _value: Any) -> None:
-        """Nothing here depends on one."""
 
     def close(self) -> None:
         if self in self._network.open:
@@ -210,10 +205,6 @@ class VirtualUdp(_Virtual):
     def __init__(self, network: VirtualNetwork) -> None:
         super().__init__(network)
         self._answers: deque[tuple[float, bytes, Address]] = deque()
-        self._peer: Address | None = None
-
-    def bind(self, _place: Address) -> None:
-        """Nothing to do: answers come back to the port that asked."""
 
     def sendto(self, data: bytes, place: Address) -> int:
         self._need_wifi()

@@ -8,7 +8,6 @@ disappear, and so do the namespaces once they are empty.
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import signal
 import subprocess
@@ -16,11 +15,11 @@ import sys
 import weakref
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 from pebble.errors import PebbleError
-from pebble.extensions.lab.bench.impair.conditions import Condition, Shape
 from pebble.extensions.lab.rig.processes import Worker, end_all, python
 from pebble.extensions.lab.rig.worker_end import answer
 from pebble.extensions.operator.places import SBIN
@@ -35,6 +34,15 @@ _COMMAND_S = _ANSWER_S = 10.0
 
 CLONE_NEWNET = 0x40000000
 _TABLE = "table ip impair { chain arriving { type filter hook prerouting priority raw; }; }"
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """The network from the robot to its broker."""
+
+    name: str
+    kbit: float | None = None  # per second; None: no limit
+    loss: float = 0.0  # share of the packets
 
 
 class NamespaceNetwork(Worker):
@@ -64,14 +72,11 @@ class NamespaceNetwork(Worker):
             raise
 
     def apply(self, condition: Condition) -> None:
-        """Apply a condition. Connections stay."""
-        self._robot.apply(condition.up.kbit, condition.down.loss)
-        self._remote.apply(condition.down.kbit, condition.up.loss)
-
-    def bytes_up(self) -> int:
-        """Return what the robot has sent, with all headers; only differences mean something."""
-        (link,) = json.loads(self._robot.run("ip", "-s", "-j", "link", "show", "dev", _WIRE))
-        return int(link["stats64"]["tx"]["bytes"])
+        """Limit the rate at which the robot sends, and drop a share of what arrives from it. Connections stay."""
+        self._robot.batch("tc", f"qdisc replace dev {_WIRE} root {_queue(condition.kbit)}")
+        rule = f'iifname != "lo" numgen random mod 10000 < {round(condition.loss * 10000)} counter drop'
+        add = f"add rule ip impair arriving {rule}\n" if condition.loss else ""
+        self._remote.run("nft", "-f", "-", stdin=f"flush chain ip impair arriving\n{add}")
 
     def close(self) -> None:
         """May be called repeatedly."""
@@ -98,20 +103,12 @@ class _Side:
             f"link set {_WIRE} up",
         )
         self.run("nft", "-f", "-", stdin=_TABLE)
-        self.apply(None, 0.0)
-
-    def apply(self, kbit: float | None, loss: float) -> None:
-        """Limit the rate of outgoing packets, and drop a share of incoming ones."""
-        self.batch("tc", f"qdisc replace dev {_WIRE} root {_queue(kbit)}")
-        rule = f'iifname != "lo" numgen random mod 10000 < {round(loss * 10000)} counter drop'
-        add = f"add rule ip impair arriving {rule}\n" if loss else ""
-        self.run("nft", "-f", "-", stdin=f"flush chain ip impair arriving\n{add}")
 
     def batch(self, program: str, *lines: str) -> None:
         """Runs lines of ``ip`` or ``tc``."""
         self.run(program, "-batch", "-", stdin="".join(f"{line}\n" for line in lines))
 
-    def run(self, program: str, *arguments: str, stdin: str = "") -> str:
+    def run(self, program: str, *arguments: str, stdin: str = "") -> None:
         command, what = self.inside([program, *arguments]), f"{program} {' '.join(arguments)}"
         env = {**os.environ, "PATH": f"{os.environ.get('PATH', os.defpath)}:{SBIN}"}
         try:
@@ -120,7 +117,6 @@ class _Side:
             raise PebbleError(f"{what}: {error}") from None
         if done.returncode:
             raise PebbleError(f"{what}: {(done.stderr.strip() or f'code {done.returncode}').splitlines()[0]}")
-        return done.stdout
 
 
 def _queue(kbit: float | None) -> str:
@@ -135,11 +131,9 @@ def _queue(kbit: float | None) -> str:
 @cache
 def why_no_namespaces() -> str | None:
     """What prevents such networks; None: nothing. Tested with every feature a condition may use."""
-    everything = Shape(kbit=1000, loss=0.01)
     try:
         with closing(NamespaceNetwork("on trial")) as network:
-            network.apply(Condition("trial", everything, everything))
-            network.bytes_up()
+            network.apply(Condition("trial", kbit=1000, loss=0.01))
     except PebbleError as error:
         return str(error)
     return None

@@ -1,4 +1,4 @@
-"""The operator of one robot, on the broker's side of the network: drives, receives video, then audio, and plays a clip.
+"""The operator of one robot, on the broker's side of the network: drives, and receives video, then audio.
 
 As a process: ``python -m pebble.extensions.lab.bench.impair.operator HOST PORT BASE PLAN``, the plan as JSON. It
 reports when the robot is ready, then serves each line, ``trial`` or ``recover``, and ends when its standard input
@@ -18,22 +18,12 @@ from typing import Any
 
 import msgspec
 
-from pebble.contract import ONLINE, SOUNDBOARD_COMMAND, SOUNDBOARD_STATUS, STATUS, Channel, codec
+from pebble.contract import ONLINE, STATUS, Channel, codec
 from pebble.contract.payloads import Heartbeat as Online
-from pebble.contract.payloads import SoundboardCommand
 from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.lab.bench.bridge_operator import wheels
 from pebble.extensions.lab.bench.clients import all_ready, drive_of
-from pebble.extensions.lab.bench.impair.metrics import (
-    Arrival,
-    Command,
-    Heartbeat,
-    OperatorReport,
-    Plan,
-    Record,
-    Sound,
-    Window,
-)
+from pebble.extensions.lab.bench.impair.metrics import Arrival, Command, Plan, Report, Window, heard, seen
 from pebble.extensions.lab.bench.usage import wall_clock_ahead_ns
 from pebble.extensions.lab.rig.worker_end import answer, serve_on_thread
 from pebble.extensions.media.decode import Decoded
@@ -42,14 +32,12 @@ from pebble.extensions.operator.client.media_receiver import MediaReceiver
 from pebble.extensions.operator.client.media_request.offer import Medium
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.operator.client.scripted_operator import ScriptedOperator, paced
-from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
+from pebble.transports import Message, MqttSettings, State, Transport, create
 
-CLIP = "clip.wav"  # in the folder of the robot's soundboard
 _RATE_HZ = 10.0  # of drive commands
 _UP_S, _CONNECT_S, _KNOWN_S = 60.0, 10.0, 5.0
 _FIRST_S = 5.0  # the longest wait for a first picture or sound before the window begins
 _POLL_S = 0.05
-_HEARTBEATS_BEFORE = 12  # heartbeats by which an operator's page judges when a trial begins
 _FRESH_MS, _FRESH_HEARTBEATS, _STARTUP_S = 500, 3, 20.0
 
 
@@ -58,7 +46,7 @@ class MediaSubscriber(MediaReceiver):
 
     def __init__(self, transport: Transport, base: str) -> None:
         self.seen: list[Arrival] = []
-        self.received: list[Sound] = []
+        self.received: list[Arrival] = []
         super().__init__(transport, base)
 
     def on_picture(self, picture: Decoded) -> None:
@@ -67,7 +55,7 @@ class MediaSubscriber(MediaReceiver):
 
     def on_sound(self, received: ReceivedSound) -> None:
         now, seconds = time.monotonic_ns(), len(received.samples) / received.rate
-        self.received.append(Sound(monotonic_ns(received.captured_ms), now, seconds, received.sequence))
+        self.received.append(Arrival(monotonic_ns(received.captured_ms), now, seconds, received.sequence))
 
 
 class TrialOperator:
@@ -81,13 +69,11 @@ class TrialOperator:
         self._driver = ScriptedOperator(RobotView(base), self._publish, by="bench")
         self._number = 0
         self._commands: list[Command] = []
-        self._heartbeats: list[Heartbeat] = []
-        self._windows: dict[str, Window] = {}
+        self._heartbeats: list[Arrival] = []
         self._ready = False  # all services
-        self._clips: list[bool] = []  # of each status of the soundboard, whether a clip plays
         self._over_at = time.monotonic()
 
-    def open(self) -> None:
+    def open(self) -> Report:
         """Connects and waits until the robot is ready. Raises PebbleError without a broker or a robot."""
         for connection in (self._controls, self._media):
             connection.open(_CONNECT_S)
@@ -95,38 +81,35 @@ class TrialOperator:
                 raise PebbleError(f"the operator cannot connect to the broker: {connection.problem}")
         self._subscribe(ONLINE, self._on_heartbeat, retained=False)  # a retained heartbeat is not current
         self._subscribe(STATUS, self._on_status)
-        self._subscribe(SOUNDBOARD_STATUS, lambda status: self._clips.append(status.playing))
         if not _wait(lambda: self._ready and len(self._heartbeats) > 1, _UP_S):
             raise PebbleError(f"the robot is not ready after {_UP_S:.0f} s")
+        return Report()
 
-    def recover(self) -> None:
+    def recover(self) -> Report:
         """Waits until the network delivers no old messages. Raises PebbleError if the robot does not recover."""
         _pause(self._over_at + self._plan.quiet_s - time.monotonic())
         if not _wait(self._is_fresh, _STARTUP_S):
             raise PebbleError(f"no fresh heartbeat {_STARTUP_S:.0f} s after the network was restored")
+        return Report()
 
-    def run_trial(self) -> Record:
-        plan, first_heartbeat = self._plan, max(0, len(self._heartbeats) - _HEARTBEATS_BEFORE)
+    def run_trial(self) -> Report:
+        plan = self._plan
         self._commands.clear()
         enough = threading.Event()
         driver = threading.Thread(target=self._drive, args=(enough,), name="driver", daemon=True)
         driver.start()
-        self._measure_phase("alone", plan.alone_s)
-        with self._watch("video", plan.video) as viewed:
-            self._measure_phase("video", plan.window_s, viewed.poll)
-        self._measure_phase("video off", plan.off_s)
+        _pause(plan.alone_s)
+        with self._watch("video", plan.video) as viewer:
+            viewed = _pause(plan.window_s, viewer.poll)
+        _pause(plan.off_s)
         with self._watch("audio", plan.audio) as listener:
-            self._measure_phase("audio", plan.window_s, listener.poll)
+            listened = _pause(plan.window_s, listener.poll)
             enough.set()
             _pause(plan.grace_s, listener.poll)
         driver.join()
-        self._measure_phase("audio off", plan.off_s)
-        clip_ns = self._play_clip()
         self._over_at = time.monotonic()
-        return Record(
-            commands=list(self._commands), heartbeats=self._heartbeats[first_heartbeat:], pictures=viewed.seen,
-            sounds=listener.received, windows=self._windows, clip_ns=clip_ns,
-        )  # fmt: skip
+        sound, video = heard(listener.received, listened), seen(viewer.seen, viewed)
+        return Report(commands=self._commands, heard=sound, seen=video)
 
     # -- phases
 
@@ -138,27 +121,11 @@ class TrialOperator:
         _wait(lambda: bool(subscriber.seen or subscriber.received), _FIRST_S, subscriber.poll)
         return closing(subscriber)
 
-    def _play_clip(self) -> int:
-        """Commands it, and waits until it was played to its end, as far as the statuses arrive."""
-        self._clips.clear()
-        sent_ns = time.monotonic_ns()
-        payload = codec.encode(SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file=CLIP))
-        self._controls.publish(SOUNDBOARD_COMMAND.topic(self._base), payload, qos=QoS.DELIVERED)
-        _wait(lambda: True in self._clips and not self._clips[-1], self._plan.clip_s)
-        return sent_ns
-
-    def _measure_phase(self, phase: str, seconds: float, meanwhile: Callable[[], None] = lambda: None) -> None:
-        _write(OperatorReport(phase=phase))
-        began = time.monotonic_ns()
-        _pause(seconds, meanwhile)
-        self._windows[phase] = Window(began, time.monotonic_ns())
-        _write(OperatorReport(phase=""))
-
     def _is_fresh(self) -> bool:
         newest = self._heartbeats[-_FRESH_HEARTBEATS:]
         since_ns = time.monotonic_ns() - 2_000_000 * _FRESH_MS
         return len(newest) == _FRESH_HEARTBEATS and all(
-            heartbeat.online and heartbeat.ms < _FRESH_MS and heartbeat.arrived_ns > since_ns for heartbeat in newest
+            heartbeat.ms < _FRESH_MS and heartbeat.arrived_ns > since_ns for heartbeat in newest
         )
 
     # -- the driver's thread
@@ -184,8 +151,8 @@ class TrialOperator:
         self._controls.subscribe(channel.topic(self._base), on_message)
 
     def _on_heartbeat(self, heartbeat: Online) -> None:
-        sent_ns, now_ns = monotonic_ns(heartbeat.t), time.monotonic_ns()
-        self._heartbeats.append(Heartbeat(sent_ns, now_ns, heartbeat.online is not False))
+        if heartbeat.online is not False:
+            self._heartbeats.append(Arrival(monotonic_ns(heartbeat.t), time.monotonic_ns()))
 
     def _on_status(self, status: Any) -> None:
         self._ready = all_ready(status.value)
@@ -200,8 +167,11 @@ def _wait(condition: Callable[[], bool], seconds: float, meanwhile: Callable[[],
     return met
 
 
-def _pause(seconds: float, meanwhile: Callable[[], None] = lambda: None) -> None:
+def _pause(seconds: float, meanwhile: Callable[[], None] = lambda: None) -> Window:
+    """Wait for so long; returns when."""
+    began_ns = time.monotonic_ns()
     _wait(lambda: False, seconds, meanwhile)
+    return Window(began_ns, time.monotonic_ns())
 
 
 def monotonic_ns(epoch_ms: int) -> int:
@@ -209,20 +179,17 @@ def monotonic_ns(epoch_ms: int) -> int:
     return epoch_ms * 1_000_000 - wall_clock_ahead_ns()
 
 
-def _write(report: OperatorReport) -> None:
-    answer(msgspec.json.encode(report))
-
-
 def main(host: str, port: str, base: str, plan: str) -> None:
     lines: queue.SimpleQueue[str] = queue.SimpleQueue()
     serve_on_thread(lines.put, lambda: os._exit(0))  # also during a trial
     operator = TrialOperator(host, int(port), base, msgspec.json.decode(plan, type=Plan))
-    act: Callable[[], Record | None] = operator.open
+    act = operator.open
     while True:
         try:
-            _write(OperatorReport(record=act()))
+            report = act()
         except PebbleError as error:
-            _write(OperatorReport(problem=str(error)))
+            report = Report(problem=str(error))
+        answer(msgspec.json.encode(report))
         act = operator.run_trial if lines.get() == "trial" else operator.recover
 
 

@@ -1,34 +1,35 @@
 """A simulated MicroPython board: the real firmware files on simulated pins, bus, console and clock."""
 
-import array
 import binascii
-import collections
 import errno
 import hashlib
-import io
 import json
 import math
+import random
 import struct
-from pathlib import Path
 from typing import Any, Final, Protocol
 
 from pebble.extensions.lab.simulation.micropython.clock import Clock
-from pebble.extensions.lab.simulation.micropython.hardware import UID as UID
-from pebble.extensions.lab.simulation.micropython.hardware import Hardware
+from pebble.extensions.lab.simulation.micropython.console import Console
+from pebble.extensions.lab.simulation.micropython.faults import WouldHang
+from pebble.extensions.lab.simulation.micropython.files import Files
+from pebble.extensions.lab.simulation.micropython.i2c import Bus, Device
 from pebble.extensions.lab.simulation.micropython.loader import FirmwareModules
 from pebble.extensions.lab.simulation.micropython.modules import machine, select, system
+from pebble.extensions.lab.simulation.micropython.modules.timing import BoardTime
+from pebble.extensions.lab.simulation.micropython.pins import Level, PinName, Pins, Volts
 from pebble.extensions.lab.simulation.micropython.ports import OF_ROBOT, SAMD21, Port
+from pebble.extensions.lab.simulation.micropython.samd21 import PwmTimers
+from pebble.extensions.lab.simulation.micropython.timers import SoftTimers, Watchdog
 
 SETTINGS_FILE: Final = "/private_config.json"
+UID: Final = b"PBL\x00\x00\x01"
 
 #: Modules of CPython: MicroPython's behave the same as far as our firmware uses them
 _SHARED: Final = {
-    "array": array,
     "binascii": binascii,
-    "collections": collections,
     "errno": errno,
     "hashlib": hashlib,
-    "io": io,
     "json": system.JSON,
     "math": math,
     "struct": struct,
@@ -50,13 +51,13 @@ class Network(Protocol):
         """Return ``network``, ``socket`` and ``ssl`` in the state after a boot."""
 
 
-class Board(Hardware):
+class Board:
     """One board. ``load`` a robot's firmware, then call its ``step`` for each turn of its loop.
 
-    ``clock`` may be shared with other boards. Ticks (period 2**30) start at ``ticks_at_boot_ms``. ``seed`` is that of
-    the random numbers; default: derived from ``uid``. ``port`` is the board type; default: that of the loaded robot. A
-    reset clears what the firmware did (outputs, modules, unread input), and nothing else; so ``files`` survive it,
-    and a power cut. ``root`` is the folder with the firmware, if it is not Pebble's.
+    All times come from ``clock``, which may be shared with other boards. Ticks (period 2**30) start at
+    ``ticks_at_boot_ms``. ``seed`` is that of the random numbers; default: derived from ``uid``. ``port`` is the board
+    type; default: that of the loaded robot. A reset clears what the firmware did (outputs, modules, unread input), and
+    nothing else; so ``files`` survive it, and a power cut.
     """
 
     def __init__(
@@ -68,21 +69,27 @@ class Board(Hardware):
         port: Port | None = None,
         ticks_at_boot_ms: int = 0,
         seed: int | None = None,
-        root: Path | None = None,
     ) -> None:
-        super().__init__(clock, uid, port=port, ticks_at_boot_ms=ticks_at_boot_ms, seed=seed)
-        self.network = network
-        self._port_is_fixed = port is not None
-        self._root = root
+        self.clock, self.network, self.uid = clock, network, uid
+        self.port, self._port_is_fixed = port or SAMD21, port is not None
+        self.pins = Pins()
+        self.bus = Bus()
+        self.console = Console(self.pause, self._wait_for_input)
+        self.timers = SoftTimers(clock)
+        self.time = BoardTime(clock, self.pause, ticks_at_boot_ms)
+        self.watchdog = Watchdog(clock)
+        self.random = random.Random(int.from_bytes(uid, "big") if seed is None else seed)  # noqa: S311 - repeatable
+        self.files = Files()
+        self.resets = 0
+        self.rtc: tuple[int, ...] = (2000, 1, 1, 5, 0, 0, 0, 0)  # as after power on
+        self._pwm_timers = PwmTimers()
         self._firmware: FirmwareModules | None = None
 
     @property
     def firmware(self) -> FirmwareModules:
         """The modules of this boot, for example ``firmware.module("goob.pins")``."""
         if self._firmware is None:
-            self._firmware = FirmwareModules(
-                self._modules(), {"open": self.files.open, "print": self.print}, self._root
-            )
+            self._firmware = FirmwareModules(self._modules(), {"open": self.files.open, "print": self.print})
         return self._firmware
 
     def load(self, robot: str, settings: dict[str, Any] | None = None) -> FirmwareRobot:
@@ -100,8 +107,30 @@ class Board(Hardware):
 
     def boot(self) -> None:
         """Power on or reset: no pin is an output, no module is loaded, the ticks restart."""
-        super().boot()
+        self.pins.float_all()
+        self.console.reset()
+        self.watchdog.disarm()
+        self.timers.clear()
+        self.time.restart()
+        self._pwm_timers = PwmTimers()
         self._firmware = None
+
+    def pause(self, seconds: float) -> None:
+        """Block the firmware for ``seconds``; timers run, and the watchdog resets the board if it expires."""
+        until = self.clock.now() + seconds
+        while self.timers.running and (left := until - self.clock.now()) > 0.0:
+            self.timers.wait(min(left, self.watchdog.left()))
+            self.watchdog.check()
+        self.clock.sleep(min(until - self.clock.now(), self.watchdog.left()))
+        self.watchdog.check()
+        self.console.interrupted()
+
+    def _wait_for_input(self) -> None:
+        """Wait while the firmware reads without input: only its timers run."""
+        if not self.timers.running:
+            raise WouldHang("the firmware waits for input while no timer is running")
+        self.timers.wait(self.watchdog.left())
+        self.watchdog.check()
 
     def _modules(self) -> dict[str, Any]:
         modules = {
@@ -111,9 +140,58 @@ class Board(Hardware):
             "micropython": system.micropython_module(self),
             "os": system.os_module(self),
             "random": system.random_module(self),
-            "select": select.module(self),
+            "select": select.module(),
             "sys": system.sys_module(self),
             "time": self.time.module(),
             **(self.network.modules() if self.network is not None else {}),
         }
         return {name: module for name, module in modules.items() if name not in self.port.absent}
+
+    # -- from outside
+
+    def duty(self, pin: PinName) -> float:
+        """Return the output level of ``pin``, 0..1."""
+        return self.pins.level(self.port.pin(pin))
+
+    def set_volts(self, pin: PinName, volts: Volts) -> None:
+        """Set the voltage at the ADC of ``pin``: a value, or a function that is called at each measurement."""
+        self.pins.set_volts(self.port.pin(pin), volts)
+
+    def set_pin(self, pin: PinName, high: Level) -> None:
+        """Drive an input high or low, or by a function called at each read; None leaves it to its pull resistor."""
+        self.pins.set_input(self.port.pin(pin), high)
+
+    def attach_i2c(self, address: int, device: Device) -> None:
+        self.bus.attach(address, device)
+
+    def type(self, data: bytes) -> None:
+        """Send data from the host to the board's serial port."""
+        self.console.type(data)
+
+    @property
+    def unread(self) -> int:
+        """Bytes from the host that the firmware has not read yet."""
+        return self.console.unread
+
+    def take_output(self) -> bytes:
+        """Return the board's output on its serial port since the last call."""
+        return self.console.take_output()
+
+    # -- from the firmware
+
+    def take_pwm(self, pin: PinName) -> None:
+        """Assign a PWM channel to ``pin``."""
+        if self.port.platform == SAMD21.platform:
+            self._pwm_timers.take(str(pin))
+
+    def free_pwm(self, pin: PinName) -> None:
+        if self.port.platform == SAMD21.platform:
+            self._pwm_timers.free(str(pin))
+
+    def print(self, *values: object, sep: str = " ", end: str = "\n", file: Any = None) -> None:
+        """The firmware's ``print``, which writes to the serial port or to ``file``."""
+        text = sep.join(map(str, values)) + end
+        if file is None:
+            self.console.write(text.replace("\n", "\r\n").encode())
+        else:
+            file.write(text)

@@ -100,15 +100,9 @@ class Input:
         data = self._take(count)
         return data.decode() if self._text else bytes(data)
 
-    def readinto(self, buffer: bytearray | memoryview, count: int = -1) -> int:
-        wanted = len(buffer) if count < 0 else min(count, len(buffer))
-        typed = self._console.typed
-        if self._text or len(typed) < wanted:
-            buffer[:wanted] = self._take(wanted)
-        else:  # the common case: single bytes
-            buffer[:wanted] = typed[:wanted]
-            del typed[:wanted]
-        return wanted
+    def readinto(self, buffer: bytearray | memoryview) -> int:
+        buffer[:] = self._take(len(buffer))
+        return len(buffer)
 
     def _take(self, count: int) -> bytearray:
         data = self._console.take(count)
@@ -127,11 +121,9 @@ class Output:
         console = self._console
         return mask & POLLOUT if console.reading or console.writable() else 0
 
-    def write(self, data: Any, *span: int) -> int:
-        """``write(data)``, ``write(data, length)`` or ``write(data, offset, length)``; returns the size written."""
-        if span:
-            start, length = (0, *span)[-2:]
-            data = data[start : start + length]
+    def write(self, data: Any, start: int = 0, length: int | None = None) -> int:
+        """``write(data)`` or ``write(data, offset, length)``; returns the size written."""
+        data = data if length is None else data[start : start + length]
         if not self._text:
             return self._console.write(data)
         raw = data.encode() if isinstance(data, str) else bytes(data)

@@ -13,8 +13,8 @@ class Files(dict[str, bytes]):
     """Contents by absolute path. What the firmware changes is also in ``folder``, if given, and read from there.
 
     As with LittleFS a written file changes when it is closed, and a rename replaces its target at once.
-    ``before(what, path, data)`` is called before each change by the firmware; ``what`` is "write", "rename" or
-    "remove". It may raise an OSError, or an exception of the test's own in place of a power cut.
+    ``before(what, path, data)`` is called before each change by the firmware; ``what`` is "write" or "rename".
+    It may raise an OSError, or an exception of the test's own in place of a power cut.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -47,15 +47,6 @@ class Files(dict[str, bytes]):
         self[new] = self.pop(old)
         if self._folder is not None:
             self._at(self._folder, old).replace(self._at(self._folder, new))
-
-    def remove(self, path: str) -> None:
-        self.before("remove", path, self._existing(path))
-        del self[path]
-        if self._folder is not None:
-            self._at(self._folder, path).unlink()
-
-    def stat(self, path: str) -> tuple[int, ...]:
-        return (0x8000, 0, 0, 0, 0, 0, len(self._existing(path)), 0, 0, 0)
 
     def listdir(self, folder: str = "/") -> list[str]:
         return [path.removeprefix(folder) for path in self if path.startswith(folder)]

@@ -17,18 +17,14 @@ class Device(Protocol):
 
 
 class Bus:
-    """One bus of a board. ``fail`` makes a device stop acknowledging until ``restore``; ``disturbed``, all of them."""
+    """One bus of a board. ``fail`` makes a device stop acknowledging until ``restore``."""
 
     def __init__(self) -> None:
-        self.disturbed = False
         self._devices: dict[int, Device] = {}
         self._failing: dict[int, int] = {}
 
     def attach(self, address: int, device: Device) -> None:
         self._devices[address] = device
-
-    def detach(self, address: int) -> None:
-        self._devices.pop(address, None)
 
     def fail(self, address: int, code: int = errno.EIO) -> None:
         """Make every later transfer with ``address`` raise OSError ``code`` (EIO, ETIMEDOUT, …)."""
@@ -37,13 +33,8 @@ class Bus:
     def restore(self, address: int) -> None:
         self._failing.pop(address, None)
 
-    def addresses(self) -> list[int]:
-        return [] if self.disturbed else sorted(self._devices.keys() - self._failing.keys())
-
     def device(self, address: int) -> Device:
         """Return the device at ``address``. Raises OSError: ENODEV if there is none."""
-        if self.disturbed:
-            raise failure(errno.EIO)
         if address in self._failing:
             raise failure(self._failing[address])
         if address not in self._devices:

@@ -16,7 +16,6 @@ class Port:
     board: str
     pin: Callable[[PinName], PinName]  # resolves the name of a pin; ValueError if there is none
     adc_v: float  # the voltage at which the ADC reads its highest value
-    hertz: int
     wdt_ms: Callable[[int], int]  # actual timeout of the watchdog for a requested one; ValueError if unsupported
     absent: frozenset[str] = frozenset()  # modules that the image lacks
     stdio_bytes: bool = True  # sys.stdin.buffer and sys.stdout.buffer
@@ -48,11 +47,11 @@ def _esp8266_wdt(timeout_ms: int) -> int:
 _XIAO: Final = "Seeed Xiao with SAMD21G18A"
 #: The ADC's reference is half the supply (MICROPY_HW_ADC_VREF 2 of the board, gain 1): it reads up to 1.65 V.
 #: This image has SAMD21_EXTRA_FEATURES (ports/samd/mcu/samd21/mpconfigmcu.h), the official one does not.
-SAMD21: Final = Port("samd", _XIAO, _samd_pin, 1.65, 48_000_000, _samd_wdt, frozenset({"hashlib"}))
+SAMD21: Final = Port("samd", _XIAO, _samd_pin, 1.65, _samd_wdt, frozenset({"hashlib"}))
 SAMD21_OFFICIAL: Final = replace(SAMD21, absent=frozenset({"hashlib", "select", "errno"}), stdio_bytes=False)
-ESP32_C6: Final = Port("esp32", "ESP32C6 module with ESP32C6", _esp_pin, 3.3, 160_000_000, lambda ms: ms)
+ESP32_C6: Final = Port("esp32", "ESP32C6 module with ESP32C6", _esp_pin, 3.3, lambda ms: ms)
 #: The ADC itself reads up to 1 V; a Wemos D1 mini has a divider in front of it for 3.2 V
-ESP8266: Final = Port("esp8266", "ESP module with ESP8266", _esp_pin, 1.0, 80_000_000, _esp8266_wdt)
+ESP8266: Final = Port("esp8266", "ESP module with ESP8266", _esp_pin, 1.0, _esp8266_wdt)
 
 #: The board type of each robot
 OF_ROBOT: Final = {

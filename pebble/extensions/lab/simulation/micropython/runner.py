@@ -1,7 +1,6 @@
 """Runs a robot's firmware on its simulated board, as common/run.py does on a real one."""
 
 import logging
-from collections.abc import Callable
 from typing import Any
 
 from pebble.extensions.lab.simulation.micropython.board import Board, FirmwareRobot
@@ -11,26 +10,15 @@ log = logging.getLogger(__name__)
 
 
 class Runner:
-    """``step`` is one turn of the loop. A reset or an error in the firmware reboots the board, and is counted.
+    """``step`` is one turn of the loop. A reset or an error in the firmware reboots the board, and is counted."""
 
-    ``on_boot`` is called with the new robot at each boot.
-    """
-
-    def __init__(
-        self,
-        board: Board,
-        robot: str,
-        settings: dict[str, Any] | None = None,
-        *,
-        on_boot: Callable[[FirmwareRobot], None] = lambda _robot: None,
-    ) -> None:
-        self.board, self.name, self.settings, self._on_boot = board, robot, settings or {}, on_boot
+    def __init__(self, board: Board, robot: str, settings: dict[str, Any] | None = None) -> None:
+        self.board, self.name, self.settings = board, robot, settings or {}
         self.robot: FirmwareRobot = self.boot()
 
     def boot(self) -> FirmwareRobot:
         """Power on, or press the reset button."""
         self.robot = self.board.load(self.name, self.settings)
-        self._on_boot(self.robot)
         return self.robot
 
     def step(self) -> None:

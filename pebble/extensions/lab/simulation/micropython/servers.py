@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import socket
-import threading
 import time
+from contextlib import suppress
 from typing import Final
 
 from pebble.extensions.lab.simulation.micropython.answers import name_answer, time_answer
@@ -20,46 +20,11 @@ _LONGEST = 1500
 _MOST = 16  # addresses in an answer, which has 512 bytes at most (RFC 1035, 2.3.4)
 
 
-class HostResolver:
-    """Resolves names by this machine's resolver without blocking: a later query gets an answer that is not ready."""
-
-    def __init__(self) -> None:
-        self._known: dict[str, list[str] | None] = {TIME_HOST: [_TIME_ADDRESS]}
-        self._asking: set[str] = set()
-
-    def known(self, name: str) -> bool:
-        """Whether ``name`` is resolved, even if it does not exist; otherwise starts to resolve it."""
-        if name in self._known:
-            return True
-        if name not in self._asking:
-            self._asking.add(name)
-            threading.Thread(target=self._ask, args=(name,), name=f"look up {name}", daemon=True).start()
-        return False
-
-    def addresses(self, name: str) -> list[str] | None:
-        found = self._known.get(name)
-        if found is None:
-            self._known.pop(name, None)  # it may exist at the next query
-        return found
-
-    def _ask(self, name: str) -> None:
-        try:
-            found = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_STREAM)
-            self._known[name] = list(dict.fromkeys(str(one[4][0]) for one in found))[:_MOST]
-        except OSError:
-            self._known[name] = None
-        self._asking.discard(name)
-
-
 class LoopbackServers:
-    """Both servers. ``routes`` is for HostNetwork; the scheduler calls ``serve`` when one of ``sockets`` is readable.
-
-    ``names`` and ``clock`` = False switch a server off, as without an uplink.
-    """
+    """Both servers. ``routes`` is for HostNetwork; call ``serve`` when one of ``sockets`` is readable."""
 
     def __init__(self) -> None:
-        self.names = self.clock = True
-        self._hosts = HostResolver()
+        self._addresses: dict[str, list[str]] = {TIME_HOST: [_TIME_ADDRESS]}  # of names that are known
         self._servers = {place: _server() for place in (_DNS, _MDNS, _NTP)}
         self.sockets = tuple(self._servers.values())
         self.routes: dict[Address, Address] = {place: sock.getsockname() for place, sock in self._servers.items()}
@@ -71,7 +36,10 @@ class LoopbackServers:
                 request, asker = sock.recvfrom(_LONGEST)
             except BlockingIOError:
                 return
-            answer = self._time(request) if sock is self._servers[_NTP] else self._name(request)
+            if sock is self._servers[_NTP]:
+                answer = time_answer(request, time.time())
+            else:
+                answer = name_answer(request, self._resolve)
             if answer is not None:
                 sock.sendto(answer, asker)
 
@@ -79,20 +47,13 @@ class LoopbackServers:
         for sock in self.sockets:
             sock.close()
 
-    def _time(self, request: bytes) -> bytes | None:
-        return time_answer(request, time.time()) if self.clock else None
-
-    def _name(self, query: bytes) -> bytes | None:
-        if not self.names:
-            return None
-        unresolved = []
-
-        def addresses_of(name: str) -> list[str] | None:
-            unresolved.append(not self._hosts.known(name))
-            return self._hosts.addresses(name)
-
-        answer = name_answer(query, addresses_of)
-        return None if any(unresolved) else answer
+    def _resolve(self, name: str) -> list[str] | None:
+        """Return the addresses of a name by this machine's resolver; None: there is none, which may change."""
+        if name not in self._addresses:
+            with suppress(OSError):
+                found = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_STREAM)
+                self._addresses[name] = list(dict.fromkeys(str(address[4][0]) for address in found))[:_MOST]
+        return self._addresses.get(name)
 
 
 def _server() -> socket.socket:

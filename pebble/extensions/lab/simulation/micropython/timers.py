@@ -12,11 +12,10 @@ class BoardReset(BaseException):
 
 
 class Watchdog:
-    """Resets the board unless it is fed in time, once armed. ``on_feed`` is called at each feed: once per turn."""
+    """Resets the board unless it is fed in time, once armed."""
 
     def __init__(self, clock: Clock) -> None:
         self.feeds = 0
-        self.on_feed: Callable[[], None] = lambda: None
         self.timeout_ms: int | None = None
         self._clock = clock
         self._fed_at = 0.0
@@ -32,7 +31,6 @@ class Watchdog:
         self.check()
         self.feeds += 1
         self._fed_at = self._clock.now()
-        self.on_feed()
 
     def left(self) -> float:
         """Seconds until it resets the board."""
@@ -66,9 +64,6 @@ class SoftTimers:
     def start(self, timer: Any) -> None:
         self._due[timer] = self._clock.now() + timer.period_s
 
-    def stop(self, timer: Any) -> None:
-        self._due.pop(timer, None)
-
     def clear(self) -> None:
         self._due.clear()
         self._busy = False
@@ -87,10 +82,7 @@ class SoftTimers:
         try:
             now = self._clock.now()
             for timer in [timer for timer, due in self._due.items() if due <= now]:
-                if timer.repeats:
-                    self._due[timer] += timer.period_s
-                else:
-                    self.stop(timer)
+                self._due[timer] += timer.period_s
                 timer.callback(timer)
         finally:
             self._busy = False

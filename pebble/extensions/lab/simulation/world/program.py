@@ -1,7 +1,6 @@
 """A simulated world as a program: the MCUs of its robots behind pseudo terminals, and their poses for their cameras."""
 
 import math
-import os
 import sys
 import tempfile
 import threading
@@ -13,9 +12,9 @@ from typing import Any, Final
 
 import msgspec
 
-from pebble.errors import ConfigError, DeviceError
+from pebble.errors import DeviceError
 from pebble.extensions.lab.simulation.board import BoardState
-from pebble.extensions.lab.simulation.mcu import actions
+from pebble.extensions.lab.simulation.mcu import actions, write_line
 from pebble.extensions.lab.simulation.motion import Pose, RobotMotion
 from pebble.extensions.lab.simulation.pty import PtyMcu
 from pebble.extensions.lab.simulation.world.pose_page import PERIOD_S, PosePage, page_path
@@ -47,7 +46,7 @@ def run(
     :class:`Snapshot` to standard output ten times a second.
     """
     end, path = EndSignal(), file.absolute()
-    world = _read(path)
+    world = read_world(path)
     folder = folder or Path(tempfile.gettempdir(), f"pebble-world-{path.stem}")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -61,7 +60,7 @@ def run(
         mcus = {name: stack.enter_context(mcu) for name, mcu in _mcus(world, motions, folder, trace).items()}
         imus = {name: stack.enter_context(imu) for name, imu in _imus(world, motions, folder).items()}
         if not report:
-            _write(_introduction(path, mcus, imus))
+            print(_introduction(path, mcus, imus), flush=True)  # noqa: T201
         if control:
             threading.Thread(target=_run_commands, args=(mcus, end), name="pebble-world control", daemon=True).start()
         _publish_poses(page, mcus, end, report=report)
@@ -81,16 +80,6 @@ def imu_port_path(folder: Path, robot: str) -> Path:
 def trace_path(folder: Path, robot: str) -> Path:
     """The file for what a robot's MCU receives."""
     return folder / f"{robot}.trace.jsonl"
-
-
-def _read(path: Path) -> World:
-    """Every line of an error names the file."""
-    try:
-        return read_world(path)
-    except ConfigError as error:
-        raise ConfigError(
-            [line if line.startswith(str(path)) else f"{path}: {line}" for line in error.problems]
-        ) from None
 
 
 def _page(path: Path, world: World) -> PosePage:
@@ -131,15 +120,11 @@ def _publish_poses(page: PosePage, mcus: Mcus, end: EndSignal, *, report: bool) 
         poses = (state.pose for state in states.values())
         page.write(ns, [RobotPose(pose.x_mm / 1000, pose.y_mm / 1000, pose.heading_rad) for pose in poses])
         count += 1
-        if (
-            report
-            and count % _SAMPLES_PER_REPORT == 0
-            and not _write(msgspec.json.encode(Snapshot(ns, states)) + b"\n")
-        ):
+        if report and count % _SAMPLES_PER_REPORT == 0 and not write_line(Snapshot(ns, states)):
             return
 
 
-def _introduction(path: Path, mcus: Mcus, imus: Mcus) -> bytes:
+def _introduction(path: Path, mcus: Mcus, imus: Mcus) -> str:
     """Where the robots are, and what belongs in their configs."""
     lines = [f"the world of {path} runs; Ctrl-C ends it"]
     for name, mcu in mcus.items():
@@ -150,20 +135,11 @@ def _introduction(path: Path, mcus: Mcus, imus: Mcus) -> bytes:
         bridge = msgspec.json.encode(serial).decode()
         lines += [f"{name}, in the services of its config:", f'    "serial_mcu_bridge": {bridge}']
         lines += [f'    "av_daemon": {{"video": {video}}}']
-    return "\n".join(lines).encode() + b"\n"
+    return "\n".join(lines)
 
 
 def _serial(mcu: PtyMcu) -> dict[str, Any]:
     return {"serial": {"port": str(mcu.symlink)}}
-
-
-def _write(text: bytes) -> bool:
-    """False if the reader of standard output has closed it."""
-    try:
-        os.write(sys.stdout.fileno(), text)
-    except BrokenPipeError:
-        return False
-    return True
 
 
 def _run_commands(mcus: Mcus, end: EndSignal) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 
+import msgspec
+
 from pebble.errors import NotRunningError
 from pebble.extensions.lab.simulation.world.pose_page import PoseReader, page_path
 from pebble.extensions.lab.simulation.world.poses import Track
@@ -30,7 +32,7 @@ class RobotView:
         self._tracks: Mapping[str, Track] = {}
         try:
             self._page = PoseReader(page_path(self._path))
-        except (OSError, ValueError):
+        except (OSError, msgspec.DecodeError):
             raise self._not_running() from None
         self.look()
 
@@ -38,7 +40,7 @@ class RobotView:
         """Choose the moment of the next picture; returns it, monotonic ns. Raises NotRunningError."""
         self._tracks = self._page.tracks()
         track = self._tracks.get(self._robot)
-        if track is None or not self._page.is_valid or self._clock_ns() - track.newest.ns > STALE_S * 1e9:
+        if track is None or self._clock_ns() - track.newest.ns > STALE_S * 1e9:
             raise self._not_running()
         self._at_ns = track.newest.ns - self._latency_ns
         return self._at_ns

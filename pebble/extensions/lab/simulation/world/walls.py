@@ -42,12 +42,6 @@ class Floor:
         with self._lock:
             self._poses[name] = pose
 
-    def touches(self, name: str) -> bool:
-        """True for a robot that stands at a wall or at another robot."""
-        with self._lock:
-            pose = self._poses[name]
-            return self._clearance_mm(name, pose.x_mm, pose.y_mm) < 0.1
-
     def _contact(self, name: str, start: Pose, end: Pose, before: float) -> float:
         """The largest part of the move that is free."""
         free, blocked = 0.0, 1.0

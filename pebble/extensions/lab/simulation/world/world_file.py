@@ -133,8 +133,12 @@ class World(Section, frozen=True, kw_only=True):
 
 
 def read_world(path: Path) -> World:
-    """Read a world file. Raises ConfigError with every mistake in it, each with its place."""
-    return parse_world(decode(read_text(path), str(path)))
+    """Read a world file. Raises ConfigError with every mistake in it, each with the file and its place."""
+    raw = decode(read_text(path), str(path))
+    try:
+        return parse_world(raw)
+    except ConfigError as error:
+        raise ConfigError([f"{path}: {problem}" for problem in error.problems]) from None
 
 
 def parse_world(raw: Any) -> World:
@@ -162,8 +166,7 @@ def open_world(path: Path, robot: str) -> World:
         world = read_world(path)
     except ConfigError as error:
         first, *more = error.problems
-        where = first if first.startswith(str(path)) else f"{path}: {first}"
-        raise DeviceError(where + (f" (and {len(more)} more)" if more else "")) from None
+        raise DeviceError(first + (f" (and {len(more)} more)" if more else "")) from None
     if robot not in world.robots:
         raise DeviceError(f"{path}: there is no robot {robot!r}, {nearest(robot, world.robots)}")
     return world

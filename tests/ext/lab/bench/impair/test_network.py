@@ -1,19 +1,22 @@
 """Impaired networks of namespaces, where the machine permits them."""
 
-import json
-import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
 
-from pebble.errors import PebbleError
-from pebble.extensions.lab.bench.impair.conditions import Condition, Shape
-from pebble.extensions.lab.bench.impair.network import REMOTE_HOST, ROBOT_HOST, NamespaceNetwork, why_no_namespaces
+from pebble.extensions.lab.bench.impair.network import (
+    REMOTE_HOST,
+    ROBOT_HOST,
+    Condition,
+    NamespaceNetwork,
+    why_no_namespaces,
+)
 from pebble.extensions.lab.rig.processes import children
 from tests.support import ROOT, Child, gone, until
 
@@ -31,9 +34,8 @@ urllib.request.urlopen(sys.argv[1]).read()
 print(time.monotonic() - began)
 """
 _SEND = "import socket; s = socket.socket(2, 2); [s.sendto(b'x' * 100, ('{}', 9)) for _ in range(2000)]"
-_DATAGRAM = 142  # bytes, with the headers of Ethernet, IP and UDP
 _BAND = range(50, 151)  # lost of 100 on average; five standard deviations
-_RATE = Condition("1024k", Shape(kbit=1024))
+_RATE = Condition("1024k", kbit=1024)
 
 
 @pytest.fixture
@@ -83,39 +85,18 @@ def test_a_rate_limits_the_uplink_only_and_a_connection_stays_when_it_ends(
         network.apply(_RATE)
         assert seconds(fetching(network.on_remote, ROBOT_HOST, 30_000)) > 30_000 * 8 / 1_024_000 * 0.95
         assert seconds(fetching(network.on_robot, REMOTE_HOST, 1_000_000)) < full_s / 2
-        before, fetch = network.bytes_up(), fetching(network.on_remote, ROBOT_HOST, 1_000_000)
-        assert until(lambda: network.bytes_up() > before + 50_000)
+        fetch = fetching(network.on_remote, ROBOT_HOST, 1_000_000)
+        time.sleep(0.5)
         network.apply(Condition("base-end"))
         assert seconds(fetch) < full_s / 2
 
 
-def test_packets_are_those_of_a_wire_and_counted_with_their_headers(network: NamespaceNetwork, tmp_path: Path) -> None:
-    with served(network, tmp_path):
-        before = network.bytes_up()
-        seconds(fetching(network.on_remote, ROBOT_HOST, 1_000_000))
-        assert 1_000_000 + 66 * 690 <= network.bytes_up() - before < 1_200_000
-
-
 def test_loss_drops_the_configured_share_of_packets(network: NamespaceNetwork) -> None:
-    before = network.bytes_up()
-    network.apply(Condition("5%", Shape(loss=0.05)))
+    network.apply(Condition("5%", loss=0.05))
     subprocess.run(network.on_robot([sys.executable, "-c", _SEND.format(REMOTE_HOST)]), check=True)
     counters = network.on_remote(["nft", "list", "chain", "ip", "impair", "arriving"])
     printed = subprocess.check_output(counters, text=True)
     assert sum(map(int, re.findall(r"packets (\d+)", printed))) in _BAND
-    assert network.bytes_up() - before >= 2000 * _DATAGRAM
-
-
-def test_close_leaves_nothing_and_may_be_repeated() -> None:
-    before = set(children(os.getpid()))
-    network = NamespaceNetwork()
-    (process,) = set(children(os.getpid())) - before
-    network.close()
-    network.close()
-    assert gone(process)
-    assert not (Path("/sys/class/net") / "wire").exists()
-    with pytest.raises(PebbleError, match="No such file"):
-        network.apply(Condition("late"))
 
 
 @pytest.mark.usefixtures("_permitted")
@@ -125,11 +106,3 @@ def test_a_killed_owner_leaves_nothing() -> None:
         (process,) = children(owner.pid)
         owner.kill()
         assert until(lambda: gone(process))
-
-
-@pytest.mark.usefixtures("_permitted")
-def test_a_user_without_permission_gets_the_reason() -> None:
-    forwarder = [sys.executable, "-m", "pebble.extensions.lab.bench.impair.network"]
-    uid = ["setpriv", "--bounding-set=-all", "--inh-caps=-all", "--", *forwarder]
-    printed = json.loads(subprocess.run(uid, stdin=subprocess.DEVNULL, capture_output=True, check=False).stdout)
-    assert "not permitted: run it as root" in printed["unavailable"]

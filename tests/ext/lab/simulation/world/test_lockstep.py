@@ -7,7 +7,6 @@ import hashlib
 import numpy as np
 import pytest
 
-from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S
 from pebble.extensions.lab.simulation.world.lockstep import CameraMode, LockstepRobot, LockstepWorld
 from pebble.extensions.lab.simulation.world.world_file import World, parse_world
 from tests.ext.lab.simulation.world.worlds import CLEAR, projected, tags_in
@@ -45,16 +44,6 @@ def history(seconds: float) -> str:
 
 def test_two_runs_are_the_same_to_the_last_bit() -> None:
     assert history(1.5) == history(1.5)
-
-
-def test_the_firmware_drives_the_wheels_and_stops_without_commands() -> None:
-    simulated = LockstepWorld(world())
-    goob = simulated.robots["goob"]
-    goob.drive(x=0.0, z=0.5)
-    simulated.run(0.5)
-    assert goob.motion.left_mm_s == pytest.approx(0.5 * FULL_SPEED_MM_S, rel=0.01)
-    simulated.run(1.5)
-    assert goob.motion.left_mm_s == 0.0, "the firmware's own failsafe"
 
 
 def test_pictures_come_at_the_rate_of_the_camera_each_once() -> None:

@@ -5,24 +5,17 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
-from pebble.extensions.lab.simulation.world.poses import RobotPose, Sample, Track
-from pebble.extensions.lab.simulation.world.renderer import Renderer
-from pebble.extensions.lab.simulation.world.surfaces import Image
 from tests.ext.lab.simulation.world.worlds import CLEAR, projected, seen, tags_in, world_of
 
 WALL = {"x1": 1.0, "y1": 1.0, "x2": 1.0, "y2": -1.0}
 TAG = {"id": 13, "x": 2.0, "y": 0.0, "yaw_deg": 180.0}
 CAMERAS = [
     (0.0, 0.0, 0.0),
-    (1.2, 0.1, 0.0),
     (0.0, 0.0, 0.35),
     (-0.5, -1.0, 0.5),
-    (1.0, -1.2, 0.9),
-    (-2.0, 0.5, -0.1),
     (3.2, 0.3, math.pi),  # of the other tag
 ]
 
@@ -32,13 +25,10 @@ def both_tags(**keys: Any) -> Any:
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("size", [(640, 480), (1280, 720)])
-def test_a_tag_is_where_the_pinhole_model_puts_it(camera: tuple[float, float, float], size: tuple[int, int]) -> None:
+def test_a_tag_is_where_the_pinhole_model_puts_it(camera: tuple[float, float, float]) -> None:
     world = both_tags()
-    found = tags_in(seen(world, size=size, goob=camera))
-    assert len(found) == 1
-    for number, corners in found.items():
-        assert np.abs(corners - projected(world, number, camera, size)).max() < 1.0
+    ((number, corners),) = tags_in(seen(world, size=(1280, 720), goob=camera)).items()
+    assert np.abs(corners - projected(world, number, camera, (1280, 720))).max() < 1.0
 
 
 NEAR = {**TAG, "y": 0.5, "size_m": 0.1}
@@ -68,11 +58,6 @@ def test_walls_and_robots_hide_what_is_behind_them(keys: dict[str, Any], poses: 
     assert set(tags_in(seen(world_of(**keys), **poses))) == tags
 
 
-def test_a_robot_does_not_see_itself() -> None:
-    own = world_of(robots={"goob": {"x": 0.0, "y": 0.0, "tag": 2}}, camera=CLEAR)
-    assert (seen(own) == seen(world_of(camera=CLEAR))).all()
-
-
 @pytest.mark.parametrize("heading", np.linspace(0.0, math.tau, 9)[:-1])
 def test_a_room_has_walls_all_around(heading: float) -> None:
     """At a wall that fills the picture, whatever the angle, no floor or sky is left in the middle rows."""
@@ -82,11 +67,6 @@ def test_a_room_has_walls_all_around(heading: float) -> None:
     assert row.max() <= 208, "the sky is lighter"
 
 
-def blurred(picture: Image) -> float:
-    """The steepest edge of a picture."""
-    return float(np.abs(np.diff(picture[200:280].astype(np.int16), axis=1)).max())
-
-
 @pytest.mark.parametrize(
     ("fault", "least", "most"),
     [({"noise": 8.0}, 6, 7), ({"blur": 3.0}, 2, 4), ({"jpeg_quality": 10}, 3, 5), ({}, -1, 0)],
@@ -94,27 +74,3 @@ def blurred(picture: Image) -> float:
 def test_a_fault_of_the_camera_changes_each_pixel_by_so_much(fault: dict[str, float], least: int, most: int) -> None:
     clear, faulty = (seen(world_of(tags=[TAG], camera={**CLEAR, **keys})) for keys in ({}, fault))
     assert least < np.abs(faulty.astype(np.int16) - clear).mean() <= most
-
-
-def turning(radians_per_s: float) -> dict[str, Track]:
-    return {
-        "goob": Track([Sample(ms * 1_000_000, RobotPose(0, 0, radians_per_s * ms / 1e3)) for ms in range(-200, 1, 20)])
-    }
-
-
-def test_motion_blurs_what_moves_along_the_way_of_the_exposure() -> None:
-    world = world_of(tags=[TAG], camera={**CLEAR, "motion_blur_ms": 40.0})
-    still, moving = np.empty((480, 640, 3), np.uint8), np.empty((480, 640, 3), np.uint8)
-    Renderer(world, "goob", 640, 480).render(turning(0.0), 0, still)
-    Renderer(world, "goob", 640, 480).render(turning(1.0), 0, moving)
-    assert (still == seen(world_of(tags=[TAG], camera=CLEAR))).all()
-    assert blurred(moving) < blurred(still) / 2
-    dark = [np.flatnonzero((picture[225, :, 0] < 140)[200:440]) for picture in (still, moving)]
-    streak = 624 * 1.0 * 0.04  # pixels that the picture moved during the exposure
-    assert cv2.mean(moving)[0] == pytest.approx(cv2.mean(still)[0], rel=0.02)
-    assert dark[0].min() - streak - 2 < dark[1].min() < dark[0].min() + streak + 2
-
-
-def test_the_same_calls_give_the_same_pixels() -> None:
-    world = both_tags(camera={"jpeg_quality": 50})
-    assert (seen(world) == seen(world)).all()

@@ -8,11 +8,9 @@ from typing import Any
 
 import pytest
 
-import pebble.extensions.lab.simulation.world
 from pebble.errors import ConfigError, DeviceError
-from pebble.extensions.lab.simulation.world.world_file import open_world, parse_world, split_device
+from pebble.extensions.lab.simulation.world.world_file import open_world, parse_world
 
-ROOM = Path(pebble.extensions.lab.simulation.world.__file__).with_name("room.json")
 GOOB = {"x": 0.0, "y": 0.0}
 
 
@@ -46,37 +44,18 @@ def test_all_mistakes_are_reported_at_once_with_their_places() -> None:
     ("keys", "problem"),
     [
         ({"robots": {}}, "robots: must be 1 to 32 robots, not 0"),
-        (
-            {"robots": {"goob": GOOB, "fred": {"x": 0.1, "y": 0.0}}},
-            "robots.fred: stands 0.10 m from goob, must be 0.2 m or more",
-        ),
-        (
-            {"tags": [{"id": 35, "x": 1, "y": 1}]},
-            "tags[0].id: must be below 35, the number of tags in APRILTAG_25h9, not 35",
-        ),
-        (
-            {"robots": {"goob": GOOB | {"tag": 99}}},
-            "robots.goob.tag: must be below 35, the number of tags in APRILTAG_25h9, not 99",
-        ),
-        (
-            {"robots": {"fred": GOOB | {"kind": "fred", "imu": True}}},
-            "robots.fred.imu: must be false, a fred has no inertial sensor",
-        ),
+        ({"robots": {"goob": GOOB, "fred": {"x": 0.1, "y": 0.0}}},
+         "robots.fred: stands 0.10 m from goob, must be 0.2 m or more"),
+        ({"robots": {"goob": GOOB | {"tag": 99}}},
+         "robots.goob.tag: must be below 35, the number of tags in APRILTAG_25h9, not 99"),
         ({"walls": [{"x1": 1, "y1": 1, "x2": 1, "y2": 1}]}, "walls[0]: begins where it ends"),
-        (
-            {"walls": [{"x1": 0.05, "y1": 1, "x2": 0.05, "y2": -1}]},
-            "robots.goob: stands 0.05 m from a wall, its radius is 0.1",
-        ),
-        (
-            {"room": {"x_min": 1, "x_max": 0, "y_min": 0, "y_max": 1}},
-            "room.x_min: must be below x_max, which is 0, not 1",
-        ),
-        (
-            {"room": {"x_min": 1, "x_max": 2, "y_min": 0, "y_max": 1}},
-            "robots.goob: stands outside the room, at 0, 0",
-        ),
+        ({"walls": [{"x1": 0.05, "y1": 1, "x2": 0.05, "y2": -1}]},
+         "robots.goob: stands 0.05 m from a wall, its radius is 0.1"),
+        ({"room": {"x_min": 1, "x_max": 0, "y_min": 0, "y_max": 1}},
+         "room.x_min: must be below x_max, which is 0, not 1"),
+        ({"room": {"x_min": 1, "x_max": 2, "y_min": 0, "y_max": 1}}, "robots.goob: stands outside the room, at 0, 0"),
     ],
-)
+)  # fmt: skip
 def test_values_that_contradict_each_other_are_refused(keys: dict[str, Any], problem: str) -> None:
     assert problems(**keys) == [problem]
 
@@ -84,16 +63,6 @@ def test_values_that_contradict_each_other_are_refused(keys: dict[str, Any], pro
 @pytest.mark.parametrize("name", ["a/b", "", "x" * 65, "ü" * 40])
 def test_a_robots_name_must_fit_into_a_topic_and_the_page(name: str) -> None:
     assert "the name must be a topic level" in problems(robots={name: GOOB})[0]
-
-
-@pytest.mark.parametrize("device", ["", "#", "world.json", "world.json#", "#goob"])
-def test_a_device_names_a_file_and_a_robot(device: str) -> None:
-    with pytest.raises(DeviceError, match=r"write for example /path/world.json#goob"):
-        split_device(device)
-
-
-def test_a_path_may_have_a_number_sign() -> None:
-    assert split_device("/a#1/world.json#goob") == (Path("/a#1/world.json"), "goob")
 
 
 def test_a_missing_or_wrong_file_is_one_line(tmp_path: Path) -> None:
@@ -108,8 +77,3 @@ def test_a_missing_or_wrong_file_is_one_line(tmp_path: Path) -> None:
         open_world(path, "goob")
     assert str(caught.value).endswith(" (and 1 more)")
     assert str(caught.value).startswith(f"{path}: robots.goob.z: unknown key")
-
-
-def test_an_unknown_robot_is_reported_with_the_nearest_known_one() -> None:
-    with pytest.raises(DeviceError, match="there is no robot 'gob', did you mean \"goob\"\\?"):
-        open_world(ROOM, "gob")

@@ -2,65 +2,43 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final
 
-from pebble.extensions.lab.simulation.micropython.faults import failure
-from pebble.extensions.lab.simulation.micropython.i2c import Bus, Device
+from pebble.extensions.lab.simulation.micropython.i2c import Bus
 from pebble.extensions.lab.simulation.micropython.modules.machine_pins import SimulatedAdc, SimulatedPin, SimulatedPwm
-from pebble.extensions.lab.simulation.micropython.modules.streams import POLLIN, POLLOUT
 from pebble.extensions.lab.simulation.micropython.timers import BoardReset
 
 if TYPE_CHECKING:
-    from pebble.extensions.lab.simulation.micropython.hardware import Hardware
+    from pebble.extensions.lab.simulation.micropython.board import Board
 
 
 class SimulatedTimer:
-    """``Timer(-1, period=ms, callback=)``: called while the program sleeps, or waits for input."""
+    """``Timer(-1, period=ms, callback=)``: called again and again while the program sleeps, or waits for input."""
 
-    ONE_SHOT: Final = 0
-    PERIODIC: Final = 1
-    _board: Hardware
+    _board: Board
 
-    def __init__(self, _number: int = -1, **settings: Any) -> None:
-        self.period_s, self.repeats = 0.0, True
-        self.callback: Callable[[Any], None] = lambda _timer: None
-        if settings:
-            self.init(**settings)
-
-    def init(self, *, period: int = -1, mode: int = PERIODIC, callback: Callable[[Any], None] | None = None) -> None:
-        if period <= 0:
-            raise ValueError("a Timer needs a period")
-        self.period_s, self.repeats = period / 1000, mode == self.PERIODIC
-        self.callback = callback or self.callback
+    def __init__(self, _number: int = -1, *, period: int, callback: Callable[[Any], None]) -> None:
+        self.period_s, self.callback = period / 1000, callback
         self._board.timers.start(self)
-
-    def deinit(self) -> None:
-        self._board.timers.stop(self)
 
 
 class SimulatedRtc:
-    """``RTC().datetime((year, month, day, weekday, hours, minutes, seconds, microseconds))``, and without it."""
+    """``RTC().datetime((year, month, day, weekday, hours, minutes, seconds, microseconds))``."""
 
-    _board: Hardware
+    _board: Board
 
-    def datetime(self, value: tuple[int, ...] | None = None) -> tuple[int, ...] | None:
-        if value is not None:
-            self._board.rtc = value
-            return None
-        return self._board.rtc
+    def datetime(self, value: tuple[int, ...]) -> None:
+        self._board.rtc = value
 
 
 class SimulatedWdt:
     """``WDT(timeout=ms)``: once made, it cannot be stopped, only fed."""
 
-    _board: Hardware
+    _board: Board
 
-    def __init__(self, number: int = 0, timeout: int = 5000) -> None:
-        if number != 0:
-            raise ValueError(f"WDT({number}) does not exist")
+    def __init__(self, _number: int = 0, timeout: int = 5000) -> None:
         self._board.watchdog.arm(self._board.port.wdt_ms(timeout))
 
     def feed(self) -> None:
@@ -68,57 +46,34 @@ class SimulatedWdt:
 
 
 class SimulatedI2c:
-    """``I2C``, ``SoftI2C``: transfers with devices on the board's bus; OSError ENODEV if there is none."""
+    """``SoftI2C``: transfers with devices on the board's bus; OSError ENODEV if there is none."""
 
-    _board: Hardware
+    _board: Board
 
     def __init__(self, *_id: int, scl: Any = None, sda: Any = None, freq: int = 400_000, timeout: int = 50_000) -> None:
         del scl, sda, freq, timeout
         self._bus: Bus = self._board.bus
 
-    def init(self, **settings: Any) -> None:
-        """Ignored: it has no visible effect."""
-
-    def deinit(self) -> None: ...
-
-    def scan(self) -> list[int]:
-        return self._bus.addresses()
-
-    def writeto(self, addr: int, buf: bytes, stop: bool = True) -> int:
-        del stop
+    def writeto(self, addr: int, buf: bytes) -> int:
         self._bus.device(addr).write(bytes(buf))
         return len(buf)
 
-    def readfrom(self, addr: int, nbytes: int, stop: bool = True) -> bytes:
-        del stop
-        return _read(self._bus.device(addr), nbytes)
+    def writeto_mem(self, addr: int, memaddr: int, buf: bytes) -> None:
+        self._bus.device(addr).write(bytes([memaddr]) + bytes(buf))
 
-    def readfrom_into(self, addr: int, buf: bytearray, stop: bool = True) -> None:
-        buf[:] = self.readfrom(addr, len(buf), stop)
-
-    def writeto_mem(self, addr: int, memaddr: int, buf: bytes, *, addrsize: int = 8) -> None:
-        self._bus.device(addr).write(memaddr.to_bytes(addrsize // 8, "big") + bytes(buf))
-
-    def readfrom_mem(self, addr: int, memaddr: int, nbytes: int, *, addrsize: int = 8) -> bytes:
+    def readfrom_mem(self, addr: int, memaddr: int, nbytes: int) -> bytes:
         device = self._bus.device(addr)
-        device.write(memaddr.to_bytes(addrsize // 8, "big"))
-        return _read(device, nbytes)
+        device.write(bytes([memaddr]))
+        return device.read(nbytes)
 
-    def readfrom_mem_into(self, addr: int, memaddr: int, buf: bytearray, *, addrsize: int = 8) -> None:
-        buf[:] = self.readfrom_mem(addr, memaddr, len(buf), addrsize=addrsize)
-
-
-def _read(device: Device, count: int) -> bytes:
-    data = device.read(count)
-    if len(data) != count:
-        raise failure(errno.EIO)
-    return data
+    def readfrom_mem_into(self, addr: int, memaddr: int, buf: bytearray) -> None:
+        buf[:] = self.readfrom_mem(addr, memaddr, len(buf))
 
 
 class SimulatedUart:
     """``UART``: connected to the host, as USB is."""
 
-    _board: Hardware
+    _board: Board
 
     def __init__(self, _number: int, baudrate: int = 9600, **_settings: Any) -> None:
         self.baudrate = baudrate
@@ -128,32 +83,21 @@ class SimulatedUart:
     def any(self) -> int:
         return self._console.unread
 
-    def read(self, count: int = -1) -> bytes | None:
-        """Return available bytes, at most ``count``; None if there are none."""
-        waiting = self._console.unread
-        return bytes(self._console.take(waiting if count < 0 else min(count, waiting))) if waiting else None
-
-    def readinto(self, buffer: bytearray | memoryview, count: int = -1) -> int | None:
-        data = self.read(len(buffer) if count < 0 else min(count, len(buffer)))
-        if data is None:
-            return None
+    def readinto(self, buffer: bytearray | memoryview) -> int | None:
+        """Read available bytes; None if there are none."""
+        data = self._console.take(min(len(buffer), self._console.unread))
         buffer[: len(data)] = data
-        return len(data)
+        return len(data) or None
 
-    def write(self, data: Any, *span: int) -> int | None:
-        """``write(data)``, ``write(data, length)`` or ``write(data, offset, length)``; None if nothing was taken."""
-        start, length = (0, *span)[-2:] if span else (0, len(data))
+    def write(self, data: Any, start: int, length: int) -> int | None:
+        """Return how many bytes were taken; None if none."""
         return self._console.write(data[start : start + length]) or None
-
-    def ready(self, mask: int) -> int:
-        return (mask & POLLIN if self._console.unread else 0) | mask & POLLOUT
 
 
 _KINDS: Final[dict[str, type]] = {
     "Pin": SimulatedPin,
     "PWM": SimulatedPwm,
     "ADC": SimulatedAdc,
-    "I2C": SimulatedI2c,
     "SoftI2C": SimulatedI2c,
     "Timer": SimulatedTimer,
     "UART": SimulatedUart,
@@ -165,14 +109,10 @@ _KINDS: Final[dict[str, type]] = {
 class Machine(SimpleNamespace):
     """The module. Its classes belong to this board and are made at first use, because a class takes 3 KB."""
 
-    def __init__(self, board: Hardware) -> None:
+    def __init__(self, board: Board) -> None:
         super().__init__(
             unique_id=lambda: board.uid,
             reset=_reset,
-            freq=lambda *_hertz: board.port.hertz,
-            idle=lambda: None,
-            disable_irq=lambda: 0,
-            enable_irq=lambda _state: None,
         )
         self._board = board
 

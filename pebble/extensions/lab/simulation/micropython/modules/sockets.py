@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import select
 import socket
+import ssl
 from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
@@ -12,18 +13,15 @@ from typing import Any
 from pebble.extensions.lab.simulation.micropython.clock import Clock
 from pebble.extensions.lab.simulation.micropython.faults import WouldHang, failure
 from pebble.extensions.lab.simulation.micropython.modules.streams import POLLERR, POLLHUP, POLLIN, POLLOUT, Stream
-from pebble.extensions.lab.simulation.micropython.modules.tls import ssl_module
+from pebble.extensions.lab.simulation.micropython.modules.tls import as_on_a_board, ssl_module
 from pebble.extensions.lab.simulation.micropython.modules.wlan import Platform, Radio, network_module
 
 Address = tuple[str, int]
 
+_LATER = (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
 MAX_SOCKETS = 5  # TCP connections of the ESP8266's lwIP; the ESP32 has a few more
-RESOLVE_S = 5.0  # how long getaddrinfo blocks a board for a name
 
-_CONSTANTS = {
-    name: int(getattr(socket, name))
-    for name in ("AF_INET", "SOCK_STREAM", "SOCK_DGRAM", "SOL_SOCKET", "SO_REUSEADDR", "IPPROTO_TCP", "TCP_NODELAY")
-}
+_CONSTANTS = {name: int(getattr(socket, name)) for name in ("AF_INET", "SOCK_STREAM", "SOCK_DGRAM")}
 
 
 class HostNetwork:
@@ -38,7 +36,6 @@ class HostNetwork:
         *,
         platform: Platform = "esp32",
         routes: Mapping[Address, Address] | None = None,
-        uid: bytes = b"",
     ) -> None:
         self.clock = clock
         self.radio = Radio(clock.now, platform)
@@ -46,7 +43,6 @@ class HostNetwork:
         self.unread = False
         self.problem = ""  # of the last connection, as text
         self.open: list[HostTcp | HostUdp] = []
-        self._uid = uid
         self._to = dict(routes or {})
         self._from = {there: here for here, there in self._to.items()}
 
@@ -54,8 +50,8 @@ class HostNetwork:
         """Return the modules for a board that has just booted."""
         self.power_off()
         return {
-            "network": network_module(self.radio, self._uid),
-            "socket": socket_module(self.clock, self._socket),
+            "network": network_module(self.radio),
+            "socket": socket_module(self._socket),
             "ssl": ssl_module(),
         }
 
@@ -80,35 +76,25 @@ class HostNetwork:
         return made
 
 
-def socket_module(clock: Clock, make: Any) -> SimpleNamespace:
-    """Make the module ``socket`` of one board; ``make`` opens a socket of the given type."""
+def socket_module(make: Any) -> SimpleNamespace:
+    """Make the module ``socket`` of one board; ``make`` opens a socket of the given type.
+
+    It has no getaddrinfo: that blocks a real board for seconds.
+    """
 
     def open_socket(_family: int = socket.AF_INET, kind: int = socket.SOCK_STREAM, _protocol: int = 0) -> Any:
         return make(kind)
 
-    def getaddrinfo(host: str, port: int, *_more: Any) -> list[tuple[int, int, int, str, Address]]:
-        """Return a numeric address at once; block the whole board for a name, as real ones do."""
-        if not _is_numeric(host):
-            clock.sleep(RESOLVE_S)
-            raise OSError(-2, "EAI_NONAME")
-        return [(socket.AF_INET, socket.SOCK_STREAM, 0, host, (host, port))]
-
-    return SimpleNamespace(socket=open_socket, getaddrinfo=getaddrinfo, **_CONSTANTS)
+    return SimpleNamespace(socket=open_socket, **_CONSTANTS)
 
 
 def numeric(address: Address) -> Address:
     """Return ``address`` if it is numeric. Raises OSError for a name, which would need a resolver."""
-    if not _is_numeric(address[0]):
-        raise OSError(-2, f"{address[0]} is not an address")
-    return address
-
-
-def _is_numeric(host: str) -> bool:
     try:
-        socket.inet_pton(socket.AF_INET, host)
+        socket.inet_pton(socket.AF_INET, address[0])
     except OSError:
-        return False
-    return True
+        raise OSError(-2, f"{address[0]} is not an address") from None
+    return address
 
 
 class _HostSocket:
@@ -125,12 +111,6 @@ class _HostSocket:
     def setblocking(self, blocking: bool) -> None:
         if blocking:
             raise WouldHang("a socket that waits: setblocking(False)")
-
-    def setsockopt(self, level: int, option: int, value: Any) -> None:
-        self._sock.setsockopt(level, option, value)
-
-    def fileno(self) -> int:
-        return self._sock.fileno()
 
     def close(self) -> None:
         if self in self._network.open:
@@ -165,17 +145,21 @@ class HostTcp(_HostSocket, Stream):
         code = self._sock.connect_ex(self._network.route(numeric(address)))
         raise failure(code or errno.EINPROGRESS)
 
+    def secure(self, context: ssl.SSLContext, server_hostname: str | None) -> None:
+        """Put TLS around the connection, at the same file descriptor."""
+        self._sock = context.wrap_socket(self._sock, server_hostname=server_hostname, do_handshake_on_connect=False)
+
     def _receive(self, size: int) -> bytes | None:
         if not self._network.radio.connected:
             return None
         try:
             got = self._sock.recv(size)
             self._network.problem = "" if got else "the broker closed the connection"
-        except BlockingIOError:
+        except _LATER:
             got = None
         except OSError as error:
             self._network.problem = error.strerror or str(error)
-            raise
+            raise (as_on_a_board(error) if isinstance(error, ssl.SSLError) else error) from None
         self._network.unread = got is not None and len(got) == size
         return got
 
@@ -189,8 +173,10 @@ class HostTcp(_HostSocket, Stream):
         self._established = True
         try:
             return self._sock.send(data)
-        except BlockingIOError:
+        except _LATER:
             return None
+        except ssl.SSLError as error:
+            raise as_on_a_board(error) from None
 
 
 class HostUdp(_HostSocket):
@@ -198,12 +184,6 @@ class HostUdp(_HostSocket):
 
     def __init__(self, network: HostNetwork) -> None:
         super().__init__(network, socket.SOCK_DGRAM)
-
-    def bind(self, _place: Address) -> None:
-        """Ignored: answers return to the port of the request."""
-
-    def connect(self, address: Address) -> None:
-        self._sock.connect(self._network.route(numeric(address)))
 
     def sendto(self, data: bytes, address: Address) -> int:
         self._need_wifi()

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any, Final
 from pebble.extensions.lab.simulation.micropython.console import Input, Output
 
 if TYPE_CHECKING:
-    from pebble.extensions.lab.simulation.micropython.hardware import Hardware
+    from pebble.extensions.lab.simulation.micropython.board import Board
 
 _VERSION: Final = (1, 29, 0)
 
 
-def sys_module(board: Hardware) -> SimpleNamespace:
-    version = ".".join(map(str, _VERSION))
+def sys_module(board: Board) -> SimpleNamespace:
     console, stdio_bytes = board.console, board.port.stdio_bytes
     return SimpleNamespace(
         stdin=Input(console, buffer=stdio_bytes),
@@ -23,64 +22,33 @@ def sys_module(board: Hardware) -> SimpleNamespace:
         stderr=Output(console, buffer=stdio_bytes),
         platform=board.port.platform,
         implementation=SimpleNamespace(name="micropython", version=_VERSION, _machine=board.port.board),
-        version=f"3.4.0; MicroPython v{version}",
-        version_info=(3, 4, 0),
-        byteorder="little",
-        maxsize=(1 << 31) - 1,
-        path=["", "/lib"],
         print_exception=lambda error, _file=None: board.print(repr(error)),
     )
 
 
-def os_module(board: Hardware) -> SimpleNamespace:
+def os_module(board: Board) -> SimpleNamespace:
     files = board.files
     return SimpleNamespace(
         urandom=board.random.randbytes,
-        stat=files.stat,
         listdir=files.listdir,
         rename=files.rename,
-        remove=files.remove,
-        uname=lambda: SimpleNamespace(sysname=board.port.platform, machine=board.port.board, release="1.29.0"),
     )
-
-
-def _nothing(*_arguments: Any) -> int:
-    return 0
 
 
 #: Without effect: memory is measured on MicroPython itself
-GC: Final = SimpleNamespace(
-    collect=_nothing, enable=_nothing, disable=_nothing, threshold=_nothing, mem_free=_nothing, mem_alloc=_nothing
-)
+GC: Final = SimpleNamespace(collect=lambda: None)
 
 
-def micropython_module(board: Hardware) -> SimpleNamespace:
+def micropython_module(board: Board) -> SimpleNamespace:
     def kbd_intr(character: int) -> None:
         board.console.interrupt = character
 
-    return SimpleNamespace(
-        const=lambda value: value,
-        kbd_intr=kbd_intr,
-        mem_info=_nothing,
-        alloc_emergency_exception_buf=_nothing,
-        heap_lock=_nothing,
-        heap_unlock=_nothing,
-        opt_level=_nothing,
-    )
+    return SimpleNamespace(const=lambda value: value, kbd_intr=kbd_intr)
 
 
-def random_module(board: Hardware) -> SimpleNamespace:
+def random_module(board: Board) -> SimpleNamespace:
     """CPython's generator, one per board, so that runs are repeatable."""
-    own = board.random
-    return SimpleNamespace(
-        seed=own.seed,
-        random=own.random,
-        uniform=own.uniform,
-        getrandbits=own.getrandbits,
-        randint=own.randint,
-        randrange=own.randrange,
-        choice=own.choice,
-    )
+    return SimpleNamespace(getrandbits=board.random.getrandbits)
 
 
 def _refuse(name: str) -> Any:

@@ -29,29 +29,17 @@ class BoardTime:
         passed = int((self._clock.now() - self.booted) * 1000 + _ROUNDING)
         return (self._ticks_at_boot + passed) & _MASK
 
-    def ticks_us(self) -> int:
-        passed = int((self._clock.now() - self.booted) * 1_000_000 + _ROUNDING)
-        return (self._ticks_at_boot * 1000 + passed) & _MASK
-
-    def time(self) -> int:
-        """Seconds since boot, which an unset clock reports as seconds since 2000."""
-        return int(self._clock.now() - self.booted)
-
     def time_ns(self) -> int:
         return int((self._clock.now() - self.booted) * 1_000_000_000)
 
     def module(self) -> SimpleNamespace:
         return SimpleNamespace(
             ticks_ms=self.ticks_ms,
-            ticks_us=self.ticks_us,
-            ticks_cpu=self.ticks_us,
             ticks_add=ticks_add,
             ticks_diff=ticks_diff,
             sleep=self._pause,
             sleep_ms=lambda ms: self._pause(ms / 1000),
-            sleep_us=lambda us: self._pause(us / 1_000_000),
             gmtime=gmtime,
-            time=self.time,
             time_ns=self.time_ns,
         )
 
