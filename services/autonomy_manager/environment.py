@@ -21,7 +21,8 @@ def environment(*more: Mapping[str, str], ours: bool = True) -> dict[str, str]:
         merged.pop(name, None)
     if not ours and sys.prefix != sys.base_prefix and SYSTEM.is_file():
         own = str(Path(sys.prefix, "bin"))
-        merged["PATH"] = os.pathsep.join(place for place in merged.get("PATH", "").split(os.pathsep) if place != own)
+        places = merged.get("PATH", "").split(os.pathsep)
+        merged["PATH"] = os.pathsep.join(sorted(places, key=lambda place: place == own))  # ours last: pebble is there
         merged.pop("VIRTUAL_ENV", None)
     for variables in more:
         merged |= variables

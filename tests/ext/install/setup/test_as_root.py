@@ -34,7 +34,18 @@ _ACTS = (
     "os.rmdir",
     "os.symlink",
 )
-_CHANGES = ("chmod", "chown", "os.open", "mkdir", "rename", "rmdir", "rmtree", "sqlite3.connect", "symlink_to")
+_CHANGES = (
+    "set_mode",
+    "chmod",
+    "chown",
+    "os.open",
+    "mkdir",
+    "rename",
+    "rmdir",
+    "rmtree",
+    "sqlite3.connect",
+    "symlink_to",
+)
 _CHANGES += ("hardlink_to", "touch", "unlink", "write_bytes", "write_text")
 _watched: list[str] = []  # folders
 _acts: set[str] = set()

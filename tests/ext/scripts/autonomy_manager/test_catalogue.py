@@ -283,7 +283,7 @@ def test_python3_of_a_script_of_others_is_the_systems(tmp_path: Path, monkeypatc
     monkeypatch.setenv("PATH", f"{own}:/usr/bin")
     monkeypatch.setenv("VIRTUAL_ENV", sys.prefix)
     theirs, ours = environment(ours=False), environment()
-    assert (theirs["PATH"], "VIRTUAL_ENV" in theirs, ours["PATH"]) == ("/usr/bin", False, f"{own}:/usr/bin")
+    assert (theirs["PATH"], "VIRTUAL_ENV" in theirs, ours["PATH"]) == (f"/usr/bin:{own}", False, f"{own}:/usr/bin")
     folder = write(tmp_path, "walk", "import json").parent
     (folder / "script.json").write_text(json.dumps({"command": ["python3", "run.py"]}))
     assert scanned(Catalogue(config(tmp_path)))["walk"].command == (interpreter(None, ours=False), "run.py")
