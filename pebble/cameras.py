@@ -79,7 +79,7 @@ class Camera:
                 log.warning("%s", error)
 
     def newest(self) -> Picture | None:
-        """The newest picture that was not returned before, or None. Does not wait."""
+        """Return the newest picture that was not returned before, or None. Does not wait."""
         frame = self._reader.read(0.0)
         if frame is None:
             return None
@@ -125,7 +125,7 @@ def _run_dir(robot: str | Path, env: Mapping[str, str]) -> Path:
 
 
 def _usual_places(robot: str, env: Mapping[str, str]) -> list[Path]:
-    """Where its run directory is if it was started in the same environment, or in one without a login's folder."""
+    """Return where its run directory is if it was started in this environment or in one without a login's folder."""
     levels = robot.split("/")
     if len(levels) not in (1, 3):
         raise ConfigError(f"camera: {robot} is neither a robot's id nor a base topic nor a config file")

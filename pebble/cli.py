@@ -17,7 +17,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # the output's dis
 
 
 def main() -> int:
-    """The entry point; returns the exit code."""
+    """Run the command line; return the exit code."""
     _use_utf8()
     _open_missing_streams()
     sys.excepthook = _print_error
@@ -86,7 +86,7 @@ def _without_secrets(text: str) -> str:
 
 
 def _print_error(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """As Python prints an error that is none of ours: what is in a traceback may come from a command line."""
+    """Print an error that is none of ours as Python does: what is in a traceback may come from a command line."""
     from traceback import format_exception
 
     sys.stderr.write(_without_secrets("".join(format_exception(kind, error, trace))))

@@ -165,7 +165,7 @@ class TopicLine(NamedTuple):
 
 
 def facts(config: Config, added: Iterable[Facts]) -> list[tuple[str, str]]:
-    """The transport, the connections and the processes, line by line, without secrets."""
+    """Return the transport, the connections and the processes, line by line, without secrets."""
     if config.robot.platform != "linux":
         firmware = f"runs on its own MCU ({config.robot.platform}), not with `pebble up`"
         return [("platform", firmware), ("broker", _mqtt(config.local_mqtt)), *_scripts(config)]
@@ -186,7 +186,7 @@ def facts(config: Config, added: Iterable[Facts]) -> list[tuple[str, str]]:
 
 
 def _off(config: Config) -> Iterator[str]:
-    """The services that have settings, but are not enabled."""
+    """Yield the services that have settings, but are not enabled."""
     own = config.services.serial_mcu_bridge
     for name, line in {"": own, **own.instances}.items():
         if not line.enabled and line.serial.port is not None:
@@ -198,7 +198,7 @@ def _off(config: Config) -> Iterator[str]:
 
 
 def topics_of(config: Config) -> Iterator[tuple[str, list[TopicLine]]]:
-    """The processes with topics, each with its topics."""
+    """Yield the processes with topics, each with its topics."""
     for name in (_LAUNCHER, *(program.name for program in programs(config))):
         service, _, instance = name.partition(":")
         lines = _lines(view_of(config, instance), service)
@@ -251,7 +251,10 @@ def _uplink(config: Config) -> str:
 
 
 def _scripts(config: Config) -> list[tuple[str, str]]:
-    """What a script's signature is worth at a broker that others share: no bridge stands between it and the motors."""
+    """Return what a script's signature is worth at a broker that others share.
+
+    No bridge stands between it and the motors.
+    """
     bridge, shared = config.services.mqtt_bridge, config.transport.mqtt_mirror
     if config.transport.kind == "mqtt":
         elsewhere = bridge.remote is not None and bridge.remote.kind != "mqtt"
@@ -271,7 +274,7 @@ def _mqtt(mqtt: Mqtt) -> str:
 
 
 def _local_media(config: Config) -> Iterator[str]:
-    """What programs of the original find on the robot besides MQTT."""
+    """Yield what programs of the original find on the robot besides MQTT."""
     for line in config.motor_lines().values():
         if (memory := config.hall_memory(line)) is not None:
             yield f"hall samples in the shared memory {memory}"

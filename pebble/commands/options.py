@@ -48,7 +48,7 @@ Quick = Annotated[bool, typer.Option("--quick", help="Few cases and short rounds
 
 
 def host_of(option: str, text: str, parse: Callable[[str], str] | None = None) -> str:
-    """The host that an option names. Raises PebbleError."""
+    """Return the host that an option names. Raises PebbleError."""
     from pebble.config import hosts  # not all commands that use this module have one
 
     try:
@@ -58,7 +58,7 @@ def host_of(option: str, text: str, parse: Callable[[str], str] | None = None) -
 
 
 def split_names(text: str) -> list[str]:
-    """The names in ``a,b, c``. Raises PebbleError if there is none."""
+    """Return the names in ``a,b, c``. Raises PebbleError if there is none."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     if not names:
         raise PebbleError(f'"{text}" holds no name')

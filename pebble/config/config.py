@@ -67,24 +67,24 @@ class Config(Root, frozen=True, kw_only=True):
         return kind()
 
     def run_dir(self) -> Path:
-        """The folder of this robot's sockets and locks, absolute; not created here."""
+        """Return the folder of this robot's sockets and locks, absolute; not created here."""
         return self.run_folder
 
     def state_dir(self) -> Path:
-        """The folder of what must survive a power cut, absolute; not created here."""
+        """Return the folder of what must survive a power cut, absolute; not created here."""
         return self.state_folder
 
     def state_file(self, name: str) -> Path:
-        """A file in the state directory, which several robots may share."""
+        """Return a file in the state directory, which several robots may share."""
         return self.state_folder / f"{name}-{file_name(self.base)}.json"
 
     @staticmethod
     def motor_owner(instance: str) -> str:
-        """What the motor owner of a serial line is called in ``outgoing/estop/{owner}``."""
+        """Return what the motor owner of a serial line is called in ``outgoing/estop/{owner}``."""
         return instance or "serial"
 
     def serial_instances(self) -> dict[str, SerialBridge]:
-        """The enabled serial lines, one process each, by instance name; the service's own entry is ``""``."""
+        """Return the enabled serial lines, one process each, by instance name; the service's own entry is ``""``."""
         own = self.services.serial_mcu_bridge
         lines: dict[str, SerialBridge] = {"": own, **own.instances}
         known = {*OF_CORE, *(key for one in self.installed for key in one.protocols)}
@@ -95,14 +95,14 @@ class Config(Root, frozen=True, kw_only=True):
         }
 
     def hall_memory(self, line: SerialBridge) -> str | None:
-        """The name of the shared memory that gets this line's hall samples; None: there is none."""
+        """Return the name of the shared memory that gets this line's hall samples; None: there is none."""
         ring = line.odometry_shm
         if ring is None or not ring.enabled:
             return None
         return ring.name or f"{self.base.replace('/', '_')}_odometry_raw"
 
     def motor_lines(self) -> dict[str, SerialBridge]:
-        """Those of the enabled serial lines that drive motors."""
+        """Return those of the enabled serial lines that drive motors."""
         lines = self.serial_instances().items()
         return {name: line for name, line in lines if SERIAL_PROTOCOLS[line.protocol].drives}
 
@@ -146,14 +146,17 @@ def hand_over(config: Config) -> None:
 
 
 def config_of_process(path: Path | str) -> Config:
-    """The config that the launcher read from ``path`` when the robot started; without a launcher, as :func:`load`."""
+    """Return the config that the launcher read from ``path`` when the robot started.
+
+    Without a launcher, as :func:`load`.
+    """
     if _handed_over is not None and _handed_over.path == Path(path).absolute():
         return _handed_over
     return load(path)
 
 
 def parse(raw: dict[str, Any], *, folder: Path, env: Mapping[str, str]) -> Config:
-    """The same from plain data. ``folder`` is where relative paths start, ``env`` the environment for passwords."""
+    """Return the same of plain data; relative paths start at ``folder``, passwords are in the environment ``env``."""
     return _config(raw, None, folder.absolute(), env)
 
 
@@ -275,7 +278,7 @@ def full_tree() -> type[Root]:
 
 
 def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
-    """The run directory of the robot with this base topic, if its config names none.
+    """Return the run directory of the robot with this base topic, if its config names none.
 
     Short, because a unix socket's path ends at 108 bytes; one per robot, because a host may run two.
     """
@@ -291,7 +294,7 @@ def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
 
 
 def _is_run_from(folder: Path, base: str) -> bool:
-    """Whether the newest launcher in this run directory, if we may read it, was that of this robot."""
+    """True if the newest launcher in this run directory, if we may read it, was that of this robot."""
     try:
         return read_plain(folder / LAUNCHER_LOCK).decode(errors="replace").splitlines()[1:2] == [base]
     except OSError:
@@ -303,7 +306,7 @@ def _user_id() -> int:
 
 
 def default_state_folder(base: str, env: Mapping[str, str]) -> Path:
-    """The state directory of the robot with this base topic, if its config names none; one per robot."""
+    """Return the state directory of the robot with this base topic, if its config names none; one per robot."""
     robot = file_name(base)
     if by_systemd := env.get("STATE_DIRECTORY"):
         return Path(by_systemd.split(":")[0], robot)
@@ -311,13 +314,13 @@ def default_state_folder(base: str, env: Mapping[str, str]) -> Path:
 
 
 def file_name(base: str) -> str:
-    """A name for one robot's files: its base, or a digest of it where a file system would refuse the name."""
+    """Return a name for one robot's files: its base, or a digest of it where a file system would refuse the name."""
     name = base.replace("/", "+")  # which no level of a topic contains
     return name if len(name.encode()) <= _LONGEST_NAME else hashlib.sha256(base.encode()).hexdigest()
 
 
 def resolved(config: Config) -> dict[str, Any]:
-    """The keys of the file with every default and inherited value, and under ``derived`` what is computed from them.
+    """Return the file's keys with every default and inherited value, and under ``derived`` what is computed from them.
 
     JSON can write all of it. Keys that are not set and have no default are left out; secrets and the values of
     variables read ``***``.
@@ -336,6 +339,6 @@ def resolved(config: Config) -> dict[str, Any]:
 
 
 def _object(section: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """The object at ``key`` of a section that is not checked; empty where something else is."""
+    """Return the object at ``key`` of a section that is not checked; empty where something else is."""
     value = section.get(key)
     return value if isinstance(value, dict) else {}

@@ -27,7 +27,7 @@ def values_of(section: object, kind: type[Value]) -> Iterator[Value]:
 
 
 def holds_secret(value: Any, key: str = "") -> bool:
-    """Whether a secret is written in plain data, to tell from its keys and its text."""
+    """True if a secret is written in plain data, to tell from its keys and its text."""
     if isinstance(value, dict):
         return any(holds_secret(item, name) for name, item in value.items())
     if isinstance(value, list):
@@ -39,7 +39,7 @@ def holds_secret(value: Any, key: str = "") -> bool:
 
 
 def masked(value: Any, key: str = "") -> Any:
-    """A value of a config as plain data that anybody may see. Keys that are not set are left out."""
+    """Return a value of a config as plain data that anybody may see. Keys that are not set are left out."""
     if isinstance(value, Secret) or (is_secret(key) and key not in _HARMLESS and value is not None):
         return HIDDEN
     if isinstance(value, Section):

@@ -32,7 +32,7 @@ class Notes:
         self.problems.append(Note(path, text))
 
     def doubt(self, path: Path, text: str) -> None:
-        """A problem that may follow from another: not reported if one is known at this place or around it."""
+        """Note a problem that may follow from another: not reported if one is known at this place or around it."""
         if not any(known.path == path[: len(known.path)] for known in self.problems):
             self.problem(path, text)
 
@@ -86,14 +86,14 @@ def holds(raw: Any, path: Path) -> bool:
 
 
 def near(key: str, known: Iterable[str], likeness: float = _ALIKE) -> str:
-    """The most similar known key; empty: none is as similar."""
+    """Return the most similar known key; empty: none is as similar."""
     from difflib import get_close_matches  # only a file with a mistake pays for this import
 
     return next(iter(get_close_matches(key, sorted(known), n=1, cutoff=likeness)), "")
 
 
 def nearest(key: str, known: Iterable[str]) -> str:
-    """The text after "unknown key": the most similar known key, and all of them if none is similar."""
+    """Return the text after "unknown key": the most similar known key, and all of them if none is similar."""
     names = sorted(known)
     if close := near(key, names):
         return f'did you mean "{close}"?'

@@ -21,7 +21,7 @@ class Pairs(list[tuple[str, Any]]):
 
 
 def read_text(path: Path) -> str:
-    """The file's text. Raises ConfigError, naming the file, when it cannot be read."""
+    """Return the file's text. Raises ConfigError, naming the file, when it cannot be read."""
     try:
         if path.is_dir():
             raise ConfigError(f"{path}: is a folder, name the JSON file in it")
@@ -82,7 +82,7 @@ def _object(pairs: Pairs, notes: problems.Notes, path: problems.Path) -> dict[st
 
 
 def _is_words(path: problems.Path) -> bool:
-    """Whether a text is a command, a variable's value or made for people: blanks at its ends may be meant."""
+    """True if a text is a command, a variable's value or made for people: blanks at its ends may be meant."""
     return "topics" not in path and any(key in _WORDS for key in path)
 
 
@@ -120,7 +120,7 @@ def without(raw: Any, keys: Iterable[str]) -> Any:
 
 
 def _at(raw: Any, *keys: str) -> Any:
-    """The value at a path of keys; None where there is none, as for a key that is not set."""
+    """Return the value at a path of keys; None where there is none, as for a key that is not set."""
     for key in keys:
         raw = raw.get(key) if isinstance(raw, dict) else None
     return raw

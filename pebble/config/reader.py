@@ -52,7 +52,10 @@ class Reader:
         self._rules = rules
 
     def section(self, kind: type[S], raw: Any, path: problems.Path = ()) -> S:
-        """A section of ``kind``. Refused values are noted and replaced by their defaults (missing ones by None)."""
+        """Return a section of ``kind``.
+
+        Refused values are noted and replaced by their defaults (missing ones by None).
+        """
         known = _known(kind)
         if not isinstance(raw, dict):
             is_switch = self._other_forms and "enabled" in known and switch(raw) is not None
@@ -185,7 +188,7 @@ def _default(field: FieldInfo) -> Any:
 
 
 def unwrap(annotation: Any) -> tuple[Any, list[Meta]]:
-    """The bare type behind ``Annotated`` and ``| None``, and the annotations around it."""
+    """Return the bare type behind ``Annotated`` and ``| None``, and the annotations around it."""
     metas: list[Meta] = []
     while True:
         if get_origin(annotation) is Annotated:
@@ -199,7 +202,7 @@ def unwrap(annotation: Any) -> tuple[Any, list[Meta]]:
 
 
 def expected(kind: Any, metas: list[Meta]) -> str:
-    """A correct value in words, to follow "must be"."""
+    """Return a correct value in words, to follow "must be"."""
     if text := _extra(metas, "expected"):
         return str(text)
     if choices := _choices(kind, metas):
@@ -230,7 +233,7 @@ def _limits(metas: list[Meta]) -> Iterator[str]:
 
 
 def _choices(kind: Any, metas: list[Meta]) -> tuple[Any, ...]:
-    """The values that a key may have, where they are listed; an extension may add to those of ``choices``."""
+    """Return the values that a key may have, where they are listed; an extension may add to those of ``choices``."""
     return get_args(kind) if get_origin(kind) is Literal else tuple(_extra(metas, "choices") or ())
 
 
@@ -243,7 +246,10 @@ def _is_section(kind: Any) -> bool:
 
 
 def _shown(raw: Any) -> str:
-    """What was written, in words; of a text only a number, because a secret may have been written in a wrong place."""
+    """Return what was written, in words.
+
+    Of a text only a number, because a secret may have been written in a wrong place.
+    """
     if isinstance(raw, str):
         return f'the text "{raw}"' if _NUMBER(raw) else "text"  # 1883 and "1883" look alike
     if isinstance(raw, dict):

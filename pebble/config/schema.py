@@ -24,7 +24,7 @@ KEYS_FILE = "configuration.md"
 
 
 def schema_text() -> str:
-    """The JSON Schema of a config file. Unlike the reader, it refuses an empty string for "not set"."""
+    """Return the JSON Schema of a config file. Unlike the reader, it refuses an empty string for "not set"."""
     _, definitions = msgspec.json.schema_components(
         [full_tree()], schema_hook=lambda _kind: {"type": "string"}, ref_template="#/$defs/{name}"
     )
@@ -73,7 +73,7 @@ def keys_text() -> str:
 
 
 def _chapters(kind: type[Section], path: str, places: dict[type[Section], str]) -> Iterator[str]:
-    """One table per section, depth first; a kind of section used in several places has its table at the first."""
+    """Yield one table per section, depth first; a kind of section used in several places has its table at the first."""
     places[kind] = path
     inner: list[tuple[type[Section], str]] = []
     rows = []
@@ -109,7 +109,7 @@ def _meaning(field: FieldInfo) -> str:
 
 
 def _allowed(field: FieldInfo) -> str:
-    """The kind of value, in words, where the meaning does not show it."""
+    """Return the kind of value, in words, where the meaning does not show it."""
     kind, metas = unwrap(field.type)
     if get_origin(kind) is tuple:
         return " A list."

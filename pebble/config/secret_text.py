@@ -16,7 +16,7 @@ _WITH_BLANKS = re.compile(r"(://)[^\s/@:]{0,100}:(?!\d{1,5}(?:[\s/?#\"',;]|$))[^
 
 
 def is_secret(key: str) -> bool:
-    """Whether the key's name says that its value, or the file or variable that it names, is secret."""
+    """True if the key's name says that its value, or the file or variable that it names, is secret."""
     return bool(_KEY(key))
 
 
@@ -45,7 +45,7 @@ def _without_login(found: re.Match[str]) -> str:
 
 
 def shown_user(name: str) -> str:
-    """A user name for messages; a password that was written behind it is hidden."""
+    """Return a user name for messages; a password that was written behind it is hidden."""
     user, colon, _ = without_secrets(name).partition(":")
     return f"{user}:{HIDDEN}" if colon else user
 

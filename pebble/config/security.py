@@ -34,12 +34,12 @@ class Security(Section, frozen=True, kw_only=True):
         return self.strangers or ("refuse" if self.level == "named" else "free")
 
     def on_board(self) -> dict[str, str]:
-        """The section `security` of a board's private_config.json; empty: what it does without one."""
+        """Return the section `security` of a board's private_config.json; empty: what it does without one."""
         if self.level == "open" and self.unnamed == "free":
             return {}
         return {"level": self.level, "strangers": self.unnamed}
 
     @property
     def named(self) -> bool:
-        """Whether the names of senders are checked."""
+        """True if the names of senders are checked."""
         return self.level == "named"

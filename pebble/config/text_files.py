@@ -13,12 +13,12 @@ class NotTextError(PebbleError):
 
 
 def read_text(path: Path) -> str:
-    """The file's text, without a byte order mark and with ``\\n`` after each line. Raises OSError and NotTextError."""
+    """Return the file's text, without a byte order mark, with ``\\n`` after each line. Raises OSError, NotTextError."""
     return text_of(path.read_bytes())
 
 
 def read_password(file: Path, option: str) -> str:
-    """The text of the file that ``option`` names, without its final newline. Raises PebbleError.
+    """Return the text of the file that ``option`` names, without its final newline. Raises PebbleError.
 
     It does not repeat the name of the file, which may be the password itself.
     """
@@ -31,12 +31,12 @@ def read_password(file: Path, option: str) -> str:
 
 
 def password(file: Path | None) -> str | None:
-    """The broker's password in the file, else in the environment. Raises PebbleError."""
+    """Return the broker's password in the file, else in the environment. Raises PebbleError."""
     return os.environ.get(PASSWORD) if file is None else read_password(file, "--password-file")
 
 
 def text_of(data: bytes) -> str:
-    """The text in the bytes of a file. Raises NotTextError, which repeats none of them."""
+    """Return the text in the bytes of a file. Raises NotTextError, which repeats none of them."""
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

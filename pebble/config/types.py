@@ -95,7 +95,7 @@ EMPTY: Any = field(default_factory=dict)
 
 
 def doc(text: str) -> Meta:
-    """What a key means, for docs/configuration.md and for editors."""
+    """Return what a key means, for docs/configuration.md and for editors."""
     return Meta(description=text)
 
 

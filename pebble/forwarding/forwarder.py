@@ -67,7 +67,7 @@ class Mirroring:
         self.on, self._was_refused = on, on and self._was_refused
 
     def is_possible(self) -> bool:
-        """A broker that sends our own commands back would repeat each one later: also after the stop."""
+        """True if the broker does not send our own commands back: it would repeat each later, also after the stop."""
         if all(one.transport.exact_echo for one in self._sides.values()):
             return True
         if not self._was_refused:

@@ -58,7 +58,7 @@ class AnnouncerPipe:
             self.dropped += 1
 
     def close(self) -> None:
-        """The announcer reads the end of the stream."""
+        """Close the stream, whose end the announcer reads."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -95,6 +95,6 @@ class AnnouncerPipe:
 
 
 def next_envelope(descriptor: int) -> Envelope | None:
-    """The announcer's end: the next envelope, None at the end. Raises BlockingIOError, DecodeError."""
+    """Return the announcer's end: the next envelope, None at the end. Raises BlockingIOError, DecodeError."""
     raw = os.read(descriptor, ENVELOPE_LIMIT)
     return msgspec.msgpack.decode(raw, type=Envelope) if raw else None

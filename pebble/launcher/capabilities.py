@@ -162,7 +162,10 @@ def _motor(
 
 
 def _estop(config: Config, owners: list[str]) -> offers.EstopOffer:
-    """Where to stop the robot, and who then reports it as stopped. If one owner lacks the stop, the robot does."""
+    """Return where to stop the robot, and who then reports it as stopped.
+
+    If one owner lacks the stop, the robot does.
+    """
     return offers.EstopOffer(
         available=bool(owners),
         topic=c.ESTOP.topic(config.base),
@@ -174,14 +177,17 @@ def _estop(config: Config, owners: list[str]) -> offers.EstopOffer:
 
 
 def _imu(config: Config) -> tuple[bool, str]:
-    """An inertial sensor, known by its line's protocol or name; a self-describing MCU's manifest comes later."""
+    """Return an inertial sensor, known by its line's protocol or name; a self-describing MCU's manifest comes later."""
     lines = [name for name, line in config.serial_instances().items() if SERIAL_PROTOCOLS[line.protocol].has_imu(name)]
     addresses = Addresses(view_of(config, lines[0]) if lines else config)
     return bool(lines), addresses[c.IMU].topic
 
 
 def _outlets(config: Config, found: Collection[str]) -> offers.OutletsOffer:
-    """The outlets of self-describing MCUs that are connected now: what reports its state, and what can be switched."""
+    """Return the outlets of self-describing MCUs that are connected now.
+
+    What reports its state, and what can be switched.
+    """
     topics: dict[str, dict[str, str]] = {}
     for key, channel in (("status_topic", c.OUTLET_STATUS), ("command_topic", c.OUTLET_COMMAND)):
         for feature in sorted(found):
@@ -194,5 +200,5 @@ def _outlets(config: Config, found: Collection[str]) -> offers.OutletsOffer:
 
 
 def _first(*values: float | None) -> float | None:
-    """The first that was set: 0 is a value."""
+    """Return the first that was set: 0 is a value."""
     return next((value for value in values if value is not None), None)

@@ -135,7 +135,7 @@ class LevelReader:
 
 
 def text_of(line: bytes) -> str:
-    """A line as text, whatever bytes are in it; without logins, which programs of others may print."""
+    """Return a line as text, whatever bytes are in it; without logins, which programs of others may print."""
     return shown(without_secrets(line.decode(errors="replace").rstrip()))
 
 

@@ -36,7 +36,7 @@ class OnDemand:
         return tuple(name for name in self._supervisors if name in self._wanted)
 
     def environment(self, program: Program) -> dict[str, str]:
-        """The variables that pass requests on to a new process of ``program``."""
+        """Return the variables that pass requests on to a new process of ``program``."""
         if program.may_request:
             return {WANTED: " ".join(f"{name}={self._encodings[name]}" for name in self.requested)}
         return {ENCODING: self._encodings[program.name]} if program.on_demand else {}
@@ -70,7 +70,7 @@ class OnDemand:
             supervisor.request()
 
     def ended(self, program: Program) -> None:
-        """A program has ended: what it requested may run on for a while, but not for ever; it holds nothing more."""
+        """Note that a program has ended: what it requested may run on for a while only, and it holds nothing more."""
         if not program.may_request:
             return
         held, self._held = self._held, set()

@@ -32,7 +32,7 @@ class Pipes:
         reactor.watch(child.notes, self._read_notes)
 
     def close(self) -> None:
-        """The child has ended: read what it left, and the line that it did not finish."""
+        """Read what the child, which has ended, left, and the line that it did not finish."""
         for timer in (self._pause, self._tick):
             if timer is not None:
                 timer.cancel()

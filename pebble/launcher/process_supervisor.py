@@ -116,7 +116,7 @@ class ProcessSupervisor:
             self._timer = self._reactor.after(self.program.stop_timeout_s, self._kill_overdue)
 
     def hold(self) -> None:
-        """As :meth:`release`, until :meth:`request`: others know that the program is requested."""
+        """Release it until :meth:`request`: others know that the program is requested."""
         if not self.held:
             self.release()
             self.shown = self.held = True

@@ -60,7 +60,7 @@ def preload(modules: Iterable[str]) -> None:
 
 
 def _transport_modules(config: Config) -> tuple[str, ...]:
-    """The modules of Pebble's own transports that some process of this robot opens."""
+    """Return the modules of Pebble's own transports that some process of this robot opens."""
     bridge = config.services.mqtt_bridge
     kinds = {config.transport.kind}
     if config.transport.mqtt_mirror is not None:
@@ -81,7 +81,7 @@ def _service(config: Config, name: str, **more: Any) -> Program:
 
 
 def _serial_line(config: Config, instance: str, line: SerialBridge) -> Program:
-    """Its process imports the bridge of its protocol, not those of others."""
+    """Return its process imports the bridge of its protocol, not those of others."""
     arguments = (str(config.path), instance) if instance else (str(config.path),)
     entry = SERIAL_PROTOCOLS[line.protocol].module
     return Program(program_of(instance), "pebble.services.serial_mcu_bridge", arguments, Stage.DEVICE, entry=entry)

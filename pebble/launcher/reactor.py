@@ -34,7 +34,7 @@ class Reactor:
         self._read: float | None = None  # when the clock was last read; None while nothing runs
 
     def now(self) -> float:
-        """The time by this reactor's clock, in seconds."""
+        """Return the time by this reactor's clock, in seconds."""
         now = self._clock()
         if self._read is not None:
             before, self._read = self._read, now

@@ -43,7 +43,7 @@ class RestartPolicy:
         return sum(now - at <= LOOP_WINDOW_S for at in self._exits)
 
     def request_delay_s(self, now: float) -> float:
-        """Seconds to wait before an on-demand program that was released is started on a new request."""
+        """Return seconds to wait before an on-demand program that was released is started on a new request."""
         return max(0.0, self._started + START_INTERVAL_S - now)
 
     def started(self, now: float, *, plain: bool = False) -> None:

@@ -45,7 +45,7 @@ class StatusPublisher:
         self._ready_reported = False
 
     def connect_announcer(self) -> int:
-        """The standard input of a new announcer process: a descriptor, which the caller closes."""
+        """Return the standard input of a new announcer process: a descriptor, which the caller closes."""
         return self._pipe.connect(self._will())
 
     def start(self) -> None:
@@ -61,7 +61,7 @@ class StatusPublisher:
         self._reactor.every(interval_s, self._publish_status)
 
     def changed(self) -> None:
-        """The state of a supervisor may have changed: publish soon."""
+        """Note that the state of a supervisor may have changed: publish soon."""
         always = (supervisor for supervisor in self._supervisors if not supervisor.program.on_demand)
         if not self._ready_reported and all(supervisor.policy.first_attempt_done for supervisor in always):
             self._ready_reported = True
@@ -71,7 +71,7 @@ class StatusPublisher:
             self._reactor.after(_STATUS_PAUSE_S, self._publish_status)
 
     def capabilities_changed(self) -> None:
-        """What the processes report has changed: publish soon."""
+        """Note that what the processes report has changed: publish soon."""
         if self._config.services.launcher.enabled and not self._capabilities_due:
             self._capabilities_due = True
             self._reactor.after(_STATUS_PAUSE_S, self._publish_capabilities)
@@ -137,7 +137,7 @@ class StatusPublisher:
         self._pipe.state(self._message(channel, value))
 
     def _will(self) -> Message:
-        """Every service is stopped: children die with the launcher, whose end is what triggers the will."""
+        """Return the status with every service stopped: children die with the launcher, whose end publishes it."""
         shown = (supervisor.program.name for supervisor in self._supervisors if supervisor.shown)
         return self._message(STATUS, self._status({name: ServiceState(state="stopped") for name in shown}))
 
@@ -147,7 +147,7 @@ class StatusPublisher:
 
 
 def _rests(supervisor: ProcessSupervisor) -> bool:
-    """An on-demand program that is not requested: systemd's summary leaves it out."""
+    """True if it is an on-demand program that is not requested: systemd's summary leaves it out."""
     return supervisor.program.on_demand and not supervisor.requested and not supervisor.running
 
 

@@ -38,7 +38,7 @@ class Step:
 
 
 def steps(bundle: int, bitrate: int) -> tuple[Step, ...]:
-    """From as configured to as little as still makes sense; only steps that save something."""
+    """Return the steps from as configured to as little as still makes sense; only those that save something."""
     found = [Step(bundle, bitrate)]
     if bundle < BUNDLE_LIMIT:
         found.append(Step(BUNDLE_LIMIT, bitrate, f"{BUNDLE_LIMIT} parts a packet"))
@@ -86,7 +86,7 @@ class RateController:
         return not self._is_resting and self._age_s <= (OPUS_WAITING_LIMIT_S if encoding == "opus" else WAITING_LIMIT_S)
 
     def sent(self, size: int, now: float) -> None:
-        """The connection has accepted a packet of ``size`` bytes."""
+        """Note that the connection has accepted a packet of ``size`` bytes."""
         self._in_flight.sent(size + _OVERHEAD, now)
 
     def connection_lost(self) -> None:
@@ -108,7 +108,7 @@ class LevelControl:
         self._calm_s = _FIRST_CALM_S
 
     def poll(self, age_s: float, now: float) -> bool:
-        """The oldest packet has waited for ``age_s``; True if the level changes."""
+        """Note that the oldest packet has waited for ``age_s``; True if the level changes."""
         if now - self._polled_at > _GAP_S:
             self._slow_since = self._fast_since = None
         self._polled_at = now

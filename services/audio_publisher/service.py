@@ -68,7 +68,7 @@ class AudioPublisher(Service):
             self._requested = self._known(request.encoding)
 
     def _known(self, requested: str | None) -> str:
-        """The requested encoding if this installation has it, else the configured one."""
+        """Return the requested encoding if this installation has it, else the configured one."""
         return requested if requested is not None and requested in SOUND_ENCODINGS else self._options.encoding
 
     @property
@@ -117,7 +117,10 @@ class AudioPublisher(Service):
         self.counters.add("bytes", len(packet))
 
     def _encoder_for(self, rate: int, channels: int) -> SoundEncoder:
-        """The present one, or a new one if anything about it has to change; another step waits for a packet's end."""
+        """Return the present one, or a new one if anything about it has to change.
+
+        Another step waits for a packet's end.
+        """
         step = self._rate.step if self._requested == "opus" else self._rate.configured
         needed = (self._requested, rate, channels, step)
         same_sound = needed[:-1] == self._made_for[:-1]
@@ -130,7 +133,10 @@ class AudioPublisher(Service):
         return self._encoder
 
     def _make(self, name: str, rate: int, channels: int, step: Step) -> SoundEncoder:
-        """The encoder called ``name``; where it cannot be made, the one that every robot has and every client reads."""
+        """Return the encoder called ``name``.
+
+        Where it cannot be made, the one that every robot has and every client reads.
+        """
         options = self._options
         self._problem = ""
         for attempt in (name, "pcm"):

@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 
 def roots(config: Config, own: Path = _OWN_SCRIPTS) -> tuple[Path, ...]:
-    """The folders of scripts; of two scripts with one name, that in the first folder counts.
+    """Return the folders of scripts; of two scripts with one name, that in the first folder counts.
 
     An absolute path is the only folder; a relative one is searched beside the config, and then Pebble's own.
     The original starts relative paths at its repository, two folders above its configs.
@@ -195,7 +195,7 @@ class Catalogue:
     def _command(
         self, folder: Path, entry: Path, section: ScriptSection, described: Description, *, ours: bool
     ) -> tuple[str, ...]:
-        """The command line without options."""
+        """Return the command line without options."""
         python = section.python
         if python is not None and "/" in python:
             python = str(self._config.folder / in_home(python))
@@ -236,7 +236,7 @@ class Catalogue:
 
 
 def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
-    """The ``files`` of `autonomy-files`; without a form where all would be too long."""
+    """Return the ``files`` of `autonomy-files`; without a form where all would be too long."""
     entries: list[dict[str, object]] = []
     left = _LONGEST_FILES
     for script in scripts:
@@ -248,7 +248,10 @@ def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
 
 
 def _first_seen(script: Script, configs: Iterable[Mapping[str, object]]) -> dict[str, object]:
-    """What operators read of it before its settings, and which of these they see first; only what it says itself."""
+    """Return what operators read of it before its settings, and which of these they see first.
+
+    Only what it says itself.
+    """
     keys = {setting["key"] for setting in configs}
     first = {"summary": script.summary, "main": [key for key in script.main if key in keys]}
     unasked = {} if script.asked else {"asked": False}
@@ -263,7 +266,7 @@ def _inside(root: Path) -> list[Path]:
 
 
 def _merged(first: Description, second: Description) -> Description:
-    """What ``first`` leaves open is taken from ``second``."""
+    """Return ``first``, with what it leaves open taken from ``second``."""
     keys = {setting.key for setting in first.configs}
     return Description(
         label=first.label or second.label,
@@ -279,7 +282,7 @@ def _with_option(configured: Setting, own: Setting) -> Setting:
 
 
 def _dependencies(name: str, section: ScriptSection, described: Description) -> tuple[Dependency, ...]:
-    """The config's, else the script's own; each script once, and never itself."""
+    """Return the config's, else the script's own; each script once, and never itself."""
     chosen: Iterable[tuple[str, Mapping[str, object]]]
     if section.dependencies:
         chosen = ((each.file, each.config) for each in section.dependencies if each.enabled)

@@ -53,7 +53,7 @@ class Description(Struct, frozen=True):
 
 
 def _texts(description: Description) -> Iterator[str]:
-    """What operators see of it, also in a terminal."""
+    """Yield what operators see of it, also in a terminal."""
     yield description.label or ""
     yield description.summary
     for setting in description.configs:
@@ -97,7 +97,7 @@ def _imports_ours(node: ast.AST) -> bool:
 
 
 def read_manifest(path: Path) -> Description | None:
-    """The description in a `script.json`; None without one. Raises DescribeError."""
+    """Return the description in a `script.json`; None without one. Raises DescribeError."""
     try:
         if path.exists() and not path.is_file():
             raise DescribeError(f"{MANIFEST} is no file")  # to open a pipe would wait for its other end
@@ -145,7 +145,7 @@ def _content(file: IO[bytes]) -> bytes:
 
 
 def _parse(raw: bytes, source: str) -> Description:
-    """The last line of a script's output counts: modules may print while they are imported."""
+    """Return what the last line of a script's output says: modules may print while they are imported."""
     if len(raw) > _LONGEST:
         raise DescribeError(f"{source} is longer than {_LONGEST} bytes")
     try:

@@ -30,7 +30,7 @@ def environment(*more: Mapping[str, str], ours: bool = True) -> dict[str, str]:
 
 
 def local_login(config: Config) -> dict[str, str]:
-    """The variable with the password of the robot's own broker, for a script that connects to it itself."""
+    """Return the variable with the password of the robot's own broker, for a script that connects to it itself."""
     local = config.local_mqtt
     if config.transport.kind != "mqtt" or local.password_env is None:
         return {}

@@ -35,14 +35,14 @@ class MotorOwners:
         return owner in self._names or (not self._names and (owner in known or len(known) < _MOST))
 
     def holder_beside(self, by: str) -> str:
-        """Who has control, if it is not the account of ``by``; else empty. The first owner decides."""
+        """Return who has control, if it is not the account of ``by``; else empty. The first owner decides."""
         state = self._controls[min(self._controls)] if self._controls else None
         if state is None or not state.key or state.by.partition("/")[0] == by.partition("/")[0]:
             return ""
         return state.by or "a program of the robot"
 
     def note_run(self, run: int) -> None:
-        """A drive command carries ``run``."""
+        """Note that a drive command carries ``run``."""
         if newer(run, self.newest_run):
             self.newest_run = run
 
@@ -66,7 +66,7 @@ class MotorOwners:
         return next((_stopped(owner, state) for owner, state in self._states.items() if state.latched), "")
 
     def baseline(self) -> Baseline:
-        """What must not change while a script runs."""
+        """Return what must not change while a script runs."""
         return {owner: (state.boot, state.count, state.last_barred) for owner, state in self._states.items()}
 
     @property
@@ -75,7 +75,7 @@ class MotorOwners:
         return any(state.key for state in self._controls.values())
 
     def ending(self, run: int, baseline: Baseline, signs: bool = True) -> str:
-        """Why this run has to end; empty if it may go on. Owners that are new are added to ``baseline``.
+        """Return why this run has to end; empty if it may go on. Owners that are new are added to ``baseline``.
 
         A run that does not sign its commands bars itself by them, and is not stopped by that.
         """

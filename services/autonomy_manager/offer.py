@@ -29,7 +29,7 @@ class Offer:
         self._wanted, self._ended = threading.Event(), False
 
     def begin(self) -> bool:
-        """Whether :meth:`scan` is to be called from now on."""
+        """True if :meth:`scan` is to be called from now on."""
         if self._fixed:
             self._found(self.scripts)
         else:
@@ -45,7 +45,7 @@ class Offer:
         self._wanted.set()
 
     def _scan(self) -> None:
-        """On a thread of its own: to ask a script what it is takes long."""
+        """Ask scripts what they are, on a thread of its own: that takes long."""
         catalogue = Catalogue(self._config)
         while self._wanted.wait() and not self._ended:
             self._wanted.clear()

@@ -72,7 +72,7 @@ class Runner:
 
     @property
     def switching(self) -> bool:
-        """Whether a start waits for the end of what runs."""
+        """True if a start waits for the end of what runs."""
         return self._next is not None
 
     @property
@@ -91,7 +91,7 @@ class Runner:
         return any(plan is not None and plan.drives for plan in plans)
 
     def refuse(self, error: str | None, *, stopped: bool = False) -> None:
-        """A start is not possible, or, with None, it is again; what runs goes on."""
+        """Note that a start is not possible, or, with None, it is again; what runs goes on."""
         self.error, self.stopped = error, stopped
         self._service.changed()
 

@@ -161,7 +161,7 @@ class AutonomyManager(Service):
 
     @on(DRIVE, direct=True)
     def drive(self, drive: Drive, _arrived: float) -> None:
-        """On the transport's thread. Without a key, a script that does not sign and a person are not told apart."""
+        """Take a drive command, on the transport's thread. Unsigned scripts and people without a key are alike."""
         if drive.signed:
             if isinstance(drive.run, int):
                 self._owners.note_run(drive.run)
@@ -185,7 +185,7 @@ class AutonomyManager(Service):
         self.changed()
 
     def _person_stops(self) -> None:
-        """The arbiter bars what starts during the hold of such a zero, too: it may have been asked for before."""
+        """End what runs, and refuse starts as the arbiter does during the hold of such a zero: they may be older."""
         self._refused_until = self.clock() + _HOLD_S
         self._end_unsigned()
 
@@ -224,7 +224,7 @@ class AutonomyManager(Service):
         return run, self._owners.baseline()
 
     def end_run(self, run: int) -> None:
-        """All processes of this run have ended."""
+        """Note that all processes of this run have ended."""
         self._owners.note_run(following(run))  # a person may bar it, too, before the next run
         self.halt(following(run))  # bars this run: a process of it may have escaped
         self._local.release()

@@ -45,7 +45,7 @@ class CaptureProgram:
         self._poll.register(self._err, select.POLLIN)
 
     def read(self, limit: int = _CHUNK) -> bytes:
-        """What it has written since, at least one byte. Raises DeviceError when it ends or hangs."""
+        """Return what it has written since, at least one byte. Raises DeviceError when it ends or hangs."""
         deadline = time.monotonic() + self._silence_s
         while True:
             left = deadline - time.monotonic()
@@ -64,7 +64,7 @@ class CaptureProgram:
                 return chunk
 
     def interrupt(self) -> None:
-        """From any thread: kill it, which makes a waiting ``read`` fail."""
+        """Kill it, from any thread, which makes a waiting ``read`` fail."""
         self._child.signal(signal.SIGKILL)
 
     def close(self) -> None:

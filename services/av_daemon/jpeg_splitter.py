@@ -15,7 +15,7 @@ class JpegSplitter:
         self._buffer = bytearray()
 
     def feed(self, chunk: bytes) -> list[bytes]:
-        """The pictures that are complete now."""
+        """Return the pictures that are complete now."""
         buffer, pictures = self._buffer, []
         buffer += chunk
         while True:

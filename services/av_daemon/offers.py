@@ -23,7 +23,7 @@ def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
 
 
 def _completed(offer: Any, captured: Any, keys: tuple[str, ...], available: bool, obeys: bool) -> Any:
-    """An offer with what is captured, where operators are not sent something else."""
+    """Return an offer with what is captured, where operators are not sent something else."""
     missing = {key: getattr(captured, key) for key in keys if getattr(offer, key) is None}
     return replace(offer, available=available, controls=available and obeys, **missing)
 

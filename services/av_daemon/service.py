@@ -34,7 +34,7 @@ class Reports:
             self._reports[program] = (now, report)
 
     def current(self, now: float) -> dict[str, MediaReport]:
-        """The reports of the last SILENCE_S seconds, by program name."""
+        """Return the reports of the last SILENCE_S seconds, by program name."""
         self._reports = {name: (at, report) for name, (at, report) in self._reports.items() if now - at < SILENCE_S}
         return {name: self._reports[name][1] for name in sorted(self._reports)}
 

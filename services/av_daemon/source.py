@@ -28,7 +28,10 @@ class Capture:
     skipped: int = 0
 
     def pixels(self, scratch: Bytes) -> Bytes:
-        """The frame as bytes in one dimension; drawn into ``scratch``, of ``size`` bytes, where it has no data."""
+        """Return the frame as bytes in one dimension.
+
+        Drawn into ``scratch``, of ``size`` bytes, where it has no data.
+        """
         if self.draw is not None:
             self.draw(scratch)
             return scratch
@@ -48,7 +51,7 @@ class Source(Protocol):
         """Release the device."""
 
     def interrupt(self) -> None:
-        """From any thread: make a waiting ``grab`` fail soon, where that is possible."""
+        """Make a waiting ``grab`` fail soon, from any thread, where that is possible."""
 
 
 def opencv() -> Any:

@@ -25,7 +25,7 @@ _BROKEN_LIMIT = 30  # pictures one after the other that cannot be decoded; a few
 
 
 def camera(options: AvDaemon, start: float) -> Opener:
-    """A function that opens the camera, upright. ``start``: when a synthetic one begins to count, in monotonic time."""
+    """Return what opens the camera, upright; ``start``: when a synthetic one begins to count, in monotonic time."""
 
     def open_() -> Source:
         degrees = options.video.rotate_degrees
@@ -63,7 +63,7 @@ def picture_bytes(options: AvDaemon) -> int:
 
 
 def chunk_bytes(options: AvDaemon) -> int:
-    """The size of one piece of sound."""
+    """Return the size of one piece of sound."""
     return round(options.audio.rate * CHUNK_S) * 2 * options.audio.channels
 
 
@@ -104,7 +104,7 @@ class Rotated:
         self._camera.interrupt()
 
     def _next(self) -> tuple[Capture, Bytes, int]:
-        """The next picture that is whole, and how many were skipped."""
+        """Return the next picture that is whole, and how many were skipped."""
         skipped = 0
         for broken in range(_BROKEN_LIMIT):
             capture = self._camera.grab()

@@ -52,7 +52,7 @@ class Pacer:
         self._interrupted.set()
 
     def _now(self) -> int:
-        """The latest turn that is due."""
+        """Return the latest turn that is due."""
         return int((self._clock() - self._start) * self._rate)
 
 
@@ -62,7 +62,7 @@ class ComputedDevice:
     _pacer: Pacer
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: nothing is open."""
 
     def interrupt(self) -> None:
         self._pacer.interrupt()

@@ -72,7 +72,7 @@ class V4l2Camera:
         return capture
 
     def _choose_format(self, video: CameraCapture) -> str:
-        """The format of the frames: the camera's own if readers can decode it and OpenCV leaves it alone."""
+        """Return the format of the frames: the camera's own if readers can decode it and OpenCV leaves it alone."""
         code = int(self._capture.get(self._cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
         has = code.to_bytes(4, "little").decode("latin-1")
         wanted = video.capture_format
@@ -119,7 +119,7 @@ def is_device(name: str) -> bool:
 
 
 def _without_secrets(device: str) -> str:
-    """A network camera's URL without its password: the name of a camera is logged and published."""
+    """Return a network camera's URL without its password: the name of a camera is logged and published."""
     scheme, separator, rest = device.partition("://")
     if not separator:
         return device

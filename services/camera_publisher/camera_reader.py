@@ -55,7 +55,7 @@ class CameraReader:
         self._put(None)
 
     def take(self) -> Frame | None:
-        """The newest frame, once; the caller releases it."""
+        """Return the newest frame, once; the caller releases it."""
         with self._lock:
             frame, self._newest = self._newest, None
         return frame

@@ -50,11 +50,11 @@ class KeyframeRequests:
         self._sent_at = float("-inf")
 
     def request(self) -> None:
-        """A receiver cannot decode the differences."""
+        """Note that a receiver cannot decode the differences."""
         self._requested = True
 
     def require(self) -> None:
-        """The next picture cannot build upon the last one: send a full one at once."""
+        """Require a full picture at once: the next one cannot build upon the last one."""
         self._required = True
 
     def due(self, now: float) -> bool:
@@ -62,6 +62,6 @@ class KeyframeRequests:
         return self._required or (self._requested and now - self._sent_at >= PERIOD_S)
 
     def sent(self, now: float) -> None:
-        """A full picture was sent, for whatever reason."""
+        """Note that a full picture was sent, for whatever reason."""
         self._requested = self._required = False
         self._sent_at = now

@@ -32,7 +32,7 @@ _HEADER, _PER_RECORD, _RECORD = 8, 30, 16 << 10
 
 
 def wire_size(topic: str, payload: bytes) -> int:
-    """The bytes that a message takes on the wire, roughly."""
+    """Return the bytes that a message takes on the wire, roughly."""
     size = _HEADER + len(topic) + len(payload)
     return size + _PER_RECORD * (1 + size // _RECORD)
 
@@ -83,7 +83,7 @@ class RateController:
         return True
 
     def sent(self, size: int, now: float) -> None:
-        """The connection has accepted a picture that takes ``size`` bytes on the wire."""
+        """Note that the connection has accepted a picture that takes ``size`` bytes on the wire."""
         self._window.sent(size, now)
 
     def poll(self, now: float) -> Step | None:
@@ -121,7 +121,7 @@ class Step:
         return self.bytes * math.pow(self.rate, 0.9)
 
     def __str__(self) -> str:
-        """What is reduced, for display: "quality 1/2, size 3/4"; empty if nothing is."""
+        """Return what is reduced, for display: "quality 1/2, size 3/4"; empty if nothing is."""
         parts = {"quality": self.quality, "size": self.size, "rate": self.rate}
         return ", ".join(f"{name} {share}" for name, share in parts.items() if share != 1)
 

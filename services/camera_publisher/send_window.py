@@ -46,7 +46,7 @@ class SendWindow:
         return len(self._frames)
 
     def clear(self) -> None:
-        """The connection is lost, and all frames in flight with it."""
+        """Note that the connection is lost, and all frames in flight with it."""
         self._frames.clear()
         self._limit = 1
 
@@ -57,7 +57,7 @@ class SendWindow:
         self._frames.sent(size, now)
 
     def poll(self, waiting: int, round_trip_s: float, now: float) -> list[Acknowledged]:
-        """The frames acknowledged since the last poll, while ``waiting`` bytes are not."""
+        """Return the frames acknowledged since the last poll, while ``waiting`` bytes are not."""
         self._round_trip_s, since_s, self._polled_at = round_trip_s, now - self._polled_at, now
         frames, slack_s = self._frames.acknowledge(waiting), self._slack_s(now)
         acknowledged = []
@@ -83,7 +83,7 @@ class SendWindow:
         return late_s > 0 and not probe
 
     def age_s(self, round_trip_s: float, now: float) -> float:
-        """How much longer than a mere round trip the oldest frame has been in flight; 0 without one."""
+        """Return how much longer than a mere round trip the oldest frame has been in flight; 0 without one."""
         if not len(self._frames):
             return 0.0
         return max(0.0, self._frames.age_s(now) - round_trip_s - self._slack_s(now))
@@ -94,5 +94,5 @@ class SendWindow:
 
 
 def _credible(took_s: float, slack_s: float) -> float:
-    """The part of it that is surely due to the connection: none below the slack, all from twice the slack on."""
+    """Return the part of it that is surely due to the connection: none below the slack, all from twice the slack on."""
     return took_s * min(1.0, max(0.0, took_s / slack_s - 1.0))

@@ -83,11 +83,14 @@ class CameraPublisher(Service):
             self._keyframes.request()
 
     def _known(self, requested: str | None) -> str:
-        """The requested encoding if this installation has it, else the configured one."""
+        """Return the requested encoding if this installation has it, else the configured one."""
         return requested if requested is not None and requested in VIDEO_ENCODINGS else self._options.encoding
 
     def _make_encoder(self, name: str) -> VideoEncoder:
-        """The encoder called ``name``; where it cannot be made, the one that every robot has and every client reads."""
+        """Return the encoder called ``name``.
+
+        Where it cannot be made, the one that every robot has and every client reads.
+        """
         try:
             encoder = self._open_encoder(name)
         except PebbleError as error:
@@ -112,7 +115,7 @@ class CameraPublisher(Service):
     # -- the connection
 
     def _on_remote(self) -> None:
-        """The present state: a change that was undone meanwhile counts as none, but what was in flight is lost."""
+        """Take the present state: a change that was undone counts as none, but what was in flight is lost."""
         self._rate.connection_lost()
         self._keyframes.require()
         self._meter.clear()
@@ -170,7 +173,7 @@ class CameraPublisher(Service):
         return self._encoder.encode(picture, captured_ms, keyframe=self._keyframes.due(self.clock()))
 
     def _throw_away(self, why: str) -> None:
-        """The encoder assumes that the picture was sent, so the next one must not build upon it."""
+        """Throw a picture away: the encoder assumes that it was sent, so the next one must not build upon it."""
         self.counters.add(why)
         self._keyframes.require()
 

@@ -101,7 +101,7 @@ class LinkMeter:
 
     @property
     def crowded(self) -> bool:
-        """Whether more is on its way, in either direction, than drains."""
+        """True if more is on its way, in either direction, than drains."""
         return self._crowd.stands
 
     @property
@@ -109,7 +109,7 @@ class LinkMeter:
         return self._shortest.seconds
 
     def follow(self, answer: Answer | None, now: float) -> None:
-        """What the connection knows of its newest question: an answer counts once, its absence again and again."""
+        """Follow what the connection knows of its newest question: an answer counts once, its absence again."""
         if answer is None:
             self.lost()
         elif answer.number != self._answers or (
@@ -119,7 +119,7 @@ class LinkMeter:
             self.answered(answer.seconds, now, answer.queue_s)
 
     def answered(self, seconds: float, now: float, tcp_queue_s: float | None = None) -> None:
-        """An answer took so long. ``tcp_queue_s``: by so much TCP's own round trips exceed the shortest one."""
+        """Note how long an answer took. ``tcp_queue_s``: by so much TCP's own round trips exceed the shortest one."""
         self._shortest.note(seconds, now)
         queue_s = seconds - self._shortest.seconds
         self.queue_s = queue_s if tcp_queue_s is None else min(queue_s, tcp_queue_s)
@@ -129,7 +129,7 @@ class LinkMeter:
             self._decide(now)
 
     def lost(self) -> None:
-        """The connection is lost: what is measured next does not follow what was measured."""
+        """Note that the connection is lost: what is measured next does not follow what was measured."""
         self._answers = 0
         self._crowd = Crowd()
         self._forget()
@@ -189,7 +189,7 @@ class Room:
         self._used = False
 
     def takes(self, rank: Rank, size: int, now: float) -> bool:
-        """Whether so many bytes of this rank are sent now, of which it takes note; one message is always on its way.
+        """True if so many bytes of this rank are sent now, of which it takes note; one message is always on its way.
 
         One that is larger than the room takes as much: what waits last leaves some for it.
         """

@@ -58,7 +58,7 @@ class Media:
         self.send()
 
     def request(self, channel: Channel, request: MediaRequest) -> None:
-        """The newest request counts as a whole: a missing or unknown encoding means the configured one."""
+        """Take the newest request, which counts as a whole: without a known encoding it means the configured one."""
         row = _ROWS[channel.suffix]
         encoding = request.encoding if request.encoding in row.encodings else None
         self._requested[row] = ProgramRequest(request.enabled, encoding or "")
@@ -89,7 +89,7 @@ class Hold:
         self._driven_at = float("-inf")
 
     def drive(self, now: float) -> None:
-        """A command that moves something has come over a thin link."""
+        """Note that a command that moves something has come over a thin link."""
         self._driven_at = now
         self.send(now)
 

@@ -24,7 +24,7 @@ class MotorOwners:
         self._reported: dict[str, bool | None] = dict.fromkeys(self.topics)
 
     def connected(self) -> None:
-        """A new connection begins; on the transport's thread, like :meth:`receive`."""
+        """Note that a new connection begins; on the transport's thread, like :meth:`receive`."""
         self._messages = dict.fromkeys(self.topics, 0)
 
     def receive(self, topic: str) -> None:

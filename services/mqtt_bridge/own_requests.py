@@ -45,13 +45,13 @@ class OwnRequests:
         }
 
     def message(self, channel: Channel, payload: bytes) -> None:
-        """A message that is no flag."""
+        """Take a message that is no flag."""
         reaction = self._messages.get(channel.suffix)
         if reaction is not None:
             reaction(payload)
 
     def flag(self, channel: Channel, payload: bytes) -> None:
-        """The value of a flag."""
+        """Take the value of a flag."""
         reaction = self._flags.get(channel.suffix)
         if reaction is not None:
             reaction(payload)
@@ -72,7 +72,7 @@ class OwnRequests:
             self._post(channel, partial(self._media.request, channel, request), newest_of=channel.metric)
 
     def _on_drive(self, payload: bytes) -> None:
-        """On a thin link pictures and sound wait while a person drives; who the robot obeys is decided elsewhere."""
+        """Let media wait on a thin link while a person drives; who the robot obeys is decided elsewhere."""
         with suppress(PayloadError):
             command: Drive = codec.decode(DRIVE, payload)
             thin = self._uplink is not None and self._uplink.level is LEVELS["thin"]
@@ -84,11 +84,11 @@ class OwnRequests:
             self._post(channel, partial(self._run_action, channel), newest_of=channel.metric)
 
     def _boolean(self, channel: Channel, payload: bytes) -> bool:
-        """The value of a boolean control; an empty payload (a removed flag) and a malformed one are false."""
+        """True if a boolean control is; an empty payload (a removed flag) and a malformed one are false."""
         return bool(payload) and bool(self._decoded(channel, payload))
 
     def _decoded(self, channel: Channel, payload: bytes) -> Any:
-        """None if it is malformed."""
+        """Return the payload's value; None if it is malformed."""
         try:
             return codec.decode(channel, payload)
         except PayloadError as error:

@@ -50,7 +50,7 @@ class PrivateTopics:
             return self._judge(message)
 
     def _learn(self, uid: str, payload: bytes) -> None:
-        """A list that is removed, or cannot be read, lets nothing pass; what was on it stays there."""
+        """Learn a list: one that is removed, or cannot be read, lets nothing pass; what was on it stays there."""
         self._listed.discard(uid)
         try:
             found: McuLocalOnly = codec.decode(MCU_LOCAL_ONLY, payload)

@@ -90,7 +90,7 @@ class SameBrokerProbe:
         return self._round if self.both_connected else None
 
     def proves_two_brokers(self, round_: int) -> bool:
-        """Whether no probe came back in this round, and no newer round has begun."""
+        """True if no probe came back in this round, and no newer round has begun."""
         return round_ == self._round != self._same_in_round and self.both_connected
 
     # -- the transports' threads

@@ -181,7 +181,7 @@ class MqttBridge(ForwardingService):
 
     @property
     def _subscribes_soon(self) -> bool:
-        """Whether the heartbeat waits: who sees it sends commands, which would be lost before the subscription."""
+        """True if the heartbeat waits: who sees it sends commands, which would be lost before the subscription."""
         subscribed = self.subscriptions[Side.REMOTE] or self.forwarder.gate is Gate.SHUT
         return not subscribed and self._same_broker.both_connected
 
@@ -391,7 +391,7 @@ class MqttBridge(ForwardingService):
             self._passed_stops.follow(owner, codec.decode(ESTOP_STATE, payload) if payload else None)
 
     def _has_passed(self, message: Message) -> bool:
-        """Whether this stop has come over the connection that stops have of their own."""
+        """True if this stop has come over the connection that stops have of their own."""
         return self._stops is not None and not self.forwarder.mirroring.on and self._stops.is_copy(message)
 
     def _pass_stop(self, message: Message) -> None:

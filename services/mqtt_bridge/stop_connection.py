@@ -50,7 +50,7 @@ class Copies:
         self._dropped = deque[tuple[float, Message]](maxlen=_DROPPED)
 
     def is_copy(self, way: Way, message: Message, *, other: bool) -> bool:
-        """Whether this stop has come the other way before; ``other``: it can come that way now."""
+        """True if this stop has come the other way before; ``other``: it can come that way now."""
         key, now, expected = hash((message.topic, message.payload)), self._clock(), self._expected[way]
         with self._lock:
             while expected and expected[0][1] < now:
@@ -74,7 +74,7 @@ class Copies:
                 expected.clear()
 
     def lost(self) -> list[Message]:
-        """The connection of stops was lost. Returns the stops that only the main one may have had."""
+        """Note that the connection of stops was lost; return the stops that only the main one may have had."""
         self.forget()
         with self._lock:
             since, dropped = self._clock() - self._notices_s, list(self._dropped)
@@ -119,7 +119,7 @@ class StopConnection:
 
     @property
     def listens(self) -> bool:
-        """Whether stops come this way."""
+        """True if stops come this way."""
         return self._transport.state is State.CONNECTED and not self._transport.not_received
 
     def is_copy(self, message: Message) -> bool:

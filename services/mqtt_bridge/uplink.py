@@ -41,18 +41,18 @@ class LinkReport:
 
     @property
     def is_outdated(self) -> bool:
-        """Whether the others have to act otherwise."""
+        """True if the others have to act otherwise."""
         return (self._meter.level, self._meter.crowded) != (self._level, self._crowded)
 
     def is_due(self, now: float) -> bool:
-        """Whether its figures have changed enough, or are old."""
+        """True if its figures have changed enough, or are old."""
         change_s = abs(self._meter.queue_s - self._queue_s)
         state_s = _CROWDED_STATE_S if self._crowded else _STATE_S
         changed = now - self._at >= state_s and change_s >= max(_CHANGE_S, self._meter.round_trip_s / 2)
         return changed or now - self._at >= _STATES_S
 
     def publish(self, now: float) -> None:
-        """A retained message: without a connection it is sent at the next one."""
+        """Publish a retained message: without a connection it is sent at the next one."""
         meter, before = self._meter, self._level
         self._level, self._crowded, self._queue_s, self._at = meter.level, meter.crowded, meter.queue_s, now
         trip_ms, queue_ms = round(1000 * meter.round_trip_s), round(1000 * meter.queue_s)
@@ -97,7 +97,7 @@ class Uplink:
 
     @property
     def is_flooded(self) -> bool:
-        """Whether a client lately sent more commands than the link carries."""
+        """True if a client lately sent more commands than the link carries."""
         return self._clock() - self._flooded_at < _FLOODED_S
 
     @property
@@ -105,7 +105,7 @@ class Uplink:
         return self.level.heartbeat_qos if self._saves_acks else None
 
     def heartbeat_due(self) -> bool:
-        """Whether it is time for a heartbeat, and there is room for it."""
+        """True if it is time for a heartbeat, and there is room for it."""
         now, level = self._clock(), self.level
         if level.heartbeat_s:
             if now - self._heartbeat_at < max(level.heartbeat_s, self._heartbeat_s) - POLL_S / 2:
@@ -116,7 +116,7 @@ class Uplink:
         return True
 
     def pause(self, seconds: float) -> float:
-        """How long to wait between two requests of what can wait."""
+        """Return how long to wait between two requests of what can wait."""
         return seconds * _PAUSE if self._meter.level == "thin" else seconds
 
     def poll(self) -> bool:
@@ -136,7 +136,7 @@ class Uplink:
         return self.level.heartbeat_s > 0
 
     def _drop_late(self) -> None:
-        """Who sends more commands than a thin link carries fills the broker's queue with them; a stop would wait there.
+        """Drop late commands: more than a thin link carries would fill the broker's queue, where a stop would wait.
 
         They are worth nothing when they come, and a new connection drops all that wait. From then on stops have a
         connection of their own.
@@ -149,7 +149,7 @@ class Uplink:
             self._remote.renew_connection("only late commands come over a thin link: those that wait there are dropped")
 
     def _suit(self, now: float) -> None:
-        """The level is another one, or a queue begins or ends to stand."""
+        """Suit the link: its level is another one, or a queue begins or ends to stand."""
         self._suit_transport()
         stream_hz = (self.level.stream_hz or 0.0) * (_CROWDED_STREAMS if self._meter.crowded else 1)
         self._sieve.stream_s = 1 / stream_hz if stream_hz else 0.0

@@ -149,7 +149,7 @@ class MqttMirror(ForwardingService):
     # -- the transports' threads
 
     def pass_stop(self, side: Side, payload: bytes) -> Iterable[bytes]:
-        """The bridge's repetitions for one motor owner stay on the robot's own transport."""
+        """Return the bridge's repetitions for one motor owner stay on the robot's own transport."""
         addressed = side is Side.LOCAL and bool(payload) and codec.decode(ESTOP, payload).owner is not UNSET
         return () if addressed else (payload,)
 
@@ -177,7 +177,7 @@ class MqttMirror(ForwardingService):
             self.post_message(ONLINE, self._request_again, newest_of="suspect")
 
     def _is_fresh(self, message: Message) -> bool:
-        """Whether a heartbeat is current: a retained one may be old. Its sender uses the same clock."""
+        """True if a heartbeat is current: a retained one may be old. Its sender uses the same clock."""
         try:
             heartbeat = codec.decode(ONLINE, message.payload)
         except PayloadError:

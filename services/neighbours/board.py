@@ -35,7 +35,7 @@ class BoardNeighbours(NeighboursService):
         )
 
     def _on_heartbeat(self, message: Message, heartbeat: Heartbeat, _names: dict[str, str]) -> None:
-        """On the transport's thread."""
+        """Take a message, on the transport's thread."""
         if not message.retain:
             self._received_live_at = float("-inf") if heartbeat.online is False else self.clock()
 

@@ -86,7 +86,7 @@ class NeighboursService(Service):
     # -- to the others
 
     def _share(self, metric: str, message: Message) -> None:
-        """On the transport's thread: what another robot may hear, as it is; never an old value."""
+        """Share what another robot may hear, as it is, on the transport's thread; never an old value."""
         if not message.retain:
             self._lan.publish(self._me.outgoing(metric), message.payload, qos=QoS.LATEST)
 
@@ -108,7 +108,7 @@ class NeighboursService(Service):
 
     @on(TO_NEIGHBOUR, direct=True)
     def to_neighbour(self, drive: Drive, arrived: float, robot: str) -> None:
-        """On the transport's thread: a command of a script of this robot, for another one."""
+        """Send a command of a script of this robot to another one, on the transport's thread."""
         if robot not in self._others or not drive.signed:
             self.counters.add("refused")
             return
@@ -122,7 +122,7 @@ class NeighboursService(Service):
     # -- from the others
 
     def _receive(self, name: str, metric: str, message: Message) -> None:
-        """On the transport's thread: what another robot lets this one hear."""
+        """Take what another robot lets this one hear, on the transport's thread."""
         if message.retain or len(message.payload) > MOST_BYTES:
             self.counters.add("refused")
             return
@@ -132,7 +132,7 @@ class NeighboursService(Service):
         self.transport.publish(topic, message.payload, qos=QoS.LATEST)
 
     def _on_command(self, message: Message, drive: Drive, names: dict[str, str]) -> None:
-        """On the transport's thread."""
+        """Take a message, on the transport's thread."""
         if not message.retain_requested:
             job = partial(self._command, names["robot"], message, drive)
             self.post_message(FROM_NEIGHBOUR, job, newest_of=message.topic)
@@ -147,7 +147,7 @@ class NeighboursService(Service):
     # -- what happens on this robot
 
     def _on_owner(self, message: Message) -> None:
-        """On the transport's thread."""
+        """Take a message, on the transport's thread."""
         if self._estop.receive(message):
             self.post(self._owners_changed, newest_of="owners")
 
@@ -157,13 +157,13 @@ class NeighboursService(Service):
 
     @on(DRIVE, direct=True)
     def drive(self, drive: Drive, _arrived: float) -> None:
-        """On the transport's thread. A person's commands all mean the same here."""
+        """Take a drive command, on the transport's thread; all of a person's mean the same here."""
         self.post(lambda: self._visit.received(drive, self.clock()), newest_of="script" if drive.signed else "person")
 
     # -- what a visit needs
 
     def _number(self, barred: int, received: int) -> int | None:
-        """The number of a run that begins now; None: a script of this robot runs, or none can be had."""
+        """Return the number of a run that begins now; None: a script of this robot runs, or none can be had."""
         with self._local.none_runs() as free:
             try:
                 return next_run(self.config, barred, received) if free else None
@@ -184,7 +184,7 @@ class NeighboursService(Service):
 
 
 def _lan_transport(config: Config) -> Transport:
-    """The connection to the hub of the LAN, not yet opened."""
+    """Return the connection to the hub of the LAN, not yet opened."""
     lan = config.section(NeighboursSection).lan
     settings = client_of_hub(config.run_dir() / "lan", lan, lan.lease_ms, lan.account)
     return create("zenoh", f"{config.base}-lan", settings)

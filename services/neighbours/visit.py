@@ -37,7 +37,7 @@ class Visit:
         self._refused: dict[str, NeighbourRefusal] = {}
 
     def command(self, name: str, drive: Drive, now: float) -> bool:
-        """A command of a robot that may drive this one. False: it has no effect."""
+        """Take a command of a robot that may drive this one. False: it has no effect."""
         if not drive.signed or not isinstance(drive.run, int):
             return False  # no script's: it could neither be ended nor told from the next one
         if self._who != (name, drive.run) and not (drive.moves and self._starts(name, drive.run, now)):
@@ -53,7 +53,7 @@ class Visit:
         self.tick(now)
 
     def received(self, drive: Drive, now: float) -> None:
-        """A command on this robot's own topic, of whomever."""
+        """Take a command on this robot's own topic, of whomever."""
         if not drive.signed:
             self._person_at = now
             self.end(PERSON, now)
@@ -76,7 +76,7 @@ class Visit:
         return self._sender.due
 
     def driver(self, now: float) -> str:
-        """Whose run drives this robot; empty: none does."""
+        """Return whose run drives this robot; empty: none does."""
         return "" if self._sender.ended(now) else self._who[0]
 
     def refused(self, now: float) -> dict[str, NeighbourRefusal]:

@@ -113,13 +113,13 @@ class SerialService(Service, ABC):
             self._understood = self.line.opened, times + 1 if opened == self.line.opened else 1
 
     def note_start(self) -> None:
-        """The board says that it has started: again, if that is not the first thing heard since the line was opened."""
+        """Note that the board has started: again, if that is not the first thing heard since the line was opened."""
         opened, times = self._understood
         if opened == self.line.opened and times > 1:
             self._starts.began(time.monotonic())
 
     def note_clock(self, mcu_ms: int) -> None:
-        """The board's clock shows ``mcu_ms``, of 32 bits."""
+        """Note what the board's clock shows: ``mcu_ms``, of 32 bits."""
         self._starts.sent(self.line.opened, mcu_ms, time.monotonic())
 
     @every(CHECK_S)

@@ -26,7 +26,7 @@ class Clip(Struct, frozen=True):
 
     @property
     def encoded(self) -> bool:
-        """Whether only PyAV can read it."""
+        """True if only PyAV can read it."""
         return self.path.suffix.lower() != _WAV
 
 
@@ -39,7 +39,9 @@ class Clips:
         self._endings = (_WAV, *_NEED_PYAV) if pyav.installed() else (_WAV,)
 
     def scan(self) -> list[str]:
-        """The names of clips, sorted without regard to case: all, or 256 KiB of them. ``find`` knows the others, too.
+        """Return the names of clips, sorted without regard to case.
+
+        All, or 256 KiB of them. ``find`` knows the others, too.
 
         What lies outside is left out, as ``find`` does.
         """
@@ -54,7 +56,10 @@ class Clips:
         return found[:listed]
 
     def find(self, name: str) -> Clip | None:
-        """The clip that a command names: relative to the folder, or absolute inside it. None if there is none."""
+        """Return the clip that a command names: relative to the folder, or absolute inside it.
+
+        None if there is none.
+        """
         root = self._folder.resolve()
         try:
             path = (root / _expanded(name.replace("\\", "/"))).resolve()

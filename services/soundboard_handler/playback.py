@@ -39,7 +39,7 @@ class Playback:
         self._on_change = partial(on_change, self)
 
     def start(self) -> None:
-        """On the service's thread, because a player ends with the thread that has started it."""
+        """Start it on the service's thread: a player ends with the thread that has started it."""
         try:
             if self.clip.encoded:
                 self._start_decoded()

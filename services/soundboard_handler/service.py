@@ -87,7 +87,7 @@ class SoundboardHandler(Service):
     # -- which clip
 
     def _requested(self, command: SoundboardCommand) -> _Request | None:
-        """The clip to play; None, and an error, if there is none."""
+        """Return the clip to play; None, and an error, if there is none."""
         name = command.file or ""
         if not name.strip():
             self._error = "Play command missing file"
@@ -134,7 +134,7 @@ class SoundboardHandler(Service):
             self._publish_status()
 
     def _changed(self, playback: Playback) -> None:
-        """The player runs, or has ended."""
+        """Note that the player runs, or has ended."""
         if playback is not self._playback:
             return
         request = self._request

@@ -56,7 +56,7 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
 
 
 def _transport(reader: Reader, transport: TransportSection, path: Path) -> TransportSection:
-    """Who may connect to a Zenoh robot from other machines is decided by certificates alone."""
+    """Warn where certificates alone decide who may connect to a Zenoh robot from other machines."""
     encrypted = next((one for one in transport.listen if one.startswith(_TLS)), None)
     if transport.allowed_names is not None and not any(
         one.startswith(_TLS) for one in (*transport.listen, *transport.connect)
@@ -217,7 +217,7 @@ def _variable(reader: Reader, name: str, path: Path) -> str | None:
 
 
 def _contents(reader: Reader, file: FilePath, path: Path) -> str | None:
-    """The file's text without its final newline; noted and None when it cannot be read."""
+    """Return the file's text without its final newline; noted and None when it cannot be read."""
     try:
         return read_text(file).rstrip("\n")
     except FileNotFoundError:

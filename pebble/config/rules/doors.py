@@ -26,7 +26,10 @@ def check_doors(notes: Notes, root: Root) -> None:
 
 
 def warning_of_open(root: Root) -> str:
-    """What the level ``open`` means where other machines reach the robot; empty: none does, or it is another level."""
+    """Return what the level ``open`` means where other machines reach the robot.
+
+    Empty: none does, or it is another level.
+    """
     hosts = [f"broker {mqtt.host}" for _, mqtt in _robots_brokers(root) if not is_loopback(mqtt.host)]
     places = [*hosts, *(endpoint for _, endpoint in _endpoints(root))]
     if root.security.level != "open" or not places:
@@ -67,7 +70,7 @@ def _check_links(notes: Notes, root: Root) -> None:
 
 
 def _endpoints(root: Root) -> Iterator[tuple[Path, str]]:
-    """Those of Zenoh that lead beyond this machine."""
+    """Return those of Zenoh that lead beyond this machine."""
     return (row for row in zenoh_endpoints(root) if not _is_near(row[1]))
 
 

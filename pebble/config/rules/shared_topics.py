@@ -12,7 +12,7 @@ _SERIAL = ("services", "serial_mcu_bridge")
 
 
 def shared_topics(root: Root) -> Iterator[tuple[Path, Channel]]:
-    """Each key whose topic is that of another channel, too, with that channel.
+    """Yield each key whose topic is that of another channel, too, with that channel.
 
     Several serial lines may share the topics of one channel: all of them obey a drive command.
     """
@@ -32,14 +32,17 @@ def shared_topics(root: Root) -> Iterator[tuple[Path, Channel]]:
 
 
 def renamed_commands(root: Root) -> Iterator[tuple[Path, str]]:
-    """Each key that gives something which a robot receives another topic, and that topic."""
+    """Yield each key that gives something which a robot receives another topic, and that topic."""
     for channel in CHANNELS:
         if channel.direction == INCOMING:
             yield from ((path, topic) for path, topic in _keys(channel, root) if topic is not None)
 
 
 def _keys(channel: Channel, root: Root) -> Iterator[tuple[Path, str | None]]:
-    """The keys that may rename the channel, one for each serial line, and the topics there; None: its own topic."""
+    """Yield the keys that may rename the channel, one for each serial line, and the topics there.
+
+    None: its own topic.
+    """
     if channel.override is None:
         yield (), None
         return

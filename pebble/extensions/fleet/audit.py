@@ -100,7 +100,7 @@ class Audit:
 
 
 def _values(row: Row) -> tuple[float | str | int, ...]:
-    """A row as it is stored; without texts it stands for those that differ too much."""
+    """Return a row as it is stored; without texts it stands for those that differ too much."""
     texts = (row.get(field, OTHERS if field == "user" else "") for field in _FIELDS)
     return (row["t"], row["what"], *texts, row.get("count", 1))
 

@@ -85,7 +85,7 @@ class Database:
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
-        """All that is executed on the connection, or nothing. Raises DatabaseError."""
+        """Execute all that the block does on the connection, or nothing. Raises DatabaseError."""
         with self._errors():
             connection = self._connection
             connection.execute("BEGIN IMMEDIATE")

@@ -150,7 +150,7 @@ def _refused_base(base: str, *, several: bool) -> str:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """One command at a time changes the folder. Raises FleetError if there is none."""
+    """Let one command at a time change the folder. Raises FleetError if there is none."""
     try:
         descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | _NO_LINK, 0o600)
     except OSError as error:

@@ -133,7 +133,7 @@ class People:
     # -- sessions
 
     def check(self, name: str, password: str, address: str) -> User | None:
-        """The person with this password. Blocks for some 20 ms, with accents 60, the same for unknown names.
+        """Return the person with this password. Blocks for some 20 ms, with accents 60, the same for unknown names.
 
         Raises TooManyTriesError. A name whose tries are used up still logs in from an address where it has a session:
         others cannot keep a person out.
@@ -152,7 +152,7 @@ class People:
         return User(found, Role(role))
 
     def start_session(self, user: User, address: str = "") -> str:
-        """A new session's token; the only copy of it."""
+        """Return a new session's token; the only copy of it."""
         token = secrets.token_urlsafe(32)
         now = self._clock()
         self._change("DELETE FROM sessions WHERE expires <= ?", now)
@@ -175,7 +175,7 @@ class People:
         return token
 
     def session(self, token: str) -> Session | None:
-        """The running session of this token, with the person's role of now.
+        """Return the running session of this token, with the person's role of now.
 
         While the file cannot be read it is what it was: who drives can go on, and stop robots.
         """

@@ -21,7 +21,10 @@ def of_broker(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str,
 
 
 def of_certificate(fleet: Fleet, name: str) -> dict[str, Any]:
-    """What who has a certificate needs in its config, or as a file of its own; keys and authority lie beside it."""
+    """Return what who has a certificate needs in its config, or as a file of its own.
+
+    Keys and authority lie beside it.
+    """
     roles = fleet.accounts[name].roles
     at_hub = _at_hub(fleet, name, certificates.CA_CERT, name)
     if ProgramRole.HUB in roles:
@@ -35,12 +38,15 @@ def of_certificate(fleet: Fleet, name: str) -> dict[str, Any]:
 
 
 def hub_file(keys: str) -> dict[str, Any]:
-    """The file of a hub that obeys the rules beside it; ``keys``: its certificate and key without their suffix."""
+    """Return the file of a hub that obeys the rules beside it.
+
+    ``keys``: its certificate and key without their suffix.
+    """
     return {"listen": [f"tls/0.0.0.0:{HUB_PORT}"], "tls": _tls(certificates.CA_CERT, keys), "access": ZENOH}
 
 
 def boards_file(fleet: Fleet, name: str, below: str) -> dict[str, Any]:
-    """The file of a gateway of boards: those that have an account as a neighbour are in it.
+    """Return the file of a gateway of boards: those that have an account as a neighbour are in it.
 
     ``below``: how that file names what is in the fleet's folder.
     """
@@ -59,7 +65,7 @@ def host_and_port(server: Server) -> str:
 
 
 def _at_hub(fleet: Fleet, name: str, ca: str, keys: str) -> dict[str, Any]:
-    """How this account connects to the fleet's hub."""
+    """Return how this account connects to the fleet's hub."""
     return {"account": name, "connect": [f"tls/{fleet.brokers[0].host}:{HUB_PORT}"], "tls": _tls(ca, keys)}
 
 
@@ -68,7 +74,10 @@ def _tls(ca: str, keys: str) -> dict[str, Any]:
 
 
 def _who(fleet: Fleet, name: str) -> dict[str, Any]:
-    """The id with the account, which may do nothing below another base: its messages would be dropped in silence."""
+    """Return the id with the account, which may do nothing below another base.
+
+    Its messages would be dropped in silence.
+    """
     account = fleet.accounts[name]
     parts = dict(zip(("system", "type", "id"), account.bases[0].split("/"), strict=True))
     robot = {key: part for key, part in parts.items() if key == "id" or part != {"system": "pebble"}.get(key, "robots")}

@@ -49,7 +49,7 @@ _COMMANDS: dict[str, Callable[[Any], Row]] = {
 
 
 def files(config: Config) -> list[Path]:
-    """The files of a robot's audit, the newer one first."""
+    """Return the files of a robot's audit, the newer one first."""
     path = config.state_file("audit").with_suffix(".jsonl")
     return [path, path.with_suffix(".old.jsonl")]
 
@@ -141,7 +141,7 @@ class Audit(Observer):
 
 
 def _sender(by: str | None, command: Any = None) -> str:
-    """The account; else what the sender claims to be, marked as such."""
+    """Return the account; else what the sender claims to be, marked as such."""
     claim = getattr(command, "by", None)
     name = shown(claim.rstrip(_UNCHECKED), _NAME) if isinstance(claim, str) else ""
     if by == ROBOT:

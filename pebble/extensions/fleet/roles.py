@@ -106,18 +106,18 @@ LOCAL = Session("local", "local", Role.ADMIN)
 
 
 def rights(roles: Iterable[str], level: SecurityLevel) -> frozenset[Right]:
-    """What a person with these roles may do, which add up. Below ``named`` those who drive also reset."""
+    """Return what a person with these roles may do, which add up. Below ``named`` those who drive also reset."""
     found = frozenset[Right]().union(*(_RIGHTS[role] for role in roles))
     return found | {Right.RESET} if level != "named" and Right.DRIVE in found else found
 
 
 def page_rights(role: Role, level: SecurityLevel = "open") -> frozenset[str]:
-    """What a person may do on the operator page beyond what everybody may there."""
+    """Return what a person may do on the operator page beyond what everybody may there."""
     return frozenset(right.value for right in rights((role,), level) - _EVERYBODY)
 
 
 def right_of(channel: Channel) -> str:
-    """The right that may write this channel."""
+    """Return the right that may write this channel."""
     return next(right.value for right, channels in WRITES.items() if channel in channels)
 
 
@@ -139,7 +139,7 @@ def rules(
     extra: Extra | None = None,
     at_hub: bool = False,
 ) -> tuple[Rule, ...]:
-    """All that a broker lets this account do. ``plain``: bases of robots that do not know names, or ``+/+/+``.
+    """Return all that a broker lets this account do. ``plain``: bases of robots that do not know names, or ``+/+/+``.
 
     ``at_hub``: what a Zenoh hub lets it do. That differs for a gateway, whose robots are at the hub, and their
     operators at the broker.
@@ -152,7 +152,7 @@ def rules(
 
 
 def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
-    """What the right may write below ``incoming/``, as parts of filters."""
+    """Return what the right may write below ``incoming/``, as parts of filters."""
     own = (one if isinstance(one, str) else one.metric for one in WRITES.get(right, ()))
     return (*(re.sub(r"{[^}]*}", "+", one) for one in own), *getattr(extra, right, ()))
 
@@ -192,7 +192,7 @@ def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
 
 
 def _of_neighbour(base: str) -> Iterator[Rule]:
-    """Its id in the topics of its commands is that of its base, so no other one can claim it."""
+    """Yield the rules of a robot: its id in topics of commands is that of its base, so no other one can claim it."""
     kind, _, name = base.rpartition("/")
     yield Rule("read", f"{kind}/+/{OUTGOING}/#")
     yield Rule("write", f"{base}/{OUTGOING}/#")

@@ -33,7 +33,7 @@ class Tries:
             return 0.0
 
     def give_back(self, key: str) -> None:
-        """A try that was right does not count."""
+        """Give a try back that was right: it does not count."""
         with self._lock:
             times = self._times.get(key[:64])
             if times:
@@ -42,7 +42,7 @@ class Tries:
 
 @lru_cache(maxsize=256)
 def network_of(address: str) -> str:
-    """What counts as one address: with IPv6 the /64, of which one machine can use every address."""
+    """Return what counts as one address: with IPv6 the /64, of which one machine can use every address."""
     try:
         parsed = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:

@@ -26,7 +26,7 @@ _FLAGS = tuple(f"/{one.suffix}" for one in CHANNELS if one.kind is Kind.FLAG)
 
 
 def zenoh_text(fleet: Fleet) -> bytes:
-    """The file that a hub reads as ``transport.access``."""
+    """Return the file that a hub reads as ``transport.access``."""
     rules = {name: fleet.rules_of(name, at_hub=True) for name in fleet.accounts}
     accounts = {name: _hub_account(fleet.accounts[name], held) for name, held in rules.items()}
     rows = (
@@ -38,7 +38,7 @@ def zenoh_text(fleet: Fleet) -> bytes:
 
 
 def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
-    """A robot retains what it publishes and leaves its will there; others retain flags without a name."""
+    """Return a robot retains what it publishes and leaves its will there; others retain flags without a name."""
     writes = [rule.filter for rule in held if rule.access == "write"]
     robot = ProgramRole.ROBOT in account.roles
     wills = [f"{base}/{OUTGOING}/#" for base in account.bases if robot]
@@ -48,7 +48,7 @@ def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
 
 
 def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: bool) -> Iterator[Grant]:
-    """Only what its client needs; so it cannot pose as a hub, nor answer queries of others."""
+    """Yield only what its client needs; so it cannot pose as a hub, nor answer queries of others."""
     if is_hub:
         yield from EVERYTHING
         return

@@ -41,7 +41,10 @@ class VideoDecoder:
         self._h264: H264Decoder | None = None
 
     def feed(self, payload: bytes) -> Decoded | None:
-        """The picture of this payload; None if it is refused or waits for a key frame. Never raises for a payload."""
+        """Return the picture of this payload; None if it is refused or waits for a key frame.
+
+        Never raises for a payload.
+        """
         try:
             header, body = _read(payload)
             if not follows(self._last, header):

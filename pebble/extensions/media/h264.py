@@ -29,7 +29,7 @@ _WORST_CRF: Final = 51.0
 
 
 def quality_to_crf(quality: float) -> float:
-    """The constant rate factor that keeps as much (SSIM) as the JPEG forms at ``quality``, fitted on a panning scene.
+    """Return the constant rate factor that keeps as much (SSIM) as JPEG at ``quality``, fitted on a panning scene.
 
     Measured pairs: 5 → 49.5, 10 → 42.8, 20 → 35.4, 40 → 28.9, 70 → 23.4.
     """
@@ -57,7 +57,7 @@ class H264Encoder:
         self._i420: Pixels | None = None
 
     def encode(self, picture: Pixels, quality: float, *, keyframe: bool = False) -> bytes:
-        """One access unit. A last odd row or column is left out: colour is stored for two by two pixels."""
+        """Return one access unit. A last odd row or column is left out: colour is stored for two by two pixels."""
         height, width = picture.shape[0] & ~1, picture.shape[1] & ~1
         if min(height, width) < SMALLEST_EDGE:
             raise PebbleError(f"h264: a picture of {picture.shape[1]}x{picture.shape[0]} is too small")
@@ -154,13 +154,13 @@ class H264Decoder:
 
 
 def seal(unit: bytes) -> bytes:
-    """The unit with its checksum: seven bits to a byte, highest first, the top bit set: no start code arises."""
+    """Return the unit with its checksum: seven bits to a byte, highest first, the top bit set: no start code arises."""
     crc = zlib.crc32(unit)
     return unit + _SEAL + bytes(crc >> shift & 0x7F | 0x80 for shift in (28, 21, 14, 7, 0))
 
 
 def unseal(sealed: bytes) -> bytes:
-    """The unit without its seal; PayloadError if that is missing or wrong."""
+    """Return the unit without its seal; PayloadError if that is missing or wrong."""
     unit = sealed[:-_SEAL_BYTES]
     if seal(unit) != sealed:
         raise PayloadError("h264: cut short or damaged")

@@ -44,7 +44,7 @@ class Chunk:
 
 
 def ahead(sequence: int, of: int) -> int:
-    """From one sequence number to another, in packets; negative if ``sequence`` is the older. 1 follows the last."""
+    """Return the way to ``sequence`` in packets; negative if it is the older. 1 follows the last."""
     distance = (sequence - of) % _NUMBERS
     return distance if distance <= _NUMBERS // 2 else distance - _NUMBERS
 
@@ -74,7 +74,7 @@ class Depth:
         self._calm_since = now
 
     def excess(self, waiting_s: float, now: float) -> float:
-        """Seconds of sound to leave out now, while ``waiting_s`` wait. Usually 0."""
+        """Return seconds of sound to leave out now, while ``waiting_s`` wait. Usually 0."""
         self._lowest = min(self._lowest, waiting_s)
         if now - self._calm_since >= self._CALM_S:
             self.target_s, self._calm_since = max(self._least_s, self.target_s - self._STEP_S), now
@@ -171,7 +171,7 @@ class JitterBuffer:
     # -- out
 
     def wait(self, now: float) -> float | None:
-        """Seconds until :meth:`take` may have something; None as long as nothing arrives."""
+        """Return seconds until :meth:`take` may have something; None as long as nothing arrives."""
         if not self._playing and not self._waiting:
             return None
         return max(0.0, self._due - now)
@@ -246,7 +246,7 @@ class JitterBuffer:
         return received if len(received.samples) else None
 
     def _leave_out(self, received: ReceivedSound, excess: float) -> ReceivedSound:
-        """The packet to play after leaving out ``excess`` seconds, its beginning faded over from ``received``."""
+        """Return the packet to play without ``excess`` seconds, its beginning faded over from ``received``."""
         newest, left = received, excess
         while self._waiting and left > len(newest.samples) / newest.rate - _ROUNDING_S:
             left -= len(newest.samples) / newest.rate
@@ -255,7 +255,7 @@ class JitterBuffer:
         return _faded_over(received, newest)
 
     def _conceal(self, gap_s: float) -> Chunk | None:
-        """A piece of estimated sound, until the gap is filled or ``concealment_ms`` are used up."""
+        """Return a piece of estimated sound, until the gap is filled or ``concealment_ms`` are used up."""
         last = self._last
         if last is None:
             return None

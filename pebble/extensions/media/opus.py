@@ -37,7 +37,10 @@ def join(packets: list[bytes]) -> bytes:
 
 
 def split(body: bytes) -> list[bytes]:
-    """The Opus packets of a PBAT body. Raises PayloadError unless it is made of whole ones, from 1 to BUNDLE_LIMIT."""
+    """Return the Opus packets of a PBAT body.
+
+    Raises PayloadError unless it is made of whole ones, from 1 to BUNDLE_LIMIT.
+    """
     packets = list(_pieces(body))
     if not 1 <= len(packets) <= BUNDLE_LIMIT:
         raise PayloadError(f"PBAT: {len(packets)} Opus packets in one body")
@@ -56,7 +59,7 @@ def _pieces(body: bytes) -> Iterator[bytes]:
 
 
 def milliseconds(packet: bytes) -> float:
-    """The duration of an Opus packet, by its first byte or two (RFC 6716, 3.1 and 3.2)."""
+    """Return the duration of an Opus packet, by its first byte or two (RFC 6716, 3.1 and 3.2)."""
     mode, code = packet[0] >> 3, packet[0] & 3
     if mode < 12:  # SILK
         frame_ms: float = (10, 20, 40, 60)[mode % 4]
@@ -94,7 +97,7 @@ class OpusEncoder:
         self._codec = codec
 
     def encode(self, frame: Samples) -> list[bytes]:
-        """One packet; ``frame`` is (self.samples, channels)."""
+        """Return one packet; ``frame`` is (self.samples, channels)."""
         interleaved = np.ascontiguousarray(frame).reshape(1, -1)
         handed = self._av.AudioFrame.from_ndarray(interleaved, format="s16", layout=self._layout)
         handed.sample_rate = self._rate
@@ -119,7 +122,10 @@ class OpusDecoder:
         return samples
 
     def conceal(self) -> Samples:
-        """An estimate of one more frame, which fades when called again and again. Empty before the first packet."""
+        """Return an estimate of one more frame, which fades when called again and again.
+
+        Empty before the first packet.
+        """
         if self._mode is None:
             return np.zeros((0, self._channels), np.int16)
         return self._decode(self._mode)

@@ -42,7 +42,7 @@ class PictureHeader(NamedTuple):
 
 
 def read_header(payload: bytes) -> PictureHeader | None:
-    """The header of a payload of any encoding; None if it is none of them."""
+    """Return the header of a payload of any encoding; None if it is none of them."""
     if payload.startswith(PBVD):
         return _read_pbvd(payload)
     if payload.startswith(_SOI):
@@ -51,7 +51,7 @@ def read_header(payload: bytes) -> PictureHeader | None:
 
 
 def follows(last: PictureHeader | None, header: PictureHeader) -> bool:
-    """Whether a receiver that has decoded ``last`` can decode this one."""
+    """True if a receiver that has decoded ``last`` can decode this one."""
     if header.keyframe:
         return True
     if last is None or last.encoding != header.encoding or header.frame != _after(last):
@@ -69,7 +69,7 @@ class PictureSequence:
         self._last: PictureHeader | None = None
 
     def take(self, payload: bytes) -> PictureHeader | None:
-        """The header of the next payload; None if it is no picture, or too large."""
+        """Return the header of the next payload; None if it is no picture, or too large."""
         header = read_header(payload) if len(payload) <= MAX_PAYLOAD else None
         self.complete = header is not None and follows(self._last, header)
         self._last = header if self.complete else None
@@ -115,5 +115,5 @@ def _milliseconds(stamp: float | None) -> int | None:
 
 
 def _plausible(captured_ms: int) -> int | None:
-    """A moment that can be written as a date, or None."""
+    """Return a moment that can be written as a date, or None."""
     return captured_ms if 0 < captured_ms < _LATEST_MS else None

@@ -50,11 +50,11 @@ class RateMeter:
         return statistics.median(ages) if ages else None
 
     def arrivals(self, now: float) -> list[Arrival]:
-        """The messages in the window, oldest first."""
+        """Return the messages in the window, oldest first."""
         return self._recent(now)[0]
 
     def _recent(self, now: float) -> tuple[list[Arrival], float]:
-        """The messages in the window, and the seconds from the first to the last."""
+        """Return the messages in the window, and the seconds from the first to the last."""
         copied = list(self._arrivals)  # another thread may add meanwhile
         recent = [arrival for arrival in copied if now - arrival.at <= self._window_s]
         return recent, recent[-1].at - recent[0].at if recent else 0.0

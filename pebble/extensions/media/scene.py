@@ -66,7 +66,7 @@ class Scene:
         self._draw_counter(number % COUNTER_LIMIT, out)
 
     def tag_centre(self, number: int) -> tuple[int, int]:
-        """Where the middle of the tag is in frame ``number``: pixels from the left and from the top."""
+        """Return where the middle of the tag is in frame ``number``: pixels from the left and from the top."""
         left, top = self._tag_corner(number)
         return left + self._tag.shape[1] // 2, top + self._tag.shape[0] // 2
 
@@ -103,7 +103,7 @@ class Scene:
 
 
 def read_counter(picture: Picture) -> int | None:
-    """The number of the frame, out of a picture of any size, in colour (h, w, 3) or grey (h, w).
+    """Return the number of the frame, out of a picture of any size, in colour (h, w, 3) or grey (h, w).
 
     None where there is no counter, or a damaged one: one in 65,536 of those is read as a wrong number.
     """
@@ -130,7 +130,7 @@ def _value(bits: NDArray[np.bool_]) -> int | None:
 
 
 def _samples(length: int, cells: int) -> NDArray[np.intp]:
-    """Where to sample ``cells`` cells on ``length`` pixels: some places within each, away from its edges."""
+    """Return where to sample ``cells`` cells on ``length`` pixels: some places within each, away from its edges."""
     return (np.add.outer(np.arange(cells), _WITHIN) * length / cells).astype(np.intp).ravel()
 
 
@@ -141,7 +141,7 @@ def _swing(number: int, period: int, room: int) -> int:
 
 
 def _landscape(width: int, height: int) -> Picture:
-    """A texture with detail of all sizes, as nature has it, whose right edge continues at its left."""
+    """Return a texture with detail of all sizes, as nature has it, whose right edge continues at its left."""
     light = _grids(0, octaves=6, contrast=100)
     tints = [_grids(100 * channel, octaves=2, contrast=40) for channel in (1, 2, 3)]
     picture = np.empty((height, width, 3), np.uint8)
@@ -164,7 +164,7 @@ def _grids(seed: int, *, octaves: int, contrast: float) -> list[NDArray[np.float
 
 
 def _texture(grids: list[NDArray[np.float32]], rows: NDArray[np.float32], width: int) -> NDArray[np.float32]:
-    """The sum of the grids, each stretched over the picture; only the given rows, 0 (top) to 1."""
+    """Return the sum of the grids, each stretched over the picture; only the given rows, 0 (top) to 1."""
     return np.asarray(sum(_stretched(grid, rows, width) for grid in grids), np.float32)
 
 
@@ -179,7 +179,7 @@ def _stretched(grid: NDArray[np.float32], rows: NDArray[np.float32], width: int)
 
 
 def _tag(cell: int) -> Picture:
-    """The AprilTag with its quiet zone, ``cell`` pixels per cell."""
+    """Return the AprilTag with its quiet zone, ``cell`` pixels per cell."""
     cells = np.full((_TAG_CELLS, _TAG_CELLS), 215, np.uint8)
     cells[1:-1, 1:-1] = 40
     cells[2:-2, 2:-2] = [[215 if bit == "1" else 40 for bit in row] for row in _TAG_BITS]

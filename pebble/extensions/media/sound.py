@@ -150,7 +150,7 @@ class ReceivedSound:
 
 
 def unpack(payload: bytes) -> Sound:
-    """The packet in ``payload``, if it may be played. Raises PayloadError for anything else."""
+    """Return the packet in ``payload``, if it may be played. Raises PayloadError for anything else."""
     sound = Sound.unpack(payload)
     if sound.channels > CHANNELS_LIMIT or sound.rate < LOWEST_RATE:
         raise PayloadError(f"PBAT: {sound.channels} channels at {sound.rate} Hz cannot be played")
@@ -185,7 +185,7 @@ class SoundDecoder:
         self._opus: OpusDecoder | None = None
 
     def feed(self, payload: bytes) -> ReceivedSound | None:
-        """The sound of one MQTT payload; None if it cannot be played."""
+        """Return the sound of one MQTT payload; None if it cannot be played."""
         try:
             return self.decode(unpack(payload))
         except PayloadError:
@@ -193,7 +193,7 @@ class SoundDecoder:
             return None
 
     def decode(self, sound: Sound) -> ReceivedSound:
-        """The sound of a packet from :func:`unpack`. Raises PayloadError if it cannot be decoded.
+        """Return the sound of a packet from :func:`unpack`. Raises PayloadError if it cannot be decoded.
 
         Raises PebbleError for Opus where PyAV is missing.
         """
@@ -207,7 +207,7 @@ class SoundDecoder:
         return ReceivedSound(samples, sound.rate, sound.channels, sound.captured_ms, sound.sequence, encoding)
 
     def conceal(self) -> Samples | None:
-        """An estimate of one more frame by the codec itself; None if it cannot conceal."""
+        """Return an estimate of one more frame by the codec itself; None if it cannot conceal."""
         if self._opus is None:
             return None
         made = self._opus.conceal()

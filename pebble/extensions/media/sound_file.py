@@ -58,7 +58,7 @@ class SoundFile:
 
 
 def write_wav(path: Path, samples: bytes, rate: int) -> None:
-    """One channel of s16le as a wav file."""
+    """Write one channel of s16le as a wav file."""
     with wave.open(str(path), "wb") as file:
         file.setnchannels(1)
         file.setsampwidth(2)

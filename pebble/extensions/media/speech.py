@@ -59,7 +59,7 @@ def _period(rate: int) -> NDArray[np.int16]:
 
 
 def _voice(count: int, rate: int, formants: tuple[int, ...], pitch_hz: float, glide: float) -> NDArray[np.float32]:
-    """A vowel that swells and fades; its pitch rises by ``glide`` × itself until its end."""
+    """Return a vowel that swells and fades; its pitch rises by ``glide`` × itself until its end."""
     time = np.arange(count) / rate
     length = count / rate
     phase = 2 * np.pi * pitch_hz * (time + glide * time**2 / (2 * length))
@@ -72,6 +72,6 @@ def _voice(count: int, rate: int, formants: tuple[int, ...], pitch_hz: float, gl
 
 
 def _loudness(frequency: float, formants: tuple[int, ...]) -> float:
-    """How strongly the mouth passes a frequency on: resonances above a slope of 6 dB per octave."""
+    """Return how strongly the mouth passes a frequency on: resonances above a slope of 6 dB per octave."""
     resonance = sum(1 / (1 + ((frequency - formant) / _FORMANT_WIDTH_HZ) ** 2) for formant in formants)
     return float((0.05 + resonance) * 100 / frequency)

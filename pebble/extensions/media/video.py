@@ -47,7 +47,7 @@ def make_encoder(
     keyframe_interval: int | None = None,
     quality: float = DEFAULT_QUALITY,
 ) -> VideoEncoder:
-    """The encoder called ``name``: json, pbvd or h264.
+    """Return the encoder called ``name``: json, pbvd or h264.
 
     ``keyframe_interval``: pictures from one key frame to the next; None means as many as come in a third of a second
     (the paper's rule), for h264 in four. Raises ConfigError for an unknown name, PebbleError saying what to install.

@@ -46,12 +46,12 @@ _estop_decoder = msgspec.json.Decoder(EstopOp)
 
 @cache
 def page_files() -> StaticFiles:
-    """The page's files, packed: the same for each server of a process."""
+    """Return the page's files, packed: the same for each server of a process."""
     return StaticFiles(files("pebble.extensions.page") / "static")
 
 
 def create_app(settings: WebSettings) -> Starlette:
-    """The application of one server; it connects to the broker when it starts."""
+    """Return the application of one server; it connects to the broker when it starts."""
     static = page_files()
     people = People(settings.people)
 
@@ -126,7 +126,7 @@ def _static_of(request: Request) -> StaticFiles:
 
 
 async def _authority(request: Request) -> Response:
-    """The certificate of our authority, which phones are asked to trust; it is public."""
+    """Return the certificate of our authority, which phones are asked to trust; it is public."""
     path = request.app.state.settings.authority
     if path is None or not path.is_file():
         return PlainTextResponse("this server has no certificate authority of its own", 404)
@@ -149,7 +149,7 @@ async def _snapshot(request: Request) -> Response:
 
 
 async def _estop(request: Request) -> Response:
-    """The way to stop that is left to a page whose control socket is down, or, as a plain form, that does not start."""
+    """Stop robots for a page whose control socket is down, or, as a plain form, for one that does not start."""
     answer = _stopped_page if content_type(request.headers) == FORM else _plain
     session = login.session_of(request)
     if session is None:
@@ -199,7 +199,7 @@ def _stopped_page(request: Request, status: int, text: str) -> Response:
 
 
 async def _audit(request: Request) -> Response:
-    """The newest rows of this server's audit about one robot, for those who look after robots."""
+    """Return the newest rows of this server's audit about one robot, for those who look after robots."""
     session, server = login.session_of(request), _server_of(request)
     if session is None:
         return PlainTextResponse("log in first", 401)

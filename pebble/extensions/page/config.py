@@ -96,7 +96,7 @@ class WebInterface(Section, frozen=True, kw_only=True):
 
     @property
     def local(self) -> bool:
-        """Whether only this machine can reach it."""
+        """True if only this machine can reach it."""
         return is_loopback(self.host)
 
     def connections(self) -> Iterator[tuple[tuple[str, ...], Section]]:
@@ -105,7 +105,7 @@ class WebInterface(Section, frozen=True, kw_only=True):
 
 
 def _check(reader: Reader, web: WebInterface, path: Path) -> WebInterface:
-    """A mistake here must not keep the robot from starting: without a page it still drives."""
+    """Warn of what keeps the page from starting: without a page the robot still drives."""
     if not web.local and web.tls.certificate is None and not web.plain_http:
         reader.notes.warning(
             (*path, "host"),

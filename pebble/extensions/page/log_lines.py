@@ -47,7 +47,7 @@ class LogLines:
             self._bytes -= len(bytes(self._lines.popleft()[1]))
 
     def after(self, number: int) -> Run | None:
-        """The oldest lines behind this number, as many as one message may have; None if there are none."""
+        """Return the oldest lines behind this number, as many as one message may have; None if there are none."""
         run: list[msgspec.Raw] = []
         first = size = 0
         for at, line in self._lines:
@@ -69,7 +69,7 @@ class LogReader:
         self._sent = "", 0  # the origin and number of the last line
 
     def begin(self, origin: str, number: int, *, on: bool) -> None:
-        """The page has lines until this one; ``on`` False: it wants no more."""
+        """Note that the page has lines until this one; ``on`` False: it wants no more."""
         self._on, self._sent, self._due = on, (origin, number), True
 
     def end(self) -> None:
@@ -79,7 +79,7 @@ class LogReader:
         self._due = True
 
     def take(self, lines: LogLines) -> Run | None:
-        """What to send now; it counts as received from now on."""
+        """Return what to send now; it counts as received from now on."""
         if not (self._on and self._due):
             return None
         origin, number = self._sent

@@ -53,7 +53,7 @@ def declarations() -> str:
 
 
 def _views() -> Iterator[type]:
-    """The values of the server's metrics, each after what it consists of."""
+    """Yield the values of the server's metrics, each after what it consists of."""
     yield messages.OwnerState
     yield from messages.SERVER_METRICS.values()
 

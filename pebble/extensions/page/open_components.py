@@ -86,7 +86,7 @@ class OpenComponents:
             self.update(ref)
 
     def update(self, ref: str) -> None:
-        """Its capabilities, or the pages that have it open, may have changed."""
+        """Note that its capabilities, or the pages that have it open, may have changed."""
         wanted = set(self._filters(ref)) if ref in self._pages else None
         received = set(self._subscriptions[ref]) if ref in self._subscriptions else None
         if ref not in self._following and wanted != received:
@@ -123,7 +123,7 @@ class OpenComponents:
             self._following.discard(ref)
 
     def _forget(self, ref: str) -> None:
-        """Nothing is received of it any more. Pages may open what is no component at all."""
+        """Receive nothing of it any more. Pages may open what is no component at all."""
         self._subscriptions.pop(ref, None)
         self._wanted.pop(ref, None)
         self._flags.pop(ref, None)
@@ -148,7 +148,7 @@ class OpenComponents:
         return take
 
     def _receive_flag(self, ref: str, channel: c.Channel, message: Message) -> None:
-        """Its newest value; an empty message removes what was retained."""
+        """Take a flag's newest value; an empty message removes what was retained."""
         try:
             value = codec.decode(channel, message.payload) if message.payload else None
         except PayloadError:
@@ -161,7 +161,7 @@ class OpenComponents:
         self._robots.set_server_metric(ref, _FLAGS_METRIC, view)
 
     def _filters(self, ref: str) -> dict[str, _Carried]:
-        """Every channel's own topic, flags, what capabilities and manifests name, and overlays of its picture."""
+        """Return the topics of channels, flags, overlays of its picture, and those that it names itself."""
         filters: dict[str, _Carried] = {channel.filter(ref): None for channel in WATCHED}
         for channel in _NAMED:
             self._add(filters, ref, channel)

@@ -12,7 +12,7 @@ class Pace:
         self._left, self._at = BURST, now
 
     def take(self, cost: float, now: float) -> float:
-        """How many seconds to wait before this is done."""
+        """Return how many seconds to wait before this is done."""
         self._left = min(BURST, self._left + PER_S * (now - self._at)) - cost
         self._at = now
         return max(0.0, -self._left / PER_S)

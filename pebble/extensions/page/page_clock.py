@@ -62,7 +62,7 @@ class PageClock:
         self._echoed_at = now
 
     def problem(self, now: float) -> str:
-        """Why no command of this page may move anything now; empty if it may."""
+        """Return why no command of this page may move anything now; empty if it may."""
         if now - self._echoed_at > _ECHO_S:
             return "the connection to the page is stalled"
         waiting = max((now - sent for sent in self._sent.values()), default=0.0)
@@ -70,7 +70,7 @@ class PageClock:
         return f"commands are late ({1000 * late:.0f} ms)" if late >= LATE_S else ""
 
     def late(self, t_ms: float, now: float) -> bool:
-        """Whether a message that the page stamped ``t_ms`` may be too old to move anything. Raises ClockJumpError."""
+        """True if a message that the page stamped ``t_ms`` may be too old to move anything. Raises ClockJumpError."""
         if not self._bounds:
             return True
         low = t_ms / 1000 - now

@@ -25,12 +25,12 @@ _FLAGS = {flag.metric.removeprefix("flags/"): flag for flag in FLAGS.values()}
 
 
 def right(op: m.RobotOp) -> str:
-    """That a person needs to ask this."""
+    """Return the right that a person needs to ask this."""
     return right_of(_command(op).channel)
 
 
 def ends(op: m.RobotOp) -> bool:
-    """Whether it ends something: then it is passed on whatever the component is and reports."""
+    """True if it ends something: then it is passed on whatever the component is and reports."""
     match op:
         case m.SoundboardOp(file="") | m.AutonomyOp(file="") | m.FlagOp(on=False) | m.OutletOp(on=False):
             return True
@@ -40,12 +40,15 @@ def ends(op: m.RobotOp) -> bool:
 
 
 def moves(op: m.RobotOp) -> bool:
-    """Whether something may move, or be switched on, because of it: not over a connection that may not drive."""
+    """True if something may move, or be switched on, because of it: not over a connection that may not drive."""
     return isinstance(op, m.AutonomyOp | m.McuOp | m.OutletOp) and not ends(op)
 
 
 def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
-    """Why a component with these capabilities is not asked this; empty if it is, also where they do not mention it."""
+    """Return why a component with these capabilities is not asked this.
+
+    Empty if it is, also where they do not mention it.
+    """
     if isinstance(op, m.McuOp) and op.name == _DESCRIBE:
         return f"{op.name} is no command of a microcontroller"
     command = _command(op)
@@ -77,14 +80,14 @@ def publication(op: m.RobotOp, capabilities: dict[str, Any]) -> Message:
 
 
 def _action_topic(op: m.ActionOp, channel: Channel, capabilities: dict[str, Any]) -> str:
-    """The first that the capabilities name."""
+    """Return the first that the capabilities name."""
     sections = (section_of(capabilities, section) for section in _sections(op))
     topics = (section.get(key) for section in sections for key in ("flag_topic", "topic"))
     return next((str(topic) for topic in topics if names(op.ref, topic, channel)), channel.topic(op.ref))
 
 
 def _sections(op: m.ActionOp) -> list[str]:
-    """The commands in the capabilities, in all spellings that the original page understands."""
+    """Return the commands in the capabilities, in all spellings that the original page understands."""
     names = (op.name.replace("-", "_"), op.name)
     return [f"system.{name}" for name in names] + list(names)
 

@@ -55,7 +55,7 @@ class Component:
         self.refreshed_at = float("-inf")
 
     def lists(self, metric: str) -> bool:
-        """Whether this is the state of a motor owner that its capabilities list."""
+        """True if this is the state of a motor owner that its capabilities list."""
         states, owners = (c.ESTOP_STATE, c.CONTROL_STATE), self.robot.estop.owners
         return metric in [state.metric.format(owner=owner) for state in states for owner in owners]
 
@@ -121,20 +121,20 @@ class Robots:
         return topic_of(ref, self.capabilities(ref), channel)
 
     def aliases(self, ref: str) -> list[str]:
-        """The metrics, none of the contract's, under which its microcontrollers say that they publish."""
+        """Return the metrics, none of the contract's, under which its microcontrollers say that they publish."""
         component = self.components.get(ref)
         declared = () if component is None else component.aliases.values()
         return list(dict.fromkeys(chain.from_iterable(declared)))[:MAX_ALIASES]
 
     def value(self, ref: str, metric: str) -> msgspec.Raw | None:
-        """The newest value; that of a server's metric as well."""
+        """Return the newest value; that of a server's metric as well."""
         found = self._find(ref, metric)
         return None if found is None else found.raw
 
     def take(
         self, interest: Interest, now: float, *, large: bool
     ) -> tuple[tuple[tuple[str, str, Any, float], ...], bool]:
-        """What this page has not received yet, None for what was removed; it counts as received from now on.
+        """Return what this page has not received yet, None for what was removed; it counts as received from now on.
 
         With it, whether there is a large value among them: one if it may be ``large``, the others wait. What is open is
         taken first; what does not fit into a message waits for the next one.
@@ -307,7 +307,7 @@ class Robots:
         return True
 
     def _remove_value(self, component: Component, metric: str) -> None:
-        """An empty message removes what was retained."""
+        """Remove what was retained: an empty message says so."""
         old = component.values.pop(metric, None)
         if old is not None:
             self._bytes -= len(bytes(old.raw))
@@ -363,7 +363,7 @@ def _channel(metric: str) -> c.Channel | None:
 
 
 def _aliases(payload: bytes) -> tuple[str, ...]:
-    """What a manifest declares besides the contract's metrics, however strange the rest of it is."""
+    """Return what a manifest declares besides the contract's metrics, however strange the rest of it is."""
     manifest = codec.plain(c.MCU_DESCRIBE, payload)
     interfaces = manifest.get("interfaces") if isinstance(manifest, dict) else None
     outgoing = [
@@ -375,7 +375,7 @@ def _aliases(payload: bytes) -> tuple[str, ...]:
 
 
 def _may_be_alias(metric: str) -> bool:
-    """Whether this is a metric that nothing else defines: neither the contract nor the server itself."""
+    """True if this is a metric that nothing else defines: neither the contract nor the server itself."""
     family = metric.partition("/")[0]
     return (
         _channel(metric) is None

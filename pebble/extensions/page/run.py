@@ -50,7 +50,10 @@ def main(arguments: list[str]) -> int:
 
 
 def settings_or_all_problems(config: Config) -> WebSettings:
-    """The settings of the page; the error also says whether a user is missing: it is not found only after the rest."""
+    """Return the settings of the page.
+
+    The error also says whether a user is missing: it is not found only after the rest.
+    """
     try:
         return settings_of(config)
     except ConfigError as error:
@@ -62,7 +65,7 @@ def settings_or_all_problems(config: Config) -> WebSettings:
 
 
 def _settings_of_process(path: str) -> WebSettings:
-    """The settings of a page that people can use. Raises ConfigError with everything that is missing."""
+    """Return the settings of a page that people can use. Raises ConfigError with everything that is missing."""
     config = config_of_process(path)
     set_log_level(config.log_level)
     settings = settings_or_all_problems(config)
@@ -82,7 +85,7 @@ def _decoded(fields: str) -> WebSettings:
 
 
 def _without_user(config: Config) -> list[str]:
-    """The problem that a login is needed and there is no user; empty if all is well."""
+    """Return the problem that a login is needed and there is no user; empty if all is well."""
     file = people_of(config)
     if not has_login(config.section(WebInterface)) or has_user(file):
         return []

@@ -135,7 +135,7 @@ def listen(settings: WebSettings) -> socket.socket:
 
 
 def url_of(settings: WebSettings, listener: socket.socket) -> str:
-    """The address that a browser on this machine opens, or the name by which others reach it."""
+    """Return the address that a browser on this machine opens, or the name by which others reach it."""
     host = settings.names[0] if settings.names else settings.host
     if host in _ALL_ADDRESSES:  # no browser can open these
         names = certificates.show(settings.certificate).names if settings.certificate else ()

@@ -164,11 +164,11 @@ class Server:
             self.spawn(asyncio.to_thread(heartbeats.close))
 
     def _has_sent(self) -> bool:
-        """Whether little waits to be sent. To repeat the stop of a thousand robots before would only delay its end."""
+        """True if little waits to be sent. To repeat the stop of a thousand robots before would only delay its end."""
         return self.stop_broker.transport.outgoing.waiting < _MANY_WAIT
 
     def stop(self, ref: str, name: str, session: Session, device: str, why: str, address: str = "") -> None:
-        """An emergency stop of one component, or of all (""): sent at once, and repeated until it is confirmed."""
+        """Stop one component, or all (""): sent at once, and repeated until it is confirmed."""
         by = f"{session.user} on {device}" if device else session.user
         if ref and not _is_base(ref):
             return
@@ -184,7 +184,10 @@ class Server:
     # -- names
 
     def level(self, ref: str) -> SecurityLevel:
-        """How strictly that robot checks names, as far as it tells; of others it is as in the server's config."""
+        """Return how strictly that robot checks names, as far as it tells.
+
+        Of others it is as in the server's config.
+        """
         robot = self.robots.view(ref)
         if robot is None or not robot.estop.has_capabilities:
             return self.settings.level
@@ -200,7 +203,7 @@ class Server:
     # -- what is open
 
     def watch(self, ref: str) -> None:
-        """A page has opened this component."""
+        """Note that a page has opened this component."""
         if _is_base(ref):
             self.open_components.open(ref)
             self.sources.show(ref)
@@ -233,7 +236,7 @@ class Server:
                 log.exception("a round of the server failed")
 
     async def _watch_people(self) -> None:
-        """A person who is removed is out soon, though each page looks after its session rarely."""
+        """Put out soon who is removed, though each page looks after its session rarely."""
         while True:
             with suppress(DatabaseError):  # which the looks at sessions report
                 self.people_version = await asyncio.to_thread(self.people.version)
@@ -259,5 +262,5 @@ def _is_base(ref: str) -> bool:
 
 
 def encode(message: m.ToPage) -> str:
-    """The text that a page receives."""
+    """Return the text that a page receives."""
     return msgspec.json.encode(message).decode()

@@ -45,7 +45,7 @@ class WebSettings:
 
 
 def settings_of(config: Config) -> WebSettings:
-    """How ``config`` sets up the operator page. Raises ConfigError with the key and what to do.
+    """Return how ``config`` sets up the operator page. Raises ConfigError with the key and what to do.
 
     Whether there is a user, where ``login`` is true, is seen only in a database: ``pebble.extensions.page.run``.
     """
@@ -100,7 +100,7 @@ def _recordings(config: Config) -> Path | None:
 
 
 def _broker(config: Config) -> Mqtt:
-    """The broker of ``web_interface.mqtt``, else the one that the robot's bridge connects to."""
+    """Return the broker of ``web_interface.mqtt``, else the one that the robot's bridge connects to."""
     bridge = config.services.mqtt_bridge
     if config.section(WebInterface).mqtt.host:
         return config.section(WebInterface).mqtt

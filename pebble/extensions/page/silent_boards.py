@@ -120,7 +120,7 @@ class SilentBoards:
             return Permission()
 
     def _refusal(self, ref: str) -> str:
-        """Why a person cannot change what counts."""
+        """Return why a person cannot change what counts."""
         listed = self._listed.get(ref, ListedRobot())
         if self._is_named and not listed.plain:
             return _NAMED

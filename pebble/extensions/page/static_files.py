@@ -69,7 +69,7 @@ class StaticFiles:
         self._packed = {name: _packed(name, content) for name, content in self.files.items()}
 
     def _imported(self, *names: str) -> list[str]:
-        """What these modules import before they run, and what that imports."""
+        """Return what these modules import before they run, and what that imports."""
         found = dict.fromkeys(names)
         for name in (waiting := list(names)):
             for path in _IMPORT.findall(self.files.get(name, b"")):
@@ -80,7 +80,7 @@ class StaticFiles:
         return [name for name in found if name not in names]
 
     def page(self, request: Request) -> Response:
-        """The operator page; which screen it shows is up to its address."""
+        """Return the operator page; which screen it shows is up to its address."""
         # with no-referrer, browsers do not say where a form comes from
         headers = {**NO_STORE, "content-security-policy": self._policy, "referrer-policy": "same-origin"}
         name = "robot.html" if request.url.path.startswith("/r/") else "fleet.html"
@@ -92,7 +92,7 @@ class StaticFiles:
         return _AGAIN.sub("", version) == self.version
 
     def answer(self, request: Request, name: str, headers: dict[str, str]) -> Response:
-        """The file ``name``, compressed if the browser takes that; 404 if there is none.
+        """Return the file ``name``, compressed if the browser takes that; 404 if there is none.
 
         With a number as query it is a module that is fetched again because one that it imports was lost: those have the
         query, too, but for the ones that run since the start.
@@ -111,7 +111,7 @@ class StaticFiles:
 
 
 def root_of(request: Request) -> str:
-    """The way from the address of ``request`` to where the server begins: ``./``, ``../../``."""
+    """Return the way from the address of ``request`` to where the server begins: ``./``, ``../../``."""
     path: bytes = request.scope["raw_path"]
     return "../" * (path.count(b"/") - 1) or "./"
 

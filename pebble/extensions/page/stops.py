@@ -66,7 +66,7 @@ class Stops:
         return self.tick(now)
 
     def waits_s(self, user: str, now: float) -> float:
-        """How long a stop of this person waits that comes without a control socket, as it would on one."""
+        """Return how long a stop of this person waits that comes without a control socket, as it would on one."""
         return min(self._paces.setdefault(user, Pace(now)).take(1, now), STOP_WAITS_S)
 
     def end(self, name: str) -> None:
@@ -123,7 +123,7 @@ class Stops:
         return messages
 
     def tick(self, now: float) -> list[Message]:
-        """What to publish now; to be called every 50 ms."""
+        """Return what to publish now; to be called every 50 ms."""
         messages, self._repeats = [], self._again()
         for name, (sender, began) in list(self._senders.items()):
             if name not in self._over:
@@ -137,7 +137,7 @@ class Stops:
         return messages
 
     def view(self, estop: RobotEstop) -> m.EstopView:
-        """What pages see of the emergency stop of one component."""
+        """Return what pages see of the emergency stop of one component."""
         name, stop = self._newest(estop.base)
         sending, text = ("", "") if stop is None else _progress(stop)
         self._shown[estop.base] = sending, text

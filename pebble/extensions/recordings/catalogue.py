@@ -42,7 +42,7 @@ class FileInfo:
 
 
 def look_at(path: Path, *, whole: bool = False, since_ns: int = 0, until_ns: int = FOREVER_NS) -> FileInfo:
-    """What a file holds, by its summary; one without, or ``whole``, is read completely. Raises RecordingError.
+    """Return what a file holds, by its summary; one without, or ``whole``, is read completely. Raises RecordingError.
 
     Only messages from ``since_ns`` to before ``until_ns`` count.
     """
@@ -97,7 +97,7 @@ def _count(info: FileInfo, channel: Channel, count: int) -> None:
 
 
 def events(paths: Iterable[Path]) -> Iterator[dict[str, Any]]:
-    """What happened to the recording itself, in the order of time."""
+    """Yield what happened to the recording itself, in the order of time."""
     for message in merged(paths, chooses=lambda channel: channel.topic == EVENTS):
         try:
             event = json.loads(message.payload)

@@ -18,7 +18,10 @@ Damages = dict[Path, Damage]
 
 
 def files(places: Iterable[Path]) -> list[Path]:
-    """The recordings among ``places`` and in folders there, finished or not. Raises RecordingError if there is none."""
+    """Return the recordings among ``places`` and in folders there, finished or not.
+
+    Raises RecordingError if there is none.
+    """
     found: list[Path] = []
     for place in places:
         if place.is_dir():
@@ -53,7 +56,7 @@ def merged(
     chooses: Chooses = lambda _channel: True,
     damages: Damages | None = None,
 ) -> Iterator[Recorded]:
-    """The messages of all files from ``since_ns`` to before ``until_ns``, by the time at which they were received.
+    """Yield the messages of all files from ``since_ns`` to before ``until_ns``, by the time of their arrival.
 
     A file is open only while its time has come: its chunks outside the period are not unpacked. What is wrong with
     those that were read is in ``damages``. Raises RecordingError.
@@ -71,7 +74,7 @@ def merged(
 
 
 def problems(damages: Damages) -> list[str]:
-    """A line for each file that could not be read completely."""
+    """Return a line for each file that could not be read completely."""
     found = ((path, damage.report(active=path.name.endswith(ACTIVE))) for path, damage in damages.items())
     return [f"{path}: {text}" for path, text in found if text]
 

@@ -26,7 +26,9 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def parse_period(since: str | None, until: str | None, *, now: datetime) -> tuple[int, int]:
-    """The period from ``since`` to before ``until``, in nanoseconds since 1970; 0 and FOREVER_NS where there is none.
+    """Return the period from ``since`` to before ``until``, in nanoseconds since 1970.
+
+    0 and FOREVER_NS where there is none.
 
     A time of day is the latest one that is not after ``now``; as ``until`` with a ``since``, the first one after that.
     A day as ``until`` is included. Times without a zone are in that of ``now``, or this machine's if that has none.
@@ -46,7 +48,7 @@ def parse_period(since: str | None, until: str | None, *, now: datetime) -> tupl
 
 
 def _zoned(option: str, text: str, now: datetime) -> tuple[str, datetime]:
-    """The text without its zone, and ``now`` in that zone."""
+    """Return the text without its zone, and ``now`` in that zone."""
     match = _ZONED.fullmatch(text)
     if match is None:
         return text, now
@@ -103,7 +105,7 @@ def _known(moments: list[datetime], zone: tzinfo | None) -> Iterator[tuple[int, 
 
 
 def _readings(moment: datetime, zone: tzinfo | None) -> set[int]:
-    """When clocks in a zone, or of this machine, show ``moment``: where they are changed it may be twice, or never."""
+    """Return when clocks of a zone, or this machine's, show ``moment``: where they are changed twice, or never."""
     return {_ns(moment.replace(tzinfo=zone, fold=fold)) for fold in (0, 1)}
 
 

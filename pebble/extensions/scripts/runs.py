@@ -43,7 +43,7 @@ class LocalScripts:
         self._held: int | None = None
 
     def hold(self) -> None:
-        """From now on one runs. Without the lock it starts all the same: neighbours then take no number, either."""
+        """Note that one runs. Without the lock it starts all the same: neighbours then take no number, either."""
         if self._held is None:
             try:
                 self._held = self._open()
@@ -83,7 +83,7 @@ class LocalScripts:
 
 
 def newest(runs: Iterable[int]) -> int:
-    """The newest of ``runs``, where 0 stands for none."""
+    """Return the newest of ``runs``, where 0 stands for none."""
     return reduce(lambda one, run: run if newer(run, one) else one, runs, 0)
 
 
@@ -92,7 +92,7 @@ def following(run: int) -> int:
 
 
 def next_run(config: Config, barred: int = 0, received: int = 0) -> int:
-    """The number of a run that starts now: newer than ``barred``, which motor owners report.
+    """Return the number of a run that starts now: newer than ``barred``, which motor owners report.
 
     It is also above ``received`` and above every earlier run of this robot, unless these are not ahead of ``barred``:
     then a stranger has sent a number far ahead. Several processes may call this at once. Without the file, or with a
@@ -144,13 +144,13 @@ def _read(file: int, path: Path, wall_clock: Callable[[], float]) -> int:
 
 
 def _from_clock(wall_clock: Callable[[], float]) -> int:
-    """Seconds since 2025; 0 by a clock that was never set or is far ahead."""
+    """Return seconds since 2025; 0 by a clock that was never set or is far ahead."""
     seconds = int(wall_clock()) - _EPOCH_S
     return seconds if 0 < seconds < LAST_RUN // 2 else 0
 
 
 def _above(barred: int, *used: int) -> int:
-    """The number after the one of ``barred`` and ``used`` that is furthest ahead and still leaves a newer one."""
+    """Return the number after the furthest of ``barred`` and ``used`` that still leaves a newer one."""
     base = barred or newest(used)
     ahead = ((run - base) & LAST_RUN for run in used if run and newer(following(run), base))
     return following((base + max(ahead, default=0)) & LAST_RUN)

@@ -345,7 +345,7 @@ def _changing(folder_: Path | None, *, any_rules: bool = False) -> Iterator[tupl
 
 
 def _place(folder_: Path | None) -> Path:
-    """The folder that is named, else the only fleet in this one. Raises PebbleError."""
+    """Return the folder that is named, else the only fleet in this one. Raises PebbleError."""
     if folder_ is not None:
         return folder_.absolute()
     found = [Path(), *sorted(path for path in Path().iterdir() if path.is_dir() and not path.name.startswith("."))]
@@ -398,7 +398,7 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
 
 
 def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, Path]) -> None:
-    """Where the certificate of an account and its key are, and what belongs into its config."""
+    """Print where the certificate of an account and its key are, and what belongs into its config."""
     roles, until = fleet.accounts[name].roles, certificates.show(files[0]).until
     typer.echo(f"{' and '.join(map(_shown, files))} are for {name}, until {until:%Y-%m-%d}.")
     copies = " and ".join(map(_shown, (files[0], place / certificates.CA_CERT)))

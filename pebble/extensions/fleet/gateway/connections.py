@@ -18,7 +18,7 @@ from pebble.transports import Message, Transport, create
 def gateway_transports(
     gateway: GatewayFile, operators: Mqtt, run_dir: Path, will: Message
 ) -> tuple[Transport, Transport, Transport, Transport]:
-    """The connections of a gateway: to where the robots are, and three to the operators' broker, one of them for its
+    """Return a gateway's connections: to where the robots are, and three to the operators' broker, one of them for its
     heartbeats, with its will, and one for stops.
     """
     base = will.topic.removesuffix(f"/{c.ONLINE.suffix}")

@@ -28,7 +28,7 @@ class Pace:
         self._waiting: dict[str, tuple[int, Message]] = {}  # and the second in which each has come
 
     def takes(self, message: Message, key: str) -> bool:
-        """Whether this one passes now; ``key``: its topic, or what it is counted with. Hot."""
+        """True if this one passes now; ``key``: its topic, or what it is counted with. Hot."""
         second, counts = int(self._clock()), self._counts
         if second != self._second:
             self._second, self._passed = second, 0
@@ -47,7 +47,7 @@ class Pace:
         return False
 
     def due(self) -> list[Message]:
-        """Those whose second has come."""
+        """Return those whose second has come."""
         if not self._waiting:
             return []
         second = int(self._clock())

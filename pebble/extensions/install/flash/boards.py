@@ -74,7 +74,7 @@ def _lines(beginning: bytes) -> Callable[[bytes], bool]:
 
 
 def _frames(received: bytes) -> bool:
-    """Whether a complete frame of pebble_serial_v1 was received: COBS(body, CRC-16/CCITT-FALSE), then a zero."""
+    """True if a complete frame of pebble_serial_v1 was received: COBS(body, CRC-16/CCITT-FALSE), then a zero."""
     return any(_is_frame(frame) for frame in received.split(b"\0")[1:-1])
 
 

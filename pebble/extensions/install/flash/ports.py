@@ -19,7 +19,7 @@ _RESET_PULSE_S = 0.1
 
 
 def described() -> list[str]:
-    """One line per serial port: its path, the USB device's own name, and its ids."""
+    """Return one line per serial port: its path, the USB device's own name, and its ids."""
     lines = []
     for port in sorted(list_ports.comports()):
         name = " ".join(filter(None, (port.manufacturer, port.product))) or port.description

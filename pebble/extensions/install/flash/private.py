@@ -26,11 +26,11 @@ class PrivateFiles:
     ca: bytes | None = field(default=None, repr=False)  # an authority's certificate, DER
 
     def text(self) -> str:
-        """The content of private_config.json, including passwords."""
+        """Return the content of private_config.json, including passwords."""
         return json.dumps(self.settings)
 
     def shown(self) -> str:
-        """The same with passwords as ***, for messages."""
+        """Return the same with passwords as ***, for messages."""
         return json.dumps(_hidden(self.settings))
 
 

@@ -10,17 +10,17 @@ from pebble.extensions.install.flash.boards import Firmware
 
 
 def firmware_folder() -> Path:
-    """The folder firmware/ of the checkout or of the installed package."""
+    """Return the folder firmware/ of the checkout or of the installed package."""
     return Path(str(files("pebble"))) / "firmware"
 
 
 def main_file(firmware: Firmware, root: Path | None = None) -> Path:
-    """The file that is installed as /main.py on the board."""
+    """Return the file that is installed as /main.py on the board."""
     return (root or firmware_folder()) / firmware.name / "main.py"
 
 
 def modules(firmware: Firmware, root: Path | None = None) -> list[Path]:
-    """All modules that main.py imports, directly or not, relative to firmware/; nothing else is copied.
+    """Return all modules that main.py imports, directly or not, relative to firmware/; nothing else is copied.
 
     Raises PebbleError if there is no main.py.
     """

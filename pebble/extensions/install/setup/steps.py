@@ -111,7 +111,7 @@ class Job:
     # -- the steps
 
     def steps(self) -> list[Step]:
-        """All of them, in their order: the config is written when all that it names is there."""
+        """Return all of them, in their order: the config is written when all that it names is there."""
         steps = [*self._passwords(), *(self._own_broker() if self.answers.broker == HERE else self._other_broker())]
         if self.answers.page:
             steps += [*self._certificate(), *self._first_user()]

@@ -50,7 +50,7 @@ class Arrived(NamedTuple):
 
 
 def wheels(number: int) -> Wheels:
-    """The wheel speeds of command ``number`` (0 … 639,999): each pair is unique."""
+    """Return the wheel speeds of command ``number`` (0 … 639,999): each pair is unique."""
     return round(0.1 + (number % _STEPS) / 1000, 3), round(0.1 + (number // _STEPS % _STEPS) / 1000, 3)
 
 
@@ -146,7 +146,7 @@ class StandIn(Robot):
             self.start(f"the stand-in's {part}", python("pebble.extensions.lab.bench.stand_in", part, *rest))
 
     def processes(self) -> dict[str, int]:
-        """Its two programs, by the names of the services that they stand for, and its broker."""
+        """Return its two programs, by the names of the services that they stand for, and its broker."""
         running = [*self._started, *([self.local_broker] if self.local_broker else [])]
         return {name: program.pid for name, program in zip((*SERVICES.values(), "mosquitto"), running, strict=False)}
 

@@ -64,7 +64,7 @@ def bridge(seconds: Seconds = None, quick: Quick = False, output: Output = FOLDE
 
 @app.command()
 def startup(quick: Quick = False, output: Output = FOLDER) -> int:
-    """How fast a robot starts: first heartbeat, all services ready, first drive command executed.
+    """Return how fast a robot starts: first heartbeat, all services ready, first drive command executed.
 
     And how fast an operator or a service that connects later receives all retained messages. Every launch is a new
     simulated robot. Needs mosquitto.
@@ -74,7 +74,7 @@ def startup(quick: Quick = False, output: Output = FOLDER) -> int:
 
 @app.command()
 def cost(quick: Quick = False, output: Output = FOLDER) -> int:
-    """What a robot costs: memory, CPU and threads of each of its processes.
+    """Return what a robot costs: memory, CPU and threads of each of its processes.
 
     Idle, driven 20 times a second, and sending pictures (640x480, 15 per second) and sound to an operator in two
     forms. Whole simulated robots; needs mosquitto.
@@ -90,7 +90,7 @@ def frames(variants: Variants = None, seconds: Seconds = None, quick: Quick = Fa
 
 @app.command()
 def scale(quick: Quick = False, output: Output = FOLDER) -> int:
-    """What many boards cost a server of the operator page: CPU, memory, latency. Needs mosquitto."""
+    """Return what many boards cost a server of the operator page: CPU, memory, latency. Needs mosquitto."""
     return _run("scale", quick, output)
 
 

@@ -179,7 +179,7 @@ def _wireless(
 
 
 def _broker(broker: str, password_file: Path | None, ca_cert: Path | None) -> tuple[MqttSettings, Config | None]:
-    """The broker that a URL or a config file names, and the config. Raises PebbleError."""
+    """Return the broker that a URL or a config file names, and the config. Raises PebbleError."""
     from pebble.config import load
     from pebble.runtime.connections import LOCAL_RECONNECT_S, mqtt_settings
 

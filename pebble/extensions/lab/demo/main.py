@@ -219,7 +219,7 @@ def usual_or_free(testbed: Testbed, ending: threading.Event, **settings: Any) ->
 
 @contextmanager
 def ending_on_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C, a closed terminal and SIGTERM set, so that every process is ended in order."""
+    """Give an event that Ctrl-C, a closed terminal and SIGTERM set, so that every process is ended in order."""
     ending = threading.Event()
 
     def ask(_signal: int, _frame: FrameType | None) -> None:

@@ -69,7 +69,7 @@ def show_qr(text: str, console: Console) -> None:
 
 
 def qr_lines(text: str) -> Iterator[str]:
-    """A QR code in black blocks on white."""
+    """Yield a QR code in black blocks on white."""
     dark = QRCodeEncoder.create().encode(text) == 0
     used = np.argwhere(dark)
     dark = np.pad(dark[used.min() : used.max() + 1, used.min() : used.max() + 1], _QUIET)

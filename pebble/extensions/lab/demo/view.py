@@ -54,7 +54,7 @@ class View:
 
     @contextmanager
     def _until_closed(self) -> Iterator[None]:
-        """A terminal may be closed before, or while, something is written to it: that ends the demo in order."""
+        """End the demo in order if its terminal is closed before, or while, something is written to it."""
         self._notice_closed_terminal()
         try:
             yield

@@ -29,7 +29,7 @@ class Visitors:
         self._step_began = 0.0
 
     def note_sent(self, topic: str, payload: bytes) -> None:
-        """The operator drives a robot by this, which the broker sends back to it."""
+        """Note a drive command of the operator's, which the broker sends back to it."""
         self._sent[topic].append(payload)
 
     def receive_drive(self, message: Message, now: float) -> None:

@@ -118,7 +118,10 @@ class Worker(Program):
         super().__init__(name, command, log, each=lambda line: self._answers.put(json.loads(line)))
 
     def answer(self, timeout: float) -> dict[str, Any]:
-        """The next answer. Raises PebbleError with its log if it ends, or does not answer within ``timeout`` s."""
+        """Return the next answer.
+
+        Raises PebbleError with its log if it ends, or does not answer within ``timeout`` s.
+        """
         why = f"did not answer within {timeout:.0f} s"
         with suppress(queue.Empty):
             if (answer := self._answers.get(timeout=timeout)) is not None:
@@ -148,7 +151,7 @@ class Worker(Program):
 
 
 def mosquitto_command(port: int, stem: Path, extra: Sequence[str] = (), host: str = HOST) -> list[str]:
-    """The command of a mosquitto on ``port``; writes its configuration to ``stem`` plus ``.conf``."""
+    """Return the command of a mosquitto on ``port``; writes its configuration to ``stem`` plus ``.conf``."""
     path = mosquitto_path()
     if path is None:
         raise PebbleError("mosquitto is not installed: apt install mosquitto")
@@ -161,7 +164,9 @@ def mosquitto_command(port: int, stem: Path, extra: Sequence[str] = (), host: st
 
 
 def free_port() -> int:
-    """An unused TCP port, also where there is no loopback device; in a new network namespace every port is unused.
+    """Return an unused TCP port, also where there is no loopback device.
+
+    In a new network namespace every port is unused.
 
     It is none that the system gives to outgoing connections: a client that tries again and again while its server is
     away gets that server's port some day, is connected to itself, and the server cannot start.
@@ -242,7 +247,7 @@ class Processes:
         end_all([program], self.ends_s[self._kinds.pop(program)])
 
     def unexpected_exits(self) -> list[str]:
-        """The processes that should still run and do not, brokers first."""
+        """Return the processes that should still run and do not, brokers first."""
         programs = sorted(self._kinds, key=lambda program: -self._kinds[program])
         return [f"{program.name} ended unexpectedly: see {program.log}" for program in programs if program.ended]
 
@@ -250,12 +255,12 @@ class Processes:
         return self.command(name, wrap(python(module, *arguments)))
 
     def command(self, name: str, command: Sequence[str]) -> Worker:
-        """A worker that is not a module."""
+        """Return a worker that is not a module."""
         self.workers.append(self.add(Worker(name, command, self.folder / f"{name}.log"), OPERATORS))
         return self.workers[-1]
 
     def broker(self, name: str = "broker", folder: Path | None = None, **more: Any) -> Broker:
-        """A broker that is starting: wait for it."""
+        """Return a broker that is starting: wait for it."""
         return self.add(Broker(name, folder or self.folder, **more), BROKERS)
 
 
@@ -277,7 +282,10 @@ def end_all(programs: Iterable[Program], within_s: float = _END_S) -> None:
 
 
 def children(pid: int) -> list[int]:
-    """The direct children of a process; none if it has ended. Not every kernel has /proc/PID/task/TID/children."""
+    """Return the direct children of a process; none if it has ended.
+
+    Not every kernel has /proc/PID/task/TID/children.
+    """
     found = []
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile

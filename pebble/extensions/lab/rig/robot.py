@@ -61,7 +61,7 @@ class SimulatedRobot:
         self._entries: deque[Entry] = deque(maxlen=5_000)  # minutes of commands
 
     def entries(self) -> list[Entry]:
-        """The lines that the MCU received and the changes of its motors, oldest first."""
+        """Return the lines that the MCU received and the changes of its motors, oldest first."""
         lines, self._trace_read = complete_lines(self._trace, self._trace_read)
         self._entries.extend(msgspec.json.decode(line, type=Entry) for line in lines)
         return list(self._entries)
@@ -75,7 +75,7 @@ class SimulatedRobot:
         return self._add(f"{self.name}'s {name}", command, MCUS, f"{name}.log")
 
     def _start_board(self, kind: str, port: Path, trace: Path, *options: object, name: str = "MCU") -> Program:
-        """An MCU on a pty."""
+        """Return an MCU on a pty."""
         return self._start_mcu(kind, "--link", port, "--trace", trace, *options, name=name)
 
 
@@ -142,14 +142,14 @@ class Robot(SimulatedRobot):
         self.start(f"the {self.kind} robot", python("pebble.cli", "up", self.config))
 
     def start(self, name: str, command: Sequence[str]) -> None:
-        """One of the robot's own processes."""
+        """Start one of the robot's own processes."""
         self._started.append(self._add(name, self._wrap(command), ROBOTS, "robot.log"))
 
     def _start_motors(self) -> Program:
         return self._start_board("goob", self.port, self._trace, *(["--trace-said"] if self.reports else []))
 
     def lines(self, since_ns: int) -> list[Entry]:
-        """What the MCU received, did and (with ``reports``) sent after ``since_ns`` (CLOCK_MONOTONIC)."""
+        """Return what the MCU received, did and (with ``reports``) sent after ``since_ns`` (CLOCK_MONOTONIC)."""
         return [entry for entry in read_trace(self._trace) if entry.ns >= since_ns]
 
     # -- its processes, once it is launched
@@ -159,11 +159,11 @@ class Robot(SimulatedRobot):
         return self._started[0]
 
     def log(self) -> str:
-        """The end of the robot's log."""
+        """Return the end of the robot's log."""
         return self.launcher.tail()
 
     def processes(self) -> dict[str, int]:
-        """The process ids of the launcher, its children (including a hub), and the local broker, by their names."""
+        """Return the process ids of the launcher, its children (a hub among them) and the local broker, by name."""
         names = {name[:15]: name for name in self._programs()}  # as long as they are in the kernel
         found = {"launcher": self.launcher.pid}
         for pid in children(self.launcher.pid):
@@ -173,7 +173,7 @@ class Robot(SimulatedRobot):
         return found if self.local_broker is None else found | {"mosquitto": self.local_broker.pid}
 
     def complete(self) -> bool:
-        """Whether all its programs run, including those started on demand."""
+        """True if all its programs run, including those started on demand."""
         return self._programs() <= self.processes().keys()
 
     def _programs(self) -> set[str]:
@@ -199,7 +199,7 @@ MEDIA: dict[str, Config] = {
 
 @contextmanager
 def one_robot(kind: str, make: type[Robot] = Robot, **options: Any) -> Iterator[Robot]:
-    """A robot of its own with a remote broker of its own, ready to be launched. Raises PebbleError."""
+    """Give a robot of its own with a remote broker of its own, ready to be launched. Raises PebbleError."""
     with Processes() as processes:
         broker = processes.broker("remote")
         robot = make(processes, kind, (HOST, broker.port), **options)

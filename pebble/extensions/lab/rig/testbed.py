@@ -178,7 +178,7 @@ class Testbed(Processes):
             self.robots[name] = McuRobot(self, name) if name in _BOARDS else linux(self, name)
 
     def start_page(self, port: int = 0, **settings: Any) -> PageServer:
-        """The operator page's server, which is starting, instead of an earlier one; ``port`` 0 is a free one."""
+        """Return the operator page's server, which is starting, instead of an earlier one; ``port`` 0 is a free one."""
         for earlier in [program for program in self._kinds if isinstance(program, PageServer)]:
             self.end(earlier)
         self.server = self.add(PageServer(self.folder, self.broker_port, port=port, **settings), OPERATORS)

@@ -28,7 +28,10 @@ def serve(handle: Handle) -> None:
 
 
 def serve_on_thread(handle: Handle, end: Callable[[], object] = lambda: None) -> threading.Event:
-    """The same on a thread of its own; the event is set, and ``end`` is called, when standard input has closed."""
+    """Return the same on a thread of its own.
+
+    The event is set, and ``end`` is called, when standard input has closed.
+    """
     ended = threading.Event()
 
     def run() -> None:

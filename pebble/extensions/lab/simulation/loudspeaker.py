@@ -45,13 +45,13 @@ class Playback(msgspec.Struct, omit_defaults=True):
     stopped: bool = False
 
     def frames(self) -> bytes:
-        """The samples that were played so far, interleaved as in a WAV file."""
+        """Return the samples that were played so far, interleaved as in a WAV file."""
         with wave.open(self.recording, "rb") as file:
             return file.readframes(file.getnframes())
 
 
 def playbacks(folder: Path) -> list[Playback]:
-    """The playbacks that a loudspeaker recorded in ``folder``, oldest first."""
+    """Return the playbacks that a loudspeaker recorded in ``folder``, oldest first."""
     path = folder / _EVENTS
     lines = complete_lines(path)[0] if path.exists() else []
     events = [msgspec.json.decode(line, type=Playback) for line in lines]

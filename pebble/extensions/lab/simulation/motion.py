@@ -22,10 +22,10 @@ class Ground(Protocol):
     """What a robot stands on."""
 
     def move(self, start: Pose, end: Pose) -> Pose:
-        """Where a robot is that drives from ``start`` to ``end``: less far, if something is in its way."""
+        """Return where a robot is that drives from ``start`` to ``end``: less far, if something is in its way."""
 
     def place(self, pose: Pose) -> None:
-        """The robot has been lifted, and put down there."""
+        """Note that the robot has been lifted, and put down there."""
 
 
 class RobotMotion:

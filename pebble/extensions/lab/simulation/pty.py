@@ -162,7 +162,7 @@ class PtyMcu:
 
     @property
     def host(self) -> bool:
-        """Whether a program has the port open."""
+        """True if a program has the port open."""
         return self._host
 
     # -- the MCU's thread

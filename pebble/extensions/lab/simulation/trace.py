@@ -70,11 +70,11 @@ class Trace:
             self._file.write(msgspec.json.encode(entry) + b"\n")
 
     def entries(self) -> list[Entry]:
-        """A copy, oldest first."""
+        """Return a copy, oldest first."""
         return list(self._entries.copy())
 
     def lines(self) -> list[str]:
-        """Only the lines, oldest first."""
+        """Return only the lines, oldest first."""
         return [entry.line for entry in self.entries() if entry.event == "line"]
 
     def close(self) -> None:
@@ -89,7 +89,7 @@ def read_trace(path: Path, start: int = 0) -> list[Entry]:
 
 
 def complete_lines(path: Path, start: int = 0) -> tuple[list[bytes], int]:
-    """The lines of a file from byte ``start`` on, without a last one that is incomplete, and where that one begins."""
+    """Return the complete lines of a file from byte ``start`` on, and where the incomplete one begins."""
     with path.open("rb") as file:
         file.seek(start)
         raw = file.read()

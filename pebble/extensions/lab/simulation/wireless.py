@@ -82,7 +82,7 @@ class WirelessRobot:
 
     @property
     def online(self) -> bool:
-        """Whether the firmware is connected to the broker and subscribed."""
+        """True if the firmware is connected to the broker and subscribed."""
         return str(self.firmware.session.connection.state) == "online"
 
     @property

@@ -21,7 +21,9 @@ _decode = msgspec.json.Decoder().decode
 
 
 def announced(base: str, payload: bytes) -> dict[str, Any]:
-    """The value of capabilities for ``"subscribes": ["incoming/drive-values", …]``; empty where there is no such list.
+    """Return the value of capabilities for ``"subscribes": ["incoming/drive-values", …]``.
+
+    Empty where there is no such list.
 
     It has ``announced``, so that people can be told what to publish. Whole topics and others' are not looked at.
     """

@@ -22,7 +22,10 @@ _LIST = msgspec.json.encode({"subscribes": [DRIVE.suffix]})
 
 
 def assumed(base: str, axes: Collection[str], name: str = "") -> dict[str, Any]:
-    """The value of capabilities that is taken for its own: that of its name, and of driving if it has any ``axes``."""
+    """Return the value of capabilities that is taken for its own.
+
+    That of its name, and of driving if it has any ``axes``.
+    """
     value = announced(base, _LIST) if axes else {}
     if axes:
         value["drive"]["axes"] = list(axes)

@@ -179,6 +179,6 @@ class Broker:
             watcher()
 
     def _call(self, function: Callable[..., None], *arguments: object) -> None:
-        """On a thread of the transport. The loop may have ended meanwhile."""
+        """Call the loop from a thread of the transport; it may have ended meanwhile."""
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(function, *arguments)

@@ -44,7 +44,7 @@ class Target:
 
 
 def target_of(robot: str | None, options: Target) -> Target:
-    """Where to connect: with --url or --config ``robot`` is an id, else a config file. Raises PebbleError."""
+    """Return where to connect: with --url or --config ``robot`` is an id, else a config file. Raises PebbleError."""
     if options.config is None and options.url is None:
         if robot is None:
             raise PebbleError("where to connect is missing: use either --config CONFIG or --url URL")
@@ -72,7 +72,7 @@ def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
 
 @contextmanager
 def listening(target: Target, sender: Transport) -> Iterator[Transport]:
-    """A second connection to where ``sender`` is, not waited for: what it receives holds up nothing that is sent.
+    """Open a second connection to where ``sender`` is, not waited for: it holds up nothing that is sent.
 
     It is ``sender`` itself where each client needs an id of its own, and within a robot's Zenoh network.
     """
@@ -87,7 +87,7 @@ def listening(target: Target, sender: Transport) -> Iterator[Transport]:
 
 
 def in_small_segments(settings: Any) -> Any:
-    """The same settings for a way that may lose large packets."""
+    """Return the same settings for a way that may lose large packets."""
     return replace(settings, max_segment=SMALL_SEGMENT) if isinstance(settings, MqttSettings) else settings
 
 
@@ -99,7 +99,10 @@ def _report_missing(transport: Transport, before: str = "") -> str:
 
 
 def resolve(target: Target) -> tuple[str, Any, Names, str]:
-    """The kind of transport and its settings, the names of topics there, and the place in words. Raises PebbleError."""
+    """Return the kind of transport and its settings, the names of topics there, and the place in words.
+
+    Raises PebbleError.
+    """
     if (target.config is None) == (target.url is None):
         raise PebbleError("where to connect is missing: use either --config CONFIG or --url URL")
     if target.config is not None:
@@ -118,7 +121,7 @@ def _account(settings: Any) -> str | None:
 
 
 def put_names(transport: Transport, names: Names, is_named: Callable[[str], bool]) -> None:
-    """From now on commands have this client's name in their topics, to robots that take them only so."""
+    """Put this client's name into the topics of commands, to robots that take them only so."""
     if names.account is not None:
         transport.policy.forms = NamedTopics(names.account, is_named).forms
 
@@ -162,7 +165,7 @@ class Listener:
             transport.subscribe(filter_, self._take, qos=QoS.DELIVERED)
 
     def next(self, timeout: float) -> Message | None:
-        """The next message, waiting up to ``timeout`` seconds for one."""
+        """Return the next message, waiting up to ``timeout`` seconds for one."""
         try:
             return self._waiting.get(timeout=max(timeout, 0.0))
         except queue.Empty:
@@ -176,7 +179,7 @@ class Listener:
 
 
 def subscribed_stop(transport: Transport, base: str) -> RobotEstop:
-    """The emergency stop of a robot, with what is retained of it, also from a broker that sends it a moment later."""
+    """Return a robot's emergency stop, with what is retained of it, also by a broker that sends it a moment later."""
     robot = RobotEstop(base)
     robot.subscribe(transport)
     wait_for(lambda: robot.has_capabilities, _LATE_S)

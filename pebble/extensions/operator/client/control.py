@@ -144,7 +144,7 @@ class ControlClient:
             self._due_at = max(self._due_at, now + APART * self._pace_of().control_s)
 
     def tick(self, now: float) -> list[Message]:
-        """What to publish now."""
+        """Return what to publish now."""
         self.update(now)
         if self.wanted and not self.held and (why := self._hopeless(now)):
             self._give_up(why)
@@ -159,7 +159,7 @@ class ControlClient:
 
     @property
     def done(self) -> bool:
-        """Whether it neither wants anything nor has anything to publish."""
+        """True if it neither wants anything nor has anything to publish."""
         return not self.wanted and not self._out
 
     @property
@@ -184,7 +184,7 @@ class ControlClient:
         return any(one.id == self.id for one in self.robot.states)
 
     def _hopeless(self, now: float) -> str:
-        """Why it is given up; empty: it is not."""
+        """Return why it is given up; empty: it is not."""
         if now - self._answered_at > self._pace_of().answer_s:
             return f"{self.robot.base.rpartition('/')[2]} {UNANSWERED}"
         return f"{self.robot.who} drives on" if now - self._asked_at > ASKS_S else ""
@@ -201,6 +201,6 @@ class ControlClient:
 
 
 def _clean(state: ControlState) -> ControlState:
-    """The state with short, printable names."""
+    """Return the state with short, printable names."""
     by, asks = (lease.shown(text, _NAME) for text in (state.by, state.asks))
     return msgspec.structs.replace(state, by=by, asks=asks, device=lease.shown(state.device, _DEVICE))

@@ -21,7 +21,7 @@ class Discovery:
         return list(self.robots.values())  # a copy: robots may be added meanwhile
 
     def awaits_heartbeat(self, waited_s: float) -> bool:
-        """Whether one of them, or the first of all, may be there although nothing was heard of it for so long."""
+        """True if one of them, or the first of all, may be there although nothing was heard of it for so long."""
         robots = [one.liveness for one in self.all_robots()]
         awaited = [silent_after(link=one.link) for one in robots if one.received_at is None]
         return waited_s < max(awaited, default=0.0 if robots else silent_after())

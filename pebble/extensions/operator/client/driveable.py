@@ -25,7 +25,10 @@ class Driveable(NamedTuple):
 
 
 def driveable_of(status: bytes) -> Driveable | None:
-    """The value in an ``outgoing/status``; None: it is not there, as for an older robot, or one without motors."""
+    """Return the value in an ``outgoing/status``.
+
+    None: it is not there, as for an older robot, or one without motors.
+    """
     found = _value(status).get("driveable")
     if not isinstance(found, dict) or found.get("state") not in ("yes", "no", "unknown"):
         return None
@@ -34,7 +37,7 @@ def driveable_of(status: bytes) -> Driveable | None:
 
 
 def is_held(status: bytes, program: str) -> bool:
-    """Whether that program is requested, and waits while people drive over a thin link."""
+    """True if that program is requested, and waits while people drive over a thin link."""
     found: Any = _value(status)
     for level in ("services", program, "state"):
         found = found.get(level) if isinstance(found, dict) else None

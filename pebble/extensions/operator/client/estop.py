@@ -127,7 +127,7 @@ class RobotStop:
 
     @property
     def sending(self) -> bool:
-        """Whether the stop is repeated."""
+        """True if the stop is repeated."""
         unsettled = self.progress is Progress.CONFIRMED and not self._settled
         unsent = self._names_due or self._sent_at == float("-inf")
         is_due = unsent or unsettled or self.progress in (Progress.WAITING, Progress.OLD)
@@ -194,7 +194,7 @@ class RobotStop:
         return state is not None and self._order.name in state.recent
 
     def _has_taken_it(self, owner: str) -> bool:
-        """Whether it has listed this stop since its start: later stops of others may have taken its place."""
+        """True if it has listed this stop since its start: later stops of others may have taken its place."""
         state = self.estop.states.get(owner)
         return state is not None and self._boots.get(owner) == state.boot
 
@@ -241,21 +241,21 @@ class StopSender:
 
     @property
     def collecting(self) -> bool:
-        """Whether further robots are stopped when they publish anything."""
+        """True if further robots are stopped when they publish anything."""
         return (
             not self.order.named and not self._ended and (self.order.hold or self._now < self._began + self._collect_s)
         )
 
     @property
     def finished(self) -> bool:
-        """Whether nothing more will be sent."""
+        """True if nothing more will be sent."""
         return self._ended or not (
             self.order.hold or self.collecting or any(robot.sending for robot in self.robots.values())
         )
 
     @property
     def confirmed(self) -> bool:
-        """Whether at least one robot is stopped, and every other one, except components that do not drive."""
+        """True if at least one robot is stopped, and every other one, except components that do not drive."""
         found = {robot.progress for robot in self.robots.values()}
         return Progress.CONFIRMED in found and found <= {Progress.CONFIRMED, Progress.SPARED} and not self.omitted
 
@@ -294,7 +294,7 @@ class StopSender:
         return [message for robot in self.robots.values() for message in robot.tick(now, again=again)] + passing
 
     def tick_robot(self, base: str, now: float, *, again: bool = True) -> list[Message]:
-        """What ``tick`` would return of this robot, from which a message was just received."""
+        """Return what ``tick`` would return of this robot, from which a message was just received."""
         passing, self._passing = self._passing, []
         robot = self.robots.get(base)
         return passing if robot is None else robot.tick(now, again=again) + passing

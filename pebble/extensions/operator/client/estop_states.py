@@ -18,7 +18,7 @@ class Reset:
         self._by = stop_of({"by": by})[1]
 
     def messages(self) -> list[Message]:
-        """What to publish, once: one message for each stopped owner."""
+        """Return what to publish, once: one message for each stopped owner."""
         commands = [EstopReset(boot=state.boot, count=state.count, by=self._by) for state in self.shown.values()]
         topic, qos = ESTOP_RESET.topic(self.robot.base), QoS(ESTOP_RESET.default_qos)
         return [Message(topic, codec.encode(ESTOP_RESET, command), qos) for command in commands]
@@ -30,11 +30,11 @@ class Reset:
 
     @property
     def free(self) -> bool:
-        """Whether every owner has confirmed that it is no longer stopped."""
+        """True if every owner has confirmed that it is no longer stopped."""
         return all(self._free(owner) for owner in self.shown)
 
     def refusals(self) -> dict[str, str]:
-        """Why owners are still stopped, in words; to be called when none is waiting, or after a timeout."""
+        """Return why owners are still stopped, in words; to be called when none is waiting, or after a timeout."""
         return {owner: self._refusal(owner) for owner in self.shown if not self._free(owner)}
 
     def _free(self, owner: str) -> bool | None:

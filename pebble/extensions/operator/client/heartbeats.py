@@ -28,7 +28,7 @@ class Heartbeats:
         threading.Thread(target=self._open, name="pebble-heartbeats", daemon=True).start()
 
     def take(self) -> list[Message]:
-        """The heartbeats since the last call."""
+        """Return the heartbeats since the last call."""
         return [self._heard.popleft() for _ in range(len(self._heard))]
 
     def close(self) -> None:

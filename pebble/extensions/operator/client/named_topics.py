@@ -26,7 +26,7 @@ class NoNameError(TransportError):
 
 
 def why_not(name: str, account: str) -> str:
-    """Why a robot does not take commands of this account, and what to do; empty if it does."""
+    """Return why a robot does not take commands of this account, and what to do; empty if it does."""
     if NAME.fullmatch(account):
         return ""
     lacks = f"{account!r} is none that it knows" if account else "there is none here"
@@ -41,7 +41,7 @@ class NamedTopics:
         self._is_named = is_named
 
     def forms(self, message: Message) -> Iterator[Message]:
-        """The messages that are published in place of this one. Raises NoNameError.
+        """Yield the messages that are published in place of this one. Raises NoNameError.
 
         A stop goes out as ever, too, and before anything is asked: it needs no name. Nothing is retained at a topic
         with a name, because the robot itself publishes its flags.
@@ -62,7 +62,7 @@ class NamedTopics:
             raise NoNameError(command.identity.id, self.account)
 
     def signed(self, topic: str, payload: bytes, person: str) -> bytes:
-        """The payload with the person for whom this client acts, where the robot puts the account before that name."""
+        """Return the payload with the person for whom this client acts, where the robot puts the account before."""
         command = _command(topic) if person else None
         if command is None or not self._is_named(command.identity.base):
             return payload
@@ -75,7 +75,7 @@ class NamedTopics:
 
 
 def _command(topic: str) -> ParsedTopic | None:
-    """The parts of a topic to a component, if it has no name yet."""
+    """Return the parts of a topic to a component, if it has no name yet."""
     parsed = parse_topic(topic)
     incoming = parsed is not None and parsed.direction is Direction.INCOMING
     return parsed if parsed is not None and incoming and not parsed.metric.startswith(f"{BY}/") else None
@@ -89,7 +89,7 @@ def _moves(payload: bytes) -> bool:
 
 
 def _without_claim(payload: bytes, account: str) -> bytes:
-    """The account alone tells who it is: its own name in the payload would be shown twice."""
+    """Return the payload without its own name: the account alone tells who it is."""
     if f'"{account}'.encode() not in payload:
         return payload
     found = _object(payload)

@@ -26,14 +26,14 @@ class Names:
         self._addresses = addresses
 
     def filters(self, name: str) -> list[str]:
-        """The filters to subscribe to for ``name``: its topic and those of its synonyms (paper Table A.5)."""
+        """Return the filters to subscribe to for ``name``: its topic and those of its synonyms (paper Table A.5)."""
         channel = self._find(name, (OUTGOING, INCOMING))
         if channel is None:
             return [name]
         return [self._place(one, name) for one in _with_synonyms(channel)]
 
     def topic(self, name: str) -> str:
-        """The topic to publish to for ``name``. Raises PebbleError if it is not exactly one."""
+        """Return the topic to publish to for ``name``. Raises PebbleError if it is not exactly one."""
         channel = self._find(name, (INCOMING, OUTGOING))
         topic = name if channel is None else self._place(channel, name)
         if is_pattern(topic):
@@ -43,7 +43,7 @@ class Names:
         return topic
 
     def channel(self, topic: str) -> Channel | None:
-        """The channel of ``topic``, of any robot."""
+        """Return the channel of ``topic``, of any robot."""
         known = None if self._addresses is None else self._addresses.channel(topic)
         if known is not None:
             return known
@@ -51,7 +51,7 @@ class Names:
         return None if address is None else channel_of(f"{address.direction}/{address.metric}")
 
     def _find(self, name: str, directions: tuple[str, str]) -> Channel | None:
-        """The channel of a short name; None for a whole topic. The first direction that has the name wins."""
+        """Return the channel of a short name; None for a whole topic. The first direction that has the name wins."""
         if name.startswith((f"{INCOMING}/", f"{OUTGOING}/")):
             found = channel_of(name)
         elif parse_topic(name) is not None or is_pattern(name):
@@ -71,7 +71,10 @@ class Names:
 
 
 def base_of(robot: str) -> str:
-    """The base topic of ``goob`` or ``pebble/robots/goob``. Raises ConfigError for names that no topic can hold."""
+    """Return the base topic of ``goob`` or ``pebble/robots/goob``.
+
+    Raises ConfigError for names that no topic can hold.
+    """
     levels = robot.split("/")
     if len(levels) == 1:
         levels = [*_USUAL.split("/")[:2], robot]
@@ -81,7 +84,7 @@ def base_of(robot: str) -> str:
 
 
 def id_of(base: str) -> str:
-    """The shortest name that :func:`base_of` takes for this robot."""
+    """Return the shortest name that :func:`base_of` takes for this robot."""
     name = base.removeprefix(_USUAL)
     return base if "/" in name else name
 

@@ -33,7 +33,9 @@ class Pace(NamedTuple):
     answer_s: float = LEVELS["wide"].answer_s  # a robot that has not answered by then will not
 
     def dated(self, drive: Drive, now: float, key: str) -> Drive:
-        """A command that moves something, as it is sent now: valid for as long as commands on this link are, and dated.
+        """Return a command that moves something, as it is sent now.
+
+        Valid for as long as commands on this link are, and dated.
 
         ``key``: where the robot has given none.
         """
@@ -46,7 +48,7 @@ WIDE = Pace()
 
 
 def pace_of(link: LinkState | None) -> Pace:
-    """The pace that a robot asks for; one that reports no link is sent everything."""
+    """Return the pace that a robot asks for; one that reports no link is sent everything."""
     if link is None or link.level == "wide":
         return WIDE
     level = LEVELS[link.level]
@@ -66,7 +68,7 @@ def pace_of(link: LinkState | None) -> Pace:
 
 
 def way_s(link: LinkState) -> float:
-    """How long a command takes to the robot, roughly: half a round trip, and whatever waits before it."""
+    """Return how long a command takes to the robot, roughly: half a round trip, and whatever waits before it."""
     return (link.rtt_ms / 2 + link.queue_ms) / 1000
 
 

@@ -66,7 +66,7 @@ class RobotEstop:
 
     @property
     def lacks(self) -> bool:
-        """Whether its capabilities, or a state that they list, have not come."""
+        """True if its capabilities, or a state that they list, have not come."""
         return not self.has_capabilities or bool(self.missing)
 
     @property
@@ -82,7 +82,7 @@ class RobotEstop:
 
     @property
     def old(self) -> bool:
-        """Whether it is known to have no emergency stop; one that announces it, but cannot receive it, is not old."""
+        """True if it is known to have no emergency stop; one that announces it, but cannot receive it, is not old."""
         return self.has_capabilities and not self.announces
 
     def subscribe(self, transport: Transport) -> None:
@@ -155,7 +155,7 @@ def _section(value: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _owners(listed: object) -> tuple[str, ...]:
-    """The owners, without repetitions; none if the list is not valid, so such a robot is never confirmed."""
+    """Return the owners, without repetitions; none if the list is not valid, so such a robot is never confirmed."""
     if not isinstance(listed, list) or len(listed) > MAX_OWNERS:
         return ()
     if not all(isinstance(owner, str) and _valid_level(owner) for owner in listed):
@@ -164,7 +164,7 @@ def _owners(listed: object) -> tuple[str, ...]:
 
 
 def _clean(state: EstopState) -> EstopState:
-    """The state with bounded, printable texts."""
+    """Return the state with bounded, printable texts."""
     _, by, why = stop_of({"by": state.by, "why": state.why})
     since = state.since if 0 <= state.since < _LATEST_MS else 0
     return msgspec.structs.replace(state, by=by, why=why, since=since, recent=state.recent[:_NAMES])

@@ -73,7 +73,7 @@ def topic_of(ref: str, capabilities: dict[str, Any], channel: c.Channel) -> str:
 
 
 def section_of(capabilities: dict[str, Any], name: str) -> dict[str, Any]:
-    """A section of capabilities, or one of a section: ``system.reboot``. Empty if there is none."""
+    """Return a section of capabilities, or one of a section: ``system.reboot``. Empty if there is none."""
     found: Any = capabilities
     for level in name.split("."):
         found = found.get(level) if isinstance(found, dict) else None
@@ -81,7 +81,7 @@ def section_of(capabilities: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def own_topic(ref: str, topic: object, direction: str) -> bool:
-    """Whether this is a topic of ``ref`` in that direction. Capabilities may name others; they are not used."""
+    """True if this is a topic of ``ref`` in that direction. Capabilities may name others; they are not used."""
     if not isinstance(topic, str) or not topic.startswith(f"{ref}/{direction}/") or parse_topic(topic) is None:
         return False
     try:
@@ -91,7 +91,7 @@ def own_topic(ref: str, topic: object, direction: str) -> bool:
 
 
 def names(ref: str, topic: object, channel: c.Channel) -> bool:
-    """Whether capabilities may name this topic for the channel: the component's own, and no other channel's."""
+    """True if capabilities may name this topic for the channel: the component's own, and no other channel's."""
     if not own_topic(ref, topic, channel.direction):
         return False
     return channel_of(str(topic)[len(ref) + 1 :]) in (None, channel)

@@ -195,7 +195,7 @@ class RobotView:
 
     @property
     def is_assumed(self) -> bool:
-        """Whether what it can do is what people say of it, until it says so itself."""
+        """True if what it can do is what people say of it, until it says so itself."""
         return "assumed" in self.capabilities
 
     def assume(self, axes: Collection[str], name: str = "") -> bool:
@@ -223,7 +223,7 @@ class RobotView:
 
     @property
     def latched(self) -> bool:
-        """Whether any of its motor owners is stopped by an emergency stop: it must not be driven."""
+        """True if any of its motor owners is stopped by an emergency stop: it must not be driven."""
         return bool(self.estop.latched)
 
     @property
@@ -233,18 +233,18 @@ class RobotView:
 
     @property
     def drives(self) -> bool:
-        """Whether it offers driving; without capabilities nothing is assumed (paper A.8.6)."""
+        """True if it offers driving; without capabilities nothing is assumed (paper A.8.6)."""
         drive = section_of(self.capabilities, "drive")
         return drive.get("available") is True and drive.get("controls") is not False
 
     @property
     def arbitrates(self) -> bool:
-        """Whether it decides itself between a script and a person."""
+        """True if it decides itself between a script and a person."""
         return section_of(self.capabilities, "drive").get("arbitrates") is True
 
     @property
     def controlled(self) -> bool:
-        """Whether it decides itself which person drives it."""
+        """True if it decides itself which person drives it."""
         return section_of(self.capabilities, "drive").get("control") is True
 
     @property
@@ -258,7 +258,7 @@ class RobotView:
 
     @property
     def named(self) -> bool:
-        """Whether it takes commands only with the name of their sender in the topic."""
+        """True if it takes commands only with the name of their sender in the topic."""
         return self.estop.named
 
     @property
@@ -277,11 +277,11 @@ class RobotView:
         return named_topic(self.base, self.capabilities, channel)
 
     def offers(self, section: str) -> bool:
-        """Whether that section of its capabilities, for example ``video``, can be requested."""
+        """True if that section of its capabilities, for example ``video``, can be requested."""
         return section_of(self.capabilities, section).get("controls") is True
 
     def ready(self, now: float) -> bool:
-        """Whether it is online, with a known drive topic."""
+        """True if it is online, with a known drive topic."""
         return self.topic(c.DRIVE) is not None and self.liveness.online(now) is True
 
     def online(self, now: float) -> bool | None:
@@ -303,7 +303,7 @@ class RobotView:
         return words("itself", self.name, script=self.script) if self.script and not waits else ""
 
     def situation(self, now: float) -> Situation:
-        """What speaks for and against driving it, as far as it says so itself."""
+        """Return what speaks for and against driving it, as far as it says so itself."""
         return Situation(
             online=self.online(now),
             latched=self.latched,

@@ -77,7 +77,10 @@ class RobotScripts:
 
 
 def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
-    """The settings that words such as ``--tag-id 5 --no-search`` select in a script's form. Raises PebbleError."""
+    """Return the settings that words such as ``--tag-id 5 --no-search`` select in a script's form.
+
+    Raises PebbleError.
+    """
     form = forms.listed(entry.get("configs"))
     options = {option: (setting, value) for setting in form for option, value in options_of(setting)}
     chosen: dict[str, Any] = {}
@@ -101,7 +104,10 @@ def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
 
 
 def options_of(setting: forms.Setting) -> list[tuple[str, bool | None]]:
-    """The options of a setting: first the script's own, then those made of its key; for flags with their value."""
+    """Return the options of a setting: first the script's own, then those made of its key.
+
+    For flags with their value.
+    """
     key = setting.key.replace("_", "-")
     on = _distinct(setting.arg, f"--{key}")
     if setting.type != "bool":

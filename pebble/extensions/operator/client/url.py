@@ -19,7 +19,7 @@ class UrlError(PebbleError):
 def settings_of(
     url: str, *, password: str | None = None, password_file: Path | None = None, ca_cert: Path | None = None
 ) -> tuple[str, MqttSettings | ZenohSettings]:
-    """The kind of transport and its settings. Raises UrlError, whose text never contains the password.
+    """Return the kind of transport and its settings. Raises UrlError, whose text never contains the password.
 
     ``password_file``: the file in which the password was found, if it was in one.
     """

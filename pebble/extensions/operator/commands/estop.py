@@ -116,7 +116,7 @@ def _parse(words: list[str]) -> tuple[str, str | None]:
 
 
 def me(account: str | None = None) -> str:
-    """Who gives this command, at the broker or else on this machine, and from which machine: ``ann@desk``."""
+    """Return who gives this command, at the broker or else on this machine, and from which machine: ``ann@desk``."""
     try:
         user = account or getpass.getuser()
     except (ImportError, KeyError, OSError):  # no name for this user id, or no such ids
@@ -363,7 +363,7 @@ def _status(target: Target, *, every: bool) -> int:
 
 
 def _print_states(robot: RobotEstop, driveable: Driveable | None = None, *, silent: bool = False) -> None:
-    """One line for a robot that is free or has no emergency stop, else one for each stopped owner.
+    """Print one line for a robot that is free or has no emergency stop, else one for each stopped owner.
 
     ``silent``: it sends no heartbeat now.
     """

@@ -71,7 +71,7 @@ def body(payload: bytes, width: int) -> str:
 
 
 def parsed(payload: bytes) -> Any:
-    """The JSON value; None if it is not JSON (or is ``null``)."""
+    """Return the JSON value; None if it is not JSON (or is ``null``)."""
     try:
         return json.loads(payload)
     except (ValueError, RecursionError):
@@ -79,7 +79,7 @@ def parsed(payload: bytes) -> Any:
 
 
 def recognised(payload: bytes) -> str | None:
-    """The name of a binary format, by its first bytes."""
+    """Return the name of a binary format, by its first bytes."""
     return next((name for start, name in RECOGNISERS.items() if payload.startswith(start)), None)
 
 
@@ -113,7 +113,7 @@ def age(seconds: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Seconds with a unit: ``12 ms``, ``3.2 s``, ``2 h``."""
+    """Return seconds with a unit: ``12 ms``, ``3.2 s``, ``2 h``."""
     if seconds < 1:
         return f"{seconds * 1000:.0f} ms"
     if seconds < 100:
@@ -125,7 +125,7 @@ def duration(seconds: float) -> str:
 
 
 def size(count: float) -> str:
-    """Bytes: ``19 B``, ``1.2 kB``, ``3.4 MB``."""
+    """Return bytes: ``19 B``, ``1.2 kB``, ``3.4 MB``."""
     if count < 1000:
         return f"{count:.0f} B"
     return f"{count / 1e3:.1f} kB" if count < 1e6 else f"{count / 1e6:.1f} MB"
@@ -203,7 +203,7 @@ def print_listing(listing: Listing, now: float, wall: float) -> None:
 
 
 def remarks(listing: Listing, wall: float) -> list[str]:
-    """Which robots are stopped, and which have a thin link."""
+    """Return which robots are stopped, and which have a thin link."""
     discovery = Discovery()
     for record in listing.records.values():
         if record.last is not None:
@@ -224,7 +224,7 @@ def stopped_line(robot: RobotEstop, wall: float) -> str:
 
 
 def stopped(state: EstopState, wall: float) -> str:
-    """Who stopped a motor owner, when and why, from its cleaned state."""
+    """Return who stopped a motor owner, when and why, from its cleaned state."""
     when = f", {age(wall - state.since / 1000)}" if state.since else ""
     return f"stopped by {state.by or 'unknown'}{when}" + (f": {state.why}" if state.why else "")
 
@@ -247,7 +247,7 @@ def _age(record: TopicRecord, last: Message, now: float, wall: float) -> str:
 
 
 def _kind(names: Names, topic: str) -> tuple[str, str]:
-    """The kind of a topic's channel, and the style to print it in."""
+    """Return the kind of a topic's channel, and the style to print it in."""
     channel = names.channel(topic)
     if channel is None:
         return "not in the contract", "dim"

@@ -209,7 +209,7 @@ def _print_rate(meter: RateMeter, *, silent: bool) -> None:
 
 
 def _moves(names: Names, message: Draft) -> bool:
-    """Whether it would move a robot."""
+    """True if it would move a robot."""
     if names.channel(message.topic) is not DRIVE:
         return False
     try:
@@ -227,7 +227,7 @@ def _refuse_stopped(robot: RobotEstop | None) -> None:
 
 
 def _estop(transport: Transport, names: Names, topic: str) -> RobotEstop | None:
-    """The emergency stop of the one robot that ``topic`` belongs to, as retained; None for several robots."""
+    """Return the emergency stop of the one robot that ``topic`` belongs to, as retained; None for several robots."""
     address = parse_topic(topic)
     base = names.base if address is None else address.identity.base
     if is_pattern(base):

@@ -32,7 +32,7 @@ def topics_document() -> str:
 
 
 def travels(channel: Channel) -> str:
-    """The direction in which the bridge forwards a channel (paper Table A.1)."""
+    """Return the direction in which the bridge forwards a channel (paper Table A.1)."""
     if not channel.remote:
         return "stays on the robot"
     if not channel.bridged:
@@ -45,7 +45,7 @@ def travels(channel: Channel) -> str:
 
 
 def authority(channel: Channel) -> str:
-    """Which side is right when the two sides of the bridge differ."""
+    """Return which side is right when the two sides of the bridge differ."""
     if channel.direction == OUTGOING:
         return "robot"
     if channel.kind is Kind.FLAG:
@@ -102,7 +102,7 @@ def _payload_name(channel: Channel) -> str:
 
 
 def _structs() -> list[type[Payload]]:
-    """The payload structs in the order of their channels, each followed by the structs inside it."""
+    """Return the payload structs in the order of their channels, each followed by the structs inside it."""
     found: dict[type[Payload], None] = {}
     for channel in CHANNELS:
         _collect(channel.payload, found)
@@ -130,7 +130,7 @@ def _payload(struct: type[Payload]) -> str:
 
 
 def _type_name(kind: Any) -> str:
-    """A field's type as a reader of JSON calls it; a field that may be absent shows it in its default."""
+    """Return a field's type as a reader of JSON calls it; a field that may be absent shows it in its default."""
     origin, inner = get_origin(kind), [one for one in get_args(kind) if one is not UnsetType]
     if origin in (Union, UnionType):
         return " or ".join(map(_type_name, inner))
@@ -158,7 +158,7 @@ def _source(struct: type[Payload]) -> str:
 
 
 def _remarks(struct: type[Payload]) -> dict[str, str]:
-    """The comments behind the fields of the structs: units and meanings."""
+    """Return the comments behind the fields of the structs: units and meanings."""
     sources = [_source(base) for base in reversed(struct.__mro__) if issubclass(base, Payload)]
     lines = [line for source in sources for line in source.splitlines()]
     found = (re.match(r"    (\w+): [^#]*#\s*(.+)$", line) for line in lines)
@@ -175,7 +175,7 @@ def _yes(value: bool) -> str:
 
 
 def documents() -> dict[str, str]:
-    """The generated files by name."""
+    """Return the generated files by name."""
     return {
         TOPICS: topics_document(),
         SCHEMAS: json.dumps(schemas(), indent=2) + "\n",

@@ -19,7 +19,7 @@ _NUMERIC = r"^\s*[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?\s*$"
 
 
 def schemas() -> dict[str, Any]:
-    """One document: ``topics`` maps ``incoming/drive-values`` to its schema, ``$defs`` holds the structs.
+    """Return one document: ``topics`` maps ``incoming/drive-values`` to its schema, ``$defs`` holds the structs.
 
     Binary topics are absent. Limits that a schema cannot express (64 KB, NaN) are in docs/topics.md.
     """
@@ -37,7 +37,7 @@ def schemas() -> dict[str, Any]:
 
 
 def _accepted(channel: Channel, root: dict[str, Any]) -> dict[str, Any]:
-    """Every accepted form: bare, and for incoming channels also wrapped."""
+    """Return every accepted form: bare, and for incoming channels also wrapped."""
     if channel.payload is bool:
         return {"description": channel.doc, "anyOf": [root, _wrapped("value", root), _wrapped("enabled", root)]}
     if channel.direction == INCOMING:

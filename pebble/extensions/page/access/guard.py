@@ -117,7 +117,7 @@ def content_type(headers: Headers) -> str:
 
 
 def host_names(settings: WebSettings) -> frozenset[str]:
-    """The names by which browsers may address the server, besides addresses."""
+    """Return the names by which browsers may address the server, besides addresses."""
     names: set[str] = {"localhost"}
     names |= {parts[1] for name in settings.names if (parts := _split(name)) is not None}  # behind a forwarded port
     if not is_loopback(settings.host):
@@ -137,7 +137,7 @@ def is_address(name: str) -> bool:
 
 
 def canonical(name: str) -> str:
-    """One spelling of a host name or address."""
+    """Return one spelling of a host name or address."""
     try:
         address = ipaddress.ip_address(name.strip("[]").partition("%")[0])
     except ValueError:
@@ -153,7 +153,7 @@ def _is_own_origin(scope: Scope, headers: Headers) -> bool:
 
 
 async def _body(receive: Receive) -> bytes | None:
-    """The whole body; None if it is too large."""
+    """Return the whole body; None if it is too large."""
     body = bytearray()
     while True:
         message = await receive()
@@ -165,7 +165,7 @@ async def _body(receive: Receive) -> bytes | None:
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:
-    """A ``receive`` that returns the body once, then what comes after it."""
+    """Return a ``receive`` that returns the body once, then what comes after it."""
     waiting: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def next_message() -> Message:

@@ -69,7 +69,10 @@ def routes() -> list[Route]:
 
 
 def session_of(connection: HTTPConnection) -> Session | None:
-    """The session of a request, read from the database each time; where there is no login, LOCAL with its ``name``."""
+    """Return the session of a request, read from the database each time.
+
+    Where there is no login, LOCAL with its ``name``.
+    """
     settings: WebSettings = connection.app.state.settings
     session: Session | None = None
     if not settings.login:
@@ -86,12 +89,12 @@ def named(session: Session, name: str) -> Session:
 
 
 def printable(text: str) -> str:
-    """What a page says of itself, as others may be shown it."""
+    """Return what a page says of itself, as others may be shown it."""
     return "".join(char if " " <= char <= "~" else "?" for char in text[:32])
 
 
 def _cookie(settings: WebSettings) -> str:
-    """The cookie's name; with the prefix, browsers take it only from this host, over https, for all paths."""
+    """Return the cookie's name; with the prefix, browsers take it only from this host, over https, for all paths."""
     return "__Host-pebble" if settings.certificate else "pebble"
 
 

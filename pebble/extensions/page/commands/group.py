@@ -138,7 +138,7 @@ def _of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) 
 
 
 def _of_config(file: Path, options: dict[str, Any], folder: Path | None) -> tuple[WebSettings, bool]:
-    """The settings, and whether the config allows plain http."""
+    """Return the settings, and whether the config allows plain http."""
     from pebble.extensions.page.run import settings_or_all_problems
 
     config = load(file)
@@ -166,7 +166,7 @@ def _default_tls_folder(host: str) -> Path | None:
 
 
 def _missing(settings: WebSettings, *, plain: bool, empty: bool) -> list[str]:
-    """Those of "certificate" and "user" that are needed and not there. ``empty``: --tls names a folder without one."""
+    """Return which of "certificate" and "user" are needed and missing; ``empty``: --tls names an empty folder."""
     if not settings.login and not empty:
         return []
     missing = [] if (settings.certificate is not None or plain) and not empty else ["certificate"]

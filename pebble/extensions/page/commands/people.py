@@ -133,12 +133,12 @@ def register_people(group: typer.Typer) -> None:
 
 
 def default_folder() -> Path:
-    """Where certificates, users and the audit log are unless an option names another place."""
+    """Return where certificates, users and the audit log are unless an option names another place."""
     return default_state_folder("web", os.environ)
 
 
 def _file(config: Path | None, people: Path | None) -> Path:
-    """The database that is named, else that of the page which the robot of this machine serves, else our own."""
+    """Return the database that is named, else that of the page which the robot of this machine serves, else our own."""
     if people is None and config is None:
         config = _of_machine()
     if people is not None or config is None:
@@ -148,7 +148,10 @@ def _file(config: Path | None, people: Path | None) -> Path:
 
 
 def _of_machine() -> Path | None:
-    """The config that `pebble setup` wrote, if its robot serves a page. Raises PebbleError if we may not read it."""
+    """Return the config that `pebble setup` wrote, if its robot serves a page.
+
+    Raises PebbleError if we may not read it.
+    """
     file = PLACES.config
     try:
         if not file.exists():

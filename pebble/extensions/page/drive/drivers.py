@@ -37,7 +37,7 @@ class Drivers:
     def take(
         self, tab: Tab, view: RobotView, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool
     ) -> None:
-        """A page wants control; ``granted``, or ``failed`` with the reason, is called as soon as that is known."""
+        """Take control for a page; ``granted``, or ``failed`` with the reason, is called as soon as that is known."""
         now, robot = clock(), self.robot(view.base)
         wanted = sum(one.wanted_by(tab) for one in self._driven.values())
         if why := self.refusals.nameless(view):
@@ -49,7 +49,7 @@ class Drivers:
             self._turn(robot, now)
 
     def release(self, tab: Tab, ref: str) -> bool:
-        """A page gives control back, or does not ask for it any more; whether it had it."""
+        """Take control back from a page, or its wish for it; True if it had it."""
         now, robot = clock(), self.robot(ref)
         had = robot.tab is tab
         self._publish(robot.release(tab, now))
@@ -61,7 +61,7 @@ class Drivers:
         return ref in self._driven and self._driven[ref].tab is not None
 
     def restore(self, token: str, tab: Tab) -> None:
-        """A page has connected again: it asks for what it had, but no gesture goes on.
+        """Note that a page has connected again: it asks for what it had, but no gesture goes on.
 
         Its old connection may still be open, if nothing comes from it any more.
         """
@@ -74,7 +74,7 @@ class Drivers:
                 self.take(tab, view, lambda: None, lambda _why: None, over=False)
 
     def closed(self, tab: Tab, *, for_good: bool = False) -> None:
-        """The connection of a page has ended; ``for_good``: its user may no longer drive."""
+        """Note that the connection of a page has ended; ``for_good``: its user may no longer drive."""
         now, wanted = clock(), [robot for robot in self._driven.values() if robot.wanted_by(tab)]
         try:
             self._publish([zero for robot in wanted for zero in robot.closed(tab, now, for_good=for_good)])
@@ -99,18 +99,18 @@ class Drivers:
         return bool(commands) and commands[0].drive.moves, ""
 
     def stop(self, ref: str, by: str) -> None:
-        """A zero from anybody, who need not drive."""
+        """Send a zero from anybody, who need not drive."""
         if self._robots.view(ref) is not None:
             self._publish(self.robot(ref).stop(clock()), by)
 
     # -- of robots
 
     def updated(self, ref: str) -> None:
-        """A robot has published what it can do, or who has control."""
+        """Note that a robot has published what it can do, or who has control."""
         self._publish(self.robot(ref).update(clock()))
 
     def renew_keys(self) -> None:
-        """The connection to the broker is another one."""
+        """Note that the connection to the broker is another one."""
         for robot in self._driven.values():
             robot.renew_key()
 

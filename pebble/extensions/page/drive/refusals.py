@@ -30,17 +30,17 @@ class Refusals:
         self.is_stopping: Callable[[str], bool] = lambda _ref: False
 
     def of_driving(self, ref: str) -> str:
-        """Why this component may not be moved by any page."""
+        """Return why this component may not be moved by any page."""
         robot = self._robot_of(ref) or RobotView(ref)
         why = self._words(robot, first_reason(self._situation(robot), SERVER_ORDER)) or self.nameless(robot)
         return why or (PARKED if robot.parked else "")
 
     def nameless(self, robot: RobotView) -> str:
-        """Why it takes no commands of this server, which has no name."""
+        """Return why it takes no commands of this server, which has no name."""
         return why_not(robot.name, self._broker.names.account) if robot.named else ""
 
     def of_op(self, op: m.RobotOp) -> str:
-        """Why this is not asked of a robot now. What ends something is always asked."""
+        """Return why this is not asked of a robot now. What ends something is always asked."""
         robot = self._robot_of(op.ref)
         if robot is None:
             return "unknown component"
@@ -52,7 +52,7 @@ class Refusals:
         return self._of_script(robot) if isinstance(op, m.AutonomyOp) and not why else why
 
     def _of_script(self, robot: RobotView) -> str:
-        """Why no script may begin now."""
+        """Return why no script may begin now."""
         by = self._moved_by(robot.base)
         situation = self._situation(robot)._replace(driven=bool(by) and not robot.arbitrates)
         code = first_reason(situation, SCRIPT_ORDER)

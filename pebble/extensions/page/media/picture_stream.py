@@ -109,7 +109,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
             self._request.wake()
 
     def _skip(self, now: float) -> None:
-        """A picture is missing before this one: it and what follows wait for a key frame."""
+        """Note that a picture is missing before this one: it and what follows wait for a key frame."""
         for viewer in self.viewers:
             viewer.queue.lost(now)
         self._request.wake()
@@ -135,7 +135,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
             await self._help_viewers()
 
     def _can(self) -> list[frozenset[str]]:
-        """What each viewer decodes. For one that decodes nothing, what this server converts counts."""
+        """Return what each viewer decodes. For one that decodes nothing, what this server converts counts."""
         known = frozenset(BEST_FIRST["video"])
         converted = frozenset(name for name in known if not rescue.unavailable(name))
         return [viewer.queue.can & known or converted for viewer in self.viewers]

@@ -33,7 +33,7 @@ class MediaHub(Streams[PictureStream]):
         )
 
     async def snapshot(self, ref: str) -> bytes | None:
-        """The newest picture as a JPEG, if pictures are flowing; it starts no camera."""
+        """Return the newest picture as a JPEG, if pictures are flowing; it starts no camera."""
         stream = self.get(ref)
         return None if stream is None else await stream.snapshot()
 

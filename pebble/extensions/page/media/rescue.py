@@ -28,7 +28,7 @@ class RescuedPicture(NamedTuple):
 
 
 def unavailable(encoding: str) -> str:
-    """Why this server cannot decode ``encoding``; empty if it can."""
+    """Return why this server cannot decode ``encoding``; empty if it can."""
     return f"this server cannot convert h264: it {pyav.INSTALL}" if encoding == "h264" and not pyav.installed() else ""
 
 

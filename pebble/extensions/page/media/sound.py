@@ -50,7 +50,7 @@ class SoundQueue:
             self._bytes -= len(self._queue.popleft())
 
     def take(self) -> bytes | None:
-        """The packet to send now; None if there is none, or too many are under way."""
+        """Return the packet to send now; None if there is none, or too many are under way."""
         if not self._queue or self._sent - self._received >= WINDOW:
             return None
         payload = self._queue.popleft()
@@ -59,7 +59,7 @@ class SoundQueue:
         return payload
 
     def acknowledge(self, count: int) -> None:
-        """The page has received ``count`` packets since it connected."""
+        """Note that the page has received ``count`` packets since it connected."""
         self._received = max(self._received, min(count, self._sent))
 
 
@@ -146,7 +146,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         return self._unheard() or refusal(self.ref, self.robot.capabilities, "audio")
 
     def _unheard(self) -> str:
-        """Why the robot would not hear it now; empty if it does."""
+        """Return why the robot would not hear it now; empty if it does."""
         if problem := self._broker.problem:
             return f"The server cannot reach the broker: {problem}"
         robot = self.robot

@@ -47,7 +47,7 @@ class Arrivals:
         return begins
 
     def quiet_s(self, now: float) -> float | None:
-        """How long nothing has come; None: nothing ever has."""
+        """Return how long nothing has come; None: nothing ever has."""
         return None if self._newest_at is None else now - self._newest_at
 
     def flowing(self, now: float) -> bool:
@@ -104,7 +104,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
 
     @abstractmethod
     def _make_view(self, state: str, why: str, rate: float, kbits: float) -> ViewT:
-        """What pages are shown."""
+        """Return what pages are shown."""
 
     def _end(self) -> None:
         """Take note that the request has ended."""
@@ -163,7 +163,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
         return "silent", f"no {_WHAT[self._request.medium]} for {int(quiet_s)} s"
 
     def _problem(self) -> str:
-        """What is wrong although it flows."""
+        """Return what is wrong although it flows."""
         return ""
 
 
@@ -179,7 +179,7 @@ class Streams(Generic[StreamT]):
         self._streams: dict[str, StreamT] = {}
 
     def get(self, ref: str) -> StreamT | None:
-        """The stream of that robot, if pages use it."""
+        """Return the stream of that robot, if pages use it."""
         return self._streams.get(ref)
 
     async def let_view(

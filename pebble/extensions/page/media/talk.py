@@ -22,7 +22,7 @@ class Talk:
         self._least = float("inf")  # the smallest lateness of its pieces
 
     def takes(self, piece: int, now: float) -> bool:
-        """Whether this piece, counted from 0 by the page's microphone, is in time."""
+        """True if this piece, counted from 0 by the page's microphone, is in time."""
         late = now - piece / PIECES_PER_S
         self._least = min(self._least + _DRIFT_S, late)
         if late - self._least > LATE_S:

@@ -39,7 +39,7 @@ class ArchiveProcess:
         return [] if self._pool is None else list(self._pool._processes or ())  # those of a pool are not public
 
     async def ask(self, question: Callable[..., AnswerT], *arguments: Any) -> AnswerT:
-        """The answer of a function of :mod:`pebble.extensions.recordings.seek.questions`. Raises PebbleError."""
+        """Return the answer of a function of :mod:`pebble.extensions.recordings.seek.questions`. Raises PebbleError."""
         if self._waiting >= MOST_WAITING:
             raise BusyError("too many questions about recordings at once: try again")
         self._waiting += 1
@@ -126,7 +126,7 @@ class Job:
 
 
 def _ended(code: int | None) -> str:
-    """Why a process said nothing more; ``code`` is what it ended with."""
+    """Return why a process said nothing more; ``code`` is what it ended with."""
     if code == -signal.SIGKILL:
         return "its process was killed, as it is where memory runs out: end other programs, or choose less"
     return f"its process has ended ({code}): the log of the server says why"

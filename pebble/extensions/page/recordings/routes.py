@@ -156,7 +156,7 @@ class Recordings:
         return _Timeline(paths, active, target, job, clock(), before)
 
     def _target(self, name: str) -> Path:
-        """Where a job writes; systems may have cleaned the folder away."""
+        """Return where a job writes; systems may have cleaned the folder away."""
         try:
             self.scratch.mkdir(mode=0o700, exist_ok=True)
         except OSError as error:
@@ -204,7 +204,7 @@ def routes() -> list[Route]:
 
 
 def _answered(answers: _Answers) -> Callable[[Request], Awaitable[Response]]:
-    """Only with a session, and one line for everything that is wrong."""
+    """Answer only with a session, and with one line for everything that is wrong."""
 
     async def endpoint(request: Request) -> Response:
         if login.session_of(request) is None:

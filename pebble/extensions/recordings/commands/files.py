@@ -112,7 +112,7 @@ def _rm(owner: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keep
 
 
 def _reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:
-    """Whether a file may hold messages of a period: one that cannot be read may."""
+    """True if a file may hold messages of a period: one that cannot be read may."""
     try:
         with RecordingFile(path) as file:
             return not file.chunks or file.reaches_into(since_ns, until_ns)
@@ -164,7 +164,7 @@ def _mend_all(folder: Folder) -> int:
 
 
 def _archive_of(path: Path) -> Path:
-    """The folder of a recorder, which has one for each year, month and day."""
+    """Return the folder of a recorder, which has one for each year, month and day."""
     folder = path.resolve().parent
     while _DATE.fullmatch(folder.name):
         folder = folder.parent

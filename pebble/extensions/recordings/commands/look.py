@@ -106,7 +106,7 @@ def _print_topics(counts: Counter[str]) -> None:
 def _looked_at(
     places: list[Path], since: str | None, until: str | None, *, check: bool, inside: bool = False
 ) -> tuple[list[FileInfo], list[str]]:
-    """The files of a period by their times, and a line for each that cannot be read completely.
+    """Return the files of a period by their times, and a line for each that cannot be read completely.
 
     They are read as a whole with ``check``, or if that takes no more than seconds; else their summaries count.
     ``inside``: only messages of the period count, for which files that reach beyond it are read.

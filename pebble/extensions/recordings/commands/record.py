@@ -78,7 +78,7 @@ def record(
 
 
 def _free_bytes(into: Path) -> int:
-    """What stays free: as much as by default, or a tenth of a small disk."""
+    """Return what stays free: as much as by default, or a tenth of a small disk."""
     place = next(path for path in (into, *into.absolute().parents) if path.exists())
     return min(Options().free_bytes, shutil.disk_usage(place).total // 10)
 
@@ -168,7 +168,7 @@ def seconds(text: str) -> float:
 
 
 def size(text: str) -> int:
-    """The size in bytes. Raises PebbleError."""
+    """Return the size in bytes. Raises PebbleError."""
     return int(_value(text.removesuffix("B"), _BYTES, "a size: 64M, 2G or 1T"))
 
 

@@ -107,7 +107,7 @@ def replay(
 
 
 def _read(recordings: list[Path], options: Options) -> tuple[ReplaySource, Rules]:
-    """What is replayed. Raises PebbleError if that is nothing."""
+    """Return what is replayed. Raises PebbleError if that is nothing."""
     paths = files(recordings)
     source = ReplaySource(paths)
     topics = {channel.topic for channel in source.channels if not channel.topic.startswith("$")}
@@ -183,7 +183,7 @@ class _Console:
             player.stop()
 
     def _report(self, problem: str) -> None:
-        """Where there is no status line, a line for each change."""
+        """Print a line for each change where there is no status line."""
         if problem != self._problem:
             self._problem = problem
             typer.echo(f"pebble: {shown(problem) or 'it goes on'}", err=True)
@@ -204,7 +204,7 @@ class _Console:
 
 
 def status(player: Player, problem: str) -> str:
-    """One line: the time in the recording, the speed, and what was sent."""
+    """Return one line: the time in the recording, the speed, and what was sent."""
     moment = datetime.fromtimestamp(player.position_ns / 1e9).astimezone()
     doing = problem or ("paused" if player.paused else f"× {player.speed:g}")
     time_ = f"{moment:%Y-%m-%d %H:%M:%S}.{moment.microsecond // 100_000}"

@@ -22,7 +22,7 @@ def errors_of_files(path: Path | None = None) -> Iterator[None]:
 
 
 def report_unread(lines: list[str]) -> int:
-    """The exit code: 1 if there is a line."""
+    """Return the exit code: 1 if there is a line."""
     for line in lines:
         typer.echo(f"pebble: {shown(line)}", err=True)
     return 1 if lines else 0
@@ -40,7 +40,7 @@ def local_time(ns: int, *, fraction: bool = False) -> str:
 
 
 def period_words(since_ns: int, until_ns: int) -> str:
-    """A period in local time with its zone, and in UTC."""
+    """Return a period in local time with its zone, and in UTC."""
     local, utc = (
         f"from {_end(since_ns, zone, 'the beginning')} to {_end(until_ns, zone, 'the end')}" for zone in (None, UTC)
     )

@@ -100,13 +100,13 @@ def write_wav(
 
 @contextmanager
 def _file_beside(target: Path) -> Iterator[Path]:
-    """A file that may become as large as the film: the folder for temporary files is often in memory."""
+    """Give a file that may become as large as the film: the folder for temporary files is often in memory."""
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as name:
         yield Path(name, "sound.wav")
 
 
 def _media(messages: Iterable[Recorded], robot: str, on_time: Progress) -> Iterator[tuple[int, bytes]]:
-    """The pictures and the sound of one robot, of one topic each, with milliseconds since the first one."""
+    """Yield the pictures and the sound of one robot, of one topic each, with milliseconds since the first one."""
     below, topics, first_ms = f"{robot}/{OUTGOING}/", dict[bool, str](), None
     for message in messages:
         on_time(message.log_ns)

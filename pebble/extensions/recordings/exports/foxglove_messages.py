@@ -64,7 +64,10 @@ class Schemas:
         return getattr(importlib.import_module(f"foxglove_schemas_protobuf.{schema}_pb2"), schema)(**fields)
 
     def descriptors(self, message: Any) -> bytes:
-        """The file descriptors of a message's schema, each after those that it imports: what MCAP calls its schema."""
+        """Return the file descriptors of a message's schema, each after those that it imports.
+
+        What MCAP calls its schema.
+        """
         found: dict[str, Any] = {}
 
         def add(file: Any) -> None:
@@ -111,7 +114,7 @@ class Media:
         return Converted(self._make(schema, frame_id=_id(topic), data=unit, format="h264"), ending)
 
     def image(self, topic: str, payload: bytes) -> Converted | None:
-        """A whole JPEG of a picture in any encoding; None as of :meth:`convert`."""
+        """Return a whole JPEG of a picture in any encoding; None as of :meth:`convert`."""
         import cv2
 
         decoded = self.decoder(topic).feed(payload)
@@ -136,7 +139,10 @@ class Media:
         return Converted(made, ending)
 
     def decoder(self, topic: str) -> VideoDecoder:
-        """What decodes the pictures of this topic: it knows why one was refused, and whether it wants a key frame."""
+        """Return what decodes the pictures of this topic.
+
+        It knows why one was refused, and whether it wants a key frame.
+        """
         from pebble.extensions.media.decode import VideoDecoder
 
         return self._pictures.get(topic) or self._pictures.setdefault(topic, VideoDecoder())
@@ -185,7 +191,7 @@ class Telemetry:
         return Converted(self._pose(f"{_id(topic)}/odom", x / per_metre, y / per_metre, 0.0, heading), "pose")
 
     def _localization(self, _topic: str, payload: bytes) -> Converted | None:
-        """The pose of a ROS robot: metres and radians in the frame that it names."""
+        """Return the pose of a ROS robot: metres and radians in the frame that it names."""
         pose = codec.plain(c.LOCALIZATION_POSE, payload)
         value = pose.get("value", pose) if isinstance(pose, dict) else None
         if not isinstance(value, dict):
@@ -212,7 +218,10 @@ class Telemetry:
         return Converted(drawn.annotations, "annotations")
 
     def _followed(self, topic: str, payload: bytes) -> Converted:
-        """The tag that is followed, as a box around the robot: x ahead, y to the left. Empty while it is not seen."""
+        """Return the tag that is followed, as a box around the robot: x ahead, y to the left.
+
+        Empty while it is not seen.
+        """
         tag: TagData = codec.decode(c.APRILTAG_DATA, payload)
         scene = self._make("SceneUpdate")
         if tag.detected and tag.distance_m is not None and tag.angle_rad is not None:
@@ -255,12 +264,12 @@ class _Drawing:
 
 
 def is_h264(payload: bytes) -> bool:
-    """Whether it is a picture in H.264, by its header."""
+    """True if it is a picture in H.264, by its header."""
     return payload.startswith(PBVD) and payload[5:6] == bytes([PictureKind.H264])
 
 
 def stamped(message: Any, ns: int) -> bytes:
-    """The message with this time, as bytes. A scene has none itself, its parts have."""
+    """Return the message with this time, as bytes. A scene has none itself, its parts have."""
     parts = [message] if "timestamp" in message.DESCRIPTOR.fields_by_name else [*message.entities, *message.deletions]
     for part in parts:
         part.timestamp.FromNanoseconds(ns)
@@ -268,13 +277,13 @@ def stamped(message: Any, ns: int) -> bytes:
 
 
 def time_of(payload: bytes, received_ns: int, publish_ns: int = 0) -> int:
-    """The payload's own time, or when it was received."""
+    """Return the payload's own time, or when it was received."""
     stamp = publish_ns or stamp_ns(payload)
     return stamp if stamp >= CLOCK_FROM_NS else received_ns
 
 
 def as_object(payload: bytes) -> bytes | None:
-    """The JSON object in ``payload``. Another JSON value is wrapped as the contract does (paper A.4.5).
+    """Return the JSON object in ``payload``. Another JSON value is wrapped as the contract does (paper A.4.5).
 
     None for what is no JSON, and for an empty payload.
     """
@@ -288,11 +297,11 @@ def as_object(payload: bytes) -> bytes | None:
 
 
 def _id(topic: str) -> str:
-    """The id of the robot, which its frame is named after."""
+    """Return the id of the robot, which its frame is named after."""
     return "/".join(topic.split("/")[2:3])
 
 
 def _number(value: dict[str, Any], *names: str) -> float | None:
-    """The first of the named fields that is a number; None if none is."""
+    """Return the first of the named fields that is a number; None if none is."""
     found = (value.get(name) for name in names)
     return next((float(one) for one in found if isinstance(one, int | float) and not isinstance(one, bool)), None)

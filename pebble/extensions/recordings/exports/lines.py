@@ -134,14 +134,17 @@ def _message(number: int, line: bytes) -> Recorded | BadLine:
 
 
 def _metadata(line: _Line) -> dict[str, str]:
-    """The form is that of a recording's channel."""
+    """Return the metadata of a recording's channel."""
     flags = {"retained": line.retain if line.retained is None else line.retained, TRUNCATED: line.payload_truncated}
     known = {"qos": str(line.qos), "retain": str(int(line.retain))}
     return known | {name: "1" for name, is_set in flags.items() if is_set}
 
 
 def _stamp_ns(stamp: bytes) -> int:
-    """The time of a number, or of a text in ISO 8601, which is UTC unless it names another zone. Raises ValueError."""
+    """Return the time of a number, or of a text in ISO 8601, which is UTC unless it names another zone.
+
+    Raises ValueError.
+    """
     if not stamp.startswith(b'"'):
         try:
             return _epoch_ns(Decimal(stamp.decode()))

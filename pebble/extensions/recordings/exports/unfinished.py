@@ -11,7 +11,7 @@ from pebble.runtime.as_owner import as_owner
 
 @contextmanager
 def unfinished(target: Path) -> Iterator[Path]:
-    """A path beside ``target`` to write to: it becomes ``target`` at the end, and is removed after an error.
+    """Give a path beside ``target`` to write to: it becomes ``target`` at the end, and is removed after an error.
 
     Raises RecordingError if there is a file already, no folder, or no room.
     """

@@ -235,7 +235,7 @@ class RecordingFile:
             return None
 
     def _take_over(self, summary: Summary) -> bool:
-        """Whether the summary names all messages: those of other programs need not."""
+        """True if the summary names all messages: those of other programs need not."""
         chunks = [_indexed(index) for index in summary.chunk_indexes if index.message_index_offsets]
         counted = summary.statistics
         if counted is None or counted.message_count != sum(chunk.messages for chunk in chunks):
@@ -309,7 +309,7 @@ class RecordingFile:
     # -- both
 
     def _unpacked(self, chunk: Chunk, chooses: Chooses) -> tuple[list[Recorded], tuple[int, int] | None]:
-        """The chosen messages of a chunk, and the numbers of its first and last one."""
+        """Return the chosen messages of a chunk, and the numbers of its first and last one."""
         found: list[Recorded] = []
         first, last = -1, -1
         chosen: dict[int, Channel | None] = {}
@@ -365,7 +365,7 @@ class RecordingFile:
             channels.setdefault(record.id, channel)
 
     def _channel(self, number: int) -> Channel:
-        """The channel of this number, wherever it is named: the chunk that named it first may be lost."""
+        """Return the channel of this number, wherever it is named: the chunk that named it first may be lost."""
         if number not in self.channels and number in self._names:
             self.channels[number] = self._names[number]
         if number not in self.channels and not self._looked_everywhere:
@@ -375,7 +375,7 @@ class RecordingFile:
         return self.channels.get(number) or unnamed(number)
 
     def _records(self, chunk: Chunk) -> bytes:
-        """The records of a chunk. Raises DamageError."""
+        """Return the records of a chunk. Raises DamageError."""
         head = self._read(chunk.at, HEAD.size if chunk.length < LARGEST_RECORD else 0)
         if len(head) < HEAD.size or HEAD.unpack(head) != (Op.CHUNK, chunk.length - HEAD.size):
             raise DamageError("a chunk is damaged")

@@ -18,7 +18,7 @@ class Disk:
 
 
 def surplus(entries: Iterable[Entry], options: Options, disk: Disk) -> list[Entry]:
-    """What to delete now to keep the limits of space: the oldest first, pictures and sound before state.
+    """Return what to delete now to keep the limits of space: the oldest first, pictures and sound before state.
 
     Files that are being written are never among them, nor those that are damaged: these may hold what was
     not read, and do not count. The newest file of each kind stays.
@@ -38,14 +38,14 @@ def surplus(entries: Iterable[Entry], options: Options, disk: Disk) -> list[Entr
 
 
 def outdated(entries: Iterable[Entry], options: Options, now: float) -> Entry | None:
-    """A file of pictures and sound that is too old; one at a time, because the clock may have been set wrong."""
+    """Return a file of pictures and sound that is too old; one at a time, because the clock may have been set wrong."""
     age_s = options.keep_media_days * _DAY_S
     old = (entry for entry in _deletable(list(entries)) if entry.is_media and now - entry.ended > age_s)
     return next(old, None) if age_s else None
 
 
 def _deletable(entries: list[Entry]) -> list[Entry]:
-    """The files in the order in which they go."""
+    """Return the files in the order in which they go."""
     finished = sorted((entry for entry in entries if entry.is_finished), key=lambda entry: entry.number)
     media = [entry for entry in finished if entry.is_media]
     state = [entry for entry in finished if not entry.is_media]

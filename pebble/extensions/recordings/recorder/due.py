@@ -21,7 +21,7 @@ class Due:
         return True
 
     def suspended_s(self, awake_ns: int) -> float:
-        """Seconds for which the machine was suspended since the last call."""
+        """Return seconds for which the machine was suspended since the last call."""
         now = self._boot_ns()
         slept = 0 if self._awake is None else (now - self._awake_at) - (awake_ns - self._awake)
         self._awake, self._awake_at = awake_ns, now

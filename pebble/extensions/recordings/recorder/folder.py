@@ -81,7 +81,7 @@ class Folder:
 
     @property
     def in_place(self) -> bool:
-        """Whether it is the folder that was taken: it may be removed, or its disk taken away or brought back."""
+        """True if it is the folder that was taken: it may be removed, or its disk taken away or brought back."""
         return self._own.in_place
 
     def release(self) -> None:
@@ -109,7 +109,7 @@ class Folder:
                 return True
 
     def create(self, lane: str, now_ns: int) -> tuple[BinaryIO, Path]:
-        """A new file that is being written. Raises OSError."""
+        """Return a new file that is being written. Raises OSError."""
         self._number += 1
         moment = time.gmtime(max(0, now_ns) // 10**9)
         day = self.root / time.strftime(_DAY, moment)
@@ -120,7 +120,7 @@ class Folder:
         return os.fdopen(descriptor, "r+b", buffering=0), path
 
     def entries(self) -> list[Entry]:
-        """The recorder's own files, the oldest first; links and what others have put there are left alone."""
+        """Return the recorder's own files, the oldest first; links and what others have put there are left alone."""
         found = []
         for path in self._files():
             match = _NAME.fullmatch(path.name)
@@ -164,7 +164,7 @@ def _locked(path: Path, used: str) -> Iterator[bool]:
 
 
 def finished_path(path: Path) -> Path:
-    """The name of a file that was ``.mcap.active``, once it is finished."""
+    """Return the name of a file that was ``.mcap.active``, once it is finished."""
     return path.with_name(path.name.removesuffix(ACTIVE) + SUFFIX)
 
 

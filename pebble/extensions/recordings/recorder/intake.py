@@ -84,7 +84,7 @@ class Intake:
         self._events.append(Item(self._boot_ns(), topic, b"", None, None, "", source))
 
     def take(self) -> list[Item]:
-        """All that waits, in the order in which it came."""
+        """Return all that waits, in the order in which it came."""
         items = [self._events.popleft() for _ in range(len(self._events))]
         with self._lock:
             for waiting in (self._state, self._media):

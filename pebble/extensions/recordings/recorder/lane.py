@@ -52,7 +52,7 @@ class OpenFile:
 
     @property
     def is_full(self) -> bool:
-        """Whether the next message belongs into another file."""
+        """True if the next message belongs into another file."""
         return self.writer.channels >= _MOST_CHANNELS or self.writer.indexed >= _MOST_INDEXED
 
     def add(self, item: Item, at_ns: int) -> None:
@@ -76,7 +76,7 @@ class OpenFile:
         return self.take_written()
 
     def take_written(self) -> int:
-        """How many messages the file has taken since the last call."""
+        """Return how many messages the file has taken since the last call."""
         since, self._taken = self._taken, self.writer.flushed
         return self._taken - since
 
@@ -102,7 +102,7 @@ class OpenFile:
         self.path.unlink(missing_ok=True)
 
     def is_there(self) -> bool:
-        """Whether its name still leads to it: the folder may have been removed."""
+        """True if its name still leads to it: the folder may have been removed."""
         try:
             return os.path.samestat(self.path.stat(), os.fstat(self.file.fileno()))
         except OSError:
@@ -110,7 +110,7 @@ class OpenFile:
 
 
 def lane_of(topic: str, *, is_media: bool) -> str:
-    """The lane of a message. A robot's media have one if its identity makes a name for a file."""
+    """Return the lane of a message. A robot's media have one if its identity makes a name for a file."""
     if not is_media:
         return STATE
     levels = topic.split("/", 3)[:3]

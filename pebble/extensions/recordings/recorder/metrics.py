@@ -16,7 +16,7 @@ _TOTALS: Final = ("messages", "bytes", "written", "dropped", "errors", "refused"
 
 
 def snapshot(recorder: Recorder, sources: Iterable[Source]) -> dict[str, Any]:
-    """All numbers; times in seconds since 1970."""
+    """Return all numbers; times in seconds since 1970."""
     counters, listed = recorder.counters, list(sources)
     totals = {name: counters[name] for name in _TOTALS}
     return {

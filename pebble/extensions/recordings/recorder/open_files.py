@@ -20,7 +20,7 @@ class RetainedValues:
         self._values = BoundedTable[Item](_TOPICS, _BYTES, lambda item: len(item.payload))
 
     def note(self, item: Item) -> None:
-        """A message. Where the broker hides how it was published, a topic that is known to be retained stays so."""
+        """Note a message. Where the broker hides how it was published, a topic known to be retained stays so."""
         key = f"{item.source} {item.topic}"
         known = self._values.get(key)
         if item.retained and known is not None and not known.retained:
@@ -38,7 +38,7 @@ class RetainedValues:
             del self._values[key]
 
     def carried(self) -> Iterator[Item]:
-        """What a new file begins with."""
+        """Yield what a new file begins with."""
         for item in list(self._values.values()):
             yield item._replace(retained=CARRIED)
 
@@ -64,13 +64,13 @@ class OpenFiles:
         return {file.path for file in self._files.values()}
 
     def lane(self, item: Item) -> str:
-        """The lane of a message; media beyond those of so many robots share one."""
+        """Return the lane of a message; media beyond those of so many robots share one."""
         lane = lane_of(item.topic, is_media=is_media(item.payload))
         media = len(self._files) - (STATE in self._files)
         return lane if lane == STATE or lane in self._files or media < _MOST_MEDIA else OTHER_MEDIA
 
     def get(self, lane: str, *, now_ns: int, at_ns: int) -> OpenFile:
-        """The file of a lane, or a new one, begun now, with the values retained at ``at_ns``. Raises OSError."""
+        """Return the file of a lane, or a new one, begun now, with the values retained at ``at_ns``. Raises OSError."""
         file = self._files.get(lane)
         if file is not None:
             return file
@@ -87,7 +87,7 @@ class OpenFiles:
         return file
 
     def take(self, lane: str) -> OpenFile:
-        """The file, which is not written any more."""
+        """Return the file, which is not written any more."""
         file = self._files.pop(lane)
         self._watch(list(self._files.values()))
         return file

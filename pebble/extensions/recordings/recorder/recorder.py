@@ -90,7 +90,7 @@ class Recorder:
             self._intake.add(topic, payload, qos, retain, "1" if retained else "", source)
 
     def forget_retained(self, source: str) -> None:
-        """The retained values of a connection are fetched anew."""
+        """Forget the retained values of a connection: they are fetched anew."""
         self._intake.add_order(FORGET, source)
 
     @property

@@ -153,7 +153,7 @@ class _Copies:
 
     @property
     def failed(self) -> bool:
-        """Whether it has never been connected for long enough."""
+        """True if it has never been connected for long enough."""
         now = time.monotonic()
         return now > self._ends_at and now - self._quiet_since <= _QUIET_S
 
@@ -171,7 +171,7 @@ class _Copies:
 
 
 def _once(filters: list[str], receive: Callable[[Message], None]) -> Iterator[tuple[str, Callable[[Message], None]]]:
-    """Each filter with its handler, so that a message that several of them match is received once."""
+    """Yield each filter with its handler, so that a message that several of them match is received once."""
     for number, filter_ in enumerate(filters):
         yield filter_, partial(_receive_unless, filters[:number], receive) if number else receive
 

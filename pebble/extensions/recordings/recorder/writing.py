@@ -159,7 +159,7 @@ class Writing:
     # -- when files cannot be written
 
     def _fail(self, lane: str, error: OSError) -> None:
-        """A file is left as it is; what it has not taken is written into the next one."""
+        """Leave a file as it is; what it has not taken is written into the next one."""
         file = self._files.take(lane)
         self._lacking += file.take_lacking()
         self._counters["written"] += file.take_written()

@@ -31,5 +31,5 @@ class Pace:
         return self.from_ns + int((self._now() - self._from) * self._speed * 1e9)
 
     def due_s(self, position_ns: int, now: float) -> float:
-        """How long after ``now`` a position is reached; negative if it was reached before."""
+        """Return how long after ``now`` a position is reached; negative if it was reached before."""
         return (position_ns - self.from_ns) / 1e9 / self._speed + self._from - now

@@ -63,11 +63,11 @@ class BusOutput:
 
     @property
     def moves(self) -> bool:
-        """Whether something may be moving because of what was published."""
+        """True if something may be moving because of what was published."""
         return bool(self._moved)
 
     def send(self, message: Recorded, position_ns: int) -> bool:
-        """Whether it is done; a stamp was ``position_ns`` - stamp old then, and is as old now."""
+        """True if it is done; a stamp was ``position_ns`` - stamp old then, and is as old now."""
         found = self._rules.outgoing(message, self._wall_ns() - position_ns)
         if found is None:
             self.skipped += 1
@@ -82,7 +82,7 @@ class BusOutput:
         return True
 
     def halt(self) -> None:
-        """A zero after each drive command that moves. Without a connection the robot's own deadline has to do."""
+        """Send a zero after each drive command that moves. Without a connection the robot's own deadline has to do."""
         self._moved = {topic: None for topic in self._moved if not self._publish(zero(topic))}
 
 
@@ -245,7 +245,7 @@ class Player:
             self._reading.advance()
 
     def _send(self, message: Recorded, position_ns: int) -> bool:
-        """Whether it is done; else it is tried again."""
+        """True if it is done; else it is tried again."""
         done = self._output.send(message, position_ns)
         if not done:
             self._pass(_RETRY_S)

@@ -84,7 +84,7 @@ class Rules:
         return self._listed(channel) is not None
 
     def outgoing(self, recorded: Recorded, by_ns: int) -> Outgoing | None:
-        """The message to publish instead of a recorded one, with stamps moved by ``by_ns``; None: none."""
+        """Return the message to publish instead of a recorded one, with stamps moved by ``by_ns``; None: none."""
         address = self._listed(recorded.channel)
         if address is None or _is_probe(recorded.payload):
             return None
@@ -179,12 +179,12 @@ def _section(name: str, section: Any, recorded: str, base: str) -> Any:
 
 
 def zero(topic: str) -> Message:
-    """What stops a robot that a drive command on ``topic`` may have set in motion."""
+    """Return what stops a robot that a drive command on ``topic`` may have set in motion."""
     return Message(topic, _ZERO, QoS.DELIVERED)
 
 
 def _is_probe(payload: bytes) -> bool:
-    """Whether a bridge looks for cycles by it; also white space alone."""
+    """True if a bridge looks for cycles by it; also white space alone."""
     return bool(payload) and payload[-_PROBE:].isspace()
 
 
@@ -198,7 +198,7 @@ def _rebased(plain: Any, old: str, new: str) -> Any:
 
 
 def _is_elsewhere(key: str, value: Any, old: str) -> bool:
-    """Whether it names a topic outside the robot's base, which a config may do."""
+    """True if it names a topic outside the robot's base, which a config may do."""
     if not isinstance(value, str):
         return False
     return not value.startswith(old) and (key.endswith("topic") or parse_topic(value) is not None)

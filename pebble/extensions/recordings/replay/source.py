@@ -41,7 +41,7 @@ class ReplaySource:
         return merged(self._files, since_ns=since_ns, until_ns=until_ns, damages=self.damages)
 
     def state_before(self, at_ns: int, publishes: Chooses = lambda _channel: True) -> list[Recorded]:
-        """The newest retained message of each topic, then all pictures since each topic's last key frame.
+        """Return the newest retained message of each topic, then all pictures since each topic's last key frame.
 
         Only of channels that ``publishes`` accepts. No heartbeats: an old one is no sign of life.
         """
@@ -79,7 +79,7 @@ class ReplaySource:
 
 
 def _is_state(channel: Channel) -> bool:
-    """Whether a subscriber would be sent its newest message at once."""
+    """True if a subscriber would be sent its newest message at once."""
     suffix = _suffix(channel)
     if not suffix.startswith(f"{OUTGOING}/") or suffix in _HEARTBEATS:
         return False
@@ -95,6 +95,6 @@ def _may_be_pictures(channel: Channel) -> bool:
 
 
 def _suffix(channel: Channel) -> str:
-    """The topic below the identity; empty for topics outside the contract's form."""
+    """Return the topic below the identity; empty for topics outside the contract's form."""
     levels = channel.topic.split("/", 3)
     return levels[3] if len(levels) > 3 else ""

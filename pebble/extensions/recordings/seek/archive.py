@@ -51,7 +51,7 @@ class Archive:
             self._open.popitem()[1].close()
 
     def messages(self, robot: str, since_ns: int, until_ns: int) -> list[Recorded]:
-        """What a robot published, and what was sent to it, from ``since_ns`` to before ``until_ns``."""
+        """Return what a robot published, and what was sent to it, from ``since_ns`` to before ``until_ns``."""
         found: list[Recorded] = []
         for file in self.files(robot, since_ns, until_ns):
             for chunk in _within(file, file.channels_of(robot), since_ns, until_ns):
@@ -64,7 +64,7 @@ class Archive:
         return found
 
     def state(self, robot: str, at_ns: int) -> list[Recorded]:
-        """The newest message of each topic of a robot before ``at_ns``, without media, the oldest first."""
+        """Return the newest message of each topic of a robot before ``at_ns``, without media, the oldest first."""
         files = self.files(robot, at_ns - _LONGEST_FILE_NS, at_ns, media=False)
         files = [file for file in files if file.first_ns < at_ns]
         if not files:
@@ -87,7 +87,7 @@ class Archive:
         return sorted((one for one in found.values() if not is_media(one.payload)), key=lambda one: one.log_ns)
 
     def log_lines(self, robot: str, at_ns: int) -> list[Recorded]:
-        """The last lines of its log before ``at_ns``, the oldest first."""
+        """Return the last lines of its log before ``at_ns``, the oldest first."""
         topic = LOGS.topic(robot)
         found: list[Recorded] = []
         for file in reversed(self.files(robot, at_ns - _LOG_NS, at_ns, media=False)):
@@ -100,7 +100,7 @@ class Archive:
         return sorted(found[:LOG_LINES], key=lambda one: one.log_ns)
 
     def pictures(self, robot: str, at_ns: int) -> list[Recorded]:
-        """The last picture before ``at_ns``, and before it all from its key frame on; empty if there is none."""
+        """Return the last picture before ``at_ns``, and before it all from its key frame on; empty if there is none."""
         chain: list[Recorded] = []
         size = 0
         for one in self._pictures_before(robot, at_ns):
@@ -127,7 +127,7 @@ class Archive:
         return found
 
     def files(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[SeekableFile]:
-        """Those that may hold messages of a robot in a period, opened, in the order of time."""
+        """Return those that may hold messages of a robot in a period, opened, in the order of time."""
         lane = lane_of(f"{robot}/", is_media=True)
         found = []
         for named in self._list():
@@ -142,12 +142,12 @@ class Archive:
         return sorted(found, key=lambda one: one.first_ns)
 
     def all_files(self) -> Iterator[SeekableFile]:
-        """All, opened one after the other."""
+        """Yield all, opened one after the other."""
         files = (self._opened(named.path) for named in self._list())
         yield from (file for file in files if file is not None)
 
     def unread(self) -> dict[Path, str]:
-        """What could not be read of each file, as far as that is known."""
+        """Return what could not be read of each file, as far as that is known."""
         return self._failed | {path: file.problem for path, file in self._open.items() if file.problem}
 
     # -- files
@@ -183,7 +183,7 @@ class Archive:
         return file
 
     def _pictures_before(self, robot: str, at_ns: int) -> Iterator[Recorded]:
-        """The newest first."""
+        """Yield the newest first."""
         since_ns = at_ns - _CHAIN_NS
         for file in reversed(self.files(robot, since_ns, at_ns)):
             for chunk in reversed(_within(file, file.channels_of(robot), since_ns, at_ns)):
@@ -194,7 +194,7 @@ class Archive:
 
 
 def metric_of(topic: str) -> tuple[str, bool]:
-    """What follows ``incoming/`` or ``outgoing/``, and whether it was sent to the robot."""
+    """Return what follows ``incoming/`` or ``outgoing/``, and whether it was sent to the robot."""
     parsed = parse_topic(topic)
     if parsed is None:
         return topic, False
@@ -210,7 +210,7 @@ def _first(file: SeekableFile, robot: str, at_ns: int) -> int | None:
 
 
 def _within(file: SeekableFile, channels: frozenset[int], since_ns: int, until_ns: int) -> list[Chunk]:
-    """The chunks of a period that hold messages of these channels."""
+    """Return the chunks of a period that hold messages of these channels."""
     return [
         chunk
         for chunk in file.chunks

@@ -45,7 +45,7 @@ class Days:
         self._known: dict[Path, list[Day]] = {}
 
     def all(self) -> list[Day]:
-        """The newest first. A file counts to each day that its messages reach into; its bytes to the first."""
+        """Return the newest first. A file counts to each day that its messages reach into; its bytes to the first."""
         found: dict[str, Day] = {}
         for file in self._archive.all_files():
             days = self._known.get(file.path)
@@ -80,7 +80,7 @@ def _days(file: SeekableFile) -> list[Day]:
 
 
 def _driven(file: SeekableFile, begin: int, end: int) -> dict[str, float]:
-    """Seconds within a day, by robot."""
+    """Return seconds within a day, by robot."""
     drives = {number: robot_of(channel) for number, channel in file.channels.items() if _drives(channel.topic)}
     robots = {number: robot for number, robot in drives.items() if robot is not None}
     found: dict[str, float] = {}
@@ -100,7 +100,7 @@ def _day_of(seconds: int) -> str:
 
 
 def _day_numbers(chunk: Chunk) -> Iterator[int]:
-    """The days that a chunk reaches into: of a clock that was set only the first ones, and the last."""
+    """Yield the days that a chunk reaches into: of a clock that was set only the first ones, and the last."""
     first, last = chunk.start_ns // DAY_NS, chunk.end_ns // DAY_NS
     yield from range(first, min(last, first + _MOST_DAYS))
     yield last
@@ -116,7 +116,7 @@ def _merge(day: Day, other: Day) -> None:
 
 
 def _gaps(file: SeekableFile) -> list[int]:
-    """When the recorder wrote down gaps."""
+    """Return when the recorder wrote down gaps."""
     numbers = {number for number, channel in file.channels.items() if channel.topic == EVENTS}
     found = []
     for chunk in file.chunks if numbers else []:

@@ -22,23 +22,23 @@ class SeekableFile(RecordingFile):
         self._about = os.fstat(self._file.fileno())
 
     def robots(self) -> set[str]:
-        """All that a channel belongs to."""
+        """Return all that a channel belongs to."""
         return {robot for channel in self.channels.values() if (robot := robot_of(channel)) is not None}
 
     def channels_of(self, robot: str) -> frozenset[int]:
-        """Those of a robot, and of topics that have no channel of their own in a file of the last version."""
+        """Return those of a robot, and of topics that have no channel of their own in a file of the last version."""
         return frozenset(
             number for number, one in self.channels.items() if robot_of(one) == robot or one.topic == OLD_OTHER
         )
 
     def is_replaced(self) -> bool:
-        """Whether its name leads to another file now. Raises OSError."""
+        """True if its name leads to another file now. Raises OSError."""
         now, then = self.path.stat(), self._about
         grown = not self.path.name.endswith(ACTIVE) and now.st_size != then.st_size
         return grown or not os.path.samestat(now, then)
 
     def messages_of(self, chunk: Chunk) -> list[Recorded]:
-        """Those of a chunk in the order of time; empty if it is damaged."""
+        """Return those of a chunk in the order of time; empty if it is damaged."""
         known = self._unpacked_chunks.get(chunk.at)
         if known is None:
             known = self._unpacked_chunks[chunk.at] = self.messages(chunk)
@@ -49,5 +49,5 @@ class SeekableFile(RecordingFile):
 
 
 def is_carried(channel: Channel) -> bool:
-    """Whether its messages were written again at the begin of the file, and are not of that time."""
+    """True if its messages were written again at the begin of the file, and are not of that time."""
     return channel.metadata.get("retained") == CARRIED

@@ -62,7 +62,7 @@ def days() -> bytes:
 
 
 def files(robot: str, since_ns: int, until_ns: int) -> tuple[list[str], bool]:
-    """The recordings of a robot in a period, and whether one of them is still being written."""
+    """Return the recordings of a robot in a period, and whether one of them is still being written."""
     found = [str(file.path) for file in _archive.files(robot, since_ns, until_ns)]
     return found, any(path.endswith(ACTIVE) for path in found)
 
@@ -141,7 +141,7 @@ def answer_with(answer: Connection, work: Callable[[], str]) -> None:
 
 
 def reason(error: Exception) -> str:
-    """What has failed and what helps, in one line."""
+    """Return what has failed and what helps, in one line."""
     match error:
         case PebbleError():
             words = str(error)

@@ -40,7 +40,10 @@ _BY_SUFFIX: Final = {
 
 
 def activity_of(suffix: str) -> Callable[[bytes], Activity]:
-    """What the payloads of a topic show, by its part below the base (``incoming/drive-values``). Not for media."""
+    """Return what the payloads of a topic show, by its part below the base (``incoming/drive-values``).
+
+    Not for media.
+    """
     if suffix == c.DRIVE.suffix:
         return _drive
     if suffix == c.LOGS.suffix:

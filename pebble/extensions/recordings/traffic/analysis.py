@@ -82,7 +82,7 @@ def _robot(queries: RobotQueries, name: str, messages: int, size: int) -> RobotT
 
 
 def recorder_events(connection: Any, indexes: Sequence[Path], since_ns: int, until_ns: int) -> RecorderEvents:
-    """What recorders noted in a period; makes the table ``breaks`` that `RobotQueries` needs."""
+    """Return what recorders noted in a period; makes the table ``breaks`` that `RobotQueries` needs."""
     found = RecorderEvents([], [])
     rows = connection.execute(_EVENTS.format(events=parquet(indexes))).fetchall() if indexes else []
     for event, ns, since, until, why, messages in rows:

@@ -27,7 +27,7 @@ def require_packages(*names: str) -> None:
 
 @contextmanager
 def connected(scratch: Path, *, memory_mb: int, threads: int = 1) -> Iterator[DuckDBPyConnection]:
-    """A database in memory; what does not fit goes to files below ``scratch``.
+    """Give a database in memory; what does not fit goes to files below ``scratch``.
 
     Raises PebbleError without DuckDB, and RecordingError for what fails in it.
     """
@@ -52,6 +52,6 @@ def quoted(value: object) -> str:
 
 
 def parquet(paths: Iterable[Path]) -> str:
-    """The rows of Parquet files, as a table in SQL. Names are no patterns: a folder may be called ``[1]``."""
+    """Return the rows of Parquet files, as a table in SQL. Names are no patterns: a folder may be called ``[1]``."""
     names = (quoted(Path(_GLOB.sub(r"[\1]", str(path)))) for path in paths)
     return f"read_parquet([{', '.join(names)}], hive_partitioning = false)"

@@ -45,7 +45,7 @@ class Figure(Struct, frozen=True):
 
 
 def figures(robot: RobotTraffic) -> list[Figure]:
-    """Those that a robot has data for."""
+    """Return those that a robot has data for."""
     drawn = [_outages(robot), _latency(robot), _bandwidth(robot)]
     return [figure for figure in drawn if figure is not None]
 
@@ -90,7 +90,7 @@ def _latency(robot: RobotTraffic) -> Figure | None:
 
 
 def draw_latency(axes: Axes, latency: Latency) -> None:
-    """The histogram, with its median and 95th percentile."""
+    """Draw the histogram, with its median and 95th percentile."""
     bars = latency.histogram
     lefts = [bars.low + number * bars.width for number in range(len(bars.counts))]
     axes.bar(lefts, bars.counts, width=bars.width, align="edge", color=_BLUE)

@@ -30,7 +30,7 @@ def _numbers(numbers: Iterable[int]) -> str:
 
 
 def _percentile(value: str, share: float) -> str:
-    """A quantile of rows with a ``place`` in their order, from 0 to ``last``; it interpolates linearly.
+    """Return a quantile of rows with a ``place`` in their order, from 0 to ``last``; it interpolates linearly.
 
     The same as ``quantile_cont``, which would hold all values in memory: sorting uses files if need be.
     """
@@ -191,7 +191,7 @@ class RobotQueries:
         return traffic.Latency(count, median, p95, self._histogram(p1, p99)) if count else None
 
     def _histogram(self, p1_ms: float, p99_ms: float) -> traffic.Histogram:
-        """From 0, or from below if the robot's clock is ahead, to a little above the 99th percentile."""
+        """Count from 0, or from below if the robot's clock is ahead, to a little above the 99th percentile."""
         margin = 0.1 * (p99_ms - p1_ms)
         low, high = min(0.0, p1_ms - margin), p99_ms + margin
         width = _round_up(max(_FINEST_MS, (high - low) / _BINS))

@@ -80,7 +80,7 @@ def _indexes(places: list[Path], scratch: Path, connection: DuckDBPyConnection, 
 
 
 def _of_deleted(place: Path) -> Iterator[Path]:
-    """The indexes of recordings that are not there any more."""
+    """Yield the indexes of recordings that are not there any more."""
     for index in sorted(place.rglob(f"*{INDEX}")):
         is_ours = _OLD not in index.relative_to(place).parts and not index.name.startswith(".")
         if is_ours and not index.with_suffix(SUFFIX).exists():
@@ -92,7 +92,7 @@ def _report(progress: Progress, name: str, before: float, own: float, share: flo
 
 
 def _index(path: Path, spare: Path, connection: DuckDBPyConnection, advance: Callable[[float], None]) -> Path | None:
-    """The index of a recording, ``spare`` if it has none beside it; None if it was deleted meanwhile."""
+    """Return the index of a recording, ``spare`` if it has none beside it; None if it was deleted meanwhile."""
     if path.name.endswith(ACTIVE) and not path.exists():
         path = finished_path(path)  # its recorder finished it a moment ago
     if not path.exists():

@@ -69,7 +69,10 @@ def timeline(
     until_ns: int,
     progress: Progress = lambda _what, _share: None,
 ) -> Timeline:
-    """What the recordings ``paths`` hold of a robot; what is not indexed yet is indexed now. Raises RecordingError."""
+    """Return what the recordings ``paths`` hold of a robot; what is not indexed yet is indexed now.
+
+    Raises RecordingError.
+    """
     found = sources(paths, scratch, progress)
     with connected(scratch, memory_mb=_MEMORY_MB) as connection:
         recorder = recorder_events(connection, found.indexes, since_ns, until_ns)

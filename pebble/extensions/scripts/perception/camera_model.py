@@ -54,14 +54,14 @@ class CameraModel:
 
     @classmethod
     def find(cls, folders: Iterable[Path], hfov_deg: float = HFOV_DEG) -> CameraModel:
-        """The calibration in the first of these folders that has one, else a camera of ``hfov_deg``."""
+        """Return the calibration in the first of these folders that has one, else a camera of ``hfov_deg``."""
         for folder in folders:
             if (folder / CALIBRATION).is_file():
                 return cls.read(folder / CALIBRATION)
         return cls.of_hfov(hfov_deg)
 
     def matrix(self, width: int, height: int) -> Any:
-        """The 3x3 matrix for pictures of this size."""
+        """Return the 3x3 matrix for pictures of this size."""
         across, down = width / self._size[0], height / self._size[1]
         matrix = self._matrix * np.array([[across], [down], [1.0]])
         matrix[:2, 2] += (0.5 * (across - 1.0), 0.5 * (down - 1.0))  # pixels are counted from their middles

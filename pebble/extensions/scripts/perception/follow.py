@@ -85,7 +85,7 @@ class Pulses:
         self._on_until = self._off_until = float("-inf")
 
     def turn(self, x: float, on_s: float, off_s: float, now: float) -> float:
-        """The ``x`` of now; a new pulse begins when the last one and its pause are over."""
+        """Return the ``x`` of now; a new pulse begins when the last one and its pause are over."""
         if now >= self._off_until:
             self._x = x
             self._on_until = now + on_s

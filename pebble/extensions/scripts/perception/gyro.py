@@ -38,7 +38,7 @@ class GyroHeading:
             self._limited = self._limited or abs(z_dps) >= _LIMIT_DPS
 
     def take(self, wheels_rad: float, now: float) -> float | None:
-        """The turn since the last call, for a turn of ``wheels_rad`` by the wheels; None: ask the wheels."""
+        """Return the turn since the last call, for a turn of ``wheels_rad`` by the wheels; None: ask the wheels."""
         turn, self._turn_rad = self._turn_rad, 0.0
         limited, self._limited = self._limited, False
         if now - self._at > _FRESH_S or limited or not self._trusted:

@@ -121,7 +121,7 @@ class PhaseTracker:
         return self._move_to(self.phase, predicted + math.remainder(phase - predicted, math.tau), power)
 
     def _predict(self, power: float) -> float:
-        """The phase that this sample is expected to add."""
+        """Return the phase that this sample is expected to add."""
         before = self._expected
         drive = (self._power + power) / 2  # a command comes between two samples
         self._expected, self._power = _CARRY * before + (1.0 - _CARRY) * self._per_power * drive, power
@@ -161,7 +161,7 @@ class HallWheel:
 
     @property
     def ready(self) -> bool:
-        """Whether distances are final, or there is none yet; until then, each new one may correct the last."""
+        """True if distances are final, or there is none yet; until then, each new one may correct the last."""
         return self._warm_up is None or not self._range.swings
 
     @property

@@ -24,7 +24,7 @@ class Pose(NamedTuple):
 
 
 def pose_of(odometry: WheelOdometry | None) -> Pose | None:
-    """The pose in a payload of any producer, in metres or millimetres; None if there is none in it."""
+    """Return the pose in a payload of any producer, in metres or millimetres; None if there is none in it."""
     if odometry is None:
         return None
     value = odometry.value
@@ -57,7 +57,7 @@ class OdomFollower:
         self._seen_at = self._planned_at = self._reached_at = float("-inf")
 
     def see(self, now: float, place: Place | None, pose: Pose | None) -> None:
-        """Where the tag is, or None if it is not in the picture, and the pose at that time, if known."""
+        """Take where the tag is, or None if it is not in the picture, and the pose at that time, if known."""
         self._place, self._seen_at = place, now
         if place is not None:
             self._goal = None if pose is None else self._plan(place, pose)
@@ -74,7 +74,7 @@ class OdomFollower:
         return Command(reason="goal reached") if now - self._reached_at < self.settings.goal_hold_s else vision
 
     def _plan(self, place: Place, pose: Pose) -> tuple[float, float] | None:
-        """The point at the wanted distance from the tag, on the way to it; None: it is near."""
+        """Return the point at the wanted distance from the tag, on the way to it; None: it is near."""
         settings = self.settings
         advance = place.distance_m - settings.target_distance_m
         if advance <= max(settings.distance_threshold_m, settings.min_goal_advance_m):

@@ -149,13 +149,13 @@ class Odometry:
         self._power.command(power, now)
 
     def imu(self, imu: ImuFast, now: float) -> None:
-        """A sample of the inertial sensor."""
+        """Take a sample of the inertial sensor."""
         still_s = now - max(self._left.turned_at, self._right.turned_at)
         at_rest = still_s > _UNCHANGED_S and not self._powered
         self._gyro.sample(imu.value.gyro_dps.z, imu.mcu_ms, now, at_rest=at_rest)
 
     def touch(self, values: TouchValues, now: float) -> None:
-        """A sample of the hall sensors."""
+        """Take a sample of the hall sensors."""
         self._samples += 1
         settings, (left_power, right_power) = self._settings, self._power.at(now)
         second = None if settings.second_channel == "none" else getattr(values, settings.second_channel)
@@ -179,7 +179,7 @@ class Odometry:
         self._was_ready = ready
 
     def value(self) -> dict[str, Any]:
-        """The ``value`` of the payload (paper A.8.12), each time with the next ``publish_seq``."""
+        """Return the ``value`` of the payload (paper A.8.12), each time with the next ``publish_seq``."""
         self._published += 1
         left, right = self._left.hall, self._right.hall
         value: dict[str, Any] = {

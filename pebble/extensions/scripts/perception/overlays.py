@@ -12,7 +12,7 @@ Size = tuple[int, int]  # width, height of the picture
 
 
 def corners_norm(tag: Tag, size: Size) -> Corners:
-    """The corners as parts of the picture, 0..1."""
+    """Return the corners as parts of the picture, 0..1."""
     return [(_part(x, size[0]), _part(y, size[1])) for x, y in tag.corners]
 
 
@@ -39,7 +39,10 @@ def overlays(source: str, tags: Sequence[Tag], size: Size, timestamp: float) -> 
 
 
 def tag_data(marker_id: int, tag: Tag | None, size: Size, timestamp: float, of: int = 1) -> TagData:
-    """The followed tag, of so many with its id; without one, ``corners_norm`` is an empty list, as consumers expect."""
+    """Return the followed tag, of so many with its id.
+
+    Without one, ``corners_norm`` is an empty list, as consumers expect.
+    """
     if tag is None:
         return TagData(detected=False, marker_id=marker_id, corners_norm=[], timestamp=timestamp)
     return TagData(
@@ -54,7 +57,7 @@ def tag_data(marker_id: int, tag: Tag | None, size: Size, timestamp: float, of: 
 
 
 def tags_in(locations: TagLocations, tag_id: int, geometry: TagGeometry) -> list[Tag]:
-    """The tags with this id that another program has found."""
+    """Return the tags with this id that another program has found."""
     size, tags = (locations.frame_width, locations.frame_height), []
     for detection in locations.detections:
         if detection.marker_id == tag_id and len(detection.corners_norm) == 4 and min(size) > 0:

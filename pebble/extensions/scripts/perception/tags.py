@@ -90,7 +90,7 @@ class TagFinder:
         self._geometry = TagGeometry(size_m, camera)
 
     def find(self, picture: Any) -> list[Tag]:
-        """All tags in an array of (height, width, 3) bytes, blue first, or (height, width), in the order of their ids.
+        """Return all tags, by their ids, in an array of (height, width, 3) bytes, blue first, or (height, width).
 
         Of several with one id the largest is the first.
 

@@ -68,7 +68,7 @@ class DriveSender:
         return obeyed
 
     def drive_another(self, now: float) -> str:
-        """A command for another robot: what ends this run ends that, too. Returns :meth:`refusal`."""
+        """Return a command for another robot: what ends this run ends that, too. Returns :meth:`refusal`."""
         self._tried = True
         return self.refusal(now)
 
@@ -92,14 +92,14 @@ class DriveSender:
     # -- what others have published
 
     def receive(self, drive: Drive, now: float) -> None:
-        """A drive command of another sender, that arrives now."""
+        """Take a drive command of another sender, that arrives now."""
         if not drive.signed:
             self._person_at = now
         elif isinstance(drive.run, int) and newer(drive.run, self.run):
             self._superseded = True
 
     def owners(self, states: Mapping[str, EstopState], now: float) -> None:
-        """The newest states of all motor owners."""
+        """Take the newest states of all motor owners."""
         if self._tried:
             for owner, state in states.items():
                 self._compare(owner, self._owners.get(owner), state)
@@ -115,11 +115,11 @@ class DriveSender:
     # -- what follows
 
     def overridden(self, now: float) -> bool:
-        """Whether a person has commanded within the last 2 s."""
+        """True if a person has commanded within the last 2 s."""
         return now - self._person_at < HOLD_S
 
     def refusal(self, now: float) -> str:
-        """Why a command has no effect now, as far as is known; empty: it has."""
+        """Return why a command has no effect now, as far as is known; empty: it has."""
         if self._end:
             return self._end
         if self._latched is not None:
@@ -129,7 +129,7 @@ class DriveSender:
         return "a person drives" if self.overridden(now) else ""
 
     def ended(self, now: float) -> str:
-        """Why this run can never drive again; empty: it may, or it never wanted to."""
+        """Return why this run can never drive again; empty: it may, or it never wanted to."""
         if not self._end and self._tried:
             if self._superseded:
                 self._end = SUPERSEDED
@@ -146,7 +146,7 @@ class DriveSender:
         return min(times, default=None)
 
     def _compare(self, owner: str, before: EstopState | None, now: EstopState) -> None:
-        """A run never outlives an emergency stop, nor a motor owner that has forgotten what it barred."""
+        """Compare states: a run never outlives an emergency stop, nor an owner that has forgotten what it barred."""
         if self._end or before is None:
             return
         if before.boot != now.boot:

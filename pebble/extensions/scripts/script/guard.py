@@ -21,7 +21,7 @@ class Guard:
     """
 
     def __init__(self, end: Callable[[int], None]) -> None:
-        """Only from the main thread."""
+        """Guard the main thread, from which alone this is called."""
         self._end = end
         self._reader, self._writer = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
@@ -39,7 +39,7 @@ class Guard:
         os._exit(128 + number)
 
     def _next(self, timeout: float | None) -> int:
-        """The next signal that ends; after one, only Ctrl-C again, or 0 after ``timeout`` seconds."""
+        """Return the next signal that ends; after one, only Ctrl-C again, or 0 after ``timeout`` seconds."""
         wanted = _NUMBERS if timeout is None else (signal.SIGINT,)
         while select.select([self._reader], [], [], timeout)[0]:
             for number in os.read(self._reader, 512):
@@ -48,7 +48,7 @@ class Guard:
         return 0
 
     def _release(self) -> None:
-        """A fork ends as any program: a signal to it is none to the script."""
+        """Let a fork end as any program: a signal to it is none to the script."""
         signal.set_wakeup_fd(-1)
         for number in _NUMBERS:
             signal.signal(number, signal.SIG_DFL)

@@ -47,11 +47,13 @@ class Neighbour:
 
     @property
     def online(self) -> bool:
-        """Whether it was heard within the last second."""
+        """True if it was heard within the last second."""
         return self._state is not None
 
     def latest(self, channel: Channel, max_age: float = 1.0) -> Any:
-        """The newest payload of ``channel`` that arrived within the last ``max_age`` seconds, or None. Does not wait.
+        """Return the newest payload of ``channel`` that arrived within the last ``max_age`` seconds, or None.
+
+        Does not wait.
 
         The first call subscribes, and mostly returns None. The other robot's config has to list it in ``shares``, and
         this one's in ``listens``.

@@ -27,7 +27,7 @@ _RESERVED = ("config", "describe", "help")  # options that every script has
 
 
 def form(options: type[msgspec.Struct]) -> list[Setting]:
-    """One setting per field. Raises TypeError that names the field and what to write instead."""
+    """Return one setting per field. Raises TypeError that names the field and what to write instead."""
     hints = typing.get_type_hints(options)
     settings = [_setting(field, hints[field.name]) for field in inspect.type_info(options).fields]  # type: ignore[attr-defined]
     words = [word for setting in settings for word in (setting.arg, setting.arg_false) if word]
@@ -40,7 +40,7 @@ def form(options: type[msgspec.Struct]) -> list[Setting]:
 def parse(
     options: type[Options], arguments: list[str], parser: argparse.ArgumentParser
 ) -> tuple[Options, argparse.Namespace]:
-    """The Struct that these words of a command line describe, and the values of all options of ``parser``.
+    """Return the Struct that these words of a command line describe, and the values of all options of ``parser``.
 
     Words that are wrong end the process with exit code 2 and one line on stderr.
     """
@@ -93,7 +93,10 @@ def _setting(field: inspect.Field, hint: Any) -> Setting:
 
 
 def _plain(kind: inspect.Type, name: str) -> tuple[Any, dict[str, Any], bool]:
-    """The type inside of Meta and ``| None``; title, description and extras of the Meta; whether None is allowed."""
+    """Return the type inside of Meta and ``| None``.
+
+    Title, description and extras of the Meta; whether None is allowed.
+    """
     meta: dict[str, Any] = {}
     optional = False
     while True:
@@ -112,7 +115,7 @@ def _plain(kind: inspect.Type, name: str) -> tuple[Any, dict[str, Any], bool]:
 
 
 def _choices(hint: Any) -> list[str]:
-    """The strings of a Literal in the order of their declaration, which msgspec does not preserve."""
+    """Return the strings of a Literal in the order of their declaration, which msgspec does not preserve."""
     if typing.get_origin(hint) is Literal:
         return list(typing.get_args(hint))
     return next((found for one in typing.get_args(hint) if (found := _choices(one))), [])
@@ -132,7 +135,7 @@ def _kind(kind: Any, name: str) -> Any:
 
 
 def _default(field: inspect.Field, setting: Setting) -> Value:
-    """The default as JSON, so that the same script always has the same form."""
+    """Return the default as JSON, so that the same script always has the same form."""
     if field.default_factory is not NODEFAULT:
         raise TypeError(f"option {field.name}: its default must be a plain value, not a function")
     if field.default is NODEFAULT or field.default is None:

@@ -25,12 +25,12 @@ class Pictures:
         self._closed = False
 
     def every(self, **options: Any) -> Iterator[Picture]:
-        """All pictures from now on, the newest each time; see `pebble.camera`."""
+        """Yield all pictures from now on, the newest each time; see `pebble.camera`."""
         with self._open(**options) as view:
             yield from view
 
     def newest(self, max_age: float) -> Picture | None:
-        """The newest picture, if it was captured within the last ``max_age`` seconds. Does not wait."""
+        """Return the newest picture, if it was captured within the last ``max_age`` seconds. Does not wait."""
         if self._polled is None:
             self._polled = self._open()
         picture = self._polled.newest()

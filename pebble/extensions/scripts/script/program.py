@@ -65,7 +65,7 @@ def run(
 
 
 def _options_of(main: Callable[..., None]) -> type[msgspec.Struct] | None:
-    """The type of main's second parameter. Raises TypeError for what cannot be called."""
+    """Return the type of main's second parameter. Raises TypeError for what cannot be called."""
     parameters = list(inspect.signature(main, eval_str=True).parameters.values())
     if not 1 <= len(parameters) <= 2:
         raise TypeError(f"{main.__name__}: write main(robot) or main(robot, options)")
@@ -78,7 +78,7 @@ def _options_of(main: Callable[..., None]) -> type[msgspec.Struct] | None:
 
 
 def _name() -> str:
-    """The name of the script's folder; of the file, if that is not the entry point of a folder."""
+    """Return the name of the script's folder; of the file, if that is not the entry point of a folder."""
     path = Path(sys.argv[0]).resolve()
     return path.parent.name if path.stem == "run" else path.stem
 
@@ -118,7 +118,7 @@ def _describe(
 def _arguments(
     main: Callable[..., None], label: str, options: type[msgspec.Struct] | None
 ) -> tuple[Path, tuple[msgspec.Struct, ...]]:
-    """The robot's config file, and main's further arguments, from the command line."""
+    """Return the robot's config file, and main's further arguments, from the command line."""
     parser = OneLineParser(prog=Path(sys.argv[0]).name, description=_documentation(main) or label)
     parser.add_argument(
         "--config",
@@ -175,7 +175,10 @@ class _Program:
 
 
 def _connected(config: Config, path: Path) -> Transport:
-    """The open local transport. Without a manager, who is at a shell learns what is missing. Raises PebbleError."""
+    """Return the open local transport.
+
+    Without a manager, who is at a shell learns what is missing. Raises PebbleError.
+    """
     transport = local_transport(config, f"script-{os.getpid()}")
     transport.open(_CONNECT_S)
     if transport.state is not State.CONNECTED and RUN not in os.environ:

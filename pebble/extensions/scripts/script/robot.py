@@ -69,7 +69,7 @@ class _Latest:
         self._arrived: dict[Channel, _Arrived | None] = {}
 
     def of(self, channel: Channel, max_age: float) -> Any:
-        """The first call subscribes."""
+        """Return the first call subscribes."""
         if channel not in self._arrived:
             self._arrived[channel] = None
             self._subscribe(channel, lambda value, **_: self._receive(channel, value))
@@ -129,12 +129,14 @@ class Robot:
         self._check()
 
     def picture(self, max_age: float = 0.5) -> Picture | None:
-        """The newest picture captured within the last ``max_age`` seconds, or None. Does not wait."""
+        """Return the newest picture captured within the last ``max_age`` seconds, or None. Does not wait."""
         self._check()
         return self._pictures.newest(max_age)
 
     def latest(self, channel: Channel, max_age: float = 1.0) -> Any:
-        """The newest payload of ``channel`` that arrived within the last ``max_age`` seconds, or None. Does not wait.
+        """Return the newest payload of ``channel`` that arrived within the last ``max_age`` seconds, or None.
+
+        Does not wait.
 
         The first call subscribes, and mostly returns None.
         """
@@ -167,7 +169,7 @@ class Robot:
 
     @property
     def overridden(self) -> bool:
-        """Whether a person has driven within the last 2 s, so that :meth:`drive` has no effect."""
+        """True if a person has driven within the last 2 s, so that :meth:`drive` has no effect."""
         return self._wheels.overridden
 
     @property

@@ -75,11 +75,11 @@ class Wheels:
 
     @property
     def overridden(self) -> bool:
-        """Whether a person has driven within the last 2 s."""
+        """True if a person has driven within the last 2 s."""
         return self._sender.overridden(self._clock())
 
     def refusal(self) -> str:
-        """Why a command has no effect now, as far as is known; empty: it has."""
+        """Return why a command has no effect now, as far as is known; empty: it has."""
         with self._lock:
             return self._sender.refusal(self._clock())
 

@@ -69,7 +69,7 @@ class Window(NamedTuple):
         return (self.ended_ns - self.began_ns) / 1e9
 
     def overlap_s(self, sound: Arrival) -> float:
-        """Seconds of the packet that were captured in the window."""
+        """Return seconds of the packet that were captured in the window."""
         ended_ns = sound.sent_ns + round(1e9 * sound.seconds)
         return max(0, min(ended_ns, self.ended_ns) - max(sound.sent_ns, self.began_ns)) / 1e9
 
@@ -120,7 +120,10 @@ def seen(pictures: Iterable[Arrival], window: Window) -> Seen:
 
 
 def driven_ms(commands: Sequence[Command], entries: Sequence[Entry]) -> list[float]:
-    """The time of each command until it, or a newer one that overtook it, reached the MCU; lost ones are left out."""
+    """Return the time of each command until it, or a newer one that overtook it, reached the MCU.
+
+    Lost ones are left out.
+    """
     arrived = arrivals(entries)
     driven, soonest = [], math.inf
     for command in reversed(commands):

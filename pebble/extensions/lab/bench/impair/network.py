@@ -90,7 +90,7 @@ class _Side:
         self._path, self._address = path, address
 
     def inside(self, command: Sequence[str]) -> list[str]:
-        """The command on this side. The process is replaced: pid and signals stay."""
+        """Return the command on this side. The process is replaced: pid and signals stay."""
         return ["nsenter", f"--net={self._path}", "--", *command]
 
     def set_up(self) -> None:
@@ -120,7 +120,7 @@ class _Side:
 
 
 def _queue(kbit: float | None) -> str:
-    """The queueing discipline in tc's syntax; without a limit the device's default."""
+    """Return the queueing discipline in tc's syntax; without a limit the device's default."""
     if kbit is None:
         return "noqueue"
     rate = kbit * 1000 / 8
@@ -130,7 +130,7 @@ def _queue(kbit: float | None) -> str:
 
 @cache
 def why_no_namespaces() -> str | None:
-    """What prevents such networks; None: nothing. Tested with every feature a condition may use."""
+    """Return what prevents such networks; None: nothing. Tested with every feature a condition may use."""
     try:
         with closing(NamespaceNetwork("on trial")) as network:
             network.apply(Condition("trial", kbit=1000, loss=0.01))

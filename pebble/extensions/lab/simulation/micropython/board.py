@@ -189,7 +189,7 @@ class Board:
             self._pwm_timers.free(str(pin))
 
     def print(self, *values: object, sep: str = " ", end: str = "\n", file: Any = None) -> None:
-        """The firmware's ``print``, which writes to the serial port or to ``file``."""
+        """Print as the firmware does: to the serial port or to ``file``."""
         text = sep.join(map(str, values)) + end
         if file is None:
             self.console.write(text.replace("\n", "\r\n").encode())

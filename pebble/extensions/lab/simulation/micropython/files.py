@@ -26,7 +26,7 @@ class Files(dict[str, bytes]):
             self.update({f"/{file.name}": file.read_bytes() for file in folder.iterdir() if file.is_file()})
 
     def open(self, path: str, mode: str = "r") -> IO[bytes] | IO[str]:
-        """The firmware's ``open``, for reading or for writing a whole file."""
+        """Return the firmware's ``open``, for reading or for writing a whole file."""
         raw: io.BytesIO
         if mode in ("w", "wb"):
             raw = _Written(self, path)

@@ -18,7 +18,7 @@ _compiled: dict[tuple[str, int], CodeType] = {}
 
 @cache
 def firmware_root() -> Path:
-    """The root folder of a board: ``firmware/`` of the checkout or of the installed package."""
+    """Return the root folder of a board: ``firmware/`` of the checkout or of the installed package."""
     with as_file(files("pebble") / "firmware") as folder:
         return folder.resolve()
 
@@ -80,7 +80,7 @@ class FirmwareModules:
     def _import(
         self, name: str, _globals: object = None, _locals: object = None, wanted: Any = (), level: int = 0
     ) -> Any:
-        """The board's ``__import__``."""
+        """Return the board's ``__import__``."""
         if level:
             raise ImportError("firmware imports by full names: relative imports differ between ports", name=name)
         module = self.module(name)

@@ -34,7 +34,7 @@ def _refuse(name: PinName) -> PinName:
 
 
 def _samd_wdt(timeout_ms: int) -> int:
-    """A power of two, rounded down (ports/samd/machine_wdt.c)."""
+    """Return a power of two, rounded down (ports/samd/machine_wdt.c)."""
     return 1 << (max(512, min(16_384, timeout_ms)).bit_length() - 1)
 
 

@@ -33,13 +33,13 @@ class Watchdog:
         self._fed_at = self._clock.now()
 
     def left(self) -> float:
-        """Seconds until it resets the board."""
+        """Return seconds until it resets the board."""
         if self.timeout_ms is None:
             return math.inf
         return max(0.0, self._fed_at + self.timeout_ms / 1000 - self._clock.now())
 
     def starved(self, now: float) -> bool:
-        """Whether it would have reset the board by ``now``."""
+        """True if it would have reset the board by ``now``."""
         return self.timeout_ms is not None and now >= self._fed_at + self.timeout_ms / 1000
 
     def check(self) -> None:

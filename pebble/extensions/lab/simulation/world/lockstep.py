@@ -115,7 +115,7 @@ class LockstepRobot:
         self._output += self.mcu.receive(data, self._now)
 
     def read(self) -> bytes:
-        """What the MCU has sent since the last call."""
+        """Return what the MCU has sent since the last call."""
         output, self._output = self._output, b""
         return output
 
@@ -127,7 +127,7 @@ class LockstepRobot:
     # -- the camera
 
     def picture(self) -> Picture | None:
-        """The newest picture, unless it has been taken already. It is rendered only then."""
+        """Return the newest picture, unless it has been taken already. It is rendered only then."""
         due = int(self._now * self._camera.fps + 1e-6)
         if due == self._pictures:
             return None

@@ -29,7 +29,7 @@ class _Page(msgspec.Struct):
 
 
 def page_path(world: Path) -> Path:
-    """The page of a world file, the same for all programs of one user."""
+    """Return the page of a world file, the same for all programs of one user."""
     folder = Path("/dev/shm")  # noqa: S108 - the page's own folder is checked
     digest = hashlib.sha256(str(world.resolve()).encode()).hexdigest()[:16]
     return folder / f"pebble-worlds-{os.getuid()}" / digest
@@ -80,7 +80,7 @@ class PoseReader:
         self._start_ns = self._read().start_ns
 
     def tracks(self) -> dict[str, Track]:
-        """The poses of every robot that has a sample; none once the world has ended or was started again."""
+        """Return the poses of every robot that has a sample; none once the world has ended or was started again."""
         try:
             page = self._read()
         except FileNotFoundError:

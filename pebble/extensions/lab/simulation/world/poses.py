@@ -32,7 +32,7 @@ class Track:
         return self.samples[-1]
 
     def at(self, ns: int) -> RobotPose:
-        """The pose at ``ns``, interpolated; the oldest or newest one for a time outside the samples."""
+        """Return the pose at ``ns``, interpolated; the oldest or newest one for a time outside the samples."""
         after = bisect_right(self.samples, ns, key=lambda sample: sample.ns)
         if after in (0, len(self.samples)):
             return self.samples[max(0, after - 1)].pose

@@ -68,17 +68,17 @@ def run(
 
 
 def port_path(folder: Path, robot: str) -> Path:
-    """The serial port of a robot's motor MCU."""
+    """Return the serial port of a robot's motor MCU."""
     return folder / f"{robot}.port"
 
 
 def imu_port_path(folder: Path, robot: str) -> Path:
-    """The serial port of its inertial sensor's MCU, if it has one."""
+    """Return the serial port of its inertial sensor's MCU, if it has one."""
     return folder / f"{robot}.imu-port"
 
 
 def trace_path(folder: Path, robot: str) -> Path:
-    """The file for what a robot's MCU receives."""
+    """Return the file for what a robot's MCU receives."""
     return folder / f"{robot}.trace.jsonl"
 
 
@@ -125,7 +125,7 @@ def _publish_poses(page: PosePage, mcus: Mcus, end: EndSignal, *, report: bool) 
 
 
 def _introduction(path: Path, mcus: Mcus, imus: Mcus) -> str:
-    """Where the robots are, and what belongs in their configs."""
+    """Return where the robots are, and what belongs in their configs."""
     lines = [f"the world of {path} runs; Ctrl-C ends it"]
     for name, mcu in mcus.items():
         video = msgspec.json.encode({"backend": "synthetic", "device": f"{path}#{name}"}).decode()

@@ -65,7 +65,7 @@ class Renderer:
         self._count += 1
 
     def _expose(self, tracks: Mapping[str, Track], ns: int, out: Image) -> None:
-        """The mean of what is seen during the exposure, which ends at ``ns``."""
+        """Draw the mean of what is seen during the exposure, which ends at ``ns``."""
         exposure_ns = self._lens.motion_blur_ms * 1e6
         times = [ns - round(exposure_ns * part / (_EXPOSURES - 1)) for part in range(_EXPOSURES)]
         views = [poses_at(tracks, moment) for moment in (times if exposure_ns else [ns])]
@@ -97,7 +97,7 @@ class Renderer:
     # -- plan: (n, 2, 2) left and right edge of each surface, as distance ahead of the camera and to its right
 
     def _seen(self, surfaces: Sequence[Surface], me: RobotPose) -> tuple[_Floats, list[int]]:
-        """The parts of surfaces that are in front of the camera, and which surfaces they are of."""
+        """Return the parts of surfaces that are in front of the camera, and which surfaces they are of."""
         edges = np.array([(surface.left, surface.right) for surface in surfaces])
         plan = self._to_camera(edges, me)
         (ahead1, right1), (ahead2, right2) = plan[:, 0].T, plan[:, 1].T
@@ -122,7 +122,7 @@ class Renderer:
         return np.asarray((points - (me.x, me.y)) @ np.array([[cosine, sine], [sine, -cosine]]))
 
     def _columns(self, plan: _Floats) -> _Floats:
-        """Where in the picture the edges are."""
+        """Return where in the picture the edges are."""
         return np.asarray(self._middle[0] + self._focal * plan[..., 1] / plan[..., 0])
 
     def _rows(self, surface: Surface, plan: _Floats) -> _Floats:
@@ -163,7 +163,7 @@ class Renderer:
 
     @staticmethod
     def _share(surface: Surface, plan: _Floats) -> float:
-        """How much larger the surface is than the part in the plan."""
+        """Return how much larger the surface is than the part in the plan."""
         whole = math.dist(surface.left, surface.right)
         return whole / max(1e-9, math.dist(plan[0], plan[1]))
 
@@ -197,7 +197,7 @@ class Renderer:
 
 
 def _back_to_front(plan: _Floats, layers: Sequence[int], columns: _Floats) -> list[int]:
-    """The order in which surfaces are drawn. Of crossing ones, the farther one is first."""
+    """Return the order in which surfaces are drawn. Of crossing ones, the farther one is first."""
     covers = _covers(plan, np.array(layers), columns)
     distance = (plan.mean(axis=1) ** 2).sum(axis=1)
     left, order = set(range(len(plan))), []
@@ -227,7 +227,10 @@ def _covers(plan: _Floats, layers: NDArray[np.int_], columns: _Floats) -> NDArra
 
 
 def _floor(world: World) -> tuple[Image, _Floats]:
-    """A texture of tiles, and the matrix from its pixels to the floor; of the room, or of 20 m around the origin."""
+    """Return a texture of tiles, and the matrix from its pixels to the floor.
+
+    Of the room, or of 20 m around the origin.
+    """
     import cv2
 
     room = world.room

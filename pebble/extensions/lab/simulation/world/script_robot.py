@@ -28,7 +28,7 @@ Handler = Callable[..., None]
 
 
 def load_script(file: Path) -> ModuleType:
-    """The module of a script's ``run.py``, whose name many scripts share, so an import would find only the first.
+    """Return the module of a script's ``run.py``; many share the name, so an import would find only the first.
 
     Raises OSError, and what the module raises.
     """
@@ -87,7 +87,10 @@ class SimulatedRobot(Robot):
         self.published += [(channel, value()) for channel, value in self._last_values.items()]
 
     def distance_to(self, *, tag: int) -> float:
-        """How far the robot's middle is from a tag's, along the floor, in m. Raises PebbleError if there is none."""
+        """Return how far the robot's middle is from a tag's, along the floor, in m.
+
+        Raises PebbleError if there is none.
+        """
         for one in self._model.tags:
             if one.id == tag:
                 return math.hypot(one.x - self._body.pose.x, one.y - self._body.pose.y)
@@ -99,7 +102,7 @@ class SimulatedRobot(Robot):
         return self._body
 
     def receive(self, channel: Channel, value: Any) -> None:
-        """A message of another program arrives now; a drive command without a source is a person's."""
+        """Take a message of another program; a drive command without a source is a person's."""
         self._messages[channel] = (value, self.world.now())
         if channel == DRIVE:
             self._sender.receive(value, self.world.now())
@@ -111,7 +114,7 @@ class SimulatedRobot(Robot):
     # -- for scripts
 
     def camera(self, *, width: int | None = None, views: bool = False, timeout: float | None = None) -> Iterator[Image]:
-        """Each picture once; time passes until there is one."""
+        """Yield each picture once; time passes until there is one."""
         del width, views, timeout
         while True:
             self._pass_step()

@@ -51,7 +51,7 @@ class Surfaces:
         ]
 
     def surfaces(self, poses: Mapping[str, RobotPose], me: str) -> list[Surface]:
-        """All of them, of the robots at these poses; without the robot ``me``, which does not see itself."""
+        """Return all of them, of the robots at these poses; without the robot ``me``, which does not see itself."""
         robots = [
             surface
             for index, name in enumerate(self._world.robots)
@@ -82,7 +82,7 @@ class Surfaces:
 
 
 def _edges(x: float, y: float, half: float, yaw: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The left and right edge of a surface whose middle is at x, y and whose front looks to ``yaw``."""
+    """Return the left and right edge of a surface whose middle is at x, y and whose front looks to ``yaw``."""
     right_x, right_y = -math.sin(yaw) * half, math.cos(yaw) * half
     return (x - right_x, y - right_y), (x + right_x, y + right_y)
 
@@ -102,7 +102,7 @@ def _modules(world: World) -> int:
 
 
 def _tag_textures(family: str, number: int) -> tuple[Image, ...]:
-    """The tag with a white border of one module, and halves of it down to one pixel per module."""
+    """Return the tag with a white border of one module, and halves of it down to one pixel per module."""
     import cv2
 
     dictionary = _dictionary(family)

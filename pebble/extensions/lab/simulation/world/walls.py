@@ -26,7 +26,7 @@ class Floor:
         self._poses = {name: start_pose(world, name) for name in world.robots}
 
     def mover(self, name: str) -> Mover:
-        """The floor under one robot."""
+        """Return the floor under one robot."""
         return Mover(self, name)
 
     def move(self, name: str, start: Pose, end: Pose) -> Pose:
@@ -43,7 +43,7 @@ class Floor:
             self._poses[name] = pose
 
     def _contact(self, name: str, start: Pose, end: Pose, before: float) -> float:
-        """The largest part of the move that is free."""
+        """Return the largest part of the move that is free."""
         free, blocked = 0.0, 1.0
         for _ in range(_HALVINGS):
             middle = (free + blocked) / 2
@@ -59,7 +59,7 @@ class Floor:
         return after >= min(0.0, before) - _ROUNDING_MM
 
     def _clearance_mm(self, name: str, x_mm: float, y_mm: float) -> float:
-        """From the robot's body to the nearest obstacle; negative: they overlap."""
+        """Return the way from the robot's body to the nearest obstacle; negative: they overlap."""
         own = self._radius_mm[name]
         walls = (wall.distance(x_mm / 1000, y_mm / 1000) * 1000 - own for wall in self._walls)
         others = (

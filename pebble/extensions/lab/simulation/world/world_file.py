@@ -109,7 +109,7 @@ class Wall(Section, frozen=True, kw_only=True):
     height_m: Length = 0.6
 
     def distance(self, x: float, y: float) -> float:
-        """From a point to the nearest point of the wall."""
+        """Return the way from a point to the nearest point of the wall."""
         along_x, along_y = self.x2 - self.x1, self.y2 - self.y1
         part = ((x - self.x1) * along_x + (y - self.y1) * along_y) / (along_x**2 + along_y**2)
         part = min(1.0, max(0.0, part))
@@ -142,7 +142,7 @@ def read_world(path: Path) -> World:
 
 
 def parse_world(raw: Any) -> World:
-    """The same from plain data."""
+    """Return the same from plain data."""
     reader = Reader(Path(), {}, ())
     world = reader.section(World, plain(raw, reader.notes))
     if not reader.notes.problems:
@@ -153,7 +153,7 @@ def parse_world(raw: Any) -> World:
 
 
 def split_device(device: str) -> tuple[Path, str]:
-    """The world file and the robot that ``world.json#goob`` names. Raises DeviceError."""
+    """Return the world file and the robot that ``world.json#goob`` names. Raises DeviceError."""
     path, _, robot = device.rpartition("#")
     if not path or not robot:
         raise DeviceError(f"{device!r} is no robot of a world, write for example /path/world.json#goob")
@@ -161,7 +161,7 @@ def split_device(device: str) -> tuple[Path, str]:
 
 
 def open_world(path: Path, robot: str) -> World:
-    """The world of this file, in which there is this robot. Raises DeviceError, one line."""
+    """Return the world of this file, in which there is this robot. Raises DeviceError, one line."""
     try:
         world = read_world(path)
     except ConfigError as error:

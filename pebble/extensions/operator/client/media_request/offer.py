@@ -33,14 +33,14 @@ WORDS: Final[dict[Medium, Words]] = {
 
 
 def offered(capabilities: dict[str, Any], medium: Medium) -> tuple[str, ...]:
-    """The encodings that may be requested; empty for robots that do not list any, whose requests name none."""
+    """Return the encodings that may be requested; empty for robots that do not list any, whose requests name none."""
     section = capabilities.get(medium)
     listed = section.get("encodings") if isinstance(section, dict) else None
     return tuple(name for name in listed if isinstance(name, str)) if isinstance(listed, list) else ()
 
 
 def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
-    """Why this robot's pictures, or its sound, are not requested; empty if they may be.
+    """Return why this robot's pictures, or its sound, are not requested; empty if they may be.
 
     Capabilities come from the network: one that names topics of another component, or channel, is not believed at all.
     """

@@ -75,7 +75,7 @@ class ViewerQueue:
             self.wait_for_keyframe()
 
     def take(self, now: float) -> Frame | None:
-        """The frame to send now; None if there is none, or too many are under way."""
+        """Return the frame to send now; None if there is none, or too many are under way."""
         if not self._queue or not self._may_send(len(self._queue[0].data)):
             return None
         frame = self._queue.popleft()
@@ -83,7 +83,7 @@ class ViewerQueue:
         return frame
 
     def acknowledge(self, seq: int, now: float) -> Frame | None:
-        """The page is done with this frame: return it, if it was under way."""
+        """Take note that the page is done with this frame, and return it if it was under way."""
         sent_at, frame = self._under_way.pop(seq, (0.0, None))
         if frame is not None:
             self.ack_s = now - sent_at
@@ -111,7 +111,7 @@ class ViewerQueue:
         self.waiting = True
 
     def not_drawn(self) -> None:
-        """The page could not draw a frame: unless a key frame is on its way, it waits for one."""
+        """Note that the page could not draw a frame: unless a key frame is on its way, it waits for one."""
         under_way = [frame for _, frame in self._under_way.values()]
         if not any(frame.keyframe for frame in (*under_way, *self._queue)):
             self.wait_for_keyframe()
@@ -131,7 +131,7 @@ class ViewerQueue:
         return self.window < WINDOW and frame.encoding != "h264"
 
     def _begin_at(self, frame: Frame) -> None:
-        """A page that keeps up receives what came before as well; another one only what is newest."""
+        """Begin so that a page that keeps up receives what came before as well, another one only what is newest."""
         late = self.window < WINDOW or len(self._queue) > _FRESH_FRAMES
         if self.waiting or late or self._queued_bytes() + len(frame.data) > MAX_QUEUED_BYTES:
             self.wait_for_keyframe()
@@ -147,7 +147,7 @@ class ViewerQueue:
         return encoding in self.can and encoding not in self._undecodable
 
     def cannot_decode(self, encoding: str) -> None:
-        """The page has tried this encoding in vain."""
+        """Note that the page has tried this encoding in vain."""
         self._undecodable.add(encoding)
 
     def offer_direct(self, frame: Frame, now: float) -> None:
@@ -171,20 +171,20 @@ class ViewerQueue:
             self.offer(frame)
 
     def lost(self, now: float) -> None:
-        """A picture is missing on the way from the robot: the differences after it are of no use."""
+        """Note that a picture is missing on the way from the robot: the differences after it are of no use."""
         if not self.rescued:
             self._note_waiting(now)
             self.wait_for_keyframe()
 
     def refuse(self, now: float) -> None:
-        """The page asked for a key frame."""
+        """Note that the page asked for a key frame."""
         if not self.rescued:
             self._note_waiting(now)
             self.not_drawn()
 
     @property
     def is_thin(self) -> bool:
-        """Whether its connection carries no large frames."""
+        """True if its connection carries no large frames."""
         return self.late_acks >= THIN_FRAMES
 
     def rescue(self, now: float) -> None:
@@ -197,7 +197,7 @@ class ViewerQueue:
         self.forget_lateness(now)
 
     def waiting_s(self, now: float) -> float:
-        """How long it has waited for a key frame of the robot's own pictures."""
+        """Return how long it has waited for a key frame of the robot's own pictures."""
         return now - self._waiting_since if self.waiting and not self.rescued else 0.0
 
     def _note_waiting(self, now: float) -> None:

@@ -97,7 +97,7 @@ class ViewerRequest:
         return asked
 
     def _waits_s(self) -> float:
-        """How long a payload is awaited that shows that the medium is running."""
+        """Return how long a payload is awaited that shows that the medium is running."""
         if self._encoding is None:
             return _JOIN_S
         if self._is_up is None:

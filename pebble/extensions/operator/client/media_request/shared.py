@@ -139,12 +139,12 @@ class SharedRequest:
             await self._broker.unsubscribe(subscription)
 
     def _is_over(self) -> bool:
-        """A request is not withdrawn while there is no broker: the robot would go on sending afterwards."""
+        """True if it was withdrawn: not without a broker, or the robot would go on sending afterwards."""
         idle = not self._wanted and time.monotonic() - self._wanted_at >= LINGER_S
         return idle and (self._broker.connected or self._request is None)
 
     async def _pause(self, began: float) -> None:
-        """A step that is needed earlier comes a tenth of a second after the last one."""
+        """Pause until the next step; one that is needed earlier comes a tenth of a second after the last one."""
         await asyncio.sleep(max(0.0, began + TICK_S / 5 - time.monotonic()))
         with contextlib.suppress(TimeoutError):  # wait_for of Python 3.11 loses a cancellation that meets a wakeup
             async with asyncio.timeout(max(0.001, began + TICK_S - time.monotonic())):

@@ -31,7 +31,7 @@ class KeyDecoder:
         return self._since + ALONE_S if self._waiting else None
 
     def feed(self, data: bytes, now: float) -> list[str]:
-        """The keys in ``data``, in order: a printable character in lower case, or one of the names above."""
+        """Return the keys in ``data``, in order: a printable character in lower case, or one of the names above."""
         keys: list[str] = []
         if self._waiting and now >= self._since + ALONE_S:  # for the rest of a sequence, in vain
             keys, self._waiting = [ESCAPE] * (self._waiting == b"\x1b"), b""

@@ -117,7 +117,7 @@ def has_terminal() -> bool:
 
 @contextmanager
 def opened() -> Iterator[Terminal]:
-    """The terminal of this process, restored at the end."""
+    """Give the terminal of this process, restored at the end."""
     terminal = Terminal()
     with handled_by(terminal.on_signal, signal.SIGQUIT, signal.SIGTSTP, signal.SIGCONT):
         try:
