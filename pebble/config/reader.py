@@ -63,10 +63,12 @@ class Reader:
         values: dict[str, Any] = {}
         for written, value in () if raw is _WRONG else raw.items():
             key = self._key(kind, known, written, (*path, written))
-            if key in known and value not in ("", None) and not (value == [] and known[key].default):
-                read = self._value(known[key].type, value, (*path, written), _default(known[key]))
-                if read is not _WRONG:
-                    values[known[key].name] = read
+            field = known.get(key)
+            if field is None or value in ("", None) or (self._other_forms and value == [] and field.default):
+                continue
+            read = self._value(field.type, value, (*path, written), _default(field))
+            if read is not _WRONG:
+                values[field.name] = read
         for field in known.values():
             if field.required and field.name not in values:
                 values[field.name] = self._missing(field, (*path, field.encode_name))

@@ -140,7 +140,7 @@ class Seen:
     def _turning(self, first: float, last: float) -> Iterator[float]:
         """Return since when motors turn, within this time."""
         ends = [at for at, _ in self.motors[1:]] + [float("inf")]
-        for (at, wheels), end in zip(self.motors, ends, strict=True):
+        for (at, wheels), end in zip(self.motors, ends, strict=False):
             if wheels != _REST and max(at, first) < min(end, last):
                 yield max(at, first)
 

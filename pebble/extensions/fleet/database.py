@@ -44,7 +44,7 @@ class Database:
                 path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
                 require_own(path.parent)  # another user may have been faster
                 if not path.exists():
-                    os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+                    os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
             self._connection = _connection(path, tables)
             upgrade(self._connection)
             self._own = None if path is None else OwnFile(path)

@@ -133,7 +133,7 @@ def test_what_it_may_not_read_is_named(places: Places, monkeypatch: pytest.Monke
     def refuse(path: Path) -> bytes:
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr(Path, "read_bytes", refuse)
+    monkeypatch.setattr("pebble.extensions.checks.report.secrets_here.read_plain", refuse)
     known = secrets_of(places, None)
     assert str(places.etc / "mqtt.password") in known.unread
 

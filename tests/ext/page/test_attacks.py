@@ -213,6 +213,7 @@ def ops(ref: str) -> dict[str, dict[str, Any]]:
         "mcu": {"ref": ref, "uid": "imu", "name": "led", "value": {}},
         "action": {"ref": ref, "name": "reboot"},
         "flag": {"ref": ref, "name": "mqtt-video", "on": False},
+        "board": {"ref": ref, "do": "allow"},
     }
 
 
@@ -224,7 +225,7 @@ def test_every_op_is_attacked() -> None:
     assert set(ops(GOOB)) == {kind.__struct_config__.tag for kind in get_args(m.FromPage)}
 
 
-@pytest.mark.parametrize(("role", "may"), [("viewer", FOR_VIEWERS), ("driver", set(ops("")) - {"action"})])
+@pytest.mark.parametrize(("role", "may"), [("viewer", FOR_VIEWERS), ("driver", set(ops("")) - {"action", "board"})])
 def test_what_a_role_may_not(
     hall: Hall, broker: Broker, driver: Page, everything: Everything, role: str, may: set[str]
 ) -> None:
