@@ -72,6 +72,7 @@ def check(browser: Browser, server: CannedServer, state: str, losses: Iterator[t
             assert opened.until(stopped, 5), (name, fault)
             while _UNANSWERED:
                 _UNANSWERED.pop().abort()
+            opened.context.unroute_all(behavior="ignoreErrors")
 
 
 @pytest.mark.timeout(300)
