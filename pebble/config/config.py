@@ -316,7 +316,7 @@ def default_state_folder(base: str, env: Mapping[str, str]) -> Path:
 def file_name(base: str) -> str:
     """Return a name for one robot's files: its base, or a digest of it where a file system would refuse the name."""
     name = base.replace("/", "+")  # which no level of a topic contains
-    return name if len(name.encode()) <= _LONGEST_NAME else hashlib.sha256(base.encode()).hexdigest()
+    return name if len(os.fsencode(name)) <= _LONGEST_NAME else hashlib.sha256(os.fsencode(base)).hexdigest()
 
 
 def resolved(config: Config) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from msgspec.structs import asdict, replace
 
 from pebble.config import LAUNCHER_LOCK, Config, load, parse, resolved
+from pebble.config.config import file_name
 from pebble.config.media import Media
 from pebble.config.transport import Tls
 from pebble.config.tree import Heartbeat
@@ -1013,3 +1014,9 @@ def test_what_cannot_be_switched_off_gives_a_warning() -> None:
     serial = {"enabled": True, "serial": {"port": "/dev/ttyACM0"}, "safety": safety}
     config = parse({"robot": {"id": "x"}, "services": {"serial_mcu_bridge": serial}}, folder=Path(), env={})
     assert [warning.split(": ")[0].rsplit(".", 1)[-1] for warning in config.warnings] == list(safety)
+
+
+def test_a_folder_whose_name_is_no_utf8_has_a_name_for_its_files() -> None:
+    long = "/h\udce9/" * 60
+    assert file_name("/h\udce9") == "+h\udce9"
+    assert len(file_name(long)) == 64
