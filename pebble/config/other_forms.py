@@ -10,7 +10,7 @@ _SWITCHES = {"1": True, "true": True, "yes": True, "on": True, "0": False, "fals
 
 
 class Reading(NamedTuple):
-    """What is used for a value that is not as expected; ``differs``: it is more than another form of the same."""
+    """The value used in place of an unexpected one; ``differs``: it is more than another form of the same."""
 
     value: Any
     differs: bool = True

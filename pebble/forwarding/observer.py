@@ -51,7 +51,7 @@ class Observer:
 
 
 class Observers(Observer):
-    """Those of all extensions. What one of them raises is logged, and costs the others nothing."""
+    """The observers of all extensions. What one of them raises is logged, and costs the others nothing."""
 
     def __init__(self, config: Config, clock: Callable[[], float]) -> None:
         self._found: list[Observer] = []

@@ -90,7 +90,7 @@ class Child:
 
 
 class Finished(NamedTuple):
-    """How a program has ended, and what it wrote: the end of it, if it is long."""
+    """The end of a program, and the last that it wrote."""
 
     code: int
     output: str

@@ -1,4 +1,4 @@
-"""Whether a source that is punctual shows something: it must not repeat itself, nor come at another rate. Pure."""
+"""Checks of a punctual source: it must not repeat itself, nor come at another rate. Pure."""
 
 from collections import deque
 from collections.abc import Hashable
@@ -11,7 +11,7 @@ _TOLERANCE = 0.2  # of the rate that was asked
 
 
 class SourceCheck:
-    """What one source gave last, for how long, and how often. One thread writes, any reads."""
+    """The record of what a source gave last, for how long, and how often. One thread writes, any reads."""
 
     def __init__(self, asked_hz: float = 0.0, *, remembered: int = 1) -> None:
         """``asked_hz``: 0 where every rate is right; ``remembered``: contents that are none if they come again."""

@@ -20,7 +20,7 @@ class StoppedError(StartError):
 
 
 class UnknownScriptError(StartError):
-    """It names a script that is not listed, or of which is not known yet what it needs."""
+    """A start of a script that is not listed, or whose needs are not known yet."""
 
 
 class Dependency(Struct, frozen=True, forbid_unknown_fields=True):

@@ -89,7 +89,7 @@ class Health:
 
     @property
     def problems(self) -> dict[str, str]:
-        """What is wrong with the frames that come, by kind."""
+        """Problems of the frames that come, by kind."""
         info, asked = self._info, self._asked
         return {} if info is None or asked is None else dict(self._problems(info, asked))
 

@@ -23,7 +23,7 @@ class MovingSensors:
 
     @property
     def problem(self) -> str:
-        """What is wrong; empty if nothing is. One that never changes may not be there, unless no other does."""
+        """The problem; empty: none. A sensor that never changes may not be there, unless no other changes."""
         still = [name for name, check in self._checks.items() if check.repeats]
         if len(still) < len(self._checks):
             still = [name for name in still if self._checks[name].changes]

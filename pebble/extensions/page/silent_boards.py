@@ -35,7 +35,7 @@ _NAMED = f'At level named it is driven only with "plain": true, in fleet.json an
 
 
 class Permission(Struct, frozen=True):
-    """Who lets pages drive a board, and by which axes; no axes: nobody does."""
+    """Permission for pages to drive a board: by whom, and by which axes; no axes: none."""
 
     by: str = ""
     axes: tuple[str, ...] = ()
@@ -51,7 +51,7 @@ class _Board(Struct):
 
 
 class SilentBoards:
-    """It belongs to one server. Only the event loop calls it."""
+    """The silent boards of one server. Only the event loop calls it."""
 
     def __init__(self, broker: Broker, robots: Robots, drivers: Drivers, people: People, settings: WebSettings) -> None:
         self._broker, self._robots, self._drivers, self._people = broker, robots, drivers, people

@@ -1,4 +1,4 @@
-"""Who else has a serial device open: both read what the board sends, so each misses some, and both send."""
+"""Other holders of a serial device: both read what the board sends, so each misses some, and both send."""
 
 import os
 from contextlib import suppress

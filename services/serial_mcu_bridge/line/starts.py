@@ -1,4 +1,4 @@
-"""How often the board on a serial line starts again, by what it sends and by the line itself. Pure."""
+"""Counts of the starts of a board on a serial line, by what it sends and by the line itself. Pure."""
 
 from collections import deque
 

@@ -1,7 +1,6 @@
-"""Makes the README's pictures of the operator page, with four simulated robots: ``python -m tests.ext.page.pictures``.
+"""Makes docs/page-fleet.jpg, with four simulated robots: ``python -m tests.ext.page.pictures``.
 
-They are docs/page-driving.jpg, in which the key W is held, and docs/page-fleet.jpg. It needs mosquitto and
-Chromium.
+It needs mosquitto and Chromium.
 """
 
 import io
@@ -11,28 +10,13 @@ from PIL import Image
 from playwright.sync_api import Browser
 
 from tests.ext.page.browser import chromium, tab
-from tests.ext.page.console import console
 from tests.ext.page.stage import Stage
 from tests.support import ROOT
 
 DOCS = ROOT / "docs"
 WIDTH, QUALITY, MOST_BYTES = 1000, 78, 200_000
-SHARP_S, SMALL_PICTURES_S, HELD_S = 4.0, 4.0, 0.4
+SMALL_PICTURES_S = 4.0
 CARDS = {"x": 0, "y": 0, "width": 1280, "height": 580}
-
-
-def driving(browser: Browser, stage: Stage) -> bytes:
-    """Return a picture of a robot's page while it drives ahead, with what its camera sees."""
-    with console(browser, stage, "goob", engineers=False) as robot:
-        assert robot.tab.until("window.pebble?.video?.info", 20), "no picture has arrived"
-        robot.page.wait_for_timeout(1000 * SHARP_S)
-        robot.take()
-        assert robot.drive(), robot.reason
-        robot.page.wait_for_timeout(1000 * HELD_S)
-        taken: bytes = robot.page.screenshot()
-        robot.let_go()
-        assert robot.rests()
-        return taken
 
 
 def fleet(browser: Browser, stage: Stage) -> bytes:
@@ -54,9 +38,7 @@ def save(name: str, png: bytes) -> int:
 
 def main() -> int:
     with Stage() as stage, chromium() as browser:
-        taken = {"driving": driving(browser, stage), "fleet": fleet(browser, stage)}
-    sizes = [save(name, png) for name, png in taken.items()]
-    return int(max(sizes) > MOST_BYTES)
+        return int(save("fleet", fleet(browser, stage)) > MOST_BYTES)
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ STARTUP_S = 1.0  # for start-up work to finish
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How the robots are driven: ``seconds`` in each round and under each load, in turns of a second."""
+    """The course of the comparison: ``seconds`` in each round and under each load, in turns of a second."""
 
     seconds: float = 12.5
     rounds: int = 20

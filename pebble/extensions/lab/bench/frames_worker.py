@@ -1,4 +1,4 @@
-"""One end of a transfer of time-stamped frames, 30 a second, as a process.
+"""The process at either end of a transfer of time-stamped frames, 30 a second.
 
 ``python -m pebble.extensions.lab.bench.frames_worker VARIANT ROLE WHERE SIZE``: ``WHERE`` is a folder for sockets, or a
 broker's port; ``SIZE`` is ``640x480``. One end of GStreamer's is this file in the system's Python, where gi and Gst are

@@ -148,7 +148,7 @@ class Viewer:
 
     @property
     def online(self) -> int:
-        """How many robots the page shows as online."""
+        """Count the robots that the page shows as online."""
         return len(self._online)
 
     def wait_until(self, condition: Callable[[], bool], what: str) -> None:

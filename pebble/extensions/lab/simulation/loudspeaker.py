@@ -28,7 +28,7 @@ _BUSY = "loudspeaker: audio open error: Device or resource busy"
 
 
 class Playback(msgspec.Struct, omit_defaults=True):
-    """One sound that was played; times are those of time.monotonic_ns(), of the first sample and the last.
+    """A sound that was played; times are those of time.monotonic_ns(), of the first sample and the last.
 
     ``file`` is ``-`` for raw sound, ``recording`` the path of the WAV file. ``ended_ns`` is None while it plays, and
     if its player was killed; ``stopped``: by a signal.

@@ -1,4 +1,4 @@
-"""What a silent board offers: one that obeys drive commands, as two of the original do, and never says so. Pure."""
+"""The offer of a silent board, which obeys drive commands, as two of the original do, and never says so. Pure."""
 
 from collections.abc import Collection
 from typing import Any, Final, Literal

@@ -285,12 +285,12 @@ class RobotView:
         return self.topic(c.DRIVE) is not None and self.liveness.online(now) is True
 
     def online(self, now: float) -> bool | None:
-        """Whether people are told that it is there."""
+        """True if people are told that it is there."""
         return self.liveness.online_to_people(now)
 
     @property
     def script(self) -> str:
-        """It is what people call the script that may move it; empty: none does."""
+        """The name for people of the script that may move it; empty: none does."""
         status = self.autonomy
         if status is None or not status.running or status.drives is False:
             return ""
@@ -298,7 +298,7 @@ class RobotView:
 
     @property
     def itself(self) -> str:
-        """It is the sentence that says that it drives itself; empty: a person drives, or nobody."""
+        """The sentence that says that it drives itself; empty: a person drives, or nobody."""
         waits = self.latched or (self.autonomy is not None and self.autonomy.overridden is True)
         return words("itself", self.name, script=self.script) if self.script and not waits else ""
 

@@ -1,4 +1,4 @@
-"""What counts in a trial, of what its operator sent and received. Pure; all times are ns of CLOCK_MONOTONIC.
+"""Measures of a trial, by what its operator sent and received. Pure; all times are ns of CLOCK_MONOTONIC.
 
 Late is not lost: sound captured in a window counts as delivered if it arrived before the trial's end; its delay is in
 the latencies.

@@ -17,7 +17,7 @@ class Device(Protocol):
 
 
 class Bus:
-    """One bus of a board. ``fail`` makes a device stop acknowledging until ``restore``."""
+    """A bus of a board. ``fail`` makes a device stop acknowledging until ``restore``."""
 
     def __init__(self) -> None:
         self._devices: dict[int, Device] = {}
