@@ -145,6 +145,11 @@ DRIVER: Rows = {
         close("b"); key("Escape"); const chosen = done.length;
         driver.escapes.pressedAt = -Infinity; close("b"); key("Escape"); result = [chosen, ...done];""",
         [0, "estop: Escape twice"]),
+    "full screen whose end is told twice was ended by one Escape": ("""
+        driver.escapes.fullScreenChanged(); driver.escapes.fullScreenChanged(); const once = done.length;
+        document.fullscreenElement = {}; driver.escapes.fullScreenChanged();
+        document.fullscreenElement = null; driver.escapes.fullScreenChanged(); result = [once, ...done];""",
+        [0, "estop: Escape twice"]),
     "a space bar that is held stops again and again": (
         "key('Space'); key('Space', { repeat: true }); await null;", ["stop", "stop", "ended", "ended"]),
     "a space bar that is held on a button stops once": ("""

@@ -300,7 +300,7 @@ def test_screen(show: Show, axe: str, screen: Screen, size: Size) -> None:
             opened.page.screenshot(path=PICTURES / f"{screen.name}-{size}-{theme}.png")
             problems += [f"{theme}: {violation}" for violation in _violations(opened.page, axe)]
         problems += [one for one in opened.complaints() if MEANT.get(screen.state, "\0") not in one]
-        assert problems == []
+        assert not problems, "\n".join(problems)
 
 
 def _wait(opened: Tab, text: str) -> None:
@@ -336,6 +336,7 @@ _NEAR = """([selector, offset]) => {
   const around = (low, high) => [low - 23, low - 12, low - 2, high + 2, high + 12, high + 23];
   const along = (low, high) => Array.from({ length: Math.floor((high - low) / 5) + 1 }, (_, i) => low + 5 * i);
   for (const stop of document.querySelectorAll(".stop")) {
+    if (!stop.checkVisibility({ visibilityProperty: true })) continue;
     const { left, right, top, bottom } = stop.getBoundingClientRect();
     if (bottom < 0 || top > innerHeight) continue;
     const places = along(left - 23, right + 23).flatMap((x) => around(top, bottom).map((y) => [x, y]));
@@ -352,6 +353,7 @@ _DRAWN_NEAR = """(selector) => {
   scrollTo(0, 0);
   const found = [];
   for (const stop of document.querySelectorAll(".stop")) {
+    if (!stop.checkVisibility({ visibilityProperty: true })) continue;
     const a = stop.getBoundingClientRect();
     for (const other of document.querySelectorAll(selector)) {
       const b = other.getBoundingClientRect();
@@ -368,6 +370,7 @@ _DRAWN_NEAR = """(selector) => {
 _SCROLLS_NEAR = """(selector) => {
   const found = [];
   for (const stop of document.querySelectorAll(".stop")) {
+    if (!stop.checkVisibility({ visibilityProperty: true })) continue;
     const a = stop.getBoundingClientRect();
     for (const other of document.querySelectorAll("body *")) {
       if (other.scrollHeight <= other.clientHeight || !other.checkVisibility()) continue;

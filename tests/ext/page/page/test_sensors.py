@@ -94,6 +94,15 @@ def test_a_plot_is_drawn_up_to_now_and_its_newest_value_is_text(sensors: Tab) ->
     assert [" ".join(text.split()) for text in texts] == ["battery 7.92 V"]
 
 
+@pytest.mark.parametrize("language", ["C", "en-US@posix"])
+def test_plots_are_drawn_where_the_language_has_a_name_that_browsers_do_not_know(show: Show, language: str) -> None:
+    named = f"Object.defineProperty(Navigator.prototype, 'language', {{ get: () => {language!r} }})"
+    with show(SENSORS, script=named) as opened:
+        see(opened, "plot-battery")
+        assert opened.until("document.querySelector('[data-test=plot-battery] canvas') !== null")
+        assert opened.complaints() == []
+
+
 def test_the_map_has_the_trail_and_the_component_in_its_middle(sensors: Tab) -> None:
     see(sensors, "map")
     assert sensors.until(lambda: trail(sensors, "middle") > 30)
@@ -201,6 +210,15 @@ def test_a_snapshot_is_what_is_on_the_canvas_under_its_time(show: Show) -> None:
         taken = time.mktime(time.strptime(name, "goob-%Y-%m-%dT%H-%M-%S.png"))
         assert abs(time.time() - taken) < 10
         assert opened.complaints() == []
+
+
+def test_a_snapshot_that_would_be_noise_is_not_saved(show: Show) -> None:
+    """As Firefox reads canvases where it resists fingerprinting."""
+    noise = """OffscreenCanvasRenderingContext2D.prototype.getImageData = (x, y, width, height) =>
+      new ImageData(crypto.getRandomValues(new Uint8ClampedArray(4 * width * height)), width, height)"""
+    with show(STATES["driving"], script=noise) as opened:
+        opened.test("snapshot").click()
+        assert opened.until("document.body.innerText.includes('Not saved: this browser gives pages other pictures')")
 
 
 # -- the robot's own stream

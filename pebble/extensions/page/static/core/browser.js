@@ -94,3 +94,8 @@ export const webSocket = (path) =>
 
 /** @param {string} name of a class or function @returns {any} undefined: it is not here */
 export const find = (name) => attempt(() => globalThis[name], undefined);
+
+// uPlot writes numbers in the browser's language, which some systems call "C" or "en-US@posix": no browser knows these.
+if (!attempt(() => new Intl.NumberFormat(navigator.language), null)) {
+  attempt(() => Object.defineProperty(navigator, "language", { value: "en" }), null);
+}

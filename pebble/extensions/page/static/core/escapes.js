@@ -9,6 +9,7 @@ export class Escapes {
   constructor(onTwice) {
     this.onTwice = onTwice;
     this.pressedAt = -Infinity;
+    this.isFull = true; // as far as it was told
     /** @type {{value: string} | null} */
     this.list = null; // that is open
     this.value = ""; // as it was when it was opened
@@ -20,10 +21,11 @@ export class Escapes {
     this.pressedAt = now;
   }
 
-  /** To be called when full screen has begun or ended. */
+  /** To be called when full screen has begun or ended. WebKit says twice that it ended if that came with its begin. */
   fullScreenChanged() {
     const { on, left } = browser.fullScreen;
-    if (!on && !left) this.press();
+    if (this.isFull && !on && !left) this.press();
+    this.isFull = on;
   }
 
   /** To be called every 50 ms: nothing tells that a list has closed. */

@@ -104,6 +104,7 @@ export function Marks({ source }) {
 
 /** Save what is on the canvas, under the time at which it was taken; returns the file's name. */
 export async function snapshot(video, store, source) {
+  if (!readsPixels()) throw new Error("this browser gives pages other pictures than they draw: allow it for this page");
   const name = fileName(source, store.now() - video.age().ms);
   const blob = await new Promise((resolve) => video.canvas.toBlob(resolve, "image/png"));
   if (!blob) throw new Error("this browser makes no PNG of it");
@@ -113,6 +114,15 @@ export async function snapshot(video, store, source) {
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
   return name;
+}
+
+/** Whether what is drawn is read back as it was: browsers that resist fingerprinting give noise. */
+function readsPixels() {
+  const context = new OffscreenCanvas(8, 8).getContext("2d");
+  context.fillStyle = "rgb(40 90 200)";
+  context.fillRect(0, 0, 8, 8);
+  const { data } = context.getImageData(0, 0, 8, 8);
+  return data.every((value, at) => Math.abs(value - [40, 90, 200, 255][at % 4]) < 9);
 }
 
 /** @param {string} source @param {number} ms epoch @returns {string} goob-2026-05-01T12-03-41.png, in local time */

@@ -1,0 +1,218 @@
+"""Browsers beside Chromium: Debian's Firefox by WebDriver BiDi, and WebKitGTK by its WebDriver."""
+
+from __future__ import annotations
+
+import base64
+import http.client
+import itertools
+import json
+import os
+import re
+import shutil
+import signal
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+from tests.support import Child, free_port, listening, until
+
+#: Keys that a character cannot name, as WebDriver has them (W3C WebDriver, 17.4.2).
+KEYS = {"Escape": "\ue00c", "Enter": "\ue007", "Control": "\ue009", "Meta": "\ue03d", "Space": " "}
+SIZE = (1280, 800)
+_WAIT_S = 20.0
+
+
+class Engine(ABC):
+    """One window of a browser that shows one page."""
+
+    name: str
+
+    @abstractmethod
+    def open(self, url: str) -> None:
+        """Show ``url``; return once it has been loaded."""
+
+    @abstractmethod
+    def evaluate(self, expression: str) -> Any:
+        """Return the value of a JavaScript expression; a promise is awaited."""
+
+    @abstractmethod
+    def perform(self, actions: list[dict[str, Any]]) -> None:
+        """Perform input as WebDriver's actions describe it, then release everything that is pressed."""
+
+    @abstractmethod
+    def picture(self) -> bytes:
+        """Return the window as PNG."""
+
+    def until(self, expression: str, timeout: float = _WAIT_S) -> bool:
+        """Wait until an expression is true; assert on the result."""
+        return until(lambda: self.evaluate(f"Boolean({expression})"), timeout)
+
+    def press(self, chord: str) -> None:
+        """Press keys together, such as "Control+Enter"."""
+        codes = [KEYS.get(key, key) for key in chord.split("+")]
+        keys = [{"type": "keyDown", "value": code} for code in codes]
+        keys += [{"type": "keyUp", "value": code} for code in reversed(codes)]
+        self.perform([{"type": "key", "id": "keys", "actions": keys}])
+
+    def hold(self, key: str, ms: int) -> None:
+        """Hold a key for some milliseconds."""
+        steps = [{"type": "keyDown", "value": key}, {"type": "pause", "duration": ms}, {"type": "keyUp", "value": key}]
+        self.perform([{"type": "key", "id": "keys", "actions": steps}])
+
+    def click(self, selector: str, hold_ms: int = 0) -> None:
+        """Press the middle of an element that is shown with the mouse."""
+        found = f"[...document.querySelectorAll({json.dumps(selector)})].find((one) => one.getClientRects().length)"
+        assert self.until(found), f"{self.name} shows no {selector}"
+        middle = f"(({{ x, y, width, height }}) => [x + width / 2, y + height / 2])({found}.getBoundingClientRect())"
+        x, y = self.evaluate(f"({found}.scrollIntoView({{ block: 'nearest' }}), {middle})")
+        steps: list[dict[str, Any]] = [
+            {"type": "pointerMove", "x": int(x), "y": int(y)},
+            {"type": "pointerDown", "button": 0},
+            {"type": "pause", "duration": hold_ms},
+            {"type": "pointerUp", "button": 0},
+        ]
+        self.perform([{"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}, "actions": steps}])
+
+
+class Firefox(Engine):
+    """Debian's Firefox without a window, by the protocol that it speaks itself."""
+
+    name = "Firefox"
+
+    def __init__(self, connection: ClientConnection) -> None:
+        self._connection, self._numbers = connection, itertools.count(1)
+        self._send("session.new", capabilities={})
+        self._context = self._send("browsingContext.create", type="tab")["context"]
+        viewport = dict(zip(("width", "height"), SIZE, strict=True))
+        self._send("browsingContext.setViewport", context=self._context, viewport=viewport)
+
+    def open(self, url: str) -> None:
+        self._send("browsingContext.navigate", context=self._context, url=url, wait="complete")
+
+    def evaluate(self, expression: str) -> Any:
+        answer = self._send(
+            "script.evaluate",
+            expression=f"(async () => JSON.stringify(await ({expression})))()",
+            target={"context": self._context},
+            awaitPromise=True,
+            userActivation=True,
+        )
+        assert answer["type"] == "success", answer["exceptionDetails"]["text"]
+        return json.loads(answer["result"].get("value", "null"))
+
+    def perform(self, actions: list[dict[str, Any]]) -> None:
+        self._send("input.performActions", context=self._context, actions=actions)
+        self._send("input.releaseActions", context=self._context)
+
+    def picture(self) -> bytes:
+        return base64.b64decode(self._send("browsingContext.captureScreenshot", context=self._context)["data"])
+
+    def _send(self, method: str, **parameters: Any) -> Any:
+        """Return the result of a command."""
+        number = next(self._numbers)
+        self._connection.send(json.dumps({"id": number, "method": method, "params": parameters}))
+        while True:
+            answer = json.loads(self._connection.recv(60))
+            if answer.get("id") == number:
+                assert answer["type"] == "success", f"{method}: {answer.get('message')}"
+                return answer["result"]
+
+
+class WebKit(Engine):
+    """WebKitGTK's own small browser, by its WebDriver."""
+
+    name = "WebKitGTK"
+
+    def __init__(self, port: int, browser: str) -> None:
+        self._connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+        options = {"binary": browser, "args": ["--automation"]}
+        self._path = ""
+        session = self._send("POST", "/session", capabilities={"alwaysMatch": {"webkitgtk:browserOptions": options}})
+        self._path = f"/session/{session['sessionId']}"
+        self._send("POST", "/window/rect", width=SIZE[0], height=SIZE[1])
+
+    def open(self, url: str) -> None:
+        self._send("POST", "/url", url=url)
+
+    def evaluate(self, expression: str) -> Any:
+        script = f"""const done = arguments[0];
+            (async () => ({expression}))().then((value) => done([value]), (error) => done(String(error)))"""
+        answer = self._send("POST", "/execute/async", script=script, args=[])
+        assert isinstance(answer, list), answer
+        return answer[0]
+
+    def perform(self, actions: list[dict[str, Any]]) -> None:
+        self._send("POST", "/actions", actions=actions)
+        self._send("DELETE", "/actions")
+
+    def picture(self) -> bytes:
+        return base64.b64decode(self._send("GET", "/screenshot"))
+
+    def close(self) -> None:
+        self._send("DELETE", "")
+        self._connection.close()
+
+    def _send(self, method: str, path: str, **body: Any) -> Any:
+        """Return the value of the answer."""
+        text = json.dumps(body) if method == "POST" else None
+        self._connection.request(method, self._path + path, text, {"content-type": "application/json"})
+        value = json.loads(self._connection.getresponse().read())["value"]
+        assert not (isinstance(value, dict) and "error" in value), value
+        return value
+
+
+@contextmanager
+def firefox(folder: Path, preferences: Mapping[str, object]) -> Iterator[Firefox]:
+    """A Firefox with a new profile in ``folder``."""
+    program = shutil.which("firefox-esr") or pytest.skip("no Firefox: apt install firefox-esr")
+    lines = [f"user_pref({json.dumps(key)}, {json.dumps(value)});\n" for key, value in preferences.items()]
+    (folder / "user.js").write_text("".join(lines))
+    command = [program, "--headless", "--no-remote", "--profile", str(folder), "--remote-debugging-port", "0"]
+    with running(command, folder / "output") as output:
+        found = lambda: re.search(r"BiDi listening on (ws://\S+)", output.read_text(errors="replace"))
+        assert until(lambda: found() is not None, 60), output.read_text(errors="replace")
+        match = found()
+        assert match is not None
+        with connect(f"{match[1]}/session", max_size=None, open_timeout=30) as connection:
+            yield Firefox(connection)
+
+
+@contextmanager
+def webkit(folder: Path, language: str) -> Iterator[WebKit]:
+    """WebKitGTK's browser on a screen that nobody sees, with everything that it stores in ``folder``."""
+    browsers = sorted(Path("/usr/lib").glob("*/webkit2gtk-4.*/MiniBrowser"))
+    if not browsers or not shutil.which("WebKitWebDriver") or not shutil.which("Xvfb"):
+        pytest.skip("no WebKitGTK: apt install webkit2gtk-driver xvfb")
+    port = free_port()
+    with ExitStack() as stack:
+        screen = ["Xvfb", "-displayfd", "1", "-nolisten", "tcp", "-screen", "0", "1400x1000x24"]
+        number = stack.enter_context(running(screen, folder / "display"))
+        assert until(lambda: number.read_text().endswith("\n"), 20), "Xvfb did not start"
+        homes = {name: str(folder) for name in ("HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME")}
+        environment = {**os.environ, **homes, "DISPLAY": f":{number.read_text().strip()}", "LC_ALL": language}
+        environment |= {"NO_AT_BRIDGE": "1", "LIBGL_ALWAYS_SOFTWARE": "1"}
+        driver = ["WebKitWebDriver", "--host=127.0.0.1", f"--port={port}"]
+        stack.enter_context(running(driver, folder / "driver", environment))
+        assert until(lambda: listening(port), 20), "WebKitWebDriver did not start"
+        yield stack.enter_context(closing(WebKit(port, str(browsers[-1]))))
+
+
+@contextmanager
+def running(command: list[str], output: Path, env: Mapping[str, str] | None = None) -> Iterator[Path]:
+    """A program and all that it starts; yields the file with its output."""
+    with output.open("wb") as file:
+        process = Child(command, stdout=file, stderr=file, env=env, start_new_session=True)
+    try:
+        yield output
+    finally:
+        process.terminate()
+        try:
+            process.wait(10)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
