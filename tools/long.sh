@@ -13,7 +13,7 @@ make long PART=stops      400 random schedules of people, stops, scripts and fau
 make long PART=soak       floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport
 make long PART=schedules  random schedules in virtual time, an hour
 make long PART=page       every state, card, interruption and finger at the operator page in Chromium, 25 minutes
-make long PART=engines    drive and stop a robot at the operator page in Firefox and WebKitGTK, four minutes
+make long PART=engines    drive and stop a robot at the page in Firefox and WebKitGTK, two minutes
 make long PART=looks      store anew how the page looks, for PART=page to compare; look at the pictures, a minute
 make long PART=fleet      brokers and hubs that are killed, hung and cut off under driven robots and 300 boards, 16 minutes
 make long PART=brokers    install NATS, RabbitMQ and aedes where possible, test robots with them, judge them, seven minutes

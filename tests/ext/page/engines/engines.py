@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import signal
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -65,11 +66,16 @@ class Engine(ABC):
         self.perform([{"type": "key", "id": "keys", "actions": steps}])
 
     def click(self, selector: str, hold_ms: int = 0) -> None:
-        """Press the middle of an element that is shown with the mouse."""
+        """Press the middle of an element with the mouse, once it is shown and rests."""
         found = f"[...document.querySelectorAll({json.dumps(selector)})].find((one) => one.getClientRects().length)"
         assert self.until(found), f"{self.name} shows no {selector}"
         middle = f"(({{ x, y, width, height }}) => [x + width / 2, y + height / 2])({found}.getBoundingClientRect())"
-        x, y = self.evaluate(f"({found}.scrollIntoView({{ block: 'nearest' }}), {middle})")
+        self.evaluate(f"void {found}.scrollIntoView({{ block: 'nearest' }})")
+        places = [self.evaluate(middle)]
+        while len(places) < 2 or places[-1] != places[-2]:
+            time.sleep(0.15)
+            places.append(self.evaluate(middle))
+        x, y = places[-1]
         steps: list[dict[str, Any]] = [
             {"type": "pointerMove", "x": int(x), "y": int(y)},
             {"type": "pointerDown", "button": 0},

@@ -107,7 +107,7 @@ WHERE: dict[str, Callable[[Engine], object]] = {
 CHORDS = {"Ctrl+Enter": 1, "⌘+Enter": 1, "Ctrl+Space": 1, "Escape": 2}
 
 
-@pytest.mark.parametrize(("where", "chord"), itertools.product(WHERE, CHORDS))
+@pytest.mark.parametrize(("where", "chord"), list(itertools.product(WHERE, CHORDS)))
 def test_the_keys_of_a_stop_work(engine: Engine, served: Served, robot: RecordingRobot, where: str, chord: str) -> None:
     shown(engine, served, robot)
     WHERE[where](engine)
