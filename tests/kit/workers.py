@@ -21,7 +21,6 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
-from types import SimpleNamespace
 from typing import Any, NamedTuple, cast
 
 import pytest
@@ -83,6 +82,8 @@ class Workers:
         finally:
             for connection in list(self._workers):
                 self._reap(connection)
+        if left := sum(len(module) for lane in (background, *others, solo) for module in lane.modules):
+            raise session.Failed(f"{left} tests did not run: the processes that should have run them died")
         return True
 
     @pytest.hookimpl(trylast=True)
@@ -201,6 +202,13 @@ def scopes(item: pytest.Item) -> set[str]:
     return {one[-1].scope for one in cast(Any, item)._fixtureinfo.name2fixturedefs.values()}
 
 
+class Terminal:
+    """What pytest's configuration looks for where its reporter was."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self._tw = config.get_terminal_writer()
+
+
 class Reports:
     """Sends reports to the process that collected the tests."""
 
@@ -217,10 +225,10 @@ def work(session: pytest.Session, connection: Connection) -> None:
     """Run what the other process sends, in a worker."""
     config = session.config
     plugins = config.pluginmanager
-    writer = SimpleNamespace(_tw=config.get_terminal_writer())  # where config looks for it
+    terminal = Terminal(config)
     for name in ("workers", "terminalreporter"):
         plugins.unregister(name=name)
-    plugins.register(writer, "terminalreporter")
+    plugins.register(terminal, "terminalreporter")
     plugins.register(Reports(config, connection))
     if capture := plugins.getplugin("capturemanager"):  # into files of its own
         capture.stop_global_capturing()

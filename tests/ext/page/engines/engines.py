@@ -65,8 +65,8 @@ class Engine(ABC):
         steps = [{"type": "keyDown", "value": key}, {"type": "pause", "duration": ms}, {"type": "keyUp", "value": key}]
         self.perform([{"type": "key", "id": "keys", "actions": steps}])
 
-    def click(self, selector: str, hold_ms: int = 0) -> None:
-        """Press the middle of an element with the mouse, once it is shown and rests."""
+    def click(self, selector: str, hold_ms: int = 0, pointer: str = "mouse") -> None:
+        """Press the middle of an element with the mouse or by "touch", once it is shown and rests."""
         found = f"[...document.querySelectorAll({json.dumps(selector)})].find((one) => one.getClientRects().length)"
         assert self.until(found), f"{self.name} shows no {selector}"
         middle = f"(({{ x, y, width, height }}) => [x + width / 2, y + height / 2])({found}.getBoundingClientRect())"
@@ -82,7 +82,7 @@ class Engine(ABC):
             {"type": "pause", "duration": hold_ms},
             {"type": "pointerUp", "button": 0},
         ]
-        self.perform([{"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}, "actions": steps}])
+        self.perform([{"type": "pointer", "id": pointer, "parameters": {"pointerType": pointer}, "actions": steps}])
 
 
 class Firefox(Engine):
@@ -94,7 +94,11 @@ class Firefox(Engine):
         self._connection, self._numbers = connection, itertools.count(1)
         self._send("session.new", capabilities={})
         self._context = self._send("browsingContext.create", type="tab")["context"]
-        viewport = dict(zip(("width", "height"), SIZE, strict=True))
+        self.resize(*SIZE)
+
+    def resize(self, width: int, height: int) -> None:
+        """Give the page this many CSS pixels."""
+        viewport = {"width": width, "height": height}
         self._send("browsingContext.setViewport", context=self._context, viewport=viewport)
 
     def open(self, url: str) -> None:

@@ -16,7 +16,7 @@ from tests.support import Broker, until
 
 pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
 
-_QUIET = {
+QUIET = {
     "app.update.enabled": False,
     "browser.shell.checkDefaultBrowser": False,
     "browser.startup.homepage_override.mstone": "ignore",
@@ -34,7 +34,7 @@ _NUMBERS = itertools.count(1)
 @pytest.fixture(scope="module", params=["Firefox", "WebKitGTK"])
 def engine(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
     folder = tmp_path_factory.mktemp(request.param)
-    with firefox(folder, _QUIET) if request.param == "Firefox" else webkit(folder, "C") as running:
+    with firefox(folder, QUIET) if request.param == "Firefox" else webkit(folder, "C") as running:
         yield running
 
 
@@ -73,7 +73,7 @@ def test_a_person_drives_and_stops_a_robot(engine: Engine, served: Served, robot
 
 def test_letters_of_26_pixels_cut_no_state(served: Served, robot: RecordingRobot, tmp_path: Path) -> None:
     """As somebody sees them who has set the smallest size of letters."""
-    with firefox(tmp_path, _QUIET | {f"font.minimum-size.x-{group}": 26 for group in ("western", "unicode")}) as engine:
+    with firefox(tmp_path, QUIET | {f"font.minimum-size.x-{group}": 26 for group in ("western", "unicode")}) as engine:
         shown(engine, served, robot)
         bottom = "document.querySelector('.picker {}').getBoundingClientRect().bottom"
         assert engine.until("document.querySelector('.picker').innerText.includes('online')")
