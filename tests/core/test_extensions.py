@@ -180,7 +180,7 @@ OBJECT = "from pebble.extension import *\nEXTENSION = Extension(name='lamp', pac
         ("1 / 0  # EXTENSION", "ZeroDivisionError: division by zero"),
         ("EXTENSION = 1", "its EXTENSION is no pebble.extension.Extension"),
         ("EXTENSION = exit(0)", "SystemExit: 0"),
-        (" " * 1_000_001, "{folder}/lamp.py has 1000001 bytes"),
+        pytest.param(" " * 1_000_001, "{folder}/lamp.py has 1000001 bytes", id="a megabyte"),
         (
             OBJECT % "sections=['lamp']",
             "its EXTENSION is not as pebble.extension has it: Expected `object`, got `array`",

@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.page, pytest.mark.timeout(600)]
 
 _TOUCH = {"dom.w3c_touch_events.enabled": 1}
 _ERRORS = """void (globalThis.complaints = [],
-  addEventListener("error", (event) => complaints.push(event.message)),
+  addEventListener("error", ({ message }) => message.startsWith("ResizeObserver loop") || complaints.push(message)),
   addEventListener("unhandledrejection", (event) => complaints.push(String(event.reason))))"""
 #: Where the parts of the header lie, and whether a press on STOP reaches it.
 _HEADER = """[...document.querySelectorAll(".top .stop")].map((stop) => {
@@ -93,3 +93,15 @@ def test_a_visitor_sees_drives_stops_and_starts_a_script(
         visitor.presses("[data-test=reset-hold]", 2000)
         visitor.sees(f"!{stopped}")
         visitor.did("it is reset")
+        if size[0] < 600:
+            visitor.presses("[data-test=tab-more]")
+        visitor.presses("[data-test=script-apriltag-follow]")
+        visitor.presses("[data-test=start-script]:enabled")
+        visitor.sees("document.querySelector('[data-test=script-state]').innerText.includes('runs')")
+        visitor.did("a script runs")
+        visitor.presses("[data-test=end-script]")
+        visitor.sees("document.querySelector('[data-test=script-state]').innerText.includes('No script runs')")
+        visitor.presses("[href*='/replay/']")
+        visitor.arrives()
+        visitor.sees("pebble.replay?.video.info")
+        visitor.did("its recording is open")
