@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from pebble.config import load
+from pebble.media.frames import Frame, FrameReader
 from pebble.ownership import others_in
 from pebble.services.av_daemon.config import AvDaemon
-from pebble.transports.frames import Frame, FrameReader
 from pebble.transports.segments import SHM
 
 

@@ -10,9 +10,9 @@ from pebble.version import __version__ as __version__
 public_names.install()
 
 if TYPE_CHECKING:
-    from pebble.cameras import camera as camera
     from pebble.contract import Channel as Channel
     from pebble.contract import Kind as Kind
+    from pebble.extensions.media.cameras import camera as camera
     from pebble.extensions.scripts.script import Robot as Robot
     from pebble.extensions.scripts.script import Stopped as Stopped
     from pebble.extensions.scripts.script import run as run

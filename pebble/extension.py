@@ -95,6 +95,7 @@ class Program(Struct, frozen=True):
     preloaded: bool = True  # False: its imports are needed by few, and would cost every process their memory
     entry: str = ""  # what the package that is run begins with; "": the module is no package
     shares: tuple[str, ...] = ()  # modules that several programs use, imported before the first fork
+    has_sockets: bool = False  # opens sockets in the run directory, whose path must then be short
     stop_timeout_s: float = 10.0  # after this an on-demand program that was released is killed
     webrtc_url: str | None = None  # where pages show its pictures
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from types import CodeType, ModuleType
 
 PUBLIC = {
+    "pebble.cameras": "pebble.extensions.media.cameras",
     "pebble.script": "pebble.extensions.scripts.script",
     "pebble.scripts": "pebble.extensions.scripts.shipped",
     "pebble.perception": "pebble.extensions.scripts.perception",

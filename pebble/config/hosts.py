@@ -75,12 +75,6 @@ def endpoint(text: str) -> str:
     return text
 
 
-def check_web_url(text: str) -> None:
-    """Raise HostError for ``http://`` or ``https://`` without a host that is one. ``text`` holds no login."""
-    if text.lower().startswith(("http://", "https://")):
-        split(text)
-
-
 def no_login(text: str) -> str:
     """Return a name, which is published and logged. Raises HostError for a login, as ``user:password@`` is."""
     if without_secrets(text) != text:

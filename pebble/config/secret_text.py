@@ -48,15 +48,3 @@ def shown_user(name: str) -> str:
     """Return a user name for messages; a password that was written behind it is hidden."""
     user, colon, _ = without_secrets(name).partition(":")
     return f"{user}:{HIDDEN}" if colon else user
-
-
-def without_login(url: str) -> str:
-    """``url`` without its user and password, where they can be told from its path."""
-    before, slashes, after = url.partition("://")
-    authority = re.match(r"[^/?#\s]*", after)
-    place = authority[0] if authority else ""
-    if "@" in place:
-        return f"{before}{slashes}{place.rpartition('@')[2]}{after[len(place) :]}"
-    if "@" not in after or not re.search(r":(?!\d*$)", place):
-        return url  # an @ behind the port is part of a path
-    return f"{before}{slashes}{after.rpartition('@')[2]}"  # the password has a slash

@@ -113,16 +113,6 @@ def parse_topic(topic: str) -> ParsedTopic | None:
     return _remembered(topic) if len(topic) <= _REMEMBERED_LENGTH else _parse(topic)
 
 
-def is_of_another(topic: str, base: str) -> bool:
-    """True if ``topic`` begins as the topics of another component do.
-
-    Capabilities may name any topic, and whoever publishes them need not be allowed to publish on it: a client that
-    believed them would drive another robot.
-    """
-    levels = topic.split("/", 3)
-    return len(levels) == 4 and "/".join(levels[:3]) != base
-
-
 def _parse(topic: str) -> ParsedTopic | None:
     levels = topic.split("/", 4)
     if len(levels) < 5 or levels[3] not in _DIRECTIONS or not levels[4]:

@@ -12,11 +12,9 @@ from msgspec import UNSET
 from pebble import contract as c
 from pebble.config import Config, SystemControl
 from pebble.contract import capabilities as offers
-from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import PebbleError
 from pebble.extension import call
-from pebble.runtime import pyav
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
 
@@ -36,8 +34,6 @@ def capabilities(
     value = offers.CapabilitiesValue(
         identity=_identity(config),
         transport=offers.TransportOffer(kind=config.transport.kind),
-        video=_video(config, addresses),
-        audio=_audio(config, addresses),
         soundboard=_files(addresses, c.SOUNDBOARD_COMMAND, c.SOUNDBOARD_FILES, c.SOUNDBOARD_STATUS),
         autonomy=_files(addresses, c.AUTONOMY_COMMAND, c.AUTONOMY_FILES, c.AUTONOMY_STATUS),
         system=_system(config, addresses),
@@ -63,39 +59,6 @@ def _identity(config: Config) -> offers.RobotIdentity:
     looks = {key: getattr(robot, key) for key in ("name", "description", "colour", "picture", "battery_cells")}
     given: dict[str, Any] = {key: value for key, value in looks.items() if value is not None}
     return offers.RobotIdentity(system=robot.system, type=robot.type, id=robot.id, **given)
-
-
-def _video(config: Config, addresses: Addresses) -> offers.VideoOffer:
-    sent = config.services.mqtt_bridge.media.video_publisher
-    return offers.VideoOffer(
-        available=False,
-        controls=False,
-        topic=addresses[c.CAMERA].topic,
-        command_topic=addresses[c.VIDEO_CONTROL].topic,
-        flag_topic=addresses[c.MQTT_VIDEO].topic,
-        overlays_topic=addresses[c.VIDEO_OVERLAYS].topic,
-        width=_first(sent.publish_width, sent.width),
-        height=_first(sent.publish_height, sent.height),
-        fps=_first(sent.publish_fps, sent.target_fps, sent.fps),
-        encoding=sent.encoding,
-        encodings=list(pyav.available(ALL_VIDEO)),
-    )
-
-
-def _audio(config: Config, addresses: Addresses) -> offers.AudioOffer:
-    sent = config.services.mqtt_bridge.media.audio_publisher
-    return offers.AudioOffer(
-        available=False,
-        controls=False,
-        topic=addresses[c.AUDIO].topic,
-        uplink_topic=addresses[c.AUDIO_STREAM].topic,
-        command_topic=addresses[c.AUDIO_CONTROL].topic,
-        flag_topic=addresses[c.MQTT_AUDIO].topic,
-        rate=sent.rate,
-        channels=sent.channels,
-        encoding=sent.encoding,
-        encodings=list(pyav.available(ALL_SOUND)),
-    )
 
 
 def _files(addresses: Addresses, command: c.Channel, files: c.Channel, status: c.Channel) -> offers.FilesOffer:
@@ -197,8 +160,3 @@ def _outlets(config: Config, found: Collection[str]) -> offers.OutletsOffer:
         offers.OutletOffer(name=name, controls="command_topic" in own, **own) for name, own in sorted(topics.items())
     ]
     return offers.OutletsOffer(available=bool(outlets), controls=any(one.controls for one in outlets), outlets=outlets)
-
-
-def _first(*values: float | None) -> float | None:
-    """Return the first that was set: 0 is a value."""
-    return next((value for value in values if value is not None), None)

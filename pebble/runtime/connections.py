@@ -27,7 +27,6 @@ ALL_VITAL = (*_VITAL_STATES, f"{_ANY}/{c.INCOMING}/#")
 
 LOCAL_RECONNECT_S, REMOTE_RECONNECT_S = 0.5, 2.0
 _BRIDGE, _STOPS = "remote-bridge", "remote-stops"
-_FRAMES = "pebble.transports.frames"  # makes sockets for pictures and sound
 #: RFC 4594: what must not wait, and what may be dropped last of what can. Where a link may be thin.
 _EXPEDITED, _ASSURED = 46, 10
 
@@ -51,7 +50,7 @@ def check_connections(config: Config) -> None:
         except TransportError as error:
             problems.append(f"{place}: {error}")
     added = programs_of(config.installed, config)
-    has_sockets = config.transport.kind == "zenoh" or any(_FRAMES in program.shares for program in added)
+    has_sockets = config.transport.kind == "zenoh" or any(program.has_sockets for program in added)
     if has_sockets and not fits_socket(config.run_dir() / LONGEST_SOCKET):
         problems.append(
             f"transport.run_dir: {config.run_dir()} is too long for the sockets in it, set it to a shorter path"

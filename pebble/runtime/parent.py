@@ -198,18 +198,3 @@ class Reported:
         """Report ``value`` if the launcher does not know it; call it regularly."""
         if value != self._known and self._send(*value):
             self._known = value
-
-
-class ProvidedFeatures:
-    """What this process provides at present, reported to the launcher: call :meth:`report` regularly."""
-
-    def __init__(self, notifier: Notifier) -> None:
-        self.names: set[str] = set()  # change it at will
-        self._notifier = notifier
-        self._reported: set[str] = set()
-
-    def report(self) -> None:
-        """Report what has changed, also what the launcher was too busy for before."""
-        for name in sorted(self._reported ^ self.names):
-            if self._notifier.feature(name, name in self.names):
-                self._reported ^= {name}

@@ -12,7 +12,7 @@ from typing import IO, TYPE_CHECKING
 
 from pebble.config import Config
 from pebble.errors import PebbleError
-from pebble.runtime.child import Child
+from pebble.extensions.media.child import Child
 from pebble.runtime.environment import child_environment
 from pebble.services.soundboard_handler.clips import Clip
 from pebble.services.soundboard_handler.config import SoundboardHandler

@@ -414,7 +414,7 @@ def test_a_program_is_started_as_the_table_says() -> None:
     assert (settings["run_dir"], settings["lease_ms"], settings["journal"]) == ("/run/rover", 700, "/robots/kept")
 
 
-MEDIA_MODULES = {"pebble.transports.frames", "pebble.extensions.media.sound"}
+MEDIA_MODULES = {"pebble.extensions.media.frames", "pebble.extensions.media.sound"}
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from pebble.config.tree import Root
 
 _ZENOH_ENCRYPTED = ("tls/", "quic/")
 _ZENOH_LOCAL = ("unixsock-stream/", "unixpipe/", "vsock/")
-_EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 -- compared only
 _BARE_HOST = re.compile(r"^[a-z0-9-]+/\[?([^\]/]*?)\]?(?::\d+)?(?:[?#].*)?$")
 
 
@@ -80,13 +79,6 @@ def zenoh_endpoints(root: Root) -> Iterator[tuple[Path, str]]:
         if isinstance(section, ZenohClient):
             for key in ("listen", "connect"):
                 yield from (((*path, key), endpoint) for endpoint in getattr(section, key, ()))
-
-
-def place_of_endpoint(endpoint: str) -> tuple[str, str]:
-    """Return host and port; all names of this machine are one."""
-    host, _, port = re.sub(r"[?#].*", "", endpoint.partition("/")[2]).rpartition(":")
-    host = host.strip("[]")
-    return ("" if host in _EVERYWHERE or is_loopback(host) else host), port
 
 
 def _is_near(endpoint: str) -> bool:

@@ -2,4 +2,6 @@
 
 from pebble.extension import Extension
 
-EXTENSION = Extension(name="media", extra="media", page="docs/ext/media.md")
+EXTENSION = Extension(
+    name="media", extra="media", offers="pebble.extensions.media.offers:offers", page="docs/ext/media.md"
+)

@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from pebble.contract.packets import SEQUENCE_LIMIT, Sound
 from pebble.errors import PayloadError
+from pebble.extensions.media.packets import SEQUENCE_LIMIT, Sound
 from pebble.extensions.media.pcm import Samples, to_bytes, to_int16
 from pebble.extensions.media.sound import ReceivedSound, SoundDecoder, unpack
 from pebble.transports.counters import Counters

@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
-from pebble.commands.options import Output, Quick, split_names
 from pebble.errors import PebbleError
+from pebble.extensions.operator.commands.options import Output, Quick, split_names
 
 FOLDER, REPORT = Path("bench-results"), Path("build/report")
 _LONGEST_S = 3600.0  # of one phase

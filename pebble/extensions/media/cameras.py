@@ -16,7 +16,7 @@ from pebble.config import default_run_folder, load
 from pebble.config.tree import Robot
 from pebble.contract.identity import Identity
 from pebble.errors import ConfigError, DeviceError, PayloadError, PebbleError
-from pebble.transports.frames import Frame, FrameReader
+from pebble.extensions.media.frames import Frame, FrameReader
 
 log = logging.getLogger(__name__)
 
