@@ -42,7 +42,7 @@ _IMPORT_S = 60.0  # for a stranger's module: large libraries take half of it on 
 _SECTION_KEY = re.compile(r"(services\.)?[A-Za-z]\w*", re.ASCII)
 #: Ours, those first that others use, with the keys of a config that belong to each. It is the order of their sections.
 OURS: Final[Mapping[str, tuple[str, ...]]] = {
-    "pebble.extensions.media": (),
+    "pebble.extensions.media": ("services.mqtt_bridge.media",),
     "pebble.extensions.paho": (),
     "pebble.extensions.operator": (),
     "pebble.extensions.scripts": (),

@@ -15,7 +15,7 @@ from msgspec.structs import asdict, fields, replace
 from pebble import extension
 from pebble.config import problems
 from pebble.config.home import in_home
-from pebble.config.masking import holds_secret, masked
+from pebble.config.masking import holds_secret, masked, values_of
 from pebble.config.problems import Note, Notes
 from pebble.config.raw import Pairs, decode, plain, read_text, with_instances, without
 from pebble.config.reader import Check, Reader, Rule
@@ -60,11 +60,7 @@ class Config(Root, frozen=True, kw_only=True):
 
     def section(self, kind: type[S]) -> S:
         """Return the section of an extension by its class; its defaults where the extension is not installed."""
-        for holder in (self.services, self):
-            for name in holder.__struct_fields__:
-                if isinstance(section := getattr(holder, name), kind):
-                    return section
-        return kind()
+        return next(values_of(self, kind), kind())
 
     def run_dir(self) -> Path:
         """Return the folder of this robot's sockets and locks, absolute; not created here."""

@@ -19,8 +19,8 @@ def values_of(section: object, kind: type[Value]) -> Iterator[Value]:
     if isinstance(section, kind):
         yield section
     elif isinstance(section, Section):
-        for field in fields(section):
-            yield from values_of(getattr(section, field.name), kind)
+        for name in section.__struct_fields__:
+            yield from values_of(getattr(section, name), kind)
     elif isinstance(section, dict):
         for item in section.values():
             yield from values_of(item, kind)

@@ -1,11 +1,11 @@
 """The sections of a robot's config file: every key with its default, its limits and its meaning."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from msgspec import Meta, defstruct, field
+from msgspec.structs import fields
 
-from pebble.config.media import Media
 from pebble.config.security import Security
 from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (
@@ -158,7 +158,7 @@ class MqttBridge(ServiceSection, frozen=True, kw_only=True):
     topics: Annotated[BridgeTopics, doc("Other names for topics.")] = BridgeTopics()
     heartbeat: Annotated[Heartbeat, doc("Sign of life.")] = Heartbeat()
     link: Annotated[Link, doc("A thin link.")] = Link()
-    media: Annotated[Media, doc("Pictures and sound, to and from operators.")] = Media()
+    media: Annotated[dict[str, Any], doc("Pictures and sound, to and from operators; an extension reads them.")] = EMPTY
     reboot_control: Annotated[
         SystemControl, doc("What `flags/reboot` runs, for example `systemctl --no-ask-password reboot`.")
     ] = SystemControl()
@@ -296,16 +296,18 @@ class Root(Section, frozen=True, kw_only=True):
 
 def tree_of(sections: Mapping[str, type[Section]]) -> type[Root]:
     """Return the class of a whole file with the sections of extensions, by key: ``services.lamp`` or ``lamp``."""
-    inner = {key.removeprefix("services."): kind for key, kind in sections.items() if key.startswith("services.")}
-    outer = {key: kind for key, kind in sections.items() if "." not in key}
-    services = _with(Services, inner)
-    tree: type[Root] = _with(
-        Root, outer, ("services", Annotated[services, doc("One section per service.")], services())
-    )
+    tree: type[Root] = _with(Root, sections)
     return tree
 
 
-def _with(kind: type[Section], sections: Mapping[str, type[Section]], *fields: Any) -> Any:
-    added = [(name, Annotated[section, doc(section.meaning())], section()) for name, section in sections.items()]
+def _with(kind: type[Section], sections: Mapping[str, type[Section]]) -> Any:
+    """Return ``kind`` with more sections; a dotted key is one of its own sections."""
+    added = [(key, Annotated[section, doc(section.meaning())]) for key, section in sections.items() if "." not in key]
+    for own in fields(kind):
+        inner = {key.partition(".")[2]: section for key, section in sections.items() if key.startswith(f"{own.name}.")}
+        if inner:
+            section, *metas = get_args(own.type)
+            added.append((own.name, Annotated[_with(section, inner), *metas]))
     names = {"__doc__": kind.__doc__, "__module__": kind.__module__}
-    return defstruct(kind.__name__, [*fields, *added], bases=(kind,), namespace=names, frozen=True, kw_only=True)
+    rows = [(name, annotation, get_args(annotation)[0]()) for name, annotation in added]
+    return defstruct(kind.__name__, rows, bases=(kind,), namespace=names, frozen=True, kw_only=True)

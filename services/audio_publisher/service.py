@@ -6,6 +6,7 @@ from typing import Any
 from pebble.contract import AUDIO, AUDIO_CONTROL, MEDIA_REPORT
 from pebble.contract.payloads import MediaReport, MediaRequest
 from pebble.errors import DeviceError, PebbleError
+from pebble.extensions.media.config import Media
 from pebble.extensions.media.frames import FrameInfo, FrameReader
 from pebble.extensions.media.rate_meter import RateMeter
 from pebble.extensions.media.sound import SOUND_ENCODINGS, SoundEncoder, make_sound_encoder, sequence_numbers
@@ -32,7 +33,7 @@ class AudioPublisher(Service):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._options = section = self.config.services.mqtt_bridge.media.audio_publisher
+        self._options = section = self.config.section(Media).audio_publisher
         self._stopping = False
         self._received_at = self.clock()
         self._remote = remote_transport(self.config, "audio-publisher")

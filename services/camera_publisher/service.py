@@ -6,6 +6,7 @@ from typing import Any
 from pebble.contract import CAMERA, MEDIA_REPORT, VIDEO_CONTROL
 from pebble.contract.payloads import MediaReport, MediaRequest
 from pebble.errors import DeviceError, PebbleError
+from pebble.extensions.media.config import Media
 from pebble.extensions.media.frames import FrameReader
 from pebble.extensions.media.frames.frame import Frame
 from pebble.extensions.media.rate_meter import RateMeter
@@ -37,7 +38,7 @@ class CameraPublisher(Service):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._options = video = self.config.services.mqtt_bridge.media.video_publisher
+        self._options = video = self.config.section(Media).video_publisher
         now = self.clock()
         self._fps = video.publish_fps or video.target_fps or video.fps or _FPS
         width, height = video.publish_width or video.width, video.publish_height or video.height

@@ -18,11 +18,11 @@ from msgspec.structs import asdict, replace
 
 from pebble.config import LAUNCHER_LOCK, Config, load, parse, resolved
 from pebble.config.config import file_name
-from pebble.config.media import Media
 from pebble.config.transport import Tls
 from pebble.config.tree import Heartbeat
 from pebble.contract import channel_of
 from pebble.errors import ConfigError
+from pebble.extensions.media.config import Media
 from pebble.extensions.page.config import WebHandler, WebInterface
 from pebble.extensions.recordings.config import Recorder
 from pebble.runtime.connections import hub_settings

@@ -3,5 +3,9 @@
 from pebble.extension import Extension
 
 EXTENSION = Extension(
-    name="media", extra="media", offers="pebble.extensions.media.offers:offers", page="docs/ext/media.md"
+    name="media",
+    extra="media",
+    sections={"services.mqtt_bridge.media": "pebble.extensions.media.config:Media"},
+    offers="pebble.extensions.media.offers:offers",
+    page="docs/ext/media.md",
 )

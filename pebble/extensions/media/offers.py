@@ -7,6 +7,7 @@ from pebble.config import Config
 from pebble.contract.capabilities import AudioOffer, CapabilitiesValue, VideoOffer
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
 from pebble.extensions.media import pyav
+from pebble.extensions.media.config import Media
 from pebble.runtime.addresses import Addresses
 
 
@@ -17,7 +18,7 @@ def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
 
 
 def _video(config: Config, addresses: Addresses) -> VideoOffer:
-    sent = config.services.mqtt_bridge.media.video_publisher
+    sent = config.section(Media).video_publisher
     return VideoOffer(
         topic=addresses[c.CAMERA].topic,
         command_topic=addresses[c.VIDEO_CONTROL].topic,
@@ -32,7 +33,7 @@ def _video(config: Config, addresses: Addresses) -> VideoOffer:
 
 
 def _audio(config: Config, addresses: Addresses) -> AudioOffer:
-    sent = config.services.mqtt_bridge.media.audio_publisher
+    sent = config.section(Media).audio_publisher
     return AudioOffer(
         topic=addresses[c.AUDIO].topic,
         uplink_topic=addresses[c.AUDIO_STREAM].topic,
