@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Annotated, Any, Final
+from functools import partial
+from typing import Annotated, Any, Final, NamedTuple
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -100,9 +101,7 @@ class _Listed(TyperCommand):
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         command = self._command(args)
         if extra.get("resilient_parsing"):  # for Tab
-            from pebble.commands.completion import complete_values
-
-            complete_values(command)
+            _complete_values(command)
         return command.make_context(info_name, args, parent, **extra)
 
     def _command(self, arguments: list[str]) -> Any:
@@ -123,6 +122,28 @@ class _Listed(TyperCommand):
         if isinstance(command, TyperGroup):
             command.commands.update(below)
         return command
+
+
+class _Completion(NamedTuple):
+    """A value, as a shell gets it."""
+
+    value: str
+    type: str = "plain"
+    help: str | None = None
+
+
+def _complete_values(command: Any) -> None:
+    """Let a command, and those below it, complete the values of arguments that extensions know by their names."""
+    places = {name: place for extension in ours() for name, place in extension.completions.items()}
+    for parameter in command.params:
+        if place := places.get(parameter.metavar or ""):
+            parameter.shell_complete = partial(_values, part(place))
+    for below in command.commands.values() if isinstance(command, TyperGroup) else ():
+        _complete_values(below)
+
+
+def _values(values: Callable[[Any], list[str]], context: Any, incomplete: str) -> list[_Completion]:
+    return [_Completion(value) for value in values(context) if value.startswith(incomplete)]
 
 
 def _run(arguments: list[str]) -> int:
