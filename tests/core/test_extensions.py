@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 
 from pebble.commands import app
 from pebble.config import load, parse
-from pebble.config.types import Section
+from pebble.config.types import Section, ServiceSection
 from pebble.errors import ConfigError
 from pebble.extension import OURS, Command, Extension, Stage, lacking_packages, ours, part, programs_of
 from pebble.launcher.capabilities import capabilities
@@ -61,11 +62,11 @@ class TestOurs:
         assert lacking_packages(extension) == []
 
     def test_a_config_that_enables_it_is_accepted(self, extension: Extension, tmp_path: Path) -> None:
-        raw: dict[str, Any] = {"robot": {"id": "goob"}, "services": {}}
-        for key in extension.sections:
-            name = key.removeprefix("services.")
-            target = raw["services"] if name != key else raw
-            target[name] = NEEDED.get(key, {}) | ({"enabled": True} if name != key else {})
+        raw: dict[str, Any] = {"robot": {"id": "goob"}}
+        for key, place in extension.sections.items():
+            *outer, name = key.split(".")
+            target = reduce(lambda section, step: section.setdefault(step, {}), outer, raw)
+            target[name] = NEEDED.get(key, {}) | ({"enabled": True} if issubclass(part(place), ServiceSection) else {})
         config = parse(raw, folder=tmp_path, env={})
         names = [program.name for program in programs_of([extension], config)]
         assert names == ([extension.program.name] if extension.program else [])
@@ -180,7 +181,6 @@ OBJECT = "from pebble.extension import *\nEXTENSION = Extension(name='lamp', pac
         ("1 / 0  # EXTENSION", "ZeroDivisionError: division by zero"),
         ("EXTENSION = 1", "its EXTENSION is no pebble.extension.Extension"),
         ("EXTENSION = exit(0)", "SystemExit: 0"),
-        (" " * 1_000_001, "{folder}/lamp.py has 1000001 bytes"),
         (
             OBJECT % "sections=['lamp']",
             "its EXTENSION is not as pebble.extension has it: Expected `object`, got `array`",
@@ -377,6 +377,7 @@ def test_root_runs_no_code_of_other_users(name: str, tmp_path: Path) -> None:
 
 WITHOUT = """
 import sys
+from functools import reduce
 from pathlib import Path
 sys.modules[{module!r}] = None
 from pebble.errors import ConfigError
@@ -385,15 +386,16 @@ from pebble.extension import OURS, ours
 from pebble.launcher.launcher import Launcher
 print(*(extension.name for extension in ours()))
 for key in OURS[{module!r}]:
-    name = key.removeprefix("services.")
-    section = {{"enabled": True}} if name != key else {{}}
-    raw = {{"robot": {{"id": "goob"}}, **({{"services": {{name: section}}}} if name != key else {{name: section}})}}
+    raw = {{"robot": {{"id": "goob"}}}}
+    *outer, name = key.split(".")
+    target = reduce(lambda section, step: section.setdefault(step, {{}}), outer, raw)
+    target[name] = {{"enabled": True}} if outer else {{}}
     try:
         parse(raw, folder=Path("/"), env={{}})
     except ConfigError as error:
         print(error)
-    if name != key:
-        raw["services"] = {{name: {{"enabled": False, "unknown": 1}}}}
+    if outer:
+        target[name] = {{"enabled": False, "unknown": 1}}
         parse(raw, folder=Path("/"), env={{}})
 """
 
