@@ -28,7 +28,7 @@ _FROM = {
 
 
 def __getattr__(name: str) -> Any:
-    """`from pebble import camera` imports what it needs only when it is used."""
+    """Import a public name when it is used: `from pebble import camera`."""
     if name in _FROM:
         from importlib import import_module
 

@@ -1,4 +1,4 @@
-"""Writes configs/schema.json for editors, and tables of all keys.
+"""The JSON Schema of configs for editors, and tables of all keys.
 
 Run ``python -m pebble.config.schema`` after every change of a section. With a folder it writes the tables there, which
 ``pebble check --keys`` prints.
@@ -73,7 +73,7 @@ def keys_text() -> str:
 
 
 def _chapters(kind: type[Section], path: str, places: dict[type[Section], str]) -> Iterator[str]:
-    """Yield one table per section, depth first; a kind of section used in several places has its table at the first."""
+    """Yield one table per section, depth first; a class of section has its table at the first place of use."""
     places[kind] = path
     inner: list[tuple[type[Section], str]] = []
     rows = []
@@ -109,7 +109,7 @@ def _meaning(field: FieldInfo) -> str:
 
 
 def _allowed(field: FieldInfo) -> str:
-    """Return the kind of value, in words, where the meaning does not show it."""
+    """Return the kind of value in words, unless the meaning shows it."""
     kind, metas = unwrap(field.type)
     if get_origin(kind) is tuple:
         return " A list."

@@ -135,7 +135,7 @@ _MEDIA_PROGRAMS = "the media services choose their programs, and services.mqtt_b
 
 
 class Link(Section, frozen=True, kw_only=True):
-    """What the way to the remote broker carries, and what is sent accordingly; `docs/thin-links.md` explains it."""
+    """The capacity of the way to the remote broker, and what is sent accordingly; `docs/thin-links.md` explains it."""
 
     profile: Annotated[
         Literal["wide", "thin", "auto"], doc("`wide`: it carries everything; `thin`: little; `auto`: by measurement.")
@@ -144,7 +144,7 @@ class Link(Section, frozen=True, kw_only=True):
 
     @property
     def slowest(self) -> LinkLevel:
-        """The level that it may come to, for those who wait for an answer over it and do not hear of its level."""
+        """The lowest level that the link may have: for programs that wait for an answer and do not know the level."""
         return "wide" if self.profile == "wide" else "thin"
 
 
@@ -186,7 +186,7 @@ class SerialPort(Section, frozen=True, kw_only=True):
 
 
 class SerialTelemetry(Section, frozen=True, kw_only=True):
-    """Which of the MCU's reports are published."""
+    """The MCU's reports that are published."""
 
     publish_touch_sensors: Annotated[bool, doc("Publish every touch report, up to 50 per second.")] = False
 
@@ -201,7 +201,7 @@ class OdometryRing(Section, frozen=True, kw_only=True):
 
 
 class SerialSafety(Section, frozen=True, kw_only=True):
-    """When the wheels are stopped."""
+    """Limits after which the wheels are stopped."""
 
     retired: ClassVar = {
         "ignore_retained_drive": "a retained drive command is stale: it is always refused",

@@ -1,4 +1,4 @@
-"""What a robot offers, with effective topics, from its config (paper A.8.6)."""
+"""The capabilities of a robot, with effective topics, from its config (paper A.8.6)."""
 
 from __future__ import annotations
 
@@ -24,11 +24,9 @@ log = logging.getLogger(__name__)
 def capabilities(
     config: Config, addresses: Addresses, lacking: Collection[str] = (), found: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Return the ``value`` of a capabilities message: ``available`` is what exists, ``controls`` what takes commands.
+    """Return the ``value`` of a capabilities message, completed by extensions.
 
-    Without extensions there are no pictures, sound, sounds and scripts: they complete the value.
-
-    ``lacking`` and ``found`` are what its processes report at present (pebble.launcher.features).
+    ``lacking`` and ``found`` are the features that its processes report now (pebble.launcher.features).
     """
     drive, estop, lights, telemetry = _motor(config, addresses, lacking)
     value = offers.CapabilitiesValue(
@@ -88,7 +86,7 @@ def _system(config: Config, addresses: Addresses) -> offers.SystemOffer:
 def _motor(
     config: Config, addresses: Addresses, lacking: Collection[str]
 ) -> tuple[offers.DriveOffer, offers.EstopOffer, offers.LightsOffer, offers.TelemetryOffer]:
-    """Drive, stop, lights and telemetry of the serial line to the motor MCU, with *its* effective topics."""
+    """Return drive, stop, lights and telemetry of the serial line to the motor MCU, with its effective topics."""
     lines, owned = config.motor_lines(), bool(config.motor_owners)
     present, moves = bool(lines), owned or bool(config.zeros)
     name, line = next(iter(lines.items())) if lines else ("", config.services.serial_mcu_bridge)
@@ -125,10 +123,7 @@ def _motor(
 
 
 def _estop(config: Config, owners: list[str]) -> offers.EstopOffer:
-    """Return where to stop the robot, and who then reports it as stopped.
-
-    If one owner lacks the stop, the robot does.
-    """
+    """Return the emergency stop: its topics, and the owners that confirm it; none if any of them lacks it."""
     return offers.EstopOffer(
         available=bool(owners),
         topic=c.ESTOP.topic(config.base),
@@ -140,23 +135,21 @@ def _estop(config: Config, owners: list[str]) -> offers.EstopOffer:
 
 
 def _imu(config: Config) -> tuple[bool, str]:
-    """Return an inertial sensor, known by its line's protocol or name; a self-describing MCU's manifest comes later."""
+    """Return whether there is an inertial sensor, by a line's protocol or name, and its topic."""
     lines = [name for name, line in config.serial_instances().items() if SERIAL_PROTOCOLS[line.protocol].has_imu(name)]
     addresses = Addresses(view_of(config, lines[0]) if lines else config)
     return bool(lines), addresses[c.IMU].topic
 
 
 def _outlets(config: Config, found: Collection[str]) -> offers.OutletsOffer:
-    """Return the outlets of self-describing MCUs that are connected now.
-
-    What reports its state, and what can be switched.
-    """
+    """Return the outlets of self-describing MCUs that are connected now, with the topics that they use."""
     topics: dict[str, dict[str, str]] = {}
     for key, channel in (("status_topic", c.OUTLET_STATUS), ("command_topic", c.OUTLET_COMMAND)):
         for feature in sorted(found):
             if name := channel.names(f"{config.base}/{channel.direction}/{feature}").get("outlet"):
                 topics.setdefault(name, {})[key] = channel.topic(config.base, outlet=name)
     outlets = [
-        offers.OutletOffer(name=name, controls="command_topic" in own, **own) for name, own in sorted(topics.items())
+        offers.OutletOffer(name=name, controls="command_topic" in used, **used) for name, used in sorted(topics.items())
     ]
-    return offers.OutletsOffer(available=bool(outlets), controls=any(one.controls for one in outlets), outlets=outlets)
+    controls = any(outlet.controls for outlet in outlets)
+    return offers.OutletsOffer(available=bool(outlets), controls=controls, outlets=outlets)

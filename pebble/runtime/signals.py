@@ -1,4 +1,4 @@
-"""The signals that end a program: waited for, handled in a ``with`` block, or turned into KeyboardInterrupt."""
+"""The signals that end a program: an event, a handler in a ``with`` block, or KeyboardInterrupt."""
 
 import select
 import signal
@@ -17,10 +17,10 @@ def _numbers() -> list[signal.Signals]:
 
 
 class EndSignal:
-    """It is set by what ends a program, or by :meth:`set`, and stays so. Make it on the main thread.
+    """An event that signals, or :meth:`set`, set for good. Make it on the main thread.
 
-    A handler must not set an event: it may have interrupted the wait for it, which holds its lock, and waits for ever.
-    A thread that a library started may receive the signal, which then interrupts no wait: so the pipe is written to.
+    This is no threading.Event: a handler may have interrupted a wait for it, which holds its lock, and would wait for
+    ever. And a signal on a thread of a library interrupts no wait of this one: the pipe ends it.
     """
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ class EndSignal:
 
 @contextmanager
 def handled_by(handler: Callable[[int, FrameType | None], Any], *more: int) -> Iterator[None]:
-    """Call ``handler`` for what ends a program, and for ``more``, inside the block. Main thread only."""
+    """Call ``handler`` for signals that end a program, and for ``more``, inside the block. Main thread only."""
     before = {number: signal.signal(number, handler) for number in (*_numbers(), *more)}
     try:
         yield
@@ -51,7 +51,7 @@ def handled_by(handler: Callable[[int, FrameType | None], Any], *more: int) -> I
 
 @contextmanager
 def interrupted_by_signals() -> Iterator[None]:
-    """SIGTERM and a closed terminal raise KeyboardInterrupt in the main thread, as Ctrl-C does; a command cleans up."""
+    """Raise KeyboardInterrupt in the main thread also on SIGTERM and SIGHUP: a command cleans up as after Ctrl-C."""
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
