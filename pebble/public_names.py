@@ -34,7 +34,11 @@ class PublicNames:
     @staticmethod
     def find_spec(fullname: str, *_: object) -> ModuleSpec | None:
         public = ".".join(fullname.split(".", 2)[:2])
-        place = _spec(PUBLIC[public] + fullname[len(public) :]) if public in PUBLIC else None
+        if public not in PUBLIC:
+            return None
+        from importlib.util import find_spec  # of use to public names only
+
+        place = find_spec(PUBLIC[public] + fullname[len(public) :])
         if place is None:
             return None
         loader: Any = _SameModule(place)
@@ -61,17 +65,6 @@ class _SameModule:
         loader: Any = self._place.loader
         code: CodeType | None = loader.get_code(self._place.name)
         return code
-
-    def get_source(self, _: str) -> str | None:
-        loader: Any = self._place.loader
-        source: str | None = loader.get_source(self._place.name)
-        return source
-
-
-def _spec(name: str) -> ModuleSpec | None:
-    from importlib.util import find_spec  # of use to public names only
-
-    return find_spec(name)
 
 
 def install() -> None:

@@ -56,9 +56,7 @@ class Drive(Payload, frozen=True, kw_only=True):
     source: str | UnsetType = UNSET  # "autonomy" of a script; anything else counts as a person
     run: Annotated[int, Meta(ge=1, le=LAST_RUN)] | UnsetType = UNSET  # of a script: grows until 2^30 - 1, then from 1
     valid_ms: Annotated[int, Meta(ge=0)] | UnsetType = UNSET  # of a zero, 0: the script must not resume
-    key: str | UnsetType = (
-        UNSET  # of control, from outgoing/control/{owner}; of several owners all, with blanks between
-    )
+    key: str | UnsetType = UNSET  # from outgoing/control/{owner}; of several owners all, with blanks between
     t: Annotated[int, Meta(ge=0, le=LARGEST_MS)] | UnsetType = UNSET  # the sender's clock, in milliseconds
     by: str | UnsetType = UNSET  # the account of a sender elsewhere, where the robot checks names
     group: bool | UnsetType = UNSET  # a copy of what a group of commands contained

@@ -32,8 +32,6 @@ def capabilities(
     value = offers.CapabilitiesValue(
         identity=_identity(config),
         transport=offers.TransportOffer(kind=config.transport.kind),
-        soundboard=_files(addresses, c.SOUNDBOARD_COMMAND, c.SOUNDBOARD_FILES, c.SOUNDBOARD_STATUS),
-        autonomy=_files(addresses, c.AUTONOMY_COMMAND, c.AUTONOMY_FILES, c.AUTONOMY_STATUS),
         system=_system(config, addresses),
         drive=drive,
         estop=estop,
@@ -57,16 +55,6 @@ def _identity(config: Config) -> offers.RobotIdentity:
     looks = {key: getattr(robot, key) for key in ("name", "description", "colour", "picture", "battery_cells")}
     given: dict[str, Any] = {key: value for key, value in looks.items() if value is not None}
     return offers.RobotIdentity(system=robot.system, type=robot.type, id=robot.id, **given)
-
-
-def _files(addresses: Addresses, command: c.Channel, files: c.Channel, status: c.Channel) -> offers.FilesOffer:
-    return offers.FilesOffer(
-        available=False,
-        controls=False,
-        command_topic=addresses[command].topic,
-        files_topic=addresses[files].topic,
-        status_topic=addresses[status].topic,
-    )
 
 
 def _system(config: Config, addresses: Addresses) -> offers.SystemOffer:

@@ -1,10 +1,10 @@
-"""Pictures and sound in the capabilities of a robot: topics and forms, before a service says that it sends them."""
+"""Sections of a robot's capabilities: pictures and sound before a service sends them, and lists of files."""
 
 from msgspec.structs import replace
 
 from pebble import contract as c
 from pebble.config import Config
-from pebble.contract.capabilities import AudioOffer, CapabilitiesValue, VideoOffer
+from pebble.contract.capabilities import AudioOffer, CapabilitiesValue, FilesOffer, VideoOffer
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
 from pebble.extensions.media import pyav
 from pebble.extensions.media.config import Media
@@ -43,6 +43,18 @@ def _audio(config: Config, addresses: Addresses) -> AudioOffer:
         channels=sent.channels,
         encoding=sent.encoding,
         encodings=list(pyav.available(ALL_SOUND)),
+    )
+
+
+def files_offer(config: Config, command: c.Channel, files: c.Channel, status: c.Channel, enabled: bool) -> FilesOffer:
+    """Return the offer of sounds or scripts, which is available and obeys commands if ``enabled``."""
+    addresses = Addresses(config)
+    return FilesOffer(
+        available=enabled,
+        controls=enabled,
+        command_topic=addresses[command].topic,
+        files_topic=addresses[files].topic,
+        status_topic=addresses[status].topic,
     )
 
 
