@@ -59,7 +59,7 @@ class Camera:
 
     @property
     def counters(self) -> dict[str, int]:
-        """How many frames were read, skipped and lost so far: see `FrameReader`."""
+        """The numbers of frames that were read, skipped and lost so far: see `FrameReader`."""
         return self._reader.counters.snapshot()
 
     def __iter__(self) -> Self:

@@ -1,4 +1,4 @@
-"""What a payload says about itself: its own stamp, and whether it is media. Pure.
+"""The facts in a payload: its own stamp, and whether it is media. Pure.
 
 Stamps of JSON are ``t`` in milliseconds or ``timestamp`` in seconds (paper A.4.2); media have theirs in the header
 (``pebble.extensions.media.packets``).

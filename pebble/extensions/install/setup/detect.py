@@ -1,4 +1,4 @@
-"""What is at this machine: boards, which are listened to and never written to, cameras, and what a robot lacks."""
+"""Devices of this machine: boards, which are only listened to, cameras, and the parts that a robot lacks."""
 
 import re
 import shutil

@@ -1,4 +1,4 @@
-"""Stock paho clients, of which operators are made: some drive robots, one watches a robot start and stream."""
+"""Operators from stock paho clients: some drive robots, one watches a robot start and stream."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class StockClient:
         self.paho.publish(message.topic, message.payload, message.qos, message.retain)
 
     def driver(self, base: str, wait: Callable[[float], object] = time.sleep) -> ScriptedOperator:
-        """Return an operator of a robot of which it knows nothing, as the original page: without control."""
+        """Return an operator that knows nothing of its robot, as the original page: without control."""
         return ScriptedOperator(RobotView(base), self.publish, by="bench", wait=wait)
 
     def request_media(self, base: str, *encodings: str) -> None:

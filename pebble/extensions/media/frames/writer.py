@@ -181,7 +181,7 @@ class FrameWriter:
 
     @property
     def readers(self) -> int:
-        """How many readers there are. A stopped one counts until its connection is closed, two seconds later."""
+        """The number of readers. A stopped one counts until its connection is closed, two seconds later."""
         return len(self._readers)
 
     def _on_reader(self, sample: zenoh.Sample) -> None:

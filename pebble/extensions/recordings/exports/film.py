@@ -31,7 +31,7 @@ _BITRATE: Final = 64_000  # bits per second of each channel
 
 @dataclass(frozen=True, slots=True)
 class FilmResult:
-    """What a film is made of."""
+    """The contents of a film."""
 
     seconds: float
     pictures: int

@@ -78,7 +78,7 @@ _COPY: Final = """
 
 
 class About(Struct):
-    """What an index says of its recording."""
+    """The facts of an index about its recording."""
 
     recording: str  # its name
     size: int  # of the file, when it was indexed
