@@ -208,4 +208,6 @@ def tls_settings(tls: Tls) -> TlsSettings | None:
     """Return the certificates, or None if TLS is off."""
     if not tls.enabled:
         return None
-    return TlsSettings(tls.ca_cert, tls.client_cert, tls.client_key, insecure=tls.insecure)
+    return TlsSettings(
+        ca_cert=tls.ca_cert, client_cert=tls.client_cert, client_key=tls.client_key, insecure=tls.insecure
+    )
