@@ -130,8 +130,8 @@ class Extension(Struct, frozen=True, kw_only=True, eq=False):
     rules: str = ""  # pairs of a Section and check(reader, section, path), which returns the section
     program: Program | None = None  # runs while the section is enabled, or always where there is none
     programs: str = ""  # a function of the config: its other Programs
-    observer: str = ""  # a function of config and clock: pebble.forwarding.observer.Observer of what the bridge passes
-    step: str = ""  # a function of the config: pebble.forwarding.observer.Step, which may refuse a message
+    observer: str = ""  # of config and clock: pebble.forwarding.observer.Observer, which sees what the bridge passes
+    step: str = ""  # a function of the config: pebble.forwarding.observer.Step, which may refuse it
     offers: str = ""  # a function of config and CapabilitiesValue, which it returns completed
     facts: str = ""  # a function of the config: Facts
     checks: str = ""  # a function of the config, for `pebble doctor`: CheckResults

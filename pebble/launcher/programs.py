@@ -33,12 +33,7 @@ def _core(config: Config) -> Iterator[tuple[bool, Program]]:
     yield config.transport.kind == "zenoh", _hub(config)
     yield True, _announcer(config)
     yield from ((True, _serial_line(config, *line)) for line in config.serial_instances().items())
-    seams = (
-        place.partition(":")[0]
-        for extension in config.installed
-        for place in (extension.observer, extension.step)
-        if place
-    )
+    seams = (place.partition(":")[0] for one in config.installed for place in (one.observer, one.step) if place)
     yield bridge.enabled, _service(config, "mqtt_bridge", may_request=True, shares=tuple(seams))
     yield mirror is not None, _service(config, "mqtt_mirror")
 

@@ -136,7 +136,7 @@ class FrameReader:
 
     @property
     def writers(self) -> int:
-        """The number of writers of the stream: 0 or 1, and 2 for a moment while one replaces another."""
+        """The number of writers of the stream now: 0 or 1, and 2 for a moment when one replaces another."""
         return len(self.running)
 
     def read(self, timeout: float | None = None) -> Frame | None:
