@@ -27,7 +27,6 @@ from pebble.motion.latch import fields, stop_of
 MAX_COMMAND_BYTES = 64 * 1024  # a larger command is refused; a larger stop is one without a name
 
 _LONGEST_MS = 1e12  # of a command's validity; far beyond every watchdog
-_LATEST_STAMP = 253_402_300_800_000  # the year 10000 in ms: later times are invalid
 
 # Narrower than float(), which also takes "1_0", digits of other scripts and the names of NaN and infinity.
 _numeric = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII).fullmatch
@@ -270,20 +269,3 @@ def _shown(value: Any) -> str:
 def _name_of(value: Any) -> str:
     names = {dict: "an object", list: "an array", str: "a string", bool: "a boolean", type(None): "null"}
     return names.get(type(value), "a number")
-
-
-def stamp_of(plain: Any) -> float | None:
-    """Return a JSON payload's time stamp in epoch seconds, from ``t`` or ``timestamp``; None: it has none.
-
-    Numbers of 1e11 and more are milliseconds, of 1e9 and more seconds (paper A.4.2).
-    """
-    if not isinstance(plain, dict):
-        return None
-    for key in ("t", "timestamp"):
-        value = plain.get(key)
-        if isinstance(value, int | float) and not isinstance(value, bool) and value < _LATEST_STAMP:
-            if value >= 1e11:
-                return value / 1000.0
-            if value >= 1e9:
-                return float(value)
-    return None

@@ -13,7 +13,7 @@ from pebble.config import load
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.connection import Target, connected, put_names
 from pebble.extensions.operator.commands.options import BrokerUrl, CaCert, PasswordFile
-from pebble.runtime.signals import interrupted_by_signals
+from pebble.extensions.operator.signals import interrupted_by_signals
 
 if TYPE_CHECKING:
     from pebble.extensions.media.cameras import Picture
