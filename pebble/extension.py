@@ -39,7 +39,8 @@ T = TypeVar("T")
 ENTRY_POINTS: Final = "pebble.extensions"
 _IMPORT_S = 60.0  # for a stranger's module: large libraries take half of it on a small board
 _SECTION_KEY = re.compile(r"(services\.)?[A-Za-z]\w*", re.ASCII)
-#: Our extensions, with the keys of a config that belong to each; one that others use stands before them.
+#: Our extensions in the order of their sections, with the keys of a config that belong to each. One that others use
+#: stands before them.
 OURS: Final[Mapping[str, tuple[str, ...]]] = {
     "pebble.extensions.media": ("services.mqtt_bridge.media",),
     "pebble.extensions.paho": (),

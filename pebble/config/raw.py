@@ -104,7 +104,7 @@ def with_instances(raw: Any) -> Any:
     if not isinstance(instances, dict):
         return raw
     shared = {key: value for key, value in serial.items() if key != "instances"}
-    merged = {name: deep_merge(shared, own) for name, own in instances.items()}
+    merged = {name: deep_merge(shared, instance) for name, instance in instances.items()}
     return raw | {"services": raw["services"] | {"serial_mcu_bridge": shared | {"instances": merged}}}
 
 

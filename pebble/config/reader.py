@@ -33,9 +33,9 @@ def _known(kind: type[Section]) -> dict[str, FieldInfo]:
 
 
 class Reader:
-    """The reader of one file. Relative paths start at ``folder``; ``env`` is the environment for secrets.
+    """Reads one file. Relative paths start at ``folder``; ``env`` is the environment for secrets.
 
-    With ``other_forms`` it also accepts the forms of the original; if a value changes by that, it is a warning.
+    With ``other_forms`` it reads what the original accepts as well; where that changes a value, it is a warning.
     """
 
     def __init__(

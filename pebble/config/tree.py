@@ -303,11 +303,12 @@ def tree_of(sections: Mapping[str, type[Section]]) -> type[Root]:
 def _with(kind: type[Section], sections: Mapping[str, type[Section]]) -> Any:
     """Return ``kind`` with more sections; a dotted key is one of its own sections."""
     added = [(key, Annotated[section, doc(section.meaning())]) for key, section in sections.items() if "." not in key]
-    for own in fields(kind):
-        inner = {key.partition(".")[2]: section for key, section in sections.items() if key.startswith(f"{own.name}.")}
+    for known in fields(kind):
+        start = f"{known.name}."
+        inner = {key.removeprefix(start): section for key, section in sections.items() if key.startswith(start)}
         if inner:
-            section, *metas = get_args(own.type)
-            added.append((own.name, Annotated[_with(section, inner), *metas]))
+            section, *metas = get_args(known.type)
+            added.append((known.name, Annotated[_with(section, inner), *metas]))
     names = {"__doc__": kind.__doc__, "__module__": kind.__module__}
     rows = [(name, annotation, get_args(annotation)[0]()) for name, annotation in added]
     return defstruct(kind.__name__, rows, bases=(kind,), namespace=names, frozen=True, kw_only=True)

@@ -123,13 +123,13 @@ def _without_uplink(notes: Notes, root: Root) -> Root:
     if root.robot.platform != "linux":
         notes.doubt(path, "is missing, write the name of the remote broker")
         return root
-    own = root.local_mqtt if transport.kind == "mqtt" else transport.mqtt_mirror
-    if own is None:
+    local = root.local_mqtt if transport.kind == "mqtt" else transport.mqtt_mirror
+    if local is None:
         notes.warning(path, "is empty: there is no uplink, so no operator sees or drives this robot")
         bridge = replace(bridge, enabled=False)
     else:
-        notes.warning(path, f"is empty: there is no uplink, operators connect to the robot's own broker, {own.host}")
-        bridge = replace(bridge, remote_mqtt=RemoteMqtt(**asdict(own), client_id=bridge.remote_mqtt.client_id))
+        notes.warning(path, f"is empty: there is no uplink, operators connect to the robot's own broker, {local.host}")
+        bridge = replace(bridge, remote_mqtt=RemoteMqtt(**asdict(local), client_id=bridge.remote_mqtt.client_id))
     return replace(root, services=replace(root.services, mqtt_bridge=bridge))
 
 
