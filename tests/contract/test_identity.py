@@ -53,7 +53,7 @@ _levels = st.text(st.characters(codec="utf-8"), min_size=1, max_size=70)
 
 
 @given(_levels, _levels, _levels)
-def test_what_an_identity_accepts_every_transport_carries(system: str, type_: str, id_: str) -> None:
+def test_every_transport_carries_an_accepted_identity(system: str, type_: str, id_: str) -> None:
     try:
         identity = Identity(system, type_, id_)
     except ConfigError:

@@ -232,7 +232,7 @@ def test_a_broken_one_is_an_error_and_keeps_a_robot_from_starting_only_if_it_dri
         ),
     ],
 )
-def test_what_fails_later_is_one_line_that_names_it(more: str, text: str, tmp_path: Path) -> None:
+def test_a_later_failure_is_one_line_that_names_the_extension(more: str, text: str, tmp_path: Path) -> None:
     source = "from pebble.config.tree import Root\n"
     source += "def fail(*_): 1 / 0\ndef text(*_): return 'x'\nRULES = [(Root, fail)]\n"
     (tmp_path / "lamp.py").write_text(source + OBJECT % more)
@@ -302,7 +302,7 @@ def test_a_robot_starts_though_a_section_of_what_is_missing_is_there(tmp_path: P
     assert load(path, lenient=True).warnings[0].startswith("extensions.lamp: no installed package offers it")
 
 
-def test_what_owns_motors_is_listed_as_such(tmp_path: Path) -> None:
+def test_an_owner_of_motors_is_listed_as_such(tmp_path: Path) -> None:
     lamp_file(tmp_path, "legs", drives=True)
     done = pebble("check", str(write(tmp_path, {"legs.py": {}})))
     assert (done.returncode, 'it owns motors, write {"drives": true}' in done.stderr) == (1, True)
@@ -311,7 +311,7 @@ def test_what_owns_motors_is_listed_as_such(tmp_path: Path) -> None:
     assert (done.returncode, "it declares no motors" in done.stderr) == (1, True)
 
 
-def test_what_owns_motors_is_a_device(tmp_path: Path) -> None:
+def test_an_owner_of_motors_is_a_device(tmp_path: Path) -> None:
     lamp_file(tmp_path, "wheels", drives=True)
     config = load(write(tmp_path, {"wheels.py": {"drives": True}}, {"enabled": True}))
     assert [(one.name, one.stage) for one in programs_of(config.installed, config)] == [("lamp", Stage.DEVICE)]
@@ -359,7 +359,7 @@ def test_two_that_want_the_same_are_refused_with_both_names(tmp_path: Path) -> N
     assert (done.returncode, text in done.stderr) == (1, True)
 
 
-def test_what_is_of_the_core_is_no_extensions(tmp_path: Path) -> None:
+def test_an_extension_adds_no_section_of_the_core(tmp_path: Path) -> None:
     (tmp_path / "lamp.py").write_text((LAMP % {"name": "lamp", "drives": False}).replace(".lamp", ".mqtt_bridge"))
     done = pebble("check", str(write(tmp_path, {"lamp.py": {}})))
     text = 'section "services.mqtt_bridge" is added by two, Pebble (core) and lamp.py (lamp): remove one of them'

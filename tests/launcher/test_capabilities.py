@@ -223,7 +223,7 @@ OFFERS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize(("robot", "listed"), OFFERS.values(), ids=OFFERS)
-def test_what_a_robot_has_is_listed(robot: dict[str, Any], listed: dict[str, Any]) -> None:
+def test_parts_of_a_robot_are_listed(robot: dict[str, Any], listed: dict[str, Any]) -> None:
     value = of(**robot)
     assert {path: at(value, path) for path in listed} == listed
 
