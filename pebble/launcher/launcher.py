@@ -70,7 +70,8 @@ class Launcher:
         config = self._config
         own_records = OwnRecords(self._logs, config.log_level)
         in_state_dir = config.state_file("launcher").with_suffix(".lock")
-        with own_records, RunLock(config.run_dir(), config.base, in_state_dir) as lock, self._signals:
+        with own_records, RunLock(config.run_dir(), config.base, in_state_dir) as lock:
+            self._signals.install()
             try:
                 self._reactor.every(_RUN_DIR_S, lambda: self._keep(lock))
                 self._start()

@@ -5,7 +5,6 @@ import signal
 import time
 from collections.abc import Callable
 from types import FrameType
-from typing import Any, Self
 
 from pebble.runtime.timers import Timer, Timers
 from pebble.transports.wakeup import WakeupPipe
@@ -86,17 +85,15 @@ class Reactor:
 
 
 class StopSignals:
-    """A counter of SIGTERM, SIGINT and SIGHUP inside its ``with`` block; ``descriptor`` is readable after each.
+    """A counter of SIGTERM, SIGINT and SIGHUP from :meth:`install` on; ``descriptor`` is readable after each.
 
     The signal handler calls ``on_repeat`` from the second signal on: the user does not want to wait any longer. Main
-    thread only. A signal that was ignored before (nohup) stays ignored.
+    thread only.
     """
 
     def __init__(self, on_repeat: Callable[[], None]) -> None:
         self.received = 0
         self._on_repeat = on_repeat
-        self._previous: dict[signal.Signals, Any] = {}
-        self._previous_wakeup = -1
         self._wakeup = WakeupPipe()
 
     @property
@@ -107,18 +104,12 @@ class StopSignals:
         """Make :attr:`descriptor` unreadable until the next signal."""
         self._wakeup.clear()
 
-    def __enter__(self) -> Self:
-        self._previous_wakeup = signal.set_wakeup_fd(self._wakeup.set_fileno, warn_on_full_buffer=False)
+    def install(self) -> None:
+        """Handle the signals until the process ends, except ignored ones (nohup)."""
+        signal.set_wakeup_fd(self._wakeup.set_fileno, warn_on_full_buffer=False)
         for number in _SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:
-                self._previous[number] = signal.signal(number, self._receive)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-        signal.set_wakeup_fd(self._previous_wakeup)
-        self._wakeup.close()
+                signal.signal(number, self._receive)
 
     def _receive(self, _number: int, _frame: FrameType | None) -> None:
         self.received += 1
