@@ -17,14 +17,14 @@ from pathlib import Path
 import numpy as np
 
 from pebble.config import load
+from pebble.media.frames import Frame, FrameReader
 from pebble.ownership import others_in
 from pebble.services.av_daemon.config import AvDaemon
-from pebble.transports.frames import Frame, FrameReader
 from pebble.transports.segments import SHM
 
 
 def picture(size: tuple[int, int], frame: Frame) -> bytes:
-    """Return rows of BGR, each of which ends at a multiple of four bytes, as everywhere in GStreamer."""
+    """Return rows of BGR, padded to a multiple of four bytes each, as GStreamer has them."""
     pixels = frame.picture()
     if (sent := pixels.shape[1::-1]) != size:
         sys.exit(f"the camera sends pictures of {sent}, and the config says {size}")

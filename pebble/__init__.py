@@ -10,9 +10,9 @@ from pebble.version import __version__ as __version__
 public_names.install()
 
 if TYPE_CHECKING:
-    from pebble.cameras import camera as camera
     from pebble.contract import Channel as Channel
     from pebble.contract import Kind as Kind
+    from pebble.extensions.media.cameras import camera as camera
     from pebble.extensions.scripts.script import Robot as Robot
     from pebble.extensions.scripts.script import Stopped as Stopped
     from pebble.extensions.scripts.script import run as run
@@ -28,7 +28,7 @@ _FROM = {
 
 
 def __getattr__(name: str) -> Any:
-    """`from pebble import camera` imports what it needs only when it is used."""
+    """Import a public name when it is used: `from pebble import camera`."""
     if name in _FROM:
         from importlib import import_module
 

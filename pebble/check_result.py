@@ -1,4 +1,4 @@
-"""Results of checks of a machine, a broker or a robot; extensions declare checks of theirs for ``pebble doctor``."""
+"""The results of checks of a machine, a broker or a robot; extensions declare checks for ``pebble doctor``."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -6,6 +6,8 @@ from functools import partial
 
 
 class State(StrEnum):
+    """The outcome of a check."""
+
     OK = "ok"
     WARN = "warn"
     FAILED = "failed"
@@ -16,8 +18,8 @@ class State(StrEnum):
 class CheckResult:
     """The result of one check.
 
-    ``fix`` is the command or config change that ends a failure; ``what`` is the subject, where a check has several.
-    The text of a check that was skipped completes "skipped because", and its fix is what would let it be made.
+    ``fix`` is the command or config change that ends a failure; ``what`` is the subject, if a check has several.
+    The text of a skipped check completes "skipped because", and its fix makes the check possible.
     """
 
     state: State

@@ -1,4 +1,4 @@
-"""The ``pebble`` command: turns errors into lines on stderr and an exit code.
+"""The ``pebble`` command: errors become lines on stderr and an exit code.
 
 0: success. 1: failure, or no result. 2: the command line is wrong. 130: Ctrl-C.
 """
@@ -42,7 +42,7 @@ def main() -> int:
 
 
 def _use_utf8() -> None:
-    """Begin anew in UTF-8 mode where the locale is of another encoding: robots' names stand in names of files."""
+    """Start again in UTF-8 mode if the locale has another encoding: names of robots stand in names of files."""
     if sys.getfilesystemencoding() != "utf-8" and not sys.flags.utf8_mode:
         os.environ["PYTHONUTF8"] = "1"  # for the programs that this one starts
         os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])  # noqa: S606
@@ -58,7 +58,7 @@ def _fail(*lines: str) -> int:
 
 
 def _flushes(stream: TextIO) -> bool:
-    """Write out what waits, and discard it if that fails: the interpreter would try again at its end."""
+    """True if the buffer was written; else it is discarded, because the interpreter would try again at its end."""
     try:
         stream.flush()
     except OSError:
@@ -70,7 +70,7 @@ def _flushes(stream: TextIO) -> bool:
 
 
 def _open_missing_streams() -> None:
-    """Read from and write to nothing where the caller has closed a standard stream (``pebble up robot.json >&-``)."""
+    """Open /dev/null for each standard stream that the caller has closed (``pebble up robot.json >&-``)."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)  # the lowest free one: that of this stream
@@ -86,7 +86,7 @@ def _without_secrets(text: str) -> str:
 
 
 def _print_error(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Print an error that is none of ours as Python does: what is in a traceback may come from a command line."""
+    """Print a traceback as Python does, without secrets: its texts may come from a command line."""
     from traceback import format_exception
 
     sys.stderr.write(_without_secrets("".join(format_exception(kind, error, trace))))

@@ -2,11 +2,11 @@
 
 
 class PebbleError(Exception):
-    """Base class. Only the CLI and the outermost lines of a process catch it; its text is the message a user reads."""
+    """The base class. Only the CLI and the outermost lines of a process catch it; users read its text."""
 
 
 class ConfigError(PebbleError):
-    """A config file is wrong. ``problems`` holds one line per mistake, each with its JSON path.
+    """The mistakes in a config file. ``problems`` holds a line for each, with its JSON path.
 
     Example: ``services.mqtt_bridge.heartbeet: unknown key, did you mean "heartbeat"?``
     """
@@ -17,19 +17,19 @@ class ConfigError(PebbleError):
 
 
 class TransportError(PebbleError):
-    """A topic, filter or payload that no transport may carry, or a transport that cannot be set up at all.
+    """A topic, filter or payload that no transport may carry, or a transport that cannot be made.
 
-    A lost connection is *not* an error: transports reconnect by themselves, and their state shows it.
+    A lost connection is *not* an error: transports connect again, and their state shows it.
     """
 
 
 class PayloadError(PebbleError):
-    """A payload does not follow its channel's contract. Example: ``drive-values: x is NaN``."""
+    """A payload that does not follow its channel's contract. Example: ``drive-values: x is NaN``."""
 
 
 class DeviceError(PebbleError):
-    """A serial line, camera or other device cannot be opened or stopped answering."""
+    """A serial line, camera or other device that cannot be opened or has stopped answering."""
 
 
 class NotRunningError(DeviceError):
-    """The program that plays a device's part does not run; it may be started later."""
+    """A device that a program stands in for, which does not run; it may be started later."""

@@ -1,4 +1,4 @@
-"""Extensions: what a robot need not have. Ours, packages of others and a file of the owner, all in the same way.
+"""Extensions: optional parts of a robot, from us, from packages of others, or from a file of the owner.
 
 An extension is one object, ``EXTENSION``, that a package or a file declares. It names its parts as ``module:name``, and
 these are imported where they are used: a robot that records nothing imports nothing of the recorder.
@@ -37,12 +37,12 @@ T = TypeVar("T")
 
 #: The group of entry points by which a package offers an extension.
 ENTRY_POINTS: Final = "pebble.extensions"
-_LONGEST = 1_000_000  # bytes of an owner's file
 _IMPORT_S = 60.0  # for a stranger's module: large libraries take half of it on a small board
 _SECTION_KEY = re.compile(r"(services\.)?[A-Za-z]\w*", re.ASCII)
-#: Ours, those first that others use, with the keys of a config that belong to each. It is the order of their sections.
+#: Our extensions in the order of their sections, with the keys of a config that belong to each. One that others use
+#: stands before them.
 OURS: Final[Mapping[str, tuple[str, ...]]] = {
-    "pebble.extensions.media": (),
+    "pebble.extensions.media": ("services.mqtt_bridge.media",),
     "pebble.extensions.paho": (),
     "pebble.extensions.operator": (),
     "pebble.extensions.scripts": (),
@@ -77,7 +77,7 @@ class Stage(IntEnum):
 
 
 class Program(Struct, frozen=True):
-    """A process: its name in logs and status, and the module that it runs with ``arguments``, as ``python -m`` would.
+    """A process: its name in logs and status, and the module that it runs with ``arguments``, as ``python -m`` does.
 
     The launcher imports the module, or ``entry``, before it forks: importing must do nothing. What that module imports
     later, because only some robots need it, is in the memory of those robots only.
@@ -95,6 +95,7 @@ class Program(Struct, frozen=True):
     preloaded: bool = True  # False: its imports are needed by few, and would cost every process their memory
     entry: str = ""  # what the package that is run begins with; "": the module is no package
     shares: tuple[str, ...] = ()  # modules that several programs use, imported before the first fork
+    has_sockets: bool = False  # opens sockets in the run directory, whose path must then be short
     stop_timeout_s: float = 10.0  # after this an on-demand program that was released is killed
     webrtc_url: str | None = None  # where pages show its pictures
 
@@ -122,9 +123,9 @@ class Extension(Struct, frozen=True, kw_only=True, eq=False):
     """
 
     name: str
-    package: str = "pebble-robot"  # who is named where two add the same
-    extra: str = ""  # of the package: what `pip install "PACKAGE[EXTRA]"` adds
-    packages: tuple[str, ...] = ()  # modules of other packages that its programs cannot do without
+    package: str = "pebble-robot"  # its name in messages
+    extra: str = ""  # of the package: `pip install "PACKAGE[EXTRA]"` installs its dependencies
+    packages: tuple[str, ...] = ()  # modules of other packages that its programs need
     needs: tuple[str, ...] = ()  # extensions without which it counts as not installed
     sections: dict[str, str] = {}  # by the key of the config, "services.lamp" or "lamp": its Section
     rules: str = ""  # pairs of a Section and check(reader, section, path), which returns the section
@@ -144,7 +145,7 @@ class Extension(Struct, frozen=True, kw_only=True, eq=False):
 
 
 class Missing(Struct, frozen=True):
-    """An extension that a config names and this machine lacks, and why."""
+    """An extension that a config names and this machine lacks."""
 
     name: str
     key: str  # of the config
@@ -161,17 +162,18 @@ def part(place: str) -> Any:
 
 @cache
 def ours() -> tuple[Extension, ...]:
-    """Return those of ours that are installed with all that they need, in the order of ``OURS``."""
-    found: dict[str, Extension] = {}
+    """Return our extensions that are installed with all that they need, in the order of ``OURS``."""
+    installed: dict[str, Extension] = {}
     for module in OURS:
         extension = _declared(module)
-        if extension is not None and all(need in found for need in extension.needs):
-            found[extension.name] = extension
+        if extension is not None and all(need in installed for need in extension.needs):
+            installed[extension.name] = extension
             SERIAL_PROTOCOLS.update(extension.protocols)
-    return tuple(found.values())
+    return tuple(installed.values())
 
 
 def _declared(module: str) -> Extension | None:
+    """Return the extension of one of our modules; None: it is not installed."""
     try:
         extension: Extension = import_module(module).EXTENSION
     except ModuleNotFoundError as error:
@@ -184,13 +186,12 @@ def _declared(module: str) -> Extension | None:
 def named(
     entries: Mapping[str, bool], folder: Path, section: type
 ) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:
-    """Return the extensions that a config lists, and what could not be loaded.
+    """Return the extensions that a config lists, and those that could not be loaded.
 
-    ``entries``: the names of entry points, or files such as ``lamp.py``, seen from ``folder``; True: it owns motors.
-    ``section``: what the class of a section extends. Raises ConfigError where one that owns motors is listed as one
-    that does not, or the other way round.
+    ``entries``: the names of entry points, or of files in ``folder`` such as ``lamp.py``; True: the config says that it
+    owns motors. ``section``: the base class of sections. Raises ConfigError if the config is wrong about the motors.
     """
-    found, missing = [], []
+    loaded, missing = [], []
     for name, drives in entries.items():
         try:
             with _in_time():
@@ -198,7 +199,7 @@ def named(
                 _check_parts(extension, section)
         except KeyboardInterrupt:
             raise
-        except BaseException as error:  # noqa: BLE001 - whatever a stranger's module raises, SystemExit for one
+        except BaseException as error:  # noqa: BLE001 - a stranger's module may raise anything, also SystemExit
             missing.append(Missing(name, f"extensions.{name}", _reason(error), drives))
             continue
         if extension.motors and not drives:
@@ -207,13 +208,13 @@ def named(
             raise ConfigError(
                 f"extensions.{name}: it declares no motors, so no stop would be confirmed: leave out drives"
             )
-        found.append(extension)
-    return tuple(found), tuple(missing)
+        loaded.append(extension)
+    return tuple(loaded), tuple(missing)
 
 
 @contextmanager
 def _in_time() -> Iterator[None]:
-    """Raise PebbleError in a block that imports a stranger's module and does not end; in the main thread only."""
+    """Raise PebbleError in a block that imports a stranger's module and takes too long. Main thread only."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -231,13 +232,13 @@ def _in_time() -> Iterator[None]:
 
 
 def _reason(error: BaseException) -> str:
-    """Return one line."""
+    """Return the message of an error in one line."""
     text = str(error) if isinstance(error, PebbleError) else f"{type(error).__name__}: {error}"
     return " ".join(text.split())
 
 
 def _check_parts(extension: Extension, section: type) -> None:
-    """Raise an error for what would keep the robot from starting, or a stop from being confirmed."""
+    """Raise PebbleError for mistakes that would keep the robot from starting, or a stop from being confirmed."""
     lacks = {*extension.needs} - {other.name for other in ours()}
     if lacks:
         raise PebbleError(f"it needs {' and '.join(sorted(lacks))}")
@@ -264,28 +265,26 @@ def _check_parts(extension: Extension, section: type) -> None:
 
 
 def lacking(raw: Any) -> Iterator[Missing]:
-    """Yield those of ours that are not installed, and that a config has sections of which are not disabled."""
-    here = {key for extension in ours() for key in extension.sections}
+    """Yield our extensions that are not installed although the config has a section of theirs that is not disabled."""
+    unknown = keys_of_missing(ours())
     for module, keys in OURS.items():
         for key in keys:
-            section = _at(raw, key.split("."))
-            if key not in here and section is not None and _at(section, ["enabled"]) is not False:
-                name = module.rpartition(".")[2]
-                yield Missing(name, key, f"is of the extension {name}, which is not installed: {_how(module)}")
+            section = value_at(raw, *key.split("."))
+            if key in unknown and section is not None and value_at(section, "enabled") is not False:
+                name, path = module.rpartition(".")[2], module.replace(".", "/")
+                install = f'pip install "pebble-robot[all]" ({path} is not there, or what it needs)'
+                yield Missing(name, key, f"is of the extension {name}, which is not installed: {install}")
 
 
 def keys_of_missing(installed: Iterable[Extension]) -> list[str]:
-    """Return the keys of a config that are ours, and of extensions that are not among ``installed``."""
-    here = {key for extension in installed for key in extension.sections}
-    return [key for keys in OURS.values() for key in keys if key not in here]
+    """Return the keys of a config that belong to extensions of ours which are not among ``installed``."""
+    known = {key for extension in installed for key in extension.sections}
+    return [key for keys in OURS.values() for key in keys if key not in known]
 
 
-def _how(module: str) -> str:
-    return f'pip install "pebble-robot[all]" ({module.replace(".", "/")} is not there, or what it needs)'
-
-
-def _at(raw: Any, path: Iterable[str]) -> Any:
-    for key in path:
+def value_at(raw: Any, *keys: str) -> Any:
+    """Return the value at a path of keys in plain data; None where there is none."""
+    for key in keys:
         raw = raw.get(key) if isinstance(raw, dict) else None
     return raw
 
@@ -296,12 +295,12 @@ def lacking_packages(extension: Extension) -> list[str]:
 
 
 def refuse_claims(core: Extension, extensions: Iterable[Extension]) -> None:
-    """Raise ConfigError where two add the same section, command, protocol or name; it names both.
+    """Raise ConfigError if two extensions add the same section, command, protocol or name; it names both.
 
-    ``core``: what the core has of these.
+    ``core`` declares those of the core.
     """
     owners: dict[tuple[str, str], int] = {}
-    listed = (core, *extensions)
+    listed = (core, *extensions)  # one may be listed twice
     for number, extension in enumerate(listed):
         claims: dict[str, Iterable[str]] = {
             "section": extension.sections,
@@ -319,7 +318,7 @@ def refuse_claims(core: Extension, extensions: Iterable[Extension]) -> None:
 
 
 def packages() -> Iterator[Extension]:
-    """Yield those of installed packages, for the command line; what cannot be loaded adds no command, and is logged."""
+    """Yield the extensions of installed packages, for the command line. One that cannot be loaded is logged."""
     for name in _offered():
         try:
             with _in_time():
@@ -332,19 +331,19 @@ def packages() -> Iterator[Extension]:
 
 
 def motors_of(extensions: Iterable[Extension], config: Any) -> dict[str, str]:
-    """Return the motor owners that extensions add to a robot, by name: their programs."""
+    """Return the programs of the motor owners that extensions add to a robot, by the owner's name."""
     running = {program.name for program in programs_of(extensions, config)}
-    found = {owner: program for extension in extensions for owner, program in extension.motors.items()}
-    return {owner: program for owner, program in found.items() if program in running}
+    owners = {owner: program for extension in extensions for owner, program in extension.motors.items()}
+    return {owner: program for owner, program in owners.items() if program in running}
 
 
 def programs_of(extensions: Iterable[Extension], config: Any, core: Iterable[str] = ()) -> list[Program]:
     """Return the processes that extensions add to a robot; ``core``: names that are taken.
 
-    What owns motors is of the stage of devices. Raises ConfigError for a name that is taken, or that two of them have.
+    One that owns motors belongs to the stage of devices. Raises ConfigError if a name is taken.
     """
     owners = dict.fromkeys(core, "the core")
-    found = []
+    programs = []
     for extension in extensions:
         for program in _programs(extension, config):
             if other := owners.get(program.name):
@@ -352,12 +351,12 @@ def programs_of(extensions: Iterable[Extension], config: Any, core: Iterable[str
             owners[program.name] = extension.package
             if program.name in extension.motors.values():
                 program = replace(program, stage=Stage.DEVICE, on_demand=False)
-            found.append(program if program.arguments else replace(program, arguments=(str(config.path),)))
-    return found
+            programs.append(program if program.arguments else replace(program, arguments=(str(config.path),)))
+    return programs
 
 
 def _programs(extension: Extension, config: Any) -> Iterator[Program]:
-    sections = (_at_section(config, key) for key in extension.sections)
+    sections = (reduce(getattr, key.split("."), config) for key in extension.sections)
     if extension.program is not None and all(getattr(section, "enabled", True) for section in sections):
         yield extension.program
     if extension.programs:
@@ -366,17 +365,17 @@ def _programs(extension: Extension, config: Any) -> Iterator[Program]:
 
 def items(extension: Extension, hook: str, kind: type[T], *arguments: Any) -> list[T]:
     """Return the list that a function of an extension returns; errors as in :func:`call`."""
-    found: list[T] = call(extension, hook, list, *arguments, finish=list)
-    for item in found:
+    returned: list[T] = call(extension, hook, list, *arguments, finish=list)
+    for item in returned:
         if not isinstance(item, kind):
             raise _failed(extension, hook, f"{type(item).__name__} is no {kind.__name__}")
-    return found
+    return returned
 
 
 def call(
     extension: Extension, hook: str, kind: Any, *arguments: Any, finish: Callable[[Any], Any] = lambda value: value
 ) -> Any:
-    """Return what a function of an extension returns. Raises ConfigError, which names both, if it fails."""
+    """Return the result of an extension's function. Raises ConfigError, which names both, if it fails."""
     try:
         value = finish(part(getattr(extension, hook))(*arguments))
     except PebbleError:
@@ -390,10 +389,6 @@ def call(
 
 def _failed(extension: Extension, hook: str, why: str) -> ConfigError:
     return ConfigError(f"extensions: {hook} of {extension.package} ({extension.name}): {why}")
-
-
-def _at_section(config: Any, key: str) -> Any:
-    return reduce(getattr, key.split("."), config)
 
 
 def _of_package(name: str) -> Extension:
@@ -413,20 +408,17 @@ def _offered() -> Mapping[str, str]:
 
 
 def _of_file(path: Path) -> Extension:
-    """Return that of an owner's file; its module is called as the file, so that its parts are found: ``lamp:Lamp``.
+    """Return the extension in an owner's file. Its module is named after the file, so ``lamp:Lamp`` is found.
 
     A file without the word EXTENSION is one program, run with the path of the config, and not imported here.
     """
     if not path.is_file():
         raise PebbleError(f"there is no file {path}")
-    state = path.stat()
     if hasattr(os, "getuid") and os.getuid() == 0:
         folders = (path.parent, path.resolve().parent)
-        if uid := state.st_uid or max(owner_of(folder, nameless=False).uid for folder in folders):
+        if uid := path.stat().st_uid or max(owner_of(folder, nameless=False).uid for folder in folders):
             why = "and root runs no code of other users: chown root it, in a folder of root's"
             raise PebbleError(f"{path} belongs to user {uid}, {why}")
-    if state.st_size > _LONGEST:
-        raise PebbleError(f"{path} has {state.st_size} bytes, and no program has more than {_LONGEST}")
     name = path.stem
     if "." in name:
         raise PebbleError(f'a module has no "." in its name: rename the file {path.name}')
@@ -437,18 +429,18 @@ def _of_file(path: Path) -> Extension:
         raise PebbleError(f"a module is called {name} already: rename the file")
     if not re.search(r"\bEXTENSION\b", path.read_text(encoding="utf-8", errors="replace")):
         return Extension(name=name, package=path.name, program=Program(name, name, plain=True, preloaded=False))
-    loaded = sys.modules.get(name)
-    if loaded is None:
+    module = sys.modules.get(name)
+    if module is None:
         spec = spec_from_file_location(name, path)
         if spec is None or spec.loader is None:
             raise PebbleError(f"{path} cannot be imported")
-        loaded = sys.modules[name] = module_from_spec(spec)
+        module = sys.modules[name] = module_from_spec(spec)
         try:
-            spec.loader.exec_module(loaded)
+            spec.loader.exec_module(module)
         except BaseException:
             del sys.modules[name]
             raise
-    return _checked(getattr(loaded, "EXTENSION", None))
+    return _checked(getattr(module, "EXTENSION", None))
 
 
 def _checked(extension: Any) -> Extension:

@@ -1,6 +1,6 @@
-"""Public names of modules that lie in an extension: ``import pebble.perception.tags`` means the same module as before.
+"""Public names of modules in extensions: ``pebble.perception.tags`` is one module, under two names.
 
-One module under two names, not two: a class is the same class. Names that no document promises are not here.
+Only names that the documents promise are here.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from types import CodeType, ModuleType
 
 PUBLIC = {
+    "pebble.cameras": "pebble.extensions.media.cameras",
     "pebble.script": "pebble.extensions.scripts.script",
     "pebble.scripts": "pebble.extensions.scripts.shipped",
     "pebble.perception": "pebble.extensions.scripts.perception",
@@ -25,15 +26,19 @@ PUBLIC = {
 
 
 class PublicNames:
-    """Finds a module by its public name.
+    """A finder of modules by their public names.
 
-    It stands before Python's own finders, which would find a part of such a package a second time, by its path.
+    It stands before Python's own finders, which would load a part of such a package a second time, by its path.
     """
 
     @staticmethod
     def find_spec(fullname: str, *_: object) -> ModuleSpec | None:
         public = ".".join(fullname.split(".", 2)[:2])
-        place = _spec(PUBLIC[public] + fullname[len(public) :]) if public in PUBLIC else None
+        if public not in PUBLIC:
+            return None
+        from importlib.util import find_spec  # of use to public names only
+
+        place = find_spec(PUBLIC[public] + fullname[len(public) :])
         if place is None:
             return None
         loader: Any = _SameModule(place)
@@ -41,7 +46,7 @@ class PublicNames:
 
 
 class _SameModule:
-    """Loads a module under a second name."""
+    """A loader of a module under a second name."""
 
     def __init__(self, place: ModuleSpec) -> None:
         self._place = place
@@ -49,28 +54,17 @@ class _SameModule:
 
     def create_module(self, _: ModuleSpec) -> ModuleType:
         module = import_module(self._place.name)
-        self._spec = module.__spec__  # importing sets that of the second name
+        self._spec = module.__spec__  # the import sets the one of the second name
         return module
 
     def exec_module(self, module: ModuleType) -> None:
         module.__spec__ = self._spec
 
     def get_code(self, _: str) -> CodeType | None:
-        """Return what ``python -m`` runs."""
+        """Return the code that ``python -m`` runs."""
         loader: Any = self._place.loader
         code: CodeType | None = loader.get_code(self._place.name)
         return code
-
-    def get_source(self, _: str) -> str | None:
-        loader: Any = self._place.loader
-        source: str | None = loader.get_source(self._place.name)
-        return source
-
-
-def _spec(name: str) -> ModuleSpec | None:
-    from importlib.util import find_spec  # of use to public names only
-
-    return find_spec(name)
 
 
 def install() -> None:

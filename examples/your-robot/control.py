@@ -1,4 +1,4 @@
-"""Who drives a robot: one has control until it ends, is released or is taken; one who asks meanwhile is shown.
+"""The control of a robot: it ends, is released or is taken; a request meanwhile is shown.
 
 Times are milliseconds of a clock that is never set.
 """

@@ -1,12 +1,13 @@
-"""Builds the command line from the modules it needs, and runs it."""
+"""The command line: its commands, and how one is run."""
 
 from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Annotated, Any, Final
+from functools import partial
+from typing import Annotated, Any, Final, NamedTuple
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -18,23 +19,23 @@ from pebble.version import __version__
 
 log = logging.getLogger(__name__)
 
-#: Ours that are of no extension.
+#: The commands of the core.
 _CORE: Final = {
     "up": Offered("pebble.commands.up:up", "run a robot", "own", 20),
     "check": Offered("pebble.commands.check:check", "validate configs and summarise them", "own", 30),
 }
-#: What a wrong command line raises: typer 0.27 has no public name for all of it.
+#: The base of errors of a wrong command line: typer 0.27 has no public name for it.
 _WRONG: Any = getattr(typer, "TyperException", typer.BadParameter.__base__)
-#: The headings of the help, in their order; other packages' commands stand last.
+#: The headings of the help, in order; commands of other packages stand last.
 _GROUPS: Final = ("use", "own", "write", "share", "measure", "more")
 
 
 def commands(words: Sequence[str] = ()) -> dict[str, Offered]:
-    """Return each command by its words, in the order of the help.
+    """Return the commands by their words, in the order of the help.
 
-    Those of other packages are looked for only if the first of ``words`` is none of ours.
+    Other packages are looked at only if none of our commands begins with the first of ``words``.
     """
-    offered = {**_CORE, **{name: row for one in ours() for name, row in one.commands.items()}}
+    offered = {**_CORE, **{name: row for extension in ours() for name, row in extension.commands.items()}}
     if not words or words[0] not in offered:
         foreign = list(packages())
         try:
@@ -42,15 +43,15 @@ def commands(words: Sequence[str] = ()) -> dict[str, Offered]:
         except ConfigError as error:
             if words and not words[0].startswith("-"):
                 raise
-            log.error("%s", error)  # and help has ours
+            log.error("%s", error)  # the help still has ours
             foreign = []
-        offered |= {name: row for one in foreign for name, row in one.commands.items()}
+        offered |= {name: row for extension in foreign for name, row in extension.commands.items()}
     return dict(sorted(offered.items(), key=lambda item: (_GROUPS.index(item[1].group), item[1].rank)))
 
 
 def run(arguments: list[str]) -> int:
-    """Run one command line; returns the exit code, 2 for a wrong command line. Raises PebbleError."""
-    for former, now in ((former, now) for one in ours() for former, now in one.former.items()):
+    """Run a command line; return the exit code, 2 if it is wrong. Raises PebbleError."""
+    for former, now in ((former, now) for extension in ours() for former, now in extension.former.items()):
         if arguments[: len(former.split())] == former.split():
             command = now.partition(" --")[0]
             sys.stderr.write(f'pebble: "{former}" is now "{now}": pebble {command} --help\n')
@@ -60,7 +61,7 @@ def run(arguments: list[str]) -> int:
 
 
 def application(words: Sequence[str] = ()) -> Any:
-    """Build the command line for such words; what is below a command is imported when it is needed."""
+    """Return the command line for these words; modules of commands are imported when they are needed."""
     app = typer.Typer(cls=_Pebble, rich_markup_mode=None)
     app.callback()(_options)
     command = typer.main.get_command(app)
@@ -75,7 +76,7 @@ class _Pebble(TyperGroup):
     _offered: Mapping[str, Offered] = {}
 
     def offer(self, offered: Mapping[str, Offered]) -> None:
-        """Have these commands."""
+        """Set the commands."""
         self._offered = offered
         self.commands = {words: _Listed(words, offered) for words in offered if " " not in words}
 
@@ -91,7 +92,7 @@ class _Pebble(TyperGroup):
 
 
 class _Listed(TyperCommand):
-    """A command of the table. It is imported when it runs, explains itself or completes what is typed."""
+    """A command of the table. Its module is imported for running, help or completion."""
 
     def __init__(self, words: str, offered: Mapping[str, Offered]) -> None:
         super().__init__(words.split()[-1], help=offered[words].help)
@@ -100,9 +101,7 @@ class _Listed(TyperCommand):
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         command = self._command(args)
         if extra.get("resilient_parsing"):  # for Tab
-            from pebble.commands.completion import complete_values
-
-            complete_values(command)
+            _complete_values(command)
         return command.make_context(info_name, args, parent, **extra)
 
     def _command(self, arguments: list[str]) -> Any:
@@ -123,6 +122,28 @@ class _Listed(TyperCommand):
         if isinstance(command, TyperGroup):
             command.commands.update(below)
         return command
+
+
+class _Completion(NamedTuple):
+    """A value, as a shell gets it."""
+
+    value: str
+    type: str = "plain"
+    help: str | None = None
+
+
+def _complete_values(command: Any) -> None:
+    """Let a command, and those below it, complete the values of arguments that extensions know by their names."""
+    places = {name: place for extension in ours() for name, place in extension.completions.items()}
+    for parameter in command.params:
+        if place := places.get(parameter.metavar or ""):
+            parameter.shell_complete = partial(_values, part(place))
+    for below in command.commands.values() if isinstance(command, TyperGroup) else ():
+        _complete_values(below)
+
+
+def _values(values: Callable[[Any], list[str]], context: Any, incomplete: str) -> list[_Completion]:
+    return [_Completion(value) for value in values(context) if value.startswith(incomplete)]
 
 
 def _run(arguments: list[str]) -> int:
@@ -150,7 +171,7 @@ def _run(arguments: list[str]) -> int:
 
 
 class _ErrorHandler(logging.StreamHandler):  # type: ignore[type-arg]  # of the stream of the moment
-    """Writes without logins, and imports what that takes with the first error."""
+    """A handler that writes errors without logins, and imports the formatter with the first error."""
 
     def format(self, record: logging.LogRecord) -> str:
         from pebble.runtime.parent import MaskingFormatter  # of use to errors only
@@ -160,7 +181,7 @@ class _ErrorHandler(logging.StreamHandler):  # type: ignore[type-arg]  # of the 
 
 @contextmanager
 def _thread_errors_on_stderr() -> Iterator[None]:
-    """Log errors to stderr: a command raises its own errors, but not those of threads."""
+    """Log errors of threads to stderr; a command raises its own errors."""
     handler = _ErrorHandler()
     handler.setLevel(logging.ERROR)
     logging.getLogger("pebble").addHandler(handler)

@@ -13,6 +13,7 @@ from pebble.config import Config, Mqtt, load, resolved
 from pebble.config.rules.doors import place_of
 from pebble.config.rules.exposure import connections
 from pebble.config.secret_text import shown_user, without_secrets
+from pebble.config.transport import ZenohClient
 from pebble.config.visible import shown
 from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
@@ -31,7 +32,7 @@ _MEDIA = {
     "audio_publisher": "audio_publisher",
     "audio_receiver": "audio_receiver",
 }
-#: Channels that no config can rename.
+#: Channels of these processes that no config can rename.
 _FIXED = {_LAUNCHER: STATUS, "av_daemon": MEDIA_STATUS}
 
 
@@ -51,7 +52,7 @@ def check(
         pebble check --keys | grep recorder
     """
     if keys:
-        from pebble.config.schema import keys_text  # few checks need it
+        from pebble.config.keys import keys_text  # few checks need it
 
         typer.echo(keys_text(), nl=False)
         return 0
@@ -69,7 +70,8 @@ def _check(path: Path, *, as_json: bool, first: bool) -> bool:
         config = load(path)
         check_connections(config)
         _check_certificates(config)
-        added = [call(one, "facts", Facts, config) for one in config.installed if one.facts and not as_json]
+        speakers = [] if as_json else [extension for extension in config.installed if extension.facts]
+        added = [call(extension, "facts", Facts, config) for extension in speakers]
     except ConfigError as error:
         for problem in error.problems:
             line = problem if f"{path.name}: " in problem else f"{path.name}: {problem}"
@@ -85,19 +87,11 @@ def _check(path: Path, *, as_json: bool, first: bool) -> bool:
 
 
 def _check_certificates(config: Config) -> None:
-    """Raise ConfigError for files of TLS that a connection would refuse."""
-    bridge, transport = config.services.mqtt_bridge, config.transport
-    sections = {
-        "local_mqtt": config.local_mqtt.tls,
-        "transport": transport.tls,
-        "transport.mqtt_mirror": None if transport.mqtt_mirror is None else transport.mqtt_mirror.tls,
-        "services.mqtt_bridge.remote_mqtt": bridge.remote_mqtt.tls,
-        "services.mqtt_bridge.remote": None if bridge.remote is None else bridge.remote.tls,
-        **{".".join(map(str, path)): section.tls for path, section in connections(config) if hasattr(section, "tls")},
-    }
+    """Raise ConfigError for files of TLS that a connection in use would refuse."""
     problems = []
-    for place, section in sections.items():
-        settings = None if section is None else tls_settings(section)
+    for path, section in connections(config):
+        place = ".".join(map(str, path))
+        settings = tls_settings(section.tls) if isinstance(section, Mqtt | ZenohClient) else None
         if settings is None:
             continue
         from pebble.transports.tls import make_context  # ssl, which few configs need
@@ -142,12 +136,12 @@ def _print(config: Config, path: Path, added: list[Facts]) -> None:
                     "yes" if line.retained else "",
                 )
         output.print(Padding(table, (1, 0, 0, 2), expand=False))
-    print_grid("dim", [tuple(map(shown, line)) for one in added for line in one.table])
+    print_grid("dim", [tuple(map(shown, line)) for facts in added for line in facts.table])
     print_grid("yellow", [("warning", warning) for warning in (*config.warnings, *_packages(config))])
 
 
 def _packages(config: Config) -> Iterator[str]:
-    """Yield what programs of this robot cannot do without, and this Python lacks."""
+    """Yield a line for each extension of this robot whose packages this Python lacks."""
     for extension in config.installed:
         if missing := lacking_packages(extension) if programs_of([extension], config) else []:
             install = f'pip install "{extension.package}[{extension.extra}]"'
@@ -155,7 +149,7 @@ def _packages(config: Config) -> Iterator[str]:
 
 
 class TopicLine(NamedTuple):
-    """One channel of one process, under the name that the config gives it."""
+    """A channel of a process, with the topic that the config gives it."""
 
     channel: Channel
     topic: str
@@ -169,26 +163,27 @@ def facts(config: Config, added: Iterable[Facts]) -> list[tuple[str, str]]:
     if config.robot.platform != "linux":
         firmware = f"runs on its own MCU ({config.robot.platform}), not with `pebble up`"
         return [("platform", firmware), ("broker", _mqtt(config.local_mqtt)), *_scripts(config)]
-    found = [("transport", _transport(config)), *_security(config)]
+    lines = [("transport", _transport(config)), *_security(config)]
     if config.transport.mqtt_mirror is not None:
-        found.append(("mirror", _mqtt(config.transport.mqtt_mirror)))
+        lines.append(("mirror", _mqtt(config.transport.mqtt_mirror)))
     if config.services.mqtt_bridge.enabled:
-        found.append(("uplink", _uplink(config)))
-    found += [line for one in added for line in one.lines]
-    found += _scripts(config)
-    found += [("serial", line) for line in _serial_lines(config)]
-    found += [("for the original's scripts", text) for text in _local_media(config)]
+        lines.append(("uplink", _uplink(config)))
+    lines += [line for facts in added for line in facts.lines]
+    lines += _scripts(config)
+    lines += [("serial", line) for line in _serial_lines(config)]
+    memories = (config.hall_memory(line) for line in config.motor_lines().values())
+    lines += [("for the original's scripts", f"hall samples in the shared memory {name}") for name in memories if name]
     table = programs(config)
-    found.append(("processes", ", ".join([_LAUNCHER, *(program.name for program in table if not program.on_demand)])))
+    lines.append(("processes", ", ".join([_LAUNCHER, *(program.name for program in table if not program.on_demand)])))
     on_request = ", ".join(program.name for program in table if program.on_demand)
     off = ", ".join(_off(config))
-    return [*found, *((name, line) for name, line in (("on request", on_request), ("off", off)) if line)]
+    return [*lines, *((name, line) for name, line in (("on request", on_request), ("off", off)) if line)]
 
 
 def _off(config: Config) -> Iterator[str]:
     """Yield the services that have settings, but are not enabled."""
-    own = config.services.serial_mcu_bridge
-    for name, line in {"": own, **own.instances}.items():
+    bridge = config.services.serial_mcu_bridge
+    for name, line in {"": bridge, **bridge.instances}.items():
         if not line.enabled and line.serial.port is not None:
             yield f"serial_mcu_bridge{name and ':'}{name} (its section has a port)"
     for name in config.services.__struct_fields__:
@@ -198,7 +193,7 @@ def _off(config: Config) -> Iterator[str]:
 
 
 def topics_of(config: Config) -> Iterator[tuple[str, list[TopicLine]]]:
-    """Yield the processes with topics, each with its topics."""
+    """Yield each process that has topics, with its topics."""
     for name in (_LAUNCHER, *(program.name for program in programs(config))):
         service, _, instance = name.partition(":")
         lines = _lines(view_of(config, instance), service)
@@ -208,18 +203,18 @@ def topics_of(config: Config) -> Iterator[tuple[str, list[TopicLine]]]:
 
 def _lines(config: Config, service: str) -> list[TopicLine]:
     addresses = Addresses(config)
-    mine = [channel for channel in CHANNELS if _is_of(channel, service) or channel is _FIXED.get(service)]
+    channels = [channel for channel in CHANNELS if _is_of(channel, service) or channel is _FIXED.get(service)]
     if service == "serial_mcu_bridge":
-        mine = [channel for channel in mine if _is_of_serial_line(channel, config)]
+        channels = [channel for channel in channels if _is_of_serial_line(channel, config)]
     return [
         TopicLine(channel, topic, qos, retained, topic != channel.topic(config.base))
-        for channel in mine
+        for channel in channels
         for topic, qos, retained in [addresses[channel]]
     ]
 
 
 def _is_of(channel: Channel, service: str) -> bool:
-    """Does the channel belong to the service? The config path that renames it begins with the service's name."""
+    """True if the channel belongs to the service: the config path that renames it begins with the service's name."""
     path = channel.override or ""
     if service in _MEDIA:
         return path == f"services.mqtt_bridge.media.{_MEDIA[service]}.topic"
@@ -245,16 +240,14 @@ def _transport(config: Config) -> str:
 def _uplink(config: Config) -> str:
     bridge = config.services.mqtt_bridge
     if bridge.remote is not None and bridge.remote.kind != "mqtt":
-        ways = [f"listens on {one}" for one in bridge.remote.listen]
-        return ", ".join([bridge.remote.kind, *ways, *(f"connects to {one}" for one in bridge.remote.connect)])
+        ways = [f"listens on {endpoint}" for endpoint in bridge.remote.listen]
+        ways += [f"connects to {endpoint}" for endpoint in bridge.remote.connect]
+        return ", ".join([bridge.remote.kind, *ways])
     return f"mqtt, {_mqtt(bridge.remote_mqtt)}"
 
 
 def _scripts(config: Config) -> list[tuple[str, str]]:
-    """Return what a script's signature is worth at a broker that others share.
-
-    No bridge stands between it and the motors.
-    """
+    """Return a warning about scripts if others share the broker: no bridge stands between it and the motors."""
     bridge, shared = config.services.mqtt_bridge, config.transport.mqtt_mirror
     if config.transport.kind == "mqtt":
         elsewhere = bridge.remote is not None and bridge.remote.kind != "mqtt"
@@ -273,13 +266,6 @@ def _mqtt(mqtt: Mqtt) -> str:
     return f"{mqtt.host}:{mqtt.port}, MQTT {mqtt.protocol}, {user}{password}, {tls}"
 
 
-def _local_media(config: Config) -> Iterator[str]:
-    """Yield what programs of the original find on the robot besides MQTT."""
-    for line in config.motor_lines().values():
-        if (memory := config.hall_memory(line)) is not None:
-            yield f"hall samples in the shared memory {memory}"
-
-
 def _security(config: Config) -> Iterator[tuple[str, str]]:
     if config.security.level != "open":
         who = {"drive": "may drive, too", "free": "may drive while nobody has control", "refuse": "may not drive"}
@@ -288,7 +274,7 @@ def _security(config: Config) -> Iterator[tuple[str, str]]:
 
 def _serial_lines(config: Config) -> Iterator[str]:
     for name, line in config.serial_instances().items():
-        own = f"{name}: " if name else ""
+        label = f"{name}: " if name else ""
         drives = SERIAL_PROTOCOLS[line.protocol].drives
         stop = f", stops {line.safety.drive_timeout_seconds:g} s after the last command" if drives else ""
-        yield f"{own}{line.protocol} at {line.serial.port}, {line.serial.baud} baud{stop}"
+        yield f"{label}{line.protocol} at {line.serial.port}, {line.serial.baud} baud{stop}"

@@ -1,10 +1,11 @@
 """``pebble up`` with options, and its help; ``pebble.cli`` runs a plain ``pebble up CONFIG`` without this module."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from pebble.commands.options import ConfigArgument
+ConfigArgument = Annotated[Path, typer.Argument(help="A robot's config file.", metavar="CONFIG", show_default=False)]
 
 
 def up(

@@ -1,4 +1,4 @@
-"""A whole config: read from its JSON file, checked, completed, and from then on typed and unchangeable."""
+"""The config of a robot: read from its JSON file, checked and completed; typed and unchangeable from then on."""
 
 import hashlib
 import os
@@ -15,7 +15,7 @@ from msgspec.structs import asdict, fields, replace
 from pebble import extension
 from pebble.config import problems
 from pebble.config.home import in_home
-from pebble.config.masking import holds_secret, masked
+from pebble.config.masking import holds_secret, masked, values_of
 from pebble.config.problems import Note, Notes
 from pebble.config.raw import Pairs, decode, plain, read_text, with_instances, without
 from pebble.config.reader import Check, Reader, Rule
@@ -48,30 +48,26 @@ class Config(Root, frozen=True, kw_only=True):
     warnings: tuple[str, ...]  # one line each
     run_folder: Path
     state_folder: Path
-    password_variables: tuple[str, ...]  # of the environment: those that passwords were read from
-    installed: tuple[Extension, ...]  # that it was read with
-    missing: tuple[Missing, ...]  # that it names and this machine lacks
+    password_variables: tuple[str, ...]  # environment variables from which passwords were read
+    installed: tuple[Extension, ...]
+    missing: tuple[Missing, ...]
     motor_owners: tuple[str, ...] = ()  # of the whole robot, also in the view of one serial line
 
     @property
     def base(self) -> str:
-        """What all topics of this robot begin with, without a final slash."""
+        """The first three levels of all topics of this robot, without a final slash."""
         return self.identity.base
 
     def section(self, kind: type[S]) -> S:
         """Return the section of an extension by its class; its defaults where the extension is not installed."""
-        for holder in (self.services, self):
-            for name in holder.__struct_fields__:
-                if isinstance(section := getattr(holder, name), kind):
-                    return section
-        return kind()
+        return next(values_of(self, kind), kind())
 
     def run_dir(self) -> Path:
         """Return the folder of this robot's sockets and locks, absolute; not created here."""
         return self.run_folder
 
     def state_dir(self) -> Path:
-        """Return the folder of what must survive a power cut, absolute; not created here."""
+        """Return the folder for files that must survive a power cut, absolute; not created here."""
         return self.state_folder
 
     def state_file(self, name: str) -> Path:
@@ -80,14 +76,14 @@ class Config(Root, frozen=True, kw_only=True):
 
     @staticmethod
     def motor_owner(instance: str) -> str:
-        """Return what the motor owner of a serial line is called in ``outgoing/estop/{owner}``."""
+        """Return the name of a serial line's motor owner, as in ``outgoing/estop/{owner}``."""
         return instance or "serial"
 
     def serial_instances(self) -> dict[str, SerialBridge]:
-        """Return the enabled serial lines, one process each, by instance name; the service's own entry is ``""``."""
-        own = self.services.serial_mcu_bridge
-        lines: dict[str, SerialBridge] = {"": own, **own.instances}
-        known = {*OF_CORE, *(key for one in self.installed for key in one.protocols)}
+        """Return the enabled serial lines, one process each, by instance name; ``""`` is the section itself."""
+        section = self.services.serial_mcu_bridge
+        lines: dict[str, SerialBridge] = {"": section, **section.instances}
+        known = {*OF_CORE, *(protocol for extension in self.installed for protocol in extension.protocols)}
         return {
             name: line
             for name, line in lines.items()
@@ -95,14 +91,14 @@ class Config(Root, frozen=True, kw_only=True):
         }
 
     def hall_memory(self, line: SerialBridge) -> str | None:
-        """Return the name of the shared memory that gets this line's hall samples; None: there is none."""
+        """Return the name of the shared memory for this line's hall samples, or None."""
         ring = line.odometry_shm
         if ring is None or not ring.enabled:
             return None
         return ring.name or f"{self.base.replace('/', '_')}_odometry_raw"
 
     def motor_lines(self) -> dict[str, SerialBridge]:
-        """Return those of the enabled serial lines that drive motors."""
+        """Return the enabled serial lines that drive motors."""
         lines = self.serial_instances().items()
         return {name: line for name, line in lines if SERIAL_PROTOCOLS[line.protocol].drives}
 
@@ -127,7 +123,7 @@ def load(
 ) -> Config:
     """Read a config file. Raises ConfigError with every problem in it.
 
-    ``lenient``: an extension that this machine lacks is a warning. ``core_only``: without any.
+    ``lenient``: an extension that this machine lacks is a warning. ``core_only``: no extension is used.
     """
     path = Path(path).absolute()
     raw = decode(read_text(path), path.name)
@@ -140,23 +136,20 @@ _handed_over: Config | None = None
 
 
 def hand_over(config: Config) -> None:
-    """Make ``config`` that of this process: the launcher does so in its children, which are forks of it."""
+    """Set the config of this process: the launcher does so in its children, which are forks of it."""
     global _handed_over
     _handed_over = config
 
 
 def config_of_process(path: Path | str) -> Config:
-    """Return the config that the launcher read from ``path`` when the robot started.
-
-    Without a launcher, as :func:`load`.
-    """
+    """Return the config that the launcher read from ``path`` when the robot started; without one, read the file."""
     if _handed_over is not None and _handed_over.path == Path(path).absolute():
         return _handed_over
     return load(path)
 
 
 def parse(raw: dict[str, Any], *, folder: Path, env: Mapping[str, str]) -> Config:
-    """Return the same of plain data; relative paths start at ``folder``, passwords are in the environment ``env``."""
+    """Return a config from plain data. Relative paths start at ``folder``; ``env`` has the passwords."""
     return _config(raw, None, folder.absolute(), env)
 
 
@@ -170,22 +163,24 @@ def _config(
     core_only: bool = False,
 ) -> Config:
     notes = Notes()
-    own = plain(raw, notes)
-    found, lost = _extensions(own, folder)
-    installed, missing = ((), ()) if core_only else (found, lost)
-    lacking = [Note(tuple(one.key.split(".", 1)), one.reason) for one in missing]
-    (notes.warnings if lenient else notes.problems).extend(lacking)
+    written = plain(raw, notes)
+    available, lacking = _extensions(written, folder)
+    installed, missing = ((), ()) if core_only else (available, lacking)
+    about_missing = [Note(tuple(lost.key.split(".", 1)), lost.reason) for lost in missing]
+    (notes.warnings if lenient else notes.problems).extend(about_missing)
     tree, kind, rules = _tree(installed)
     reader = Reader(folder, env, rules, notes, other_forms=True)
-    merged = with_instances(own)
-    unread = [*extension.keys_of_missing(installed), *(key for one in found if core_only for key in one.sections)]
+    merged = with_instances(written)
+    unread = extension.keys_of_missing(installed)
+    if core_only:
+        unread += [key for unused in available for key in unused.sections]
     root = reader.section(tree, without(merged, unread))
-    notes.forget_inherited(own, merged)
-    if path is not None and holds_secret(own):
+    notes.forget_inherited(written, merged)
+    if path is not None and holds_secret(written):
         warn_if_readable(notes, (), path, "it, and there is a password in it")
     if notes.problems:
-        # What is missing is said first: unknown sections may be its own.
-        raise ConfigError(list(dict.fromkeys(map(str, (*lacking, *notes.problems)))))
+        # Missing extensions come first: unknown sections may be theirs.
+        raise ConfigError(list(dict.fromkeys(map(str, (*about_missing, *notes.problems)))))
     identity = Identity(root.robot.system, root.robot.type, root.robot.id)
     config: Config = kind(
         **asdict(root),
@@ -211,30 +206,30 @@ def _config(
     return replace(config, motor_owners=owners)
 
 
-def _extensions(own: Any, folder: Path) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:
-    """Return ours and those that the file lists, and those of both that this machine lacks."""
-    listed = own.get("extensions") if isinstance(own, dict) else None
+def _extensions(written: Any, folder: Path) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:
+    """Return our extensions and those that the file lists, and the ones that this machine lacks."""
+    listed = extension.value_at(written, "extensions")
     entries = listed if isinstance(listed, dict) else {}
-    drives = {name: isinstance(entry, dict) and entry.get("drives") is True for name, entry in entries.items()}
-    found, missing = extension.named(drives, folder, Section)
-    installed = (*extension.ours(), *found)
+    drives = {name: extension.value_at(entry, "drives") is True for name, entry in entries.items()}
+    named, missing = extension.named(drives, folder, Section)
+    installed = (*extension.ours(), *named)
     sections = [*dir(Config), *(f"services.{name}" for name in dir(Services))]  # with the names of methods
     protocols = {name: SERIAL_PROTOCOLS[name] for name in OF_CORE}
     core = Extension(name="core", package="Pebble", sections=dict.fromkeys(sections, ""), protocols=protocols)
     extension.refuse_claims(core, installed)
-    for one in found:
-        SERIAL_PROTOCOLS.update(one.protocols)
-    return installed, (*missing, *extension.lacking(own))
+    for added in named:
+        SERIAL_PROTOCOLS.update(added.protocols)
+    return installed, (*missing, *extension.lacking(written))
 
 
 def _without_broken(config: Config) -> Config:
-    """Return the config without extensions whose programs cannot be told: the rest of the robot starts."""
-    for one in config.installed:
+    """Return the config without extensions that cannot list their programs: the rest of the robot starts."""
+    for tried in config.installed:
         try:
-            extension.programs_of([one], config)
+            extension.programs_of([tried], config)
         except ConfigError as error:
-            lost = Missing(one.name, f"extensions.{one.name}", str(error), drives=bool(one.motors))
-            installed = tuple(other for other in config.installed if other is not one)
+            lost = Missing(tried.name, f"extensions.{tried.name}", str(error), drives=bool(tried.motors))
+            installed = tuple(other for other in config.installed if other is not tried)
             warnings = (*config.warnings, str(error))
             config = replace(config, installed=installed, missing=(*config.missing, lost), warnings=warnings)
     return config
@@ -242,38 +237,38 @@ def _without_broken(config: Config) -> Config:
 
 @cache
 def _tree(installed: tuple[Extension, ...]) -> tuple[type[Root], Any, tuple[Rule, ...]]:
-    """Return the class of a file with the sections of these extensions, that of such a config, and the rules."""
-    tree = tree_of({key: extension.part(place) for one in installed for key, place in one.sections.items()})
-    added = [
+    """Return the classes of a file and of a config with the sections of these extensions, and the rules."""
+    tree = tree_of({key: extension.part(place) for added in installed for key, place in added.sections.items()})
+    added_fields = [
         (field.name, field.type, field.default) for field in fields(tree) if field.name not in Root.__struct_fields__
     ]
     names = {"__doc__": Config.__doc__, "__module__": __name__}
-    kind = defstruct("Config", added, bases=(Config,), namespace=names, frozen=True, kw_only=True)
-    rules = [(of, _guarded(one, rule)) for one in installed if one.rules for of, rule in extension.part(one.rules)]
+    kind = defstruct("Config", added_fields, bases=(Config,), namespace=names, frozen=True, kw_only=True)
+    with_rules = [added for added in installed if added.rules]
+    rules = [(of, _guarded(added, rule)) for added in with_rules for of, rule in extension.part(added.rules)]
     return tree, kind, (*CHECKS, *rules)
 
 
-def _guarded(one: Extension, rule: Check) -> Check:
-    """Return a rule that notes a problem where it fails; ours are as they are."""
-    if one in extension.ours():
+def _guarded(owner: Extension, rule: Check) -> Check:
+    """Return the rule of a stranger's extension so that its failure is a problem of the config; ours unchanged."""
+    if owner in extension.ours():
         return rule
 
     def check(reader: Reader, section: Any, path: problems.Path) -> Any:
         try:
-            checked = rule(reader, section, path)
+            checked, why = rule(reader, section, path), f"returned no {type(section).__name__}"
         except Exception as error:  # noqa: BLE001 - a stranger's
-            reader.notes.problem(path, f"a rule of {one.package} failed: {type(error).__name__}: {error}")
-            return section
-        if not isinstance(checked, type(section)):
-            reader.notes.problem(path, f"a rule of {one.package} returned no {type(section).__name__}")
-            return section
-        return checked
+            checked, why = None, f"failed: {type(error).__name__}: {error}"
+        if isinstance(checked, type(section)):
+            return checked
+        reader.notes.problem(path, f"a rule of {owner.package} {why}")
+        return section
 
     return check
 
 
 def full_tree() -> type[Root]:
-    """Return the class of a whole file that lists no other extensions, for the schema and the table of keys."""
+    """Return the class of a file with our extensions only, for the schema and the table of keys."""
     return _tree(extension.ours())[0]
 
 
@@ -314,21 +309,20 @@ def default_state_folder(base: str, env: Mapping[str, str]) -> Path:
 
 
 def file_name(base: str) -> str:
-    """Return a name for one robot's files: its base, or a digest of it where a file system would refuse the name."""
+    """Return a name for one robot's files: its base, or a digest of a base that is too long for a file system."""
     name = base.replace("/", "+")  # which no level of a topic contains
     return name if len(os.fsencode(name)) <= _LONGEST_NAME else hashlib.sha256(os.fsencode(base)).hexdigest()
 
 
 def resolved(config: Config) -> dict[str, Any]:
-    """Return the file's keys with every default and inherited value, and under ``derived`` what is computed from them.
+    """Return the file's keys as JSON can write them, with every default and inherited value, and ``derived`` values.
 
-    JSON can write all of it. Keys that are not set and have no default are left out; secrets and the values of
-    variables read ``***``.
+    Keys that are not set and have no default are left out; secrets and the values of variables read ``***``.
     """
     derived = {*Config.__struct_fields__} - {*Root.__struct_fields__}
     names = [name for name in config.__struct_fields__ if name not in derived and name != "schema_"]
-    own = {name: masked(getattr(config, name), name) for name in names}
-    return own | {
+    keys = {name: masked(getattr(config, name), name) for name in names}
+    return keys | {
         "derived": {
             "base": config.base,
             "run_dir": str(config.run_dir()),

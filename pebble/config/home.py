@@ -6,7 +6,7 @@ from pebble.errors import ConfigError
 
 
 def in_home(path: str | Path) -> Path:
-    """``path`` with a ``~`` at its beginning replaced.
+    """Return ``path`` with a ``~`` at its beginning replaced.
 
     Raises ConfigError where that folder is not known: there is no HOME, and no entry for this user or for that name.
     """

@@ -1,4 +1,4 @@
-"""Reads hosts as people write them: a name or an address is understood, all else is refused with what to write."""
+"""Readers of hosts as people write them: names and addresses. An error says what to write instead."""
 
 import re
 from ipaddress import IPv4Address, IPv6Address, ip_address
@@ -18,7 +18,7 @@ _RULE = 'must be a name or a whole address, such as "broker.lan" or "192.168.1.7
 
 
 class HostError(PebbleError):
-    """An error that says what is wrong with a host and what to write; it repeats nothing of what was written."""
+    """An error that says what is wrong with a host and what to write. It repeats nothing of the text."""
 
 
 class UrlParts(NamedTuple):
@@ -43,7 +43,7 @@ def host(text: str) -> str:
 
 
 def broker_host(text: str) -> str:
-    """Return the host of a broker, to which a connection is made. Raises HostError."""
+    """Return the host of a broker. Raises HostError."""
     name = host(text)
     if ":" in name and IPv6Address(name).is_link_local and "%" not in name:
         raise HostError(f'names no network card: write "{name}%eth0" with the name of yours')
@@ -75,21 +75,15 @@ def endpoint(text: str) -> str:
     return text
 
 
-def check_web_url(text: str) -> None:
-    """Raise HostError for ``http://`` or ``https://`` without a host that is one. ``text`` holds no login."""
-    if text.lower().startswith(("http://", "https://")):
-        split(text)
-
-
 def no_login(text: str) -> str:
-    """Return a name, which is published and logged. Raises HostError for a login, as ``user:password@`` is."""
+    """Return a name that is published and logged. Raises HostError for a login such as ``user:password@``."""
     if without_secrets(text) != text:
         raise HostError("holds a login or a password, and is shown to everybody: remove it")
     return text
 
 
 def typeable(text: str) -> str:
-    """Return a name that people type, such as a robot's. Raises HostError for one that they cannot."""
+    """Return a name that people type, such as a robot's. Raises HostError if no keyboard writes it."""
     if why := untypeable(text):
         raise HostError(why)
     return no_login(text)
@@ -103,7 +97,7 @@ def no_url(text: str) -> str:
 
 
 def split(text: str) -> UrlParts:
-    """Take a URL, or ``[user@]host[:port]``, apart. Raises HostError."""
+    """Split a URL, or ``[user@]host[:port]``, into its parts. Raises HostError."""
     if flaw := hidden(text):
         raise HostError(flaw)
     if "://" not in text:
@@ -142,7 +136,7 @@ def _address(text: str) -> str:
 
 def _with_zone(text: str) -> str:
     """Return a text with ``[fe80::1%eth0]`` in place of ``[fe80::1%25eth0]``."""
-    return _ZONE.sub(lambda found: f"[{found[1]}%{unquote(found[2])}]", text)
+    return _ZONE.sub(lambda match: f"[{match[1]}%{unquote(match[2])}]", text)
 
 
 def _name(text: str) -> str:
@@ -162,7 +156,7 @@ def _name(text: str) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """True if ``host`` is an address of this machine that no other one reaches."""
+    """True if ``host`` is an address of this machine that no other machine reaches."""
     try:
         return ip_address(host).is_loopback
     except ValueError:

@@ -1,4 +1,4 @@
-"""Finds and hides what is secret in a config: by its keys, and in its texts as secret_text does."""
+"""Secrets in a config: found by their keys, and in texts as secret_text does; and hidden."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,15 +19,15 @@ def values_of(section: object, kind: type[Value]) -> Iterator[Value]:
     if isinstance(section, kind):
         yield section
     elif isinstance(section, Section):
-        for field in fields(section):
-            yield from values_of(getattr(section, field.name), kind)
+        for name in section.__struct_fields__:
+            yield from values_of(getattr(section, name), kind)
     elif isinstance(section, dict):
         for item in section.values():
             yield from values_of(item, kind)
 
 
 def holds_secret(value: Any, key: str = "") -> bool:
-    """True if a secret is written in plain data, to tell from its keys and its text."""
+    """True if plain data seems to hold a secret, by its keys and texts."""
     if isinstance(value, dict):
         return any(holds_secret(item, name) for name, item in value.items())
     if isinstance(value, list):
@@ -45,8 +45,8 @@ def masked(value: Any, key: str = "") -> Any:
     if isinstance(value, Section):
         return _object({field.encode_name: getattr(value, field.name) for field in fields(value)})
     if isinstance(value, dict):
-        variables = key == "env" or key.endswith("_env")  # whatever they are called
-        return dict.fromkeys(value, HIDDEN) if variables else _object(value)
+        is_environment = key == "env" or key.endswith("_env")
+        return dict.fromkeys(value, HIDDEN) if is_environment else _object(value)
     if isinstance(value, tuple | list) and (key == "command" or key.endswith("_command")):
         return [masked(word) if number == 0 else HIDDEN for number, word in enumerate(value)]  # any may be a secret
     if isinstance(value, tuple | list):

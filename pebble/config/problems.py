@@ -1,4 +1,4 @@
-"""Problems of and warnings about a config file: collected while it is read, reported all at once."""
+"""Problems and warnings of a config file: collected while it is read, reported all at once."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -7,11 +7,11 @@ from pebble.config.secret_text import without_secrets
 
 Path = tuple[str | int, ...]
 _ALIKE = 0.6  # of 1.0, which is equal
-_FEW_REASONS = 2  # why keys are no longer used, that are told; a file of the original has a dozen
+_FEW_REASONS = 2  # why keys are no longer used: more reasons are not told; a file of the original has a dozen
 
 
 class Note(NamedTuple):
-    """One remark about one place of the file."""
+    """A remark about one place of the file."""
 
     path: Path
     text: str
@@ -21,7 +21,7 @@ class Note(NamedTuple):
 
 
 class Notes:
-    """Problems, which refuse the file, and warnings, which do not."""
+    """Problems, for which the file is refused, and warnings."""
 
     def __init__(self) -> None:
         self.problems: list[Note] = []
@@ -32,17 +32,17 @@ class Notes:
         self.problems.append(Note(path, text))
 
     def doubt(self, path: Path, text: str) -> None:
-        """Note a problem that may follow from another: not reported if one is known at this place or around it."""
+        """Note a problem, unless one is known here or around this place: it may be the cause."""
         if not any(known.path == path[: len(known.path)] for known in self.problems):
             self.problem(path, text)
 
     def warning(self, path: Path, text: str) -> None:
         self.warnings.append(Note(path, text))
 
-    def forget_inherited(self, own: Any, merged: Any) -> None:
-        """Remove notes about values in ``merged`` that are not in ``own``: they are reported where they are written."""
+    def forget_inherited(self, written: Any, merged: Any) -> None:
+        """Remove notes about values in ``merged`` that are not in ``written``: their source has the same notes."""
         for notes in (self.problems, self.warnings, self.retired):
-            notes[:] = [note for note in notes if holds(own, note.path) or not holds(merged, note.path)]
+            notes[:] = [note for note in notes if holds(written, note.path) or not holds(merged, note.path)]
 
     def warning_lines(self) -> tuple[str, ...]:
         """Return one line per warning; the keys that are no longer used share one."""
@@ -50,7 +50,7 @@ class Notes:
 
 
 def _unused(retired: list[Note]) -> Iterator[str]:
-    """Example: ``video.{shm_size, io_mode}: no longer used, …``; of many keys only the ends of their paths."""
+    """Yield lines such as ``video.{shm_size, io_mode}: no longer used, …``; many keys share one line."""
     reasons = dict.fromkeys(note.text for note in retired)
     if len(reasons) > _FEW_REASONS:
         paths = (tuple(step for step in note.path if isinstance(step, str)) for note in retired)
@@ -70,7 +70,7 @@ def _unused(retired: list[Note]) -> Iterator[str]:
 
 
 def show_path(path: Path) -> str:
-    """Example: ``web_interface.robots[0].id``."""
+    """Return a path as text, such as ``web_interface.robots[0].id``."""
     text = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
     return text.removeprefix(".") or "(the whole file)"
 
@@ -86,14 +86,14 @@ def holds(raw: Any, path: Path) -> bool:
 
 
 def near(key: str, known: Iterable[str], likeness: float = _ALIKE) -> str:
-    """Return the most similar known key; empty: none is as similar."""
+    """Return the most similar known key, or "" if none is similar enough."""
     from difflib import get_close_matches  # only a file with a mistake pays for this import
 
     return next(iter(get_close_matches(key, sorted(known), n=1, cutoff=likeness)), "")
 
 
 def nearest(key: str, known: Iterable[str]) -> str:
-    """Return the text after "unknown key": the most similar known key, and all of them if none is similar."""
+    """Return the text after "unknown key": the most similar known key, or all keys if none is similar."""
     names = sorted(known)
     if close := near(key, names):
         return f'did you mean "{close}"?'

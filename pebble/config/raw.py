@@ -1,4 +1,4 @@
-"""From a config file to plain data: JSON, `//` and `_` keys are comments, and what instances share copied to them."""
+"""Reads a config file into plain data: JSON without comments, the keys that serial lines share copied to each."""
 
 import json
 import math
@@ -9,11 +9,12 @@ from typing import Any
 from pebble.config import problems, text_files
 from pebble.config.visible import hidden, shown
 from pebble.errors import ConfigError
+from pebble.extension import value_at
 
 _WORDS = ("command", "player_command", "env", "robots", "robot_discovery")
-#: Objects whose keys are names of the owner's, which may begin with _.
+#: Objects whose keys are names that the owner chose, which may begin with _.
 _OF_NAMES = ("env", "instances", "scripts", "extensions", "aliases", "settings", "camera_controls")
-_DEEPEST = 50  # levels: far more than any section has, and few enough for whatever reads it later
+_DEEPEST = 50  # levels: far more than any section has, and few enough for later readers
 
 
 class Pairs(list[tuple[str, Any]]):
@@ -48,7 +49,7 @@ def decode(text: str, name: str) -> Any:
 
 
 def plain(raw: Any, notes: problems.Notes, path: problems.Path = ()) -> Any:
-    """Make ``raw`` plain data: without comments; repeated keys and invalid values are problems."""
+    """Return ``raw`` as plain data, without comments. Repeated keys and invalid values are noted as problems."""
     if len(path) > _DEEPEST:
         notes.problem(path[:2], f"is nested more than {_DEEPEST} levels deep")
         return None
@@ -82,12 +83,12 @@ def _object(pairs: Pairs, notes: problems.Notes, path: problems.Path) -> dict[st
 
 
 def _is_words(path: problems.Path) -> bool:
-    """True if a text is a command, a variable's value or made for people: blanks at its ends may be meant."""
+    """True if a text is a command, the value of a variable or made for people: blanks at its ends may be wanted."""
     return "topics" not in path and any(key in _WORDS for key in path)
 
 
 def deep_merge(under: Any, over: Any) -> Any:
-    """``under`` updated by ``over``: objects key by key, all else whole. An empty string or null changes nothing."""
+    """Return ``under`` updated by ``over``, objects key by key. An empty string or null changes nothing."""
     if over is None or over == "":
         return under
     if not isinstance(under, dict) or not isinstance(over, dict):
@@ -97,18 +98,18 @@ def deep_merge(under: Any, over: Any) -> Any:
 
 
 def with_instances(raw: Any) -> Any:
-    """Return ``raw`` with the keys of a serial line in its instances."""
-    serial = _at(raw, "services", "serial_mcu_bridge")
-    instances = _at(serial, "instances")
+    """Return ``raw`` with the keys of the section of serial lines copied to each of its instances."""
+    serial = value_at(raw, "services", "serial_mcu_bridge")
+    instances = value_at(serial, "instances")
     if not isinstance(instances, dict):
         return raw
     shared = {key: value for key, value in serial.items() if key != "instances"}
-    merged = {name: deep_merge(shared, own) for name, own in instances.items()}
+    merged = {name: deep_merge(shared, instance) for name, instance in instances.items()}
     return raw | {"services": raw["services"] | {"serial_mcu_bridge": shared | {"instances": merged}}}
 
 
 def without(raw: Any, keys: Iterable[str]) -> Any:
-    """Return ``raw`` without what is at these dotted keys."""
+    """Return ``raw`` without the values at these dotted keys."""
     for key in keys:
         first, _, rest = key.partition(".")
         inner = raw.get(first) if isinstance(raw, dict) else None
@@ -116,11 +117,4 @@ def without(raw: Any, keys: Iterable[str]) -> Any:
             raw = raw | {first: without(inner, [rest])}
         elif not rest and inner is not None:
             raw = {name: value for name, value in raw.items() if name != first}
-    return raw
-
-
-def _at(raw: Any, *keys: str) -> Any:
-    """Return the value at a path of keys; None where there is none, as for a key that is not set."""
-    for key in keys:
-        raw = raw.get(key) if isinstance(raw, dict) else None
     return raw

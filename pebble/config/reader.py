@@ -1,4 +1,4 @@
-"""Turns plain data into config sections; continues after a mistake, so that all are reported at once."""
+"""The reader of config sections from plain data. It continues after a mistake, so that all are reported at once."""
 
 import re
 import types
@@ -23,11 +23,11 @@ Check = Callable[["Reader", Any, problems.Path], Any]
 Rule = tuple[type[Section], Check]
 
 _NUMBER = re.compile(r"[+-]?[0-9.]{1,10}|true|false", re.ASCII).fullmatch
-_SAME_SECTION = 0.7  # of 1.0: so like a known one is a mistake, not the section of another program
+_SAME_SECTION = 0.7  # of 1.0: a name this similar to a known one is a mistake, not another program's section
 _WRONG = object()  # in place of a refused value: the key gets its default
 
 
-@cache  # each name of a type is looked up anew, which takes longer than all else that a reader does
+@cache  # fields() looks up each name of a type, which takes longer than all else that a reader does
 def _known(kind: type[Section]) -> dict[str, FieldInfo]:
     return {field.encode_name: field for field in fields(kind)}
 
@@ -48,14 +48,11 @@ class Reader:
         other_forms: bool = False,
     ) -> None:
         self.folder, self.env, self.notes, self._other_forms = folder, env, notes or problems.Notes(), other_forms
-        self.password_variables: dict[str, None] = {}  # those that were read, in order
+        self.password_variables: dict[str, None] = {}  # the names that were read, in order
         self._rules = rules
 
     def section(self, kind: type[S], raw: Any, path: problems.Path = ()) -> S:
-        """Return a section of ``kind``.
-
-        Refused values are noted and replaced by their defaults (missing ones by None).
-        """
+        """Return a section of ``kind``. Refused values are noted and replaced by defaults, missing ones by None."""
         known = _known(kind)
         if not isinstance(raw, dict):
             is_switch = self._other_forms and "enabled" in known and switch(raw) is not None
@@ -66,9 +63,9 @@ class Reader:
             field = known.get(key)
             if field is None or value in ("", None) or (self._other_forms and value == [] and field.default):
                 continue
-            read = self._value(field.type, value, (*path, written), _default(field))
-            if read is not _WRONG:
-                values[field.name] = read
+            result = self._value(field.type, value, (*path, written), _default(field))
+            if result is not _WRONG:
+                values[field.name] = result
         for field in known.values():
             if field.required and field.name not in values:
                 values[field.name] = self._missing(field, (*path, field.encode_name))
@@ -81,7 +78,7 @@ class Reader:
         return section
 
     def _key(self, kind: type[Section], known: Mapping[str, Any], key: str, path: problems.Path) -> str:
-        """Return the key, or the one of which it is another name. One that is not known is noted."""
+        """Return the key under its own name, where it was written under another. Note an unknown one."""
         name = kind.other_names.get(key, key)
         for retired, replacement in kind.all_retired().items():
             if key == retired or (retired.endswith("*") and key.startswith(retired[:-1])):
@@ -133,7 +130,7 @@ class Reader:
         return Secret(value) if _extra(metas, "secret") else self._parsed(metas, value, path)
 
     def _otherwise(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:
-        """Return what is used for a value that is not as expected, and note where that is another one."""
+        """Return the value to use for an unexpected one, and note it if it differs."""
         kind, metas = unwrap(annotation)
         shown = "a value of another kind" if _extra(metas, "secret") else _shown(raw)
         instead = "" if shown == "text" and (get_origin(kind) is Literal or kind in (str, Path)) else f", not {shown}"
@@ -185,7 +182,7 @@ class Reader:
 
 
 def _default(field: FieldInfo) -> Any:
-    """Return the default of a key; NODEFAULT: it has none."""
+    """Return the default of a key, or NODEFAULT."""
     return field.default if field.default_factory is NODEFAULT else field.default_factory()
 
 
@@ -235,7 +232,7 @@ def _limits(metas: list[Meta]) -> Iterator[str]:
 
 
 def _choices(kind: Any, metas: list[Meta]) -> tuple[Any, ...]:
-    """Return the values that a key may have, where they are listed; an extension may add to those of ``choices``."""
+    """Return the values that a key may have, if they are listed; extensions may add to ``choices``."""
     return get_args(kind) if get_origin(kind) is Literal else tuple(_extra(metas, "choices") or ())
 
 
@@ -248,10 +245,7 @@ def _is_section(kind: Any) -> bool:
 
 
 def _shown(raw: Any) -> str:
-    """Return what was written, in words.
-
-    Of a text only a number, because a secret may have been written in a wrong place.
-    """
+    """Return a value in words. A text is only shown if it is a number: a secret may stand in a wrong place."""
     if isinstance(raw, str):
         return f'the text "{raw}"' if _NUMBER(raw) else "text"  # 1883 and "1883" look alike
     if isinstance(raw, dict):

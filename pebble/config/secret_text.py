@@ -1,4 +1,4 @@
-"""Hides in texts what is secret: logins in addresses, passwords and tokens."""
+"""Secrets in texts, and texts without them: logins in addresses, passwords and tokens."""
 
 import re
 
@@ -16,47 +16,35 @@ _WITH_BLANKS = re.compile(r"(://)[^\s/@:]{0,100}:(?!\d{1,5}(?:[\s/?#\"',;]|$))[^
 
 
 def is_secret(key: str) -> bool:
-    """True if the key's name says that its value, or the file or variable that it names, is secret."""
+    """True if the key's name says that its value, or the file or variable that it names, is a secret."""
     return bool(_KEY(key))
 
 
 def without_secrets(text: str) -> str:
-    """``text`` with stars in place of logins in URLs, and of passwords and tokens in queries and options.
+    """Return ``text`` with stars in place of logins in URLs, and of passwords and tokens in queries and options.
 
-    It rather hides too much: all before the last @ of a word that holds ``://``, or a colon before the @.
+    It rather hides too much: everything before the last @ of a word that holds ``://``, or a colon before the @.
     """
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
     return _WORD.sub(rf"\1{HIDDEN}", text) if "=" in text else text
 
 
-def _without_login(found: re.Match[str]) -> str:
-    word = found[0]
+def _without_login(match: re.Match[str]) -> str:
+    word = match[0]
     ends = [end.start() for end in _AT.finditer(word)]
     if not ends:
         return word
     if (slashes := _SLASHES.search(word)) and slashes.end() <= ends[-1]:
         start = slashes.end()
-    elif colon := next((one for one in _COLON.finditer(word, 0, ends[-1]) if one.end() < ends[-1]), None):
-        start = max((one.end() for one in _BEFORE_USER.finditer(word, 0, colon.start())), default=0)
+    elif colon := next((colon for colon in _COLON.finditer(word, 0, ends[-1]) if colon.end() < ends[-1]), None):
+        start = max((before.end() for before in _BEFORE_USER.finditer(word, 0, colon.start())), default=0)
     else:
         return word
     return f"{word[:start]}{HIDDEN}{word[ends[-1] :]}"
 
 
 def shown_user(name: str) -> str:
-    """Return a user name for messages; a password that was written behind it is hidden."""
+    """Return a user name for messages; a password behind it is hidden."""
     user, colon, _ = without_secrets(name).partition(":")
     return f"{user}:{HIDDEN}" if colon else user
-
-
-def without_login(url: str) -> str:
-    """``url`` without its user and password, where they can be told from its path."""
-    before, slashes, after = url.partition("://")
-    authority = re.match(r"[^/?#\s]*", after)
-    place = authority[0] if authority else ""
-    if "@" in place:
-        return f"{before}{slashes}{place.rpartition('@')[2]}{after[len(place) :]}"
-    if "@" not in after or not re.search(r":(?!\d*$)", place):
-        return url  # an @ behind the port is part of a path
-    return f"{before}{slashes}{after.rpartition('@')[2]}"  # the password has a slash

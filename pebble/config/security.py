@@ -1,4 +1,4 @@
-"""The config section of who may do what: how strictly names and roles are checked."""
+"""The config section of security: how strictly names and roles are checked."""
 
 from typing import Annotated, Literal
 
@@ -30,11 +30,11 @@ class Security(Section, frozen=True, kw_only=True):
 
     @property
     def unnamed(self) -> Strangers:
-        """What becomes of drive commands without a key of control."""
+        """The rule for drive commands without a key of control."""
         return self.strangers or ("refuse" if self.level == "named" else "free")
 
     def on_board(self) -> dict[str, str]:
-        """Return the section `security` of a board's private_config.json; empty: what it does without one."""
+        """Return the section `security` of a board's private_config.json; empty: the board's default."""
         if self.level == "open" and self.unnamed == "free":
             return {}
         return {"level": self.level, "strangers": self.unnamed}

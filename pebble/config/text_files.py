@@ -1,4 +1,4 @@
-"""Reads the text files that people write, on every system and in every locale as UTF-8."""
+"""Text files that people write, read as UTF-8 on every system and in every locale."""
 
 import os
 from pathlib import Path
@@ -9,7 +9,7 @@ PASSWORD = "PEBBLE_PASSWORD"  # noqa: S105 - the name of an environment variable
 
 
 class NotTextError(PebbleError):
-    """A file is not UTF-8. Example: ``is not UTF-8 at its byte 24, in line 3: save it as UTF-8``."""
+    """An error for a file that is not UTF-8: ``is not UTF-8 at its byte 24, in line 3: save it as UTF-8``."""
 
 
 def read_text(path: Path) -> str:

@@ -1,11 +1,11 @@
 """The sections of a robot's config file: every key with its default, its limits and its meaning."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from msgspec import Meta, defstruct, field
+from msgspec.structs import fields
 
-from pebble.config.media import Media
 from pebble.config.security import Security
 from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (
@@ -135,7 +135,7 @@ _MEDIA_PROGRAMS = "the media services choose their programs, and services.mqtt_b
 
 
 class Link(Section, frozen=True, kw_only=True):
-    """What the way to the remote broker carries, and what is sent accordingly; `docs/thin-links.md` explains it."""
+    """The capacity of the way to the remote broker, and what is sent accordingly; `docs/thin-links.md` explains it."""
 
     profile: Annotated[
         Literal["wide", "thin", "auto"], doc("`wide`: it carries everything; `thin`: little; `auto`: by measurement.")
@@ -144,7 +144,7 @@ class Link(Section, frozen=True, kw_only=True):
 
     @property
     def slowest(self) -> LinkLevel:
-        """The level that it may come to, for those who wait for an answer over it and do not hear of its level."""
+        """The lowest level that the link may have: for programs that wait for an answer and do not know the level."""
         return "wide" if self.profile == "wide" else "thin"
 
 
@@ -158,7 +158,7 @@ class MqttBridge(ServiceSection, frozen=True, kw_only=True):
     topics: Annotated[BridgeTopics, doc("Other names for topics.")] = BridgeTopics()
     heartbeat: Annotated[Heartbeat, doc("Sign of life.")] = Heartbeat()
     link: Annotated[Link, doc("A thin link.")] = Link()
-    media: Annotated[Media, doc("Pictures and sound, to and from operators.")] = Media()
+    media: Annotated[dict[str, Any], doc("Pictures and sound, to and from operators; an extension reads them.")] = EMPTY
     reboot_control: Annotated[
         SystemControl, doc("What `flags/reboot` runs, for example `systemctl --no-ask-password reboot`.")
     ] = SystemControl()
@@ -186,7 +186,7 @@ class SerialPort(Section, frozen=True, kw_only=True):
 
 
 class SerialTelemetry(Section, frozen=True, kw_only=True):
-    """Which of the MCU's reports are published."""
+    """The MCU's reports that are published."""
 
     publish_touch_sensors: Annotated[bool, doc("Publish every touch report, up to 50 per second.")] = False
 
@@ -201,7 +201,7 @@ class OdometryRing(Section, frozen=True, kw_only=True):
 
 
 class SerialSafety(Section, frozen=True, kw_only=True):
-    """When the wheels are stopped."""
+    """Limits after which the wheels are stopped."""
 
     retired: ClassVar = {
         "ignore_retained_drive": "a retained drive command is stale: it is always refused",
@@ -296,16 +296,19 @@ class Root(Section, frozen=True, kw_only=True):
 
 def tree_of(sections: Mapping[str, type[Section]]) -> type[Root]:
     """Return the class of a whole file with the sections of extensions, by key: ``services.lamp`` or ``lamp``."""
-    inner = {key.removeprefix("services."): kind for key, kind in sections.items() if key.startswith("services.")}
-    outer = {key: kind for key, kind in sections.items() if "." not in key}
-    services = _with(Services, inner)
-    tree: type[Root] = _with(
-        Root, outer, ("services", Annotated[services, doc("One section per service.")], services())
-    )
+    tree: type[Root] = _with(Root, sections)
     return tree
 
 
-def _with(kind: type[Section], sections: Mapping[str, type[Section]], *fields: Any) -> Any:
-    added = [(name, Annotated[section, doc(section.meaning())], section()) for name, section in sections.items()]
+def _with(kind: type[Section], sections: Mapping[str, type[Section]]) -> Any:
+    """Return ``kind`` with more sections; a dotted key is one of its own sections."""
+    added = [(key, Annotated[section, doc(section.meaning())]) for key, section in sections.items() if "." not in key]
+    for known in fields(kind):
+        start = f"{known.name}."
+        inner = {key.removeprefix(start): section for key, section in sections.items() if key.startswith(start)}
+        if inner:
+            section, *metas = get_args(known.type)
+            added.append((known.name, Annotated[_with(section, inner), *metas]))
     names = {"__doc__": kind.__doc__, "__module__": kind.__module__}
-    return defstruct(kind.__name__, [*fields, *added], bases=(kind,), namespace=names, frozen=True, kw_only=True)
+    rows = [(name, annotation, get_args(annotation)[0]()) for name, annotation in added]
+    return defstruct(kind.__name__, rows, bases=(kind,), namespace=names, frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""The kinds of value a config key may have, and what every section of a config has in common."""
+"""The kinds of values of config keys, and the base classes of sections."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -9,9 +9,9 @@ from msgspec import Meta, Struct, field
 from pebble.config import hosts
 from pebble.contract.identity import LEVEL, LEVEL_RULE
 
-# As pebble.transports.topics checks it: brokers close the connection on what is refused here.
+# As pebble.transports.topics checks it: brokers close the connection on these.
 _BAD = r"+#\x00-\x1f\x7f-\x9f\ufdd0-\ufdef\ufffe\uffff"
-# Of any robot, who stops and who drives it, and its neighbours: nothing else may be published there.
+# The topics of stops, control and neighbours, of any robot: nothing else may be published there.
 _RESERVED = "(?:[^/]+/){3}(?:incoming|outgoing)/(?:estop|(?:by|control|from|to|neighbours)(?:/|$))"
 _TOPIC = rf"^(?!\$)(?!{_RESERVED})(?!(?:[^/]*/){{200}})[^{_BAD}]{{1,250}}$(?!\n)"
 
@@ -64,7 +64,7 @@ _LEVELS = {"WARN": "WARNING", "FATAL": "CRITICAL", "NOTSET": "DEBUG"}
 LogLevel = Annotated[
     Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"], Meta(extra={"synonyms": _LEVELS, "unlike": "INFO"})
 ]
-#: A value that is not replaced by another one: it is an address, or says who may do what.
+#: A value that is never replaced by a similar one: it is an address, or a right.
 EXACT = Meta(extra={"exact": True})
 Port = Annotated[int, Meta(ge=1, le=65535), EXACT]
 Count = Annotated[int, Meta(ge=1, le=1_000_000_000)]
@@ -95,7 +95,7 @@ EMPTY: Any = field(default_factory=dict)
 
 
 def doc(text: str) -> Meta:
-    """Return what a key means, for docs/configuration.md and for editors."""
+    """Return the meaning of a key as an annotation, for `pebble check --keys` and for editors."""
     return Meta(description=text)
 
 
@@ -108,7 +108,7 @@ BY_CONTRACT: Mapping[str, str] = dict.fromkeys(("qos", "retain"), "the contract 
 
 
 class Secret(str):
-    """Text that is not shown by accident: ``repr()`` hides it, ``str()`` does not."""
+    """A text that is not shown by accident: ``repr()`` hides it, ``str()`` does not."""
 
     __slots__ = ()
 
@@ -117,7 +117,7 @@ class Secret(str):
 
 
 class Section(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One object of a config file. Subclasses are data: keys, defaults, limits and what they mean."""
+    """An object of a config file. Subclasses are data: keys, defaults, limits and meanings."""
 
     #: Keys that are accepted and do nothing, with what replaces them; a final ``*`` stands for any ending.
     retired: ClassVar[Mapping[str, str]] = {}
@@ -129,22 +129,22 @@ class Section(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     refused: ClassVar[Mapping[str, str]] = {}
 
     def connections(self) -> Iterator[tuple[tuple[str, ...], "Section"]]:
-        """Yield its connections in use, to brokers and Zenoh hubs, by their keys: the security level judges them."""
+        """Yield the connections of this section in use, with their keys: the security level judges them."""
         yield from ()
 
     @classmethod
     def meaning(cls) -> str:
-        """Return what it is for: the first line of its docstring."""
+        """Return the purpose of the section: the first line of its docstring."""
         return (cls.__doc__ or "").partition("\n")[0]
 
     @classmethod
     def all_retired(cls) -> dict[str, str]:
-        """Return ``retired`` of this class and of those it extends."""
+        """Return ``retired`` of this class and of its base classes."""
         return {key: why for kind in reversed(cls.__mro__) for key, why in getattr(kind, "retired", {}).items()}
 
 
 class ServiceSection(Section, frozen=True, kw_only=True):
-    """The keys of every service's section."""
+    """The base class of the sections of services."""
 
     retired: ClassVar = {
         "retained_publish_interval_seconds": "services.defaults has one for all",

@@ -1,4 +1,4 @@
-"""Finds characters in a text that are not shown: they make two texts differ that look the same."""
+"""Characters that are not shown: they make two texts differ that look the same."""
 
 import re
 
@@ -11,7 +11,7 @@ _JOINERS = re.compile("[\u200c\u200d\ufe00-\ufe0f]")  # parts of emoji and of Pe
 
 
 def hidden(text: str, *, words: bool = False) -> str:
-    """Return what is wrong with ``text``: a character that is not shown, or a blank at an end; "" if nothing is.
+    """Return the mistake in ``text``: a character that is not shown, or a blank at an end; "" without a mistake.
 
     ``words``: a blank, a tab and a new line may stand anywhere.
     """
@@ -22,14 +22,14 @@ def hidden(text: str, *, words: bool = False) -> str:
 
 
 def is_text(text: str) -> bool:
-    """True if ``text``, perhaps a name of a file, is UTF-8: all can be written that is not the code of a lost byte."""
+    """True if ``text``, perhaps the name of a file, can be written as UTF-8."""
     return re.search("[\ud800-\udfff]", text) is None
 
 
 def shown(text: str) -> str:
-    """Return ``text`` for a terminal or a log: what is not seen, or steers what shows it, is its code: ``\\u202e``.
+    """Return ``text`` for a terminal or a log; a character that is not seen, or steers it, is a code: ``\\u202e``.
 
-    Tabs, line ends and blanks of all kinds stay, and what joins the parts of an emoji or of a Persian word.
+    Tabs, line ends and blanks of all kinds stay, and the joiners in emoji and in Persian words.
     """
     if text.isascii() and text.isprintable():
         return text
@@ -58,7 +58,7 @@ def _is_hidden(char: str) -> bool:
 
 
 def _joins(text: str, place: int) -> bool:
-    """Return True if the character joins or varies what is beside it, which then looks different."""
+    """True if the character joins its neighbours, or varies the one before it, which then looks different."""
     if place == 0 or not _JOINERS.match(text[place]) or text[place - 1].isascii() or _is_hidden(text[place - 1]):
         return False
     return "\ufe00" <= text[place] <= "\ufe0f" or (place + 1 < len(text) and not text[place + 1].isascii())

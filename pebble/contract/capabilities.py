@@ -1,7 +1,7 @@
-"""What a component offers: the sections of the ``value`` of its Capabilities (paper A.8.6).
+"""The offers of a component: sections of the ``value`` of its Capabilities (paper A.8.6).
 
-Nothing here is required: a reader takes a section that is absent, or is none of these, as one that offers nothing.
-Topics are whole ones and the component's own; readers use no others. What is absent has the topic of the contract.
+No section is required: readers take a section that is absent or malformed as one that offers nothing. Topics are whole,
+and below the component's own identity; readers use no others. An absent topic is that of the contract.
 """
 
 from typing import Any, Literal
@@ -14,7 +14,7 @@ from pebble.contract.payloads import Payload
 
 
 class RobotIdentity(Payload, frozen=True, kw_only=True):
-    """Which robot it is, and how people shall see it. What is absent, each program has its own default for."""
+    """The identity of the robot, and its looks. Each program has defaults for absent fields."""
 
     system: str  # the first three levels of its topics
     type: str
@@ -27,7 +27,7 @@ class RobotIdentity(Payload, frozen=True, kw_only=True):
 
 
 class TransportOffer(Payload, frozen=True, kw_only=True):
-    """How its processes talk to each other; for people only."""
+    """The transport inside the robot; for people only."""
 
     kind: str  # mqtt or zenoh
 
@@ -75,13 +75,13 @@ class FilesOffer(Offer, frozen=True, kw_only=True):
 
 
 class FlagOffer(Offer, frozen=True, kw_only=True):
-    """Something that a flag starts."""
+    """An action that a flag starts."""
 
     flag_topic: str | UnsetType = UNSET
 
 
 class SystemOffer(Payload, frozen=True, kw_only=True):
-    """The computer of the robot. What is absent has no button."""
+    """Actions of the robot's computer. An absent action has no button."""
 
     reboot: FlagOffer | UnsetType = UNSET
     service_restart: FlagOffer | UnsetType = UNSET
@@ -105,9 +105,7 @@ class EstopOffer(Payload, frozen=True, kw_only=True):
     reset_topic: str | UnsetType = UNSET
     owners: list[str] | UnsetType = UNSET  # the names of all motor owners: a stop is confirmed when each reports it
     status_topics: list[str] | UnsetType = UNSET  # of their states, in the order of `owners`
-    zeros: list[str] | UnsetType = (
-        UNSET  # drive topics of what moves and no stop can hold: while it is sent, zeros go there
-    )
+    zeros: list[str] | UnsetType = UNSET  # drive topics of motors that no stop can hold: zeros go there during a stop
 
 
 class LightsOffer(Payload, frozen=True, kw_only=True):
@@ -120,7 +118,7 @@ class LightsOffer(Payload, frozen=True, kw_only=True):
 
 
 class TelemetryOffer(Payload, frozen=True, kw_only=True):
-    """What it measures. What is not listed is shown from its first message on."""
+    """Measurements. One that is not listed is shown from its first message on."""
 
     touch_sensors: bool = False
     charging_status: bool = False
@@ -164,9 +162,9 @@ class CapabilitiesValue(Payload, frozen=True, kw_only=True):
     telemetry: TelemetryOffer | UnsetType = UNSET
     outlets: OutletsOffer | UnsetType = UNSET
     named: bool | UnsetType = UNSET  # it takes commands only with an account's name in the topic (docs/ext/fleet.md)
-    announced: bool | UnsetType = UNSET  # only in what readers make of a heartbeat's `subscribes`; robots leave it out
+    announced: bool | UnsetType = UNSET  # set by readers that derive this from a heartbeat's `subscribes`; never sent
 
 
 def offered(offer: Any, enabled: bool) -> Any:
-    """Return an offer of something that exists and obeys if it is enabled."""
+    """Return an offer that is available and obeys commands if ``enabled``."""
     return replace(offer, available=enabled, controls=enabled)

@@ -15,14 +15,14 @@ from msgspec import Struct
 from pebble.contract import payloads as p
 
 INCOMING, OUTGOING = "incoming", "outgoing"
-WAITS_S = 0.5  # how long what happens once may wait; in the connection another 2 s at most
-_PATIENT_S = 2.0  # the same, where it moves nothing
-_HOLD_S = 3.0  # the same, of what is repeated every second and lasts for 3 s
-_HOLD_THIN_S = 10.0  # the same, where the link may be thin: control lasts for as long at most
+WAITS_S = 0.5  # a one-shot message may wait for so long; in the connection another 2 s at most
+_PATIENT_S = 2.0  # the same, if it moves nothing
+_HOLD_S = 3.0  # the same, if it is repeated every second and lasts for 3 s
+_HOLD_THIN_S = 10.0  # the same, if the link may be thin: control lasts for as long at most
 
 
 class Kind(Enum):
-    """What a channel means; direction and delivery follow from it: (direction, qos, retain)."""
+    """The meaning of a channel; direction and delivery follow from it: (direction, qos, retain)."""
 
     COMMAND = (INCOMING, 1, False, "one-shot; a retained one is stale and is never executed or forwarded")
     FLAG = (INCOMING, 1, True, "a switch whose last position matters")
@@ -32,22 +32,22 @@ class Kind(Enum):
     STREAM = (OUTGOING, 0, False, "freshness first; drop the oldest")
     FEED = (INCOMING, 0, False, "a stream sent to the robot")
 
-    __hash__ = object.__hash__  # of C's, not of Python's: kinds are looked up several times for each message
+    __hash__ = object.__hash__  # in C, not in Python: kinds are looked up several times for each message
 
     def __init__(self, direction: str, qos: int, retain: bool, meaning: str) -> None:
         self.direction, self.qos, self.retain, self.meaning = direction, qos, retain, meaning
-        #: Whether it means something that happens once: a retained message of it is stale.
+        #: True if a message means something that happens once: a retained one is stale.
         self.one_shot = direction == INCOMING and not retain
 
 
 class Channel(Struct, frozen=True, kw_only=True, dict=True):
-    """One topic, or a family of topics: its name, payload and delivery.
+    """A topic, or a family of topics: its name, payload and delivery.
 
     ``metric`` may hold ``{names}``, one level each. With ``remote=False`` it never leaves the robot. With
     ``bridged=False`` its own process is connected to the remote broker. With ``newest``, only the newest of several
-    waiting messages is handled. A one-shot message that has waited for longer than ``waits_s``, in a process or at a
-    broker, is stale, unless it ends something; on the way over a link that may be thin, than ``thin_waits_s``.
-    A ``prompt`` one never waits for room on a thin link.
+    waiting messages is handled. A one-shot message that has waited for longer than ``waits_s`` in a process or at a
+    broker (``thin_waits_s`` over a link that may be thin) is stale, unless it ends something. A ``prompt`` message
+    never waits for room on a thin link.
     """
 
     metric: str
@@ -63,7 +63,7 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
     prompt: bool = False
     qos: int = -1  # -1: that of the kind
     retain: bool | None = None  # None: that of the kind
-    override: str | None = None  # where a config may rename it (paper Table A.6): the dotted path of a key
+    override: str | None = None  # the dotted path of the config's key that may rename it (paper Table A.6)
     synonym_of: str | None = None  # another name for this metric: understood, never published
 
     @property
@@ -96,17 +96,17 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
         return f"{base}/{self.suffix.format(**names)}" if names else f"{base}/{self.suffix}"
 
     def filter(self, base: str) -> str:
-        """Return what to subscribe to in order to receive this channel of ``base`` (which may hold ``+`` levels)."""
+        """Return the filter that receives this channel of ``base``, which may hold ``+`` levels."""
         return f"{base}/{re.sub(r'{[^}]*}', '+', self.suffix)}"
 
     def ends(self, value: Any) -> bool:
-        """True if ``value``, a payload of this channel, can only bring something to rest."""
+        """True if ``value``, a payload of this channel, can only end something."""
         return issubclass(self.payload, p.Payload) and value.ends()
 
     def names(self, topic: str) -> dict[str, str]:
         """Return the names in one of this pattern's topics: ``{"program": "camera_publisher"}``."""
-        found = re.search(re.sub(r"{([^}]*)}", r"(?P<\1>[^/]+)", self.suffix) + r"\Z", topic)
-        return found.groupdict() if found is not None else {}
+        match = re.search(re.sub(r"{([^}]*)}", r"(?P<\1>[^/]+)", self.suffix) + r"\Z", topic)
+        return match.groupdict() if match is not None else {}
 
 
 def _c(metric: str, kind: Kind, payload: Any, doc: str, **more: Any) -> Channel:
@@ -260,7 +260,7 @@ NEIGHBOUR_VALUE = _c("neighbours/{robot}/{metric}", Kind.STREAM, bytes,
                      "What another robot of the LAN publishes, as it does, for scripts of this one.",
                      remote=False)  # fmt: skip
 
-#: Families that pass neither to operators nor to a mirror, whatever stands below them.
+#: Families of topics that pass neither to operators nor to a mirror.
 BETWEEN_ROBOTS = (f"{INCOMING}/from/", f"{INCOMING}/to/", f"{OUTGOING}/neighbours/")
 
 CHANNELS: tuple[Channel, ...] = tuple(value for value in list(vars().values()) if isinstance(value, Channel))
@@ -274,7 +274,7 @@ _RESERVED = frozenset(("by", "control", "control-turn", "control-vouched", "from
 
 
 def is_reserved(metric: str) -> bool:
-    """Return True if only the robot itself may define ``metric``, in either direction: who stops and drives it."""
+    """True if ``metric`` belongs to stops, control or neighbours: only the robot itself may define it."""
     family = metric.partition("/")[0]
     return family.startswith("estop") or family in _RESERVED
 

@@ -1,4 +1,4 @@
-"""Encodes and decodes payloads: JSON within limits, and the wrappers the contract accepts (paper A.4.5, A.8.2)."""
+"""The codec of payloads: JSON within limits, and the wrappers that the contract accepts (paper A.4.5, A.8.2)."""
 
 import math
 import re
@@ -24,17 +24,16 @@ from pebble.contract.payloads import (
 from pebble.errors import PayloadError
 from pebble.motion.latch import fields, stop_of
 
-MAX_COMMAND_BYTES = 64 * 1024  # a larger command is refused; as a stop it is one without a name
+MAX_COMMAND_BYTES = 64 * 1024  # a larger command is refused; a larger stop is one without a name
 
 _LONGEST_MS = 1e12  # of a command's validity; far beyond every watchdog
-_LATEST_STAMP = 253_402_300_800_000  # the year 10000 in ms: later times are invalid
 
-# Narrower than float(): that also takes "1_0", digits of other scripts and the names of NaN and infinity.
+# Narrower than float(), which also takes "1_0", digits of other scripts and the names of NaN and infinity.
 _numeric = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII).fullmatch
-#: All of UTF-8 but printable ASCII, by which every JSON text begins and ends: a byte order mark, a C string's NUL,
-#: white space. The bytes above are in no UTF-8: what they are around is no text.
+#: The bytes of UTF-8 except printable ASCII, with which every JSON text begins and ends: a byte order mark, a C
+#: string's NUL, white space. Bytes above these are in no UTF-8, so a payload with them is no text.
 _AROUND = bytes(byte for byte in range(0xF5) if not 0x21 <= byte <= 0x7E)
-_KEYS_SHOWN, _SHOWN = 8, 20  # of a payload that is not understood, and characters of each
+_KEYS_SHOWN, _SHOWN = 8, 20  # keys of a payload that is not understood, and characters of each
 _encoder = msgspec.json.Encoder()
 _decoder = msgspec.json.Decoder()
 
@@ -42,7 +41,7 @@ _decoder = msgspec.json.Decoder()
 def encode(channel: Channel, value: Any) -> bytes:
     """Return the wire form of ``value``: JSON, or the bytes themselves on binary channels.
 
-    A name of the file system or of a user may be no UTF-8: what is none is written as a code, ``\\udce9``.
+    The name of a file or user may be no UTF-8: its other bytes are written as codes, ``\\udce9``.
     """
     if channel.payload is bytes:
         return bytes(value)
@@ -61,7 +60,7 @@ def _encodable(plain: Any) -> Any:
     return plain.encode(errors="backslashreplace").decode() if isinstance(plain, str) else plain
 
 
-#: Receives a command's channel, its sender as far as that is in it, and what it does that may not be meant.
+#: Takes a command's channel, its sender if the command names one, and a remark on an effect that may be unwanted.
 Remark = Callable[[Channel, str, str], None]
 
 
@@ -107,16 +106,16 @@ def plain(channel: Channel, raw: bytes) -> Any:
 
 
 def trim(raw: bytes) -> bytes:
-    """``raw`` without the bytes around its JSON that programs of other languages add; the same object if it has none.
+    """Return ``raw`` without the bytes around its JSON that other languages add; the same object if there are none.
 
-    No JSON has a NUL in it: after one is what was in a C program's buffer before. Firmware does the same
+    No JSON holds a NUL: after it comes the old content of a C program's buffer. Firmware does the same
     (firmware/common/payload.py).
     """
     return raw.lstrip(_AROUND).partition(b"\0")[0].rstrip(_AROUND)
 
 
 def _stop(channel: Channel, raw: bytes) -> EstopCommand:
-    """Read a stop: what cannot be read is one without a name; an empty payload, of a removed retained one, is none."""
+    """Return a stop; one that cannot be read has no name. An empty payload, of a removed message, is no stop."""
     if not raw:
         raise PayloadError(f"{channel.metric}: empty")
     try:
@@ -129,7 +128,7 @@ def _stop(channel: Channel, raw: bytes) -> EstopCommand:
 
 
 def is_blank(raw: bytes) -> bool:
-    """True if ``raw`` is white space only: by such payloads bridges look for cycles, and everybody ignores them."""
+    """True if ``raw`` is white space: bridges look for cycles by such payloads, and all programs ignore them."""
     return bool(raw) and raw.isspace()
 
 
@@ -144,11 +143,11 @@ def _boolean(channel: Channel, plain: Any) -> bool:
 
 
 def _ignore(_channel: Channel, _sender: str, _text: str) -> None:
-    """Do nothing: the caller wants no remarks."""
+    """Do nothing, for a caller that wants no remarks."""
 
 
 def _unwrap(channel: Channel, plain: Any, remark: Remark) -> Any:
-    """Commands: the object under ``value`` if there is one, else the root (paper A.4.5)."""
+    """Return the fields of a command: the object under ``value`` if there is one, else the root (paper A.4.5)."""
     if channel.payload in (SoundboardCommand, AutonomyCommand):
         return _switch(plain)
     if channel.payload is MediaRequest:
@@ -160,7 +159,7 @@ def _unwrap(channel: Channel, plain: Any, remark: Remark) -> Any:
 
 
 def _switch(plain: Any) -> Any:
-    """Bare or wrapped, a boolean or an object; some keys may stay outside the wrapper (paper A.8.10)."""
+    """Return a command, bare or wrapped, boolean or object; some keys may be outside the wrapper (paper A.8.10)."""
     if isinstance(plain, bool):
         return {"enabled": plain}
     if isinstance(plain, dict):
@@ -174,18 +173,18 @@ def _switch(plain: Any) -> Any:
 
 
 def _request(channel: Channel, plain: Any) -> Any:
-    """Return a boolean control in any of its forms, with optional further fields."""
+    """Return a boolean control from any of its forms, with its further fields."""
     inner = plain["value"] if isinstance(plain, dict) and isinstance(plain.get("value"), dict) else plain
     return {**(inner if isinstance(inner, dict) else {}), "enabled": _boolean(channel, inner)}
 
 
 def _drive(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str, Any]:
-    """Check a drive command: wrong ``source``, ``run``, ``valid_ms`` or ``key`` refuse what moves, never a stop."""
+    """Check a drive command: a wrong ``source``, ``run``, ``valid_ms`` or ``key`` refuses a motion, never a stop."""
     axes = _numbers(channel, plain, remark)
     if not axes:
-        found = ", ".join([_shown(key) for key in plain][:_KEYS_SHOWN]) or "nothing"
+        keys = ", ".join([_shown(key) for key in plain][:_KEYS_SHOWN]) or "nothing"
         expected = 'expected {"x": steering, "z": throttle}, each -1 to 1'
-        remark(channel, _sender(plain), f"none of x, z and y is in it, but {found}: so it is a stop; {expected}")
+        remark(channel, _sender(plain), f"none of x, z and y is in it, but {keys}: so it is a stop; {expected}")
     moves = any(axes.values())
     more = {key: plain[key] for key in _DRIVE_CHECKS if plain.get(key) is not None}
     wrong = [key for key, value in more.items() if not _DRIVE_CHECKS[key][0](value)]
@@ -201,14 +200,14 @@ def _drive(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str,
     return axes | more | {key: plain[key] for key, fits in _DRIVE_MORE.items() if fits(plain.get(key))}
 
 
-#: What a drive command may have besides its axes; null is the same as absent.
+#: Fields of a drive command besides its axes; null is the same as absent.
 _DRIVE_CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "source": (lambda value: isinstance(value, str), "a string"),
     "key": (lambda value: isinstance(value, str), "a string"),
     "run": (lambda value: type(value) is int and 1 <= value <= LAST_RUN, f"an integer from 1 to {LAST_RUN}"),
     "valid_ms": (lambda value: type(value) in (int, float) and 0 <= value < _LONGEST_MS, "a number of milliseconds"),
 }
-#: What else it may have: what does not fit is the same as absent, because it decides about no motion.
+#: Its other fields; a wrong value is the same as absent, because none of them decides about motion.
 _DRIVE_MORE: dict[str, Callable[[Any], bool]] = {
     "t": lambda value: type(value) is int and 0 <= value <= LARGEST_MS,
     "by": lambda value: isinstance(value, str),
@@ -216,7 +215,7 @@ _DRIVE_MORE: dict[str, Callable[[Any], bool]] = {
 }
 
 
-#: The numbers of a command and what one is that cannot be read, by payload.
+#: The numbers of a command, with the value of one that cannot be read, by payload.
 _NUMBERS: dict[Any, dict[str, float]] = {
     Drive: {"x": 0.0, "z": 0.0, "y": 0.0},
     LightsSolid: {"b": 0.0, "g": 0.0, "r": 0.0},
@@ -225,23 +224,23 @@ _NUMBERS: dict[Any, dict[str, float]] = {
 
 
 def _numbers(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str, float]:
-    """Return those that are given, as the original reads them: also from text, and a default for what is no number.
+    """Return the numbers in a command as the original reads them: also from text, and a default for a wrong value.
 
-    NaN and infinity refuse the command.
+    Raises PayloadError for NaN and infinity.
     """
-    found = {}
+    numbers = {}
     for name, default in _NUMBERS[channel.payload].items():
         if name in plain:
             number = _number(channel, name, plain[name])
-            found[name] = default if number is None else number
+            numbers[name] = default if number is None else number
             if number is None and plain[name] is not None:
-                what = f"{name} is {_shown(plain[name])}, which is no number: it counts as {default:g}"
-                remark(channel, _sender(plain), what)
-    return found
+                text = f"{name} is {_shown(plain[name])}, which is no number: it counts as {default:g}"
+                remark(channel, _sender(plain), text)
+    return numbers
 
 
 def _number(channel: Channel, name: str, value: Any) -> float | None:
-    """Return a number, or None for what is none. Firmware reads the same (firmware/common/payload.py)."""
+    """Return the number in ``value``, or None. Firmware reads the same (firmware/common/payload.py)."""
     if isinstance(value, str):
         if "nan" in (word := value.lower()) or "inf" in word:
             raise PayloadError(f"{channel.metric}: {name} is not a finite number")
@@ -270,20 +269,3 @@ def _shown(value: Any) -> str:
 def _name_of(value: Any) -> str:
     names = {dict: "an object", list: "an array", str: "a string", bool: "a boolean", type(None): "null"}
     return names.get(type(value), "a number")
-
-
-def stamp_of(plain: Any) -> float | None:
-    """Return a JSON payload's time stamp in epoch seconds: ``t`` in ms or ``timestamp`` in s, distinguished by size.
-
-    Readings of 1e11 and more are milliseconds, 1e9 and more are seconds (the readers' rule, paper A.4.2); else None.
-    """
-    if not isinstance(plain, dict):
-        return None
-    for key in ("t", "timestamp"):
-        value = plain.get(key)
-        if isinstance(value, int | float) and not isinstance(value, bool) and value < _LATEST_STAMP:
-            if value >= 1e11:
-                return value / 1000.0
-            if value >= 1e9:
-                return float(value)
-    return None

@@ -59,12 +59,12 @@ class Identity(Struct, frozen=True):
 
     @property
     def base(self) -> str:
-        """What all topics of this component begin with, without a final slash."""
+        """The first three levels of all topics of this component, without a final slash."""
         return f"{self.system}/{self.type}/{self.id}"
 
     @property
     def is_server(self) -> bool:
-        """True if it is an operators' server or a gateway: nothing that drives, is stopped or is listed with robots."""
+        """True for an operators' server or a gateway: it does not drive, and is not listed with robots."""
         return self.type in (SERVERS, GATEWAYS)
 
     def incoming(self, metric: str) -> str:
@@ -89,19 +89,19 @@ class ParsedTopic(Struct, frozen=True):
 
 
 def composed(name: str) -> str:
-    """Return a name as keyboards write it: one letter with its accent, not two (Unicode's NFC)."""
+    """Return a name as keyboards write it: a letter and its accent are one character (Unicode's NFC)."""
     return normalize("NFC", name)
 
 
 def untypeable(name: str) -> str:
-    """Return why people cannot type this name, with what to write instead; empty: they can."""
+    """Return why people cannot type this name, and what to write instead; "" if they can."""
     if name in (".", ".."):
         return "is a folder, and no name: write another"
     return "" if composed(name) == name else f"has a letter that no keyboard writes: write {json.dumps(composed(name))}"
 
 
 def meant(names: Iterable[str], typed: str) -> str:
-    """Return which of these names is typed, or else looks the same; ``typed`` itself if none does."""
+    """Return the name that was typed, or one that looks the same; ``typed`` itself if there is none."""
     if typed.isascii():
         return typed
     alike = [name for name in names if composed(name) == composed(typed)]
@@ -109,18 +109,8 @@ def meant(names: Iterable[str], typed: str) -> str:
 
 
 def parse_topic(topic: str) -> ParsedTopic | None:
-    """Parse ``topic``; None for topics that are not of the form ``{system}/{type}/{id}/{direction}/{metric}``."""
+    """Return the parts of ``topic``; None if it is not ``{system}/{type}/{id}/{direction}/{metric}``."""
     return _remembered(topic) if len(topic) <= _REMEMBERED_LENGTH else _parse(topic)
-
-
-def is_of_another(topic: str, base: str) -> bool:
-    """True if ``topic`` begins as the topics of another component do.
-
-    Capabilities may name any topic, and whoever publishes them need not be allowed to publish on it: a client that
-    believed them would drive another robot.
-    """
-    levels = topic.split("/", 3)
-    return len(levels) == 4 and "/".join(levels[:3]) != base
 
 
 def _parse(topic: str) -> ParsedTopic | None:

@@ -1,4 +1,4 @@
-"""What a robot and its operators send on a link of each level: the robot publishes the level as ``outgoing/link``.
+"""Levels of a link, and the traffic on each: the robot publishes the level of its link as ``outgoing/link``.
 
 Source: measured over 64, 19.2 and 9.6 kbit/s (docs/thin-links.md).
 """
@@ -13,21 +13,21 @@ from pebble.contract.channels import LINK
 from pebble.contract.payloads import LinkLevel, LinkState
 from pebble.errors import PayloadError
 
-INTERVAL_S: Final = 1.0  # between heartbeats, of a robot of which it is not known: most send four a second
+INTERVAL_S: Final = 1.0  # assumed between heartbeats: most robots send four a second
 
 
 class Level(Struct, frozen=True, kw_only=True):
-    """``drive_qos`` and ``heartbeat_qos`` None: as without levels. What ends something is QoS 1, at once, at each."""
+    """The traffic on a link. QoS None: the channel's own. At each level an end of something is QoS 1, and at once."""
 
     drive_hz: float  # commands of one operator, a second
     drive_qos: int | None = None
     valid_ms: int = 400  # of a drive command, in milliseconds
-    heartbeat_s: float = 0.0  # at least, between two
+    heartbeat_s: float = 0.0  # between two heartbeats, at least
     heartbeat_qos: int | None = None
-    stream_hz: float | None = None  # of each stream at most, the newest; None: all of it
-    silent_s: float = 0.0  # a robot is not called silent before
-    answer_s: float = 2.0  # a robot that has not answered by then will not
-    stamped: bool = False  # drive commands tell their own age, by ``t`` and ``key``
+    stream_hz: float | None = None  # of each stream, at most; None: all messages
+    silent_s: float = 0.0  # a robot counts as silent after this at the earliest
+    answer_s: float = 2.0  # a robot that has not answered by then will not answer
+    stamped: bool = False  # drive commands have their own age, by ``t`` and ``key``
 
 
 LEVELS: Mapping[LinkLevel, Level] = {
@@ -48,16 +48,16 @@ LEVELS: Mapping[LinkLevel, Level] = {
 
 
 def silent_after(interval_s: float = INTERVAL_S, link: LinkLevel = "wide", late_s: float = 0.0) -> float:
-    """Return seconds without a heartbeat after which a robot counts as silent.
+    """Return the seconds without a heartbeat after which a robot counts as silent.
 
-    ``interval_s`` is between its heartbeats, which come ``late_s`` late; ``link`` is what it publishes. Who has not
-    heard of its link takes the default.
+    ``interval_s``: between its heartbeats, which come ``late_s`` late. ``link``: the level that it has published, if
+    known.
     """
     return max(2 * interval_s, 4 * late_s, LEVELS[link].silent_s)
 
 
 def link_of(payload: bytes) -> LinkState | None:
-    """Return what a message on ``outgoing/link`` reports; None where it is removed, or cannot be read."""
+    """Return the state in a message on ``outgoing/link``; None if it was removed, or cannot be read."""
     try:
         return codec.decode(LINK, payload) if payload else None
     except PayloadError:

@@ -1,4 +1,4 @@
-"""How robots look on the operator page. Configs may name it: they need nothing else of what capabilities have."""
+"""The looks of robots on the operator page, as configs and capabilities name them."""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""One frozen struct per payload of the contract, with the field names of the wire. Source: paper Appendix A.8.
+"""The payloads of the contract, a frozen struct each, with the field names of the wire. Source: paper Appendix A.8.
 
 Unknown fields are tolerated, wrong types are not. Numbers are finite: NaN and infinity are refused.
 Values that the contract clamps are clamped when the struct is made, so no value is out of range.
@@ -15,7 +15,7 @@ from pebble.motion.lease import shown
 
 
 class Payload(Struct, frozen=True, kw_only=True, omit_defaults=False):
-    """Base of every JSON payload: refuses NaN and infinities in every number field."""
+    """The base class of JSON payloads. It refuses NaN and infinities in every number field."""
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
@@ -24,7 +24,7 @@ class Payload(Struct, frozen=True, kw_only=True, omit_defaults=False):
                 raise ValueError(f"{name} is not a finite number")
 
     def ends(self) -> bool:
-        """True if it can only bring something to rest: a zero, and the end of a script, a sound or a picture."""
+        """True if it can only end something: a zero, and the end of a script, a sound or a picture."""
         return False
 
 
@@ -56,9 +56,7 @@ class Drive(Payload, frozen=True, kw_only=True):
     source: str | UnsetType = UNSET  # "autonomy" of a script; anything else counts as a person
     run: Annotated[int, Meta(ge=1, le=LAST_RUN)] | UnsetType = UNSET  # of a script: grows until 2^30 - 1, then from 1
     valid_ms: Annotated[int, Meta(ge=0)] | UnsetType = UNSET  # of a zero, 0: the script must not resume
-    key: str | UnsetType = (
-        UNSET  # of control, as outgoing/control/{owner} has it; of several owners all, with a blank between
-    )
+    key: str | UnsetType = UNSET  # from outgoing/control/{owner}; of several owners all, with blanks between
     t: Annotated[int, Meta(ge=0, le=LARGEST_MS)] | UnsetType = UNSET  # the sender's clock, in milliseconds
     by: str | UnsetType = UNSET  # the account of a sender elsewhere, where the robot checks names
     group: bool | UnsetType = UNSET  # a copy of what a group of commands contained
@@ -216,14 +214,14 @@ class GatewayHeartbeat(Payload, frozen=True, kw_only=True):
 
 
 class NeighbourRefusal(Payload, frozen=True, kw_only=True):
-    """Why one run of a script of another robot has no effect."""
+    """A run of another robot's script that has no effect, and why."""
 
     run: int
     why: str
 
 
 class Neighbours(Payload, frozen=True, kw_only=True):
-    """What robots of a LAN tell each other, and operators. Names are those of robots in the config."""
+    """The relations of a robot to others of its LAN. Names are those of robots in the config."""
 
     shares: list[str] = []  # metrics that the others may receive
     commanded: dict[str, list[str]] = {}  # metrics that a script of this robot may command
@@ -233,7 +231,7 @@ class Neighbours(Payload, frozen=True, kw_only=True):
 
 
 class ChargingStatus(Payload, frozen=True, kw_only=True):
-    """Whether the robot is on its charger; null: unknown."""
+    """The connection to the charger; null: unknown."""
 
     value: bool | None
 
@@ -261,7 +259,7 @@ class TouchSensors(Payload, frozen=True, kw_only=True):
 
 
 class Capabilities(Payload, frozen=True, kw_only=True):
-    """What a robot can do, with the effective topics (paper A.8.6); again whenever it changes.
+    """The capabilities of a robot, with its effective topics (paper A.8.6); again whenever they change.
 
     Send ``value`` as CapabilitiesValue has it. One section that is wrong does not make the others unreadable.
     """
@@ -292,7 +290,7 @@ class EstopState(Payload, frozen=True, kw_only=True):
 
 
 class ControlState(Payload, frozen=True, kw_only=True):
-    """Who has control of one motor owner, at most 300 bytes; ``key`` is ``""`` while nobody has.
+    """The control of one motor owner, at most 300 bytes; ``key`` is ``""`` while nobody has it.
 
     Where a robot has several owners, the first one by name decides who drives.
     """
@@ -309,7 +307,7 @@ class ControlState(Payload, frozen=True, kw_only=True):
 
 
 class ControlTurn(Payload, frozen=True, kw_only=True, omit_defaults=True):
-    """What the first of several motor owners grants; of another owner only ``boot`` and ``turn``, which it follows."""
+    """The grant of the first of several motor owners; of another owner only ``boot`` and ``turn``, which it follows."""
 
     boot: str  # of the first owner
     turn: Annotated[int, Meta(ge=0)]  # grows whenever control passes on, also to nobody
@@ -333,7 +331,7 @@ class ControlVouched(Payload, frozen=True, kw_only=True):
 
 
 class LinkState(Payload, frozen=True, kw_only=True):
-    """What the way between a robot and its remote broker carries now, as its bridge measures it."""
+    """The capacity of the way between a robot and its remote broker, as its bridge measures it."""
 
     level: LinkLevel
     drive_hz: float  # commands of one operator, a second

@@ -1,7 +1,6 @@
-"""What may be done to a robot, by kinds: the rights, and what each of them writes.
+"""The rights on a robot, and the commands that each of them allows.
 
-pebble/extensions/fleet/roles.py says who has them. A robot asks only what they write, where it takes commands
-without a name.
+pebble/extensions/fleet/roles.py gives them to roles. A robot uses the table for commands without a name.
 """
 
 from collections.abc import Mapping
@@ -21,7 +20,7 @@ class Right(StrEnum):
     PEOPLE = "people"
 
 
-#: What each right may write to a robot: channels of the contract, or metrics below ``incoming/``.
+#: The commands that a right allows: channels of the contract, or metrics below ``incoming/``.
 WRITES: Mapping[Right, tuple[Channel | str, ...]] = {
     Right.LOOK: (c.VIDEO_CONTROL,),
     Right.STOP: (c.ESTOP,),

@@ -1,7 +1,7 @@
-"""The protocols of serial lines to MCUs, one row each: all that other programs know of them.
+"""The protocols of serial lines to MCUs, a row each: other programs need no more.
 
-A new protocol is a row that an extension declares, and the service that the row names. The row is kept apart from that
-service, because every process reads the config, and must not import the serial port's library for the names in it.
+A new protocol is a row that an extension declares, and the service that the row names. The rows are apart from the
+services, because every process reads the config, and should not import the library of serial ports for these names.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _IMU_INSTANCE = "imu"
 
 
 class SerialProtocol(Struct, frozen=True):
-    """``service`` is the ``module:class`` that runs such a line, a subclass of SerialService."""
+    """A protocol. ``service``: the ``module:class`` that runs such a line, a subclass of SerialService."""
 
     service: str
     drives: bool = False  # has motors and lights: takes drive commands, is stopped when they end
@@ -26,7 +26,7 @@ class SerialProtocol(Struct, frozen=True):
         return self.service.partition(":")[0]
 
     def has_imu(self, instance: str) -> bool:
-        """Return whether the line of this name is known to have an inertial sensor before the device is connected."""
+        """True if a line of this name has an inertial sensor, as far as is known before the device is connected."""
         return self.is_imu or (self.describes_itself and instance == _IMU_INSTANCE)
 
 

@@ -1,1 +1,1 @@
-"""Starts, supervises, restarts and stops the processes of a robot, and publishes their status."""
+"""The launcher of a robot: starts, supervises, restarts and stops its processes, and publishes their status."""

@@ -1,6 +1,6 @@
 """The process that publishes the launcher's messages: ``python -m pebble.launcher.announcer CONFIG``.
 
-The launcher itself never opens a transport: it could not fork any more, and a broker might keep it waiting.
+The launcher itself never opens a transport: it could not fork any more, and it might wait for a broker.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 
 from pebble.config import config_of_process
 from pebble.errors import PebbleError
@@ -27,7 +28,7 @@ log = logging.getLogger(__name__)
 
 
 class Announcer:
-    """Publishes the envelopes that arrive on ``pipe``; states again on every new connection, records only once."""
+    """The publisher of the envelopes on ``pipe``: states again on every new connection, records only once."""
 
     def __init__(self, pipe: int, transport: Transport) -> None:
         self._pipe, self._transport = pipe, transport
@@ -38,7 +39,7 @@ class Announcer:
         os.set_blocking(pipe, False)
 
     def run(self, notify: Notifier) -> None:
-        """Run until :meth:`stop` or the end of the pipe; then publish what is still in it, and the will."""
+        """Run until :meth:`stop` or the end of the pipe; then publish the rest of the pipe, and the will."""
         self._reactor.watch(self._pipe, self._receive)
         self._reactor.watch(self._wake.fileno(), self._publish_states)
         self._reactor.every(ALIVE_PERIOD_S, notify.alive)
@@ -47,7 +48,9 @@ class Announcer:
         try:
             self._transport.open(timeout=0.0)
             self._reactor.run_until(lambda: self._stopping)
-            self._receive_rest()
+            with suppress(BlockingIOError):
+                while (envelope := next_envelope(self._pipe)) is not None:
+                    self._handle(envelope)
         finally:
             self._transport.close()
 
@@ -62,13 +65,6 @@ class Announcer:
             self._stopping = True
         else:
             self._handle(envelope)
-
-    def _receive_rest(self) -> None:
-        try:
-            while (envelope := next_envelope(self._pipe)) is not None:
-                self._handle(envelope)
-        except BlockingIOError:
-            pass
 
     def _handle(self, envelope: Envelope) -> None:
         if envelope.kind == "state":
@@ -89,7 +85,7 @@ class Announcer:
 
 
 def run(make_transport: Callable[[Message], Transport]) -> int:
-    """Publish what arrives on stdin through ``make_transport(will)``; returns the exit code."""
+    """Publish the envelopes on stdin through ``make_transport(will)``; return the exit code."""
     try:
         will = next_envelope(_STDIN)
         if will is None:  # the launcher has ended already
@@ -110,6 +106,7 @@ def run(make_transport: Callable[[Message], Transport]) -> int:
 
 
 def main(arguments: list[str]) -> int:
+    """Run the announcer of the robot with this config; return the exit code."""
     set_up_logging("INFO")
     if len(arguments) != 1:
         log.error("usage: python -m pebble.launcher.announcer CONFIG, with envelopes from the launcher on stdin")

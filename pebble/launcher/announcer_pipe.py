@@ -1,4 +1,4 @@
-"""Messages from the launcher to its announcer process, over a socket pair on which neither side waits."""
+"""The pipe from the launcher to its announcer process: a socket pair on which neither side waits."""
 
 import os
 import socket
@@ -17,14 +17,14 @@ Kind = Literal["will", "state", "record"]
 
 
 class Envelope(msgspec.Struct, frozen=True, array_like=True):
-    """The will comes first; a state is published again on every new connection, a record only once."""
+    """A message with its kind. The will comes first; states are published on every new connection, records once."""
 
     kind: Kind
     message: Message
 
 
 class AnnouncerPipe:
-    """The launcher's end. Records that the socket has no room for are dropped and counted; states are sent later.
+    """The launcher's end. Without room in the socket, records are dropped and counted; states are sent later.
 
     The kernel's buffer is the bound: some hundred log records that an announcer has not read yet.
     """
@@ -38,7 +38,7 @@ class AnnouncerPipe:
         self._socket: socket.socket | None = None
 
     def connect(self, will: Message) -> int:
-        """Send the will and all states to a new announcer; returns its end of the socket, which the caller closes."""
+        """Send the will and all states to a new announcer; return its end of the socket, which the caller closes."""
         self.close()
         self._socket, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.setblocking(False)
@@ -48,33 +48,30 @@ class AnnouncerPipe:
         return other.detach()
 
     def state(self, message: Message) -> None:
-        """Send the newest value of its topic."""
+        """Send a state, which replaces the former one of its topic."""
         self._states[message.topic] = self._unsent[message.topic] = message
         self._send_states()
 
     def record(self, message: Message) -> None:
-        """Send a message that only counts now. States go first."""
+        """Send a message that counts only now. Unsent states go first."""
         if not (self._send_states() and self._send("record", message)):
             self.dropped += 1
 
     def close(self) -> None:
-        """Close the stream, whose end the announcer reads."""
+        """Close the launcher's end: the announcer reads the end of the pipe."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
     def _send_states(self) -> bool:
-        """Send what is unsent; False, and another attempt later, if there is no room."""
+        """Send the unsent states; False, and another attempt later, if there is no room."""
         for topic in list(self._unsent):
             if not self._send("state", self._unsent[topic]):
-                self._retry_later()
+                if self._socket is not None and self._retry is None:
+                    self._retry = self._reactor.after(_RETRY_S, self._retry_now)
                 return False
             del self._unsent[topic]
         return True
-
-    def _retry_later(self) -> None:
-        if self._socket is not None and self._retry is None:
-            self._retry = self._reactor.after(_RETRY_S, self._retry_now)
 
     def _retry_now(self) -> None:
         self._retry = None
@@ -95,6 +92,6 @@ class AnnouncerPipe:
 
 
 def next_envelope(descriptor: int) -> Envelope | None:
-    """Return the announcer's end: the next envelope, None at the end. Raises BlockingIOError, DecodeError."""
+    """Return the next envelope from the announcer's end; None at the end. Raises BlockingIOError, DecodeError."""
     raw = os.read(descriptor, ENVELOPE_LIMIT)
     return msgspec.msgpack.decode(raw, type=Envelope) if raw else None

@@ -1,4 +1,4 @@
-"""What a robot offers, with effective topics, from its config (paper A.8.6)."""
+"""The capabilities of a robot, with effective topics, from its config (paper A.8.6)."""
 
 from __future__ import annotations
 
@@ -12,11 +12,9 @@ from msgspec import UNSET
 from pebble import contract as c
 from pebble.config import Config, SystemControl
 from pebble.contract import capabilities as offers
-from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import PebbleError
 from pebble.extension import call
-from pebble.runtime import pyav
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
 
@@ -26,20 +24,14 @@ log = logging.getLogger(__name__)
 def capabilities(
     config: Config, addresses: Addresses, lacking: Collection[str] = (), found: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Return the ``value`` of a capabilities message: ``available`` is what exists, ``controls`` what takes commands.
+    """Return the ``value`` of a capabilities message, completed by extensions.
 
-    Without extensions there are no pictures, sound, sounds and scripts: they complete the value.
-
-    ``lacking`` and ``found`` are what its processes report at present (pebble.launcher.features).
+    ``lacking`` and ``found`` are the features that its processes report now (pebble.launcher.features).
     """
     drive, estop, lights, telemetry = _motor(config, addresses, lacking)
     value = offers.CapabilitiesValue(
         identity=_identity(config),
         transport=offers.TransportOffer(kind=config.transport.kind),
-        video=_video(config, addresses),
-        audio=_audio(config, addresses),
-        soundboard=_files(addresses, c.SOUNDBOARD_COMMAND, c.SOUNDBOARD_FILES, c.SOUNDBOARD_STATUS),
-        autonomy=_files(addresses, c.AUTONOMY_COMMAND, c.AUTONOMY_FILES, c.AUTONOMY_STATUS),
         system=_system(config, addresses),
         drive=drive,
         estop=estop,
@@ -65,49 +57,6 @@ def _identity(config: Config) -> offers.RobotIdentity:
     return offers.RobotIdentity(system=robot.system, type=robot.type, id=robot.id, **given)
 
 
-def _video(config: Config, addresses: Addresses) -> offers.VideoOffer:
-    sent = config.services.mqtt_bridge.media.video_publisher
-    return offers.VideoOffer(
-        available=False,
-        controls=False,
-        topic=addresses[c.CAMERA].topic,
-        command_topic=addresses[c.VIDEO_CONTROL].topic,
-        flag_topic=addresses[c.MQTT_VIDEO].topic,
-        overlays_topic=addresses[c.VIDEO_OVERLAYS].topic,
-        width=_first(sent.publish_width, sent.width),
-        height=_first(sent.publish_height, sent.height),
-        fps=_first(sent.publish_fps, sent.target_fps, sent.fps),
-        encoding=sent.encoding,
-        encodings=list(pyav.available(ALL_VIDEO)),
-    )
-
-
-def _audio(config: Config, addresses: Addresses) -> offers.AudioOffer:
-    sent = config.services.mqtt_bridge.media.audio_publisher
-    return offers.AudioOffer(
-        available=False,
-        controls=False,
-        topic=addresses[c.AUDIO].topic,
-        uplink_topic=addresses[c.AUDIO_STREAM].topic,
-        command_topic=addresses[c.AUDIO_CONTROL].topic,
-        flag_topic=addresses[c.MQTT_AUDIO].topic,
-        rate=sent.rate,
-        channels=sent.channels,
-        encoding=sent.encoding,
-        encodings=list(pyav.available(ALL_SOUND)),
-    )
-
-
-def _files(addresses: Addresses, command: c.Channel, files: c.Channel, status: c.Channel) -> offers.FilesOffer:
-    return offers.FilesOffer(
-        available=False,
-        controls=False,
-        command_topic=addresses[command].topic,
-        files_topic=addresses[files].topic,
-        status_topic=addresses[status].topic,
-    )
-
-
 def _system(config: Config, addresses: Addresses) -> offers.SystemOffer:
     bridge = config.services.mqtt_bridge
 
@@ -125,7 +74,7 @@ def _system(config: Config, addresses: Addresses) -> offers.SystemOffer:
 def _motor(
     config: Config, addresses: Addresses, lacking: Collection[str]
 ) -> tuple[offers.DriveOffer, offers.EstopOffer, offers.LightsOffer, offers.TelemetryOffer]:
-    """Drive, stop, lights and telemetry of the serial line to the motor MCU, with *its* effective topics."""
+    """Return drive, stop, lights and telemetry of the serial line to the motor MCU, with its effective topics."""
     lines, owned = config.motor_lines(), bool(config.motor_owners)
     present, moves = bool(lines), owned or bool(config.zeros)
     name, line = next(iter(lines.items())) if lines else ("", config.services.serial_mcu_bridge)
@@ -162,10 +111,7 @@ def _motor(
 
 
 def _estop(config: Config, owners: list[str]) -> offers.EstopOffer:
-    """Return where to stop the robot, and who then reports it as stopped.
-
-    If one owner lacks the stop, the robot does.
-    """
+    """Return the emergency stop: its topics, and the owners that confirm it; none if any of them lacks it."""
     return offers.EstopOffer(
         available=bool(owners),
         topic=c.ESTOP.topic(config.base),
@@ -177,28 +123,21 @@ def _estop(config: Config, owners: list[str]) -> offers.EstopOffer:
 
 
 def _imu(config: Config) -> tuple[bool, str]:
-    """Return an inertial sensor, known by its line's protocol or name; a self-describing MCU's manifest comes later."""
+    """Return whether there is an inertial sensor, by a line's protocol or name, and its topic."""
     lines = [name for name, line in config.serial_instances().items() if SERIAL_PROTOCOLS[line.protocol].has_imu(name)]
     addresses = Addresses(view_of(config, lines[0]) if lines else config)
     return bool(lines), addresses[c.IMU].topic
 
 
 def _outlets(config: Config, found: Collection[str]) -> offers.OutletsOffer:
-    """Return the outlets of self-describing MCUs that are connected now.
-
-    What reports its state, and what can be switched.
-    """
+    """Return the outlets of self-describing MCUs that are connected now, with the topics that they use."""
     topics: dict[str, dict[str, str]] = {}
     for key, channel in (("status_topic", c.OUTLET_STATUS), ("command_topic", c.OUTLET_COMMAND)):
         for feature in sorted(found):
             if name := channel.names(f"{config.base}/{channel.direction}/{feature}").get("outlet"):
                 topics.setdefault(name, {})[key] = channel.topic(config.base, outlet=name)
     outlets = [
-        offers.OutletOffer(name=name, controls="command_topic" in own, **own) for name, own in sorted(topics.items())
+        offers.OutletOffer(name=name, controls="command_topic" in used, **used) for name, used in sorted(topics.items())
     ]
-    return offers.OutletsOffer(available=bool(outlets), controls=any(one.controls for one in outlets), outlets=outlets)
-
-
-def _first(*values: float | None) -> float | None:
-    """Return the first that was set: 0 is a value."""
-    return next((value for value in values if value is not None), None)
+    controls = any(outlet.controls for outlet in outlets)
+    return offers.OutletsOffer(available=bool(outlets), controls=controls, outlets=outlets)

@@ -1,4 +1,4 @@
-"""One child process and the pipes to it."""
+"""A child process of the launcher, and the pipes to it."""
 
 import os
 import signal
@@ -16,11 +16,11 @@ _SIGNALS = signal.valid_signals()
 
 
 class Child:
-    """A process of its own group, so that a terminal's Ctrl-C reaches only the launcher and no grandchild outlives it.
+    """A process in a group of its own: a terminal's Ctrl-C reaches only the launcher, and no grandchild outlives it.
 
     ``output`` (stdout and stderr, in order), ``notes`` (pebble.runtime.notes) and ``exited`` are descriptors to wait
-    on; ``exited`` is None where it has to be asked (pebble.runtime.exits). ``stdin`` stays the caller's. Forks: only
-    for a process with one thread and without sessions. Raises OSError.
+    on; ``exited`` is None where the process has to be asked (pebble.runtime.exits). The caller closes ``stdin``. It
+    forks: only for a process with one thread and without sessions. Raises OSError.
     """
 
     def __init__(self, program: Program, environment: Mapping[str, str], config: Config, *, stdin: int) -> None:
@@ -45,7 +45,7 @@ class Child:
             os.kill(self.pid, signal.SIGTERM)
 
     def kill(self) -> None:
-        """Kill it and what it started that stayed in its group. Safe at any time, also from a signal handler."""
+        """Kill its process group. Safe at any time, also from a signal handler."""
         if self._reaped:  # the number may belong to another process by now
             return
         try:
@@ -54,7 +54,7 @@ class Child:
             os.kill(self.pid, signal.SIGKILL)
 
     def end(self) -> str:
-        """Clean up after it has exited; returns how it ended: ``exit code 1`` or ``signal 9``."""
+        """Clean up after its exit; return ``exit code 1`` or ``signal 9``."""
         self._reaped = True  # first: a signal handler may come in between
         code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
         for descriptor in (self.output, self.notes, self.exited):
@@ -72,7 +72,7 @@ class Child:
 
 
 def read_available(descriptor: int) -> bytes | None:
-    """Read what a non-blocking pipe holds, up to 64 KiB; empty at its end, None when there is nothing."""
+    """Read up to 64 KiB from a non-blocking pipe; empty at its end, None when there is nothing."""
     try:
         return os.read(descriptor, _READ_BYTES)
     except BlockingIOError:

@@ -1,4 +1,4 @@
-"""Whether drive commands, and stops, reach the robot's motors, as far as its processes can tell. Pure."""
+"""An assessment of whether drive commands and stops reach the robot's motors, from its processes' notes. Pure."""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -7,13 +7,13 @@ from msgspec.structs import replace
 
 from pebble.runtime.notes import OFTEN, Local, Mcu, Reach
 
-_NO, _UNKNOWN, _YES = "no", "unknown", "yes"  # the worst one first
+_NO, _UNKNOWN, _YES = _STATES = "no", "unknown", "yes"  # the worst first
 
 _WORDS = {"init": "starting"}  # of a process's state
 
 
 def _shown(mcu: Mcu) -> dict[str, Any]:
-    """Return the line as the status has it."""
+    """Return the state of a serial line as the robot's status has it."""
     age = {} if mcu.silent_ms is None else {"heard_ms": mcu.silent_ms}
     starts = {"starts_per_minute": mcu.starts} if mcu.starts else {}
     why = mcu.why or _starts(mcu)
@@ -26,10 +26,7 @@ def _starts(mcu: Mcu) -> str:
 
 
 def _drives(mcu: Mcu) -> tuple[str, str]:
-    """Return whether it drives, and why not.
-
-    A board that is silent by design at rest cannot be told from a dead one.
-    """
+    """Return whether the board can drive, and why not. A board may be silent at rest: it then looks like a dead one."""
     match mcu.state:
         case "absent":
             return _NO, mcu.why or "there is no such device"
@@ -45,10 +42,10 @@ def _drives(mcu: Mcu) -> tuple[str, str]:
 
 
 class Driveable:
-    """Handles the notes Mcu, Local and Reach; ``on_change()`` is called when the status must follow.
+    """The newest notes Mcu, Local and Reach of all programs; ``on_change()`` is called when the status must follow.
 
-    ``lines``: the name of each serial line by its program. ``owners``: those of the programs that drive motors.
-    ``ways``: the programs that bring drive commands to them; they must receive what the owners publish.
+    ``lines``: the name of each serial line by its program. ``owners``: the programs that drive motors. ``ways``: the
+    programs that bring drive commands to them; they must receive what the owners publish.
     """
 
     def __init__(
@@ -62,7 +59,7 @@ class Driveable:
 
     @property
     def mcus(self) -> dict[str, dict[str, Any]]:
-        """What is known of each serial line, by its name."""
+        """The states of the serial lines, by name, as the status has them."""
         return {name: _shown(self._mcus[program]) for program, name in self._lines.items() if program in self._mcus}
 
     def mcu(self, program: str, note: Mcu) -> None:
@@ -86,22 +83,23 @@ class Driveable:
             self._on_change()
 
     def ended(self, program: str) -> None:
+        """Forget the notes of a program that has ended."""
         for table in (self._mcus, self._connected, self._reached):
             table.pop(program, None)
 
     def assessment(self, states: Mapping[str, str]) -> dict[str, str] | None:
-        """``{"state": "no", "why": "serial: …"}`` by the worst that is known; None: the robot has no motors.
+        """Return the worst judgement, such as ``{"state": "no", "why": "serial: …"}``; None: the robot has no motors.
 
-        ``states`` are those of all programs.
+        ``states``: of all programs.
         """
         if not self._owners:
             return None
-        found = [
+        judgements = [
             *(self._of_process(program, states.get(program, "stopped")) for program in (*self._owners, *self._ways)),
             *(self._of_line(program) for program in self._owners),
             *(self._of_way(way, self._lines[program]) for way in self._ways for program in self._owners),
         ]
-        state, why = min(found, key=lambda one: (_NO, _UNKNOWN, _YES).index(one[0]))
+        state, why = min(judgements, key=lambda judgement: _STATES.index(judgement[0]))
         return {"state": state, "why": why} if why else {"state": state}
 
     def _of_process(self, program: str, state: str) -> tuple[str, str]:

@@ -1,16 +1,16 @@
-"""What the robot offers at present, as its processes report it: capabilities follow. Pure."""
+"""The features that the robot's processes report: capabilities follow. Pure."""
 
 from collections.abc import Callable
 
 from pebble.runtime.notes import Feature
 
-#: A robot has these unless a process reports that it lacks them; all others it has while a process reports them.
+#: A robot has these unless a process reports that it lacks them. It has other features while a process reports them.
 _EXPECTED = frozenset({"estop", "control"})
 _MOST_REPORTS = 256  # of all processes; a self-describing MCU names its own outlets
 
 
 class Features:
-    """Handles the note Feature; ``on_change()`` is called when a property changes.
+    """The newest notes Feature of all programs; ``on_change()`` is called when a property changes.
 
     ``estop``: the emergency stop. ``control``: requests for control are answered. ``outlets/NAME/status`` and
     ``outlets/NAME/power``: the contract's topics of an outlet are in use.
@@ -39,7 +39,7 @@ class Features:
             self._set(self._reports | report)
 
     def ended(self, program: str) -> None:
-        """Forget what a process reported that has ended."""
+        """Forget the reports of a program that has ended."""
         self._set({report for report in self._reports if report[0] != program})
 
     @property

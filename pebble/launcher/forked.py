@@ -1,4 +1,4 @@
-"""How a forked copy of the launcher becomes one of its programs: the first and the last lines of every child."""
+"""The first and the last lines of every child: a forked copy of the launcher becomes one of its programs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pebble.runtime.parent import NOTIFY_FD, die_with_launcher
 
 _NOTES = 3  # the descriptor of notes, next after stdin, stdout and stderr
 _PR_SET_NAME, _NAME_BYTES = 15, 15
-_SIGNALS = signal.valid_signals()  # each call makes the set anew
+_SIGNALS = signal.valid_signals()  # each call would make another set
 
 
 def become(
@@ -29,10 +29,9 @@ def become(
 ) -> NoReturn:
     """Run ``program`` with these descriptors and no others, and exit with its code. Call right after the fork.
 
-    The program gets ``config`` as it is: its file may have changed since.
-
-    Expects all signals blocked. Never returns or raises: the frames below belong to the launcher. They must stay,
-    too, because closing an object of theirs would close a descriptor that by then belongs to another.
+    The program gets ``config`` as it is: its file may have changed since. All signals must be blocked. It never returns
+    or raises: the frames below belong to the launcher. They must stay as well, because closing one of their objects
+    would close a descriptor that by then belongs to another object.
     """
     code = 1
 
@@ -52,7 +51,7 @@ def become(
 
 
 def _arrange_descriptors(stdin: int, output: int, notes: int) -> None:
-    """Close everything else: the launcher's lock, for one, would be held for as long as this child lives."""
+    """Close all other descriptors: this child would hold the launcher's lock, for one, as long as it lives."""
     wanted = (stdin, output, output, notes)
     clear = [fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, len(wanted)) for descriptor in wanted]
     for number, descriptor in enumerate(clear):
@@ -76,7 +75,7 @@ def _reset_signals() -> None:
 
 
 def _forget_launcher(environment: Mapping[str, str]) -> None:
-    """Touch only what differs: a page that is written to is no longer shared."""
+    """Remove the launcher's handlers and variables. Change only what differs: a written page is no longer shared."""
     atexit._clear()
     logging.getLogger().handlers.clear()
     for name in os.environ.keys() - environment.keys():
@@ -96,7 +95,7 @@ def _run(program: Program) -> None:
 
 
 def _finish() -> None:
-    """Do what the interpreter does at its end, up to where it would destroy what belongs to the launcher."""
+    """End as the interpreter does, but keep the objects that belong to the launcher."""
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()
     sys.stdout.flush()

@@ -1,10 +1,8 @@
-"""Runs a robot: starts its processes in order, supervises them, and stops them in order."""
+"""The launcher: starts a robot's processes in order, supervises them, and stops them in order."""
 
 import logging
 import os
 from collections.abc import Callable, Collection, Sequence
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 from pebble.config import Config
@@ -29,23 +27,23 @@ from pebble.runtime.parent import LAUNCHER_PID
 from pebble.transports import segments
 
 _RUN_DIR_S = 1.0
-_ORPHANS_S = 1.0
-_REAP_S = 2.0  # the kernel needs this long at most to end what was killed
+_REAP_S = 2.0  # the kernel needs this long at most to end killed processes
 
 log = logging.getLogger(__name__)
 
 
 class Launcher:
-    """One robot on this machine. Raises ConfigError for a config that does not run here.
+    """A running robot. Raises ConfigError for a config that does not run on this machine.
 
-    ``table`` replaces the programs that the config asks for; tests and other products use it. They are forked from
-    this process, which therefore has no second thread and opens no transport (docs/decisions/0006).
+    ``table`` replaces the programs of the config, for tests. Programs are forked from this process, which therefore has
+    no second thread and opens no transport (docs/decisions/0006).
     """
 
     def __init__(self, config: Config, *, table: Sequence[Program] | None = None) -> None:
         _check_runs_here(config)
         self._config = config
-        self._environment = _inherited_environment()
+        #: Without systemd's variables: children do not report to systemd.
+        self._environment = {name: value for name, value in os.environ.items() if name not in SystemdNotifier.VARIABLES}
         self._reactor = Reactor(on_stall=self._stood_still)
         self._supervisors = [self._supervise(program) for program in (programs(config) if table is None else table)]
         self._on_demand = OnDemand(self._reactor, self._supervisors)
@@ -65,14 +63,15 @@ class Launcher:
         self._lost = False  # another launcher has taken the run directory
 
     def run(self) -> int:
-        """Run until a stop signal; 0 after an orderly stop, 1 after one that a second signal or a lost lock enforced.
+        """Run until a stop signal; return 0 after an orderly stop, 1 if a second signal or a lost lock enforced it.
 
         Raises PebbleError if the robot runs already or its run directory cannot be used. Main thread only.
         """
         config = self._config
         own_records = OwnRecords(self._logs, config.log_level)
         in_state_dir = config.state_file("launcher").with_suffix(".lock")
-        with own_records, RunLock(config.run_dir(), config.base, in_state_dir) as lock, self._signals:
+        with own_records, RunLock(config.run_dir(), config.base, in_state_dir) as lock:
+            self._signals.install()
             try:
                 self._reactor.every(_RUN_DIR_S, lambda: self._keep(lock))
                 self._start()
@@ -82,13 +81,13 @@ class Launcher:
                 self._end(self._supervisors)
                 self._status.close()
                 self._reactor.close()
-                segments.sweep()  # Zenoh leaves its files in /dev/shm even when its processes end in order
+                segments.sweep()  # Zenoh leaves files in /dev/shm even if its processes end in order
         return 0 if self._signals.received <= 1 and not self._lost else 1
 
     # -- starting
 
     def _start(self) -> None:
-        """Start all programs without waiting: every process connects by itself as soon as it can."""
+        """Start all programs without waiting: each process connects as soon as it can."""
         self._reactor.watch(self._signals.descriptor, self._signals.drain)
         preload(shared_modules(self._config, [supervisor.program for supervisor in self._supervisors]))
         for supervisor in self._supervisors:
@@ -99,8 +98,6 @@ class Launcher:
         for warning in (*self._config.warnings, warning_of_open(self._config)):
             if warning:
                 log.warning("%s", warning)
-        if os.getpid() == 1:
-            self._reactor.every(_ORPHANS_S, self._reap_orphans)
         self._status.start()
 
     def _supervise(self, program: Program) -> ProcessSupervisor:
@@ -110,7 +107,7 @@ class Launcher:
             self._reactor,
             spawn=self._spawn,
             on_line=lambda pid, line: self._log_line(program, pid, line),
-            on_note=lambda note: self._receive_note(program, note),
+            on_note=lambda note: self._handlers[type(note)](program, note),
             on_change=lambda: self._status.changed(),
             on_end=lambda: self._ended(program),
             is_stopping=self._stop_requested,
@@ -133,9 +130,6 @@ class Launcher:
         else:
             self._logs.child_line(program.name, pid, line, published=not program.reads_announcer_pipe)
 
-    def _receive_note(self, program: Program, note: notes.Note) -> None:
-        self._handlers[type(note)](program, note)
-
     def _ended(self, program: Program) -> None:
         self._features.ended(program.name)
         self._driveable.ended(program.name)
@@ -144,16 +138,11 @@ class Launcher:
     def _spawn(self, program: Program) -> Child:
         announcer = program.reads_announcer_pipe
         stdin = self._status.connect_announcer() if announcer else os.open(os.devnull, os.O_RDONLY)
+        environment = {**self._environment, LAUNCHER_PID: str(os.getpid()), **self._on_demand.environment(program)}
         try:
-            return Child(program, self._environment_of(program), self._config, stdin=stdin)
+            return Child(program, environment, self._config, stdin=stdin)
         finally:
             os.close(stdin)
-
-    def _environment_of(self, program: Program) -> dict[str, str]:
-        return {**self._environment, LAUNCHER_PID: str(os.getpid()), **self._on_demand.environment(program)}
-
-    def _reap_orphans(self) -> None:
-        reap({supervisor.pid for supervisor in self._supervisors if supervisor.pid is not None})
 
     def _stood_still(self, seconds: float) -> None:
         self._status.stood_still()
@@ -177,7 +166,7 @@ class Launcher:
             log.error("%s", error)
 
     def _stop(self) -> None:
-        """Stop stage by stage. Each has its own share of the timeout, so a hung process cannot starve later stages."""
+        """Stop stage by stage, each within its share of the timeout: a hung process takes no time from later stages."""
         log.info("stopping")
         self._status.stopping()
         end = self._reactor.now() + self._config.services.launcher.shutdown_timeout_seconds
@@ -199,7 +188,7 @@ class Launcher:
             self._end(supervisors)
 
     def _end(self, supervisors: Sequence[ProcessSupervisor]) -> None:
-        """Kill what still runs and wait until it has ended; nothing starts again."""
+        """Kill the programs that still run and wait for their end; none starts again."""
         for supervisor in supervisors:
             supervisor.stop()
             supervisor.kill()
@@ -218,30 +207,10 @@ def _check_runs_here(config: Config) -> None:
         )
     if config.path is None:
         raise ConfigError("the robot's processes know its config by its file, and this one has none")
-    if lost := [f"{one.key}: {one.reason}" for one in config.missing if one.drives]:
-        raise ConfigError(lost)  # it owns motors
+    if lost := [f"{extension.key}: {extension.reason}" for extension in config.missing if extension.drives]:
+        raise ConfigError(lost)
     check_connections(config)
 
 
 def _running(supervisors: Sequence[ProcessSupervisor]) -> list[str]:
     return [supervisor.program.name for supervisor in supervisors if supervisor.running]
-
-
-def _inherited_environment() -> dict[str, str]:
-    """Without systemd's variables: children do not report to systemd."""
-    return {name: value for name, value in os.environ.items() if name not in SystemdNotifier.VARIABLES}
-
-
-def reap(own: Collection[int]) -> int:
-    """Collect children that have ended, except those in ``own``: their supervisors do that. Returns how many.
-
-    The kernel gives process 1 whatever process loses its parent. Nothing else waits for these, and each would hold its
-    number until the container has none left.
-    """
-    collected = 0
-    with suppress(OSError):  # a kernel that lists no children
-        for pid in map(int, Path(f"/proc/self/task/{os.getpid()}/children").read_text(encoding="utf-8").split()):
-            if pid not in own:
-                with suppress(ChildProcessError):
-                    collected += os.waitpid(pid, os.WNOHANG)[0] == pid
-    return collected

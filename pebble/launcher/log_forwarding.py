@@ -1,4 +1,4 @@
-"""Where log lines go: the launcher's own stderr, and as records to the robot's log topic (paper A.8.7)."""
+"""Log lines of all processes: to the launcher's stderr, and as records to the robot's log topic (paper A.8.7)."""
 
 import logging
 import os
@@ -14,26 +14,26 @@ from pebble.config.visible import shown
 from pebble.contract.payloads import LogRecord
 from pebble.runtime.parent import TAG
 
-LINE_LIMIT = 16_384  # bytes of a child's line; the rest of a longer one is dropped
+LINE_LIMIT = 16_384  # bytes of a child's line; the rest of a longer line is dropped
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 
 _OWN_NAME = "launcher"
-_LEAST = LEVELS.index("INFO")  # of what is published
+_LEAST = LEVELS.index("INFO")  # that is published
 _LONGEST = 2048  # characters; longer lines are cut and end in three dots
 _FORM = re.compile(r"\d\d:\d\d:\d\d(?:[.,]\d+)? \[([A-Z]+)\] (.*)", re.DOTALL).fullmatch
 _TRACEBACK = re.compile(r"[\s|+]*(Exception Group )?Traceback \(most recent call last\):").match
 
 
 class LogForwarder:
-    """Writes every line to stderr, and hands those of INFO and above to ``publish`` as records."""
+    """A writer of every line to stderr; ``publish`` gets the lines of INFO and above as records."""
 
     def __init__(self, publish: Callable[[LogRecord], None], *, stderr: int | None = None) -> None:
         self._publish = publish
         self._stderr = NonBlockingWriter(sys.stderr.fileno() if stderr is None else stderr)
-        self._readers: dict[str, tuple[int, LevelReader]] = {}  # with the pid of the process that it reads
+        self._readers: dict[str, tuple[int, LevelReader]] = {}  # with the process id, by service
 
     def child_line(self, service: str, pid: int, line: str, *, published: bool = True) -> None:
-        """Forward one line of a child. Those of the process that publishes would cause new ones for ever."""
+        """Forward a line of a child. Lines of the publishing process are not published: each would cause another."""
         last_pid, reader = self._readers.get(service, (pid, None))
         if reader is None or last_pid != pid:  # the level of the last line belongs to the previous process
             reader = LevelReader()
@@ -42,7 +42,7 @@ class LogForwarder:
         self._forward(level, service, pid, text, logger="root", published=published)
 
     def tagged_line(self, service: str, pid: int, line: str) -> None:
-        """Forward one line of a child that may be another process's: its tag names that one."""
+        """Forward a line of a child that may come from a process of the child: its tag names that one."""
         tag = TAG.fullmatch(line)
         if tag is None:
             self.child_line(service, pid, line)
@@ -50,6 +50,7 @@ class LogForwarder:
             self.child_line(f"{service}:{tag[1]}", int(tag[2]), tag[3])
 
     def own_record(self, record: logging.LogRecord, text: str) -> None:
+        """Forward a log record of the launcher."""
         level = LEVELS[min(max(record.levelno // 10 - 1, 0), len(LEVELS) - 1)]  # others may lie in between
         self._forward(level, _OWN_NAME, os.getpid(), text, logger=record.name)
 
@@ -64,7 +65,7 @@ class LogForwarder:
 
 
 class OwnRecords(logging.Handler):
-    """Forwards the launcher's own log records the same two ways, inside its ``with`` block."""
+    """A log handler that forwards the launcher's own records inside its ``with`` block."""
 
     def __init__(self, forwarder: LogForwarder, level: str) -> None:
         super().__init__()
@@ -88,7 +89,7 @@ class OwnRecords(logging.Handler):
 
 
 class NonBlockingWriter:
-    """Writes lines to a descriptor and drops those it has no room for: a stopped terminal must not stop a robot."""
+    """A writer of lines that drops them if the descriptor has no room: a stopped terminal must not stop a robot."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
@@ -108,10 +109,10 @@ class NonBlockingWriter:
 
 
 class LevelReader:
-    """The level of each line of one process: ``HH:MM:SS [LEVEL] text`` names it, other lines are INFO (paper A.8.7).
+    """A reader of the levels of one process's lines: ``HH:MM:SS [LEVEL] text``; other lines are INFO (paper A.8.7).
 
-    A traceback, up to the next line that names its level, has that of the line it belongs to; ERROR without one.
-    Indented lines continue the line before them.
+    A traceback, up to the next line that names its level, has the level of the line before it, or ERROR. Indented lines
+    continue the line before them.
     """
 
     def __init__(self) -> None:
@@ -135,7 +136,7 @@ class LevelReader:
 
 
 def text_of(line: bytes) -> str:
-    """Return a line as text, whatever bytes are in it; without logins, which programs of others may print."""
+    """Return a line of any bytes as text, without logins: foreign programs may print them."""
     return shown(without_secrets(line.decode(errors="replace").rstrip()))
 
 
@@ -145,5 +146,5 @@ def _known(level: str) -> str | None:
 
 
 def cut(text: str, limit: int) -> str:
-    """At most ``limit`` characters; what was longer ends in three dots."""
+    """Return at most ``limit`` characters; a longer text ends in three dots."""
     return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -1,4 +1,4 @@
-"""Programs that run only while they are requested: which program may request them, and what follows from its exit."""
+"""Programs that run only while another program requests them."""
 
 import logging
 from collections.abc import Iterable
@@ -10,33 +10,30 @@ from pebble.launcher.reactor import Reactor
 from pebble.runtime.notes import Held, Wanted
 from pebble.runtime.parent import ENCODING, WANTED
 
-#: Requests of a program that has ended count for this long; then its successor must have repeated them.
+#: Requests of an ended program count for this long; by then its successor must have repeated them.
 OUTLIVE_S = 5.0
 
 log = logging.getLogger(__name__)
 
 
 class OnDemand:
-    """Handles the notes Wanted and Held from a program that may request others.
-
-    One that is requested does not run while it is held. For one thread only.
-    """
+    """The requests in the notes Wanted and Held: a program runs while it is wanted and not held. For one thread."""
 
     def __init__(self, reactor: Reactor, supervisors: Iterable[ProcessSupervisor]) -> None:
         self._reactor = reactor
         self._supervisors = {s.program.name: s for s in supervisors if s.program.on_demand}
         self._wanted: set[str] = set()
         self._held: set[str] = set()
-        self._encodings: dict[str, str] = {}  # that a program is to begin with, whenever it is started
-        self._until: dict[str, float] = {}  # when requests of a program that has ended expire
-        self._refused: set[str] = set()  # programs whose first refused note has been logged
+        self._encodings: dict[str, str] = {}  # with which a program begins, whenever it is started
+        self._until: dict[str, float] = {}  # when requests of an ended program expire
+        self._refused: set[str] = set()  # programs whose first refused note was logged
 
     @property
     def requested(self) -> tuple[str, ...]:
         return tuple(name for name in self._supervisors if name in self._wanted)
 
     def environment(self, program: Program) -> dict[str, str]:
-        """Return the variables that pass requests on to a new process of ``program``."""
+        """Return the variables that tell a new process of ``program`` about requests."""
         if program.may_request:
             return {WANTED: " ".join(f"{name}={self._encodings[name]}" for name in self.requested)}
         return {ENCODING: self._encodings[program.name]} if program.on_demand else {}
@@ -51,7 +48,7 @@ class OnDemand:
         self._encodings[name] = note.encoding
         self._until.pop(name, None)
         if changed and supervisor.requested and supervisor.policy.state != "ready":
-            supervisor.release()  # one that still starts would not receive the new encoding
+            supervisor.release()  # a starting process would not receive the new encoding
         self._follow(name)
 
     def hold(self, sender: Program, note: Held) -> None:
@@ -70,7 +67,7 @@ class OnDemand:
             supervisor.request()
 
     def ended(self, program: Program) -> None:
-        """Note that a program has ended: what it requested may run on for a while only, and it holds nothing more."""
+        """Note that a program has ended: its requests last for a while only, and it holds nothing any more."""
         if not program.may_request:
             return
         held, self._held = self._held, set()
@@ -92,7 +89,7 @@ class OnDemand:
             self._follow(name)
 
     def _may(self, sender: Program, note: Wanted | Held) -> bool:
-        """Return True if ``sender`` may request this program; a refusal is logged once."""
+        """True if ``sender`` may request this program; a refusal is logged once."""
         may = sender.may_request and note.program in self._supervisors
         if not may and sender.name not in self._refused:
             self._refused.add(sender.name)

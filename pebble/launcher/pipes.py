@@ -1,4 +1,4 @@
-"""Reads what one child writes: its output and its notes, line by line."""
+"""The output and the notes of a child process, line by line."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,22 +17,22 @@ Taker = Callable[[bytes], None]
 
 
 class Pipes:
-    """``on_line`` and ``on_note`` get each line that is not empty, on the reactor's thread, until :meth:`close`.
+    """A reader of a child: ``on_line`` and ``on_note`` get each line that is not empty, until :meth:`close`.
 
-    ``rate``: lines of its output in a second, over some seconds; of those beyond ``on_line`` gets the number.
+    ``rate``: lines of output in a second; of the lines beyond it ``on_line`` gets the number.
     """
 
     def __init__(self, child: Child, reactor: Reactor, on_line: Taker, on_note: Taker, *, rate: float) -> None:
         self._child, self._reactor, self._on_note = child, reactor, on_note
         self._output = BoundedOutput(on_line, LINE_LIMIT, reactor.now(), rate=rate)
         self._notes = LineSplitter(LINE_LIMIT, truncate=True)
-        self._pause: Timer | None = None  # in which its output is not read
+        self._pause: Timer | None = None  # until its output is read again
         self._tick: Timer | None = None
         self._watch_output()
         reactor.watch(child.notes, self._read_notes)
 
     def close(self) -> None:
-        """Read what the child, which has ended, left, and the line that it did not finish."""
+        """Read the rest that an ended child has left, and its unfinished line."""
         for timer in (self._pause, self._tick):
             if timer is not None:
                 timer.cancel()

@@ -1,4 +1,4 @@
-"""Supervises one program of the robot: starts it, restarts it and stops it."""
+"""The supervisor of one program of the robot: starts it, restarts it and stops it."""
 
 import logging
 from collections.abc import Callable
@@ -24,12 +24,12 @@ log = logging.getLogger(__name__)
 
 
 class ProgramState(Enum):
-    """What the program does, and with it what the supervisor's one timer is for."""
+    """The state of the program, which also says what the supervisor's one timer is for."""
 
     IDLE = auto()  # no child; started by request() or start()
     WAITING = auto()  # no child; the timer starts one
     RUNNING = auto()  # the timer checks for signs of life
-    STUCK = auto()  # killed because there was none; started again after its exit
+    STUCK = auto()  # killed for lack of signs of life; started again after its exit
     RELEASED = auto()  # asked to end because it is not needed; the timer kills it; IDLE after its exit
     REPLACED = auto()  # as RELEASED, and requested again since: started again after its exit
     STOPPING = auto()  # asked to end for good
@@ -40,12 +40,12 @@ _ACTIVE = (ProgramState.WAITING, ProgramState.RUNNING, ProgramState.STUCK, Progr
 
 
 class ProcessSupervisor:
-    """One program, its restart policy and its present child. All methods belong to the reactor's thread.
+    """A program, its restart policy and its present child. All methods belong to the reactor's thread.
 
     An on-demand program is started by :meth:`request`, any other by :meth:`start`. ``on_line(pid, line)`` gets the
-    child's output, ``on_note(note)`` its notes other than Ready and Alive; ``on_change()`` is called when the state
-    that is reported may have changed, ``on_end()`` whenever a child has ended. While ``is_stopping()``, whatever ends
-    stays ended: the programs of other stages may still have their turn.
+    child's output, ``on_note(note)`` its notes other than Ready and Alive; ``on_change()`` is called when the reported
+    state may have changed, ``on_end()`` whenever a child has ended. While ``is_stopping()``, an ended child is not
+    started again.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class ProcessSupervisor:
         self.program, self.policy = program, policy
         self.state = ProgramState.IDLE
         self.shown = not program.on_demand  # in the robot's status: on-demand programs from their first request on
-        self.held = False  # an on-demand program is requested, and waits for its turn
+        self.held = False  # an on-demand program is requested, and has to wait
         self._reactor, self._spawn = reactor, spawn
         self._on_line, self._on_note, self._on_change, self._on_end = on_line, on_note, on_change, on_end
         self._is_stopping = is_stopping
@@ -80,7 +80,7 @@ class ProcessSupervisor:
 
     @property
     def pid(self) -> int | None:
-        """The present child's; None while there is none."""
+        """The process id of the present child, if there is one."""
         return None if self._child is None else self._child.pid
 
     @property
@@ -89,7 +89,7 @@ class ProcessSupervisor:
         return self.state in _ACTIVE
 
     def request(self) -> None:
-        """Run an on-demand program: now, or as soon as its child that is being stopped has ended."""
+        """Run an on-demand program: now, or after the exit of a child that was asked to end."""
         self.held = False
         if self.state not in (ProgramState.IDLE, ProgramState.RELEASED):
             return
@@ -101,7 +101,7 @@ class ProcessSupervisor:
             self._start_after_request()
 
     def release(self) -> None:
-        """Ask an on-demand program to end, and kill it if it does not; returns at once."""
+        """Ask an on-demand program to end, and kill it later if it does not. Does not wait."""
         if self.held:
             self.held = False
             self._on_change()
@@ -116,13 +116,14 @@ class ProcessSupervisor:
             self._timer = self._reactor.after(self.program.stop_timeout_s, self._kill_overdue)
 
     def hold(self) -> None:
-        """Release it until :meth:`request`: others know that the program is requested."""
+        """Let a requested on-demand program wait until :meth:`request`."""
         if not self.held:
             self.release()
             self.shown = self.held = True
             self._on_change()
 
     def start(self) -> None:
+        """Start the program, unless the robot is stopping."""
         if self._is_stopping():
             self.stop()
             return
@@ -146,7 +147,7 @@ class ProcessSupervisor:
         self._end_child(ProgramState.STOPPING, ProgramState.STOPPED)
 
     def restart(self) -> None:
-        """Ask the child to end; if it was to run, another one is started."""
+        """Ask the child to end; a program that should run is then started again."""
         if self._child is not None:
             self._child.terminate()
 
@@ -220,7 +221,7 @@ class ProcessSupervisor:
     # -- the end of a child
 
     def _end_child(self, ending: ProgramState, ended: ProgramState) -> None:
-        """Ask the child to end. The state is ``ending``, or already ``ended`` if there is none."""
+        """Ask the child to end. The state is ``ending``, or at once ``ended`` if there is no child."""
         self._cancel_timer()
         if self._child is not None:
             self.state = ending
@@ -244,7 +245,7 @@ class ProcessSupervisor:
         ask()
 
     def _exited(self, child: Child) -> None:
-        child.kill()  # what it started must not go on without it; until it is reaped the group's number is its own
+        child.kill()  # its own children must not go on; until it is reaped nobody else has the group's number
         if self._pipes is not None:
             self._pipes.close()
         if child.exited is not None:
@@ -275,7 +276,7 @@ class ProcessSupervisor:
         was_in_crash_loop = self.policy.in_crash_loop
         wait_s = self.policy.exited(self._reactor.now(), how)
         self._start_in(wait_s)
-        self._reactor.after(LOOP_WINDOW_S + 1.0, self._on_change)  # then this exit is not of the last minute any more
+        self._reactor.after(LOOP_WINDOW_S + 1.0, self._on_change)  # by then this exit is older than a minute
         name = self.program.name
         times = self.policy.exits_within_a_minute(self._reactor.now())
         if not self.policy.in_crash_loop:

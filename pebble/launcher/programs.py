@@ -1,4 +1,4 @@
-"""Which processes a robot has, in the order they start: those of the core, and those that extensions add."""
+"""The processes of a robot in the order of their start: of the core, and of extensions."""
 
 import gc
 import logging
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 def programs(config: Config) -> tuple[Program, ...]:
-    """Return the processes of this robot. Raises ConfigError where two of them have one name.
+    """Return the processes of this robot. Raises ConfigError if two of them have one name.
 
     Devices start before connections, so that a motor has received its stop before any command can arrive.
     """
@@ -39,15 +39,17 @@ def _core(config: Config) -> Iterator[tuple[bool, Program]]:
 
 
 def shared_modules(config: Config, table: Iterable[Program]) -> list[str]:
-    """Return the modules to import before the first fork: what the programs run, and what several of them use."""
-    shared = dict.fromkeys(module for program in table for module in program.shares)
-    return [*_transport_modules(config), *shared, *(one.entry or one.module for one in table if one.preloaded)]
+    """Return the modules to import before the first fork: those of the programs, and those that several use."""
+    programs = list(table)
+    shared = dict.fromkeys(module for program in programs for module in program.shares)
+    entries = (program.entry or program.module for program in programs if program.preloaded)
+    return [*_transport_modules(config), *shared, *entries]
 
 
 def preload(modules: Iterable[str]) -> None:
-    """Import ``modules``: what is in memory before a fork, parent and children share.
+    """Import ``modules``: parent and children share the memory that was written before a fork.
 
-    A module that cannot be imported is left to the process that runs it, which reports what is wrong.
+    A module that cannot be imported is left to the process that runs it, which reports the error.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # else numpy starts threads, and no fork may follow
     for name in modules:
@@ -56,11 +58,11 @@ def preload(modules: Iterable[str]) -> None:
         except Exception:
             log.debug("%s cannot be imported", name, exc_info=True)
     gc.collect()
-    gc.freeze()  # a collection writes into every object it visits, and a page that is written to is no longer shared
+    gc.freeze()  # a collection writes into every object, and a written page is no longer shared
 
 
 def _transport_modules(config: Config) -> tuple[str, ...]:
-    """Return the modules of Pebble's own transports that some process of this robot opens."""
+    """Return the modules of our transports that any process of this robot opens."""
     bridge = config.services.mqtt_bridge
     kinds = {config.transport.kind}
     if config.transport.mqtt_mirror is not None:
@@ -81,7 +83,7 @@ def _service(config: Config, name: str, **more: Any) -> Program:
 
 
 def _serial_line(config: Config, instance: str, line: SerialBridge) -> Program:
-    """Return its process imports the bridge of its protocol, not those of others."""
+    """Return the program of a serial line, which imports the bridge of its protocol."""
     arguments = (str(config.path), instance) if instance else (str(config.path),)
     entry = SERIAL_PROTOCOLS[line.protocol].module
     return Program(program_of(instance), "pebble.services.serial_mcu_bridge", arguments, Stage.DEVICE, entry=entry)

@@ -1,11 +1,10 @@
-"""One thread that waits for file descriptors, timers and stop signals at once."""
+"""A thread that waits for descriptors, timers and stop signals at once."""
 
 import selectors
 import signal
 import time
 from collections.abc import Callable
 from types import FrameType
-from typing import Any, Self
 
 from pebble.runtime.timers import Timer, Timers
 from pebble.transports.wakeup import WakeupPipe
@@ -18,10 +17,10 @@ Job = Callable[[], None]
 
 
 class Reactor:
-    """Calls jobs when a descriptor can be read or a time has come. For one thread only.
+    """A loop that calls jobs when a descriptor can be read or a time has come. For one thread only.
 
-    Its clock does not run while this process stands still, because what it waits for then stands still, too, as a
-    rule. ``on_stall(seconds)`` is called afterwards.
+    Its clock stands still while this process does, because the other processes then stand still, too, as a rule.
+    ``on_stall(seconds)`` is called afterwards.
     """
 
     def __init__(
@@ -39,7 +38,7 @@ class Reactor:
         if self._read is not None:
             before, self._read = self._read, now
             if now - before > _TURN_S + _STALL_S:
-                self._stood_still_s += now - before - _TURN_S  # it goes on: a starved launcher still ends what hangs
+                self._stood_still_s += now - before - _TURN_S  # a starved launcher still ends a program that hangs
                 self._on_stall(now - before)
         return now - self._stood_still_s
 
@@ -78,7 +77,7 @@ class Reactor:
         self._selector.close()
 
     def _turn(self, *waits: float | None) -> None:
-        """Read descriptors before timers run: a timer that checks for signs of life must know those that have come."""
+        """Read descriptors, then run timers: a timer that checks for signs of life must know the newest."""
         for key, _ in self._selector.select(min([_TURN_S, *(wait for wait in waits if wait is not None)])):
             if key.fd in self._selector.get_map():  # an earlier job of this turn may have forgotten it
                 key.data()
@@ -86,17 +85,15 @@ class Reactor:
 
 
 class StopSignals:
-    """Counts SIGTERM, SIGINT and SIGHUP inside its ``with`` block; ``descriptor`` is readable after each one.
+    """A counter of SIGTERM, SIGINT and SIGHUP from :meth:`install` on; ``descriptor`` is readable after each.
 
-    ``on_repeat`` is called in the signal handler from the second one on: the user does not want to wait any longer.
-    Main thread only. A signal that was ignored before (nohup) stays ignored.
+    The signal handler calls ``on_repeat`` from the second signal on: the user does not want to wait any longer. Main
+    thread only.
     """
 
     def __init__(self, on_repeat: Callable[[], None]) -> None:
         self.received = 0
         self._on_repeat = on_repeat
-        self._previous: dict[signal.Signals, Any] = {}
-        self._previous_wakeup = -1
         self._wakeup = WakeupPipe()
 
     @property
@@ -104,21 +101,15 @@ class StopSignals:
         return self._wakeup.fileno()
 
     def drain(self) -> None:
-        """Read what made :attr:`descriptor` readable."""
+        """Make :attr:`descriptor` unreadable until the next signal."""
         self._wakeup.clear()
 
-    def __enter__(self) -> Self:
-        self._previous_wakeup = signal.set_wakeup_fd(self._wakeup.set_fileno, warn_on_full_buffer=False)
+    def install(self) -> None:
+        """Handle the signals until the process ends, except ignored ones (nohup)."""
+        signal.set_wakeup_fd(self._wakeup.set_fileno, warn_on_full_buffer=False)
         for number in _SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:
-                self._previous[number] = signal.signal(number, self._receive)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-        signal.set_wakeup_fd(self._previous_wakeup)
-        self._wakeup.close()
+                signal.signal(number, self._receive)
 
     def _receive(self, _number: int, _frame: FrameType | None) -> None:
         self.received += 1

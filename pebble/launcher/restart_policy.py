@@ -1,4 +1,4 @@
-"""When a program is started again, and when it counts as stuck: the record of one program across its restarts. Pure."""
+"""The record of one program across its restarts: when it is started again, and when it counts as stuck. Pure."""
 
 from collections import deque
 from typing import Literal
@@ -14,7 +14,7 @@ START_INTERVAL_S = 1.0  # between two starts of an on-demand program: a start co
 
 
 class RestartPolicy:
-    """Decides about one program from the times of its starts, signs of life and exits. Clock values are passed in.
+    """The decisions about one program by the times of its starts, signs of life and exits. Times are passed in.
 
     ``restart_delay_s`` (services.launcher.restart_delay_seconds) scales the waits: the first restart is immediate,
     the second waits a quarter of it, and each further one twice as long, up to five times ``restart_delay_s``.
@@ -47,8 +47,8 @@ class RestartPolicy:
         return max(0.0, self._started + START_INTERVAL_S - now)
 
     def started(self, now: float, *, plain: bool = False) -> None:
-        """Record a start; a ``plain`` program is ready at once, and not watched until it gives a sign of life."""
-        if self.state == "stopped":  # it ended because it was asked to: no restart
+        """Record a start. A ``plain`` program is ready at once, and not watched until it gives a sign of life."""
+        if self.state == "stopped":  # it was asked to end: this is no restart
             self.state = "init"
         elif self.last_exit is not None:
             self.restarts += 1
@@ -66,7 +66,7 @@ class RestartPolicy:
         self.stuck_at = now + ALIVE_LIMIT_S
 
     def exited(self, now: float, how: str) -> float:
-        """Record an unexpected exit; returns how many seconds to wait before the next start."""
+        """Record an unexpected exit; return the seconds to wait before the next start."""
         self._ended(how)
         if now - self._started >= STABLE_S:
             self._exits.clear()
@@ -80,7 +80,7 @@ class RestartPolicy:
         return self._wait_s()
 
     def stopped(self, how: str | None) -> None:
-        """Record an exit that was asked for; ``how`` is None if no process was running."""
+        """Record a requested exit; ``how`` is None if no process was running."""
         self._ended(self.last_exit if how is None else how)
         self.state = "stopped"
 

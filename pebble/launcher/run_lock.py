@@ -1,4 +1,4 @@
-"""One launcher per robot: a lock file in its run directory and one in its state directory."""
+"""The locks that allow one launcher per robot: a file in its run directory and one in its state directory."""
 
 import logging
 import os
@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 
 
 class RunLock:
-    """Makes the run directory for this user alone and holds its lock; the kernel releases it however the process ends.
+    """The lock of a run directory, which it makes for this user alone. The kernel releases it when the process ends.
 
     A second lock is in the state directory, for launchers whose environment names another run directory.
 
@@ -29,6 +29,7 @@ class RunLock:
         self._problem = ""
 
     def take(self) -> Self:
+        """Make the directory, and take both locks."""
         make_private(self._run_dir, close=True)
         self._lock = self._taken(self.path)
         try:
@@ -55,10 +56,10 @@ class RunLock:
                 lock.write(f"{os.getpid()}\n{self._robot}\n".encode())
 
     def keep(self) -> bool:
-        """Make the directory and the lock again if they were removed, by a cleaner or a logout; call it every second.
+        """Make the directory and the lock again if a cleaner or a logout has removed them. Call it every second.
 
-        Returns True if it did: nothing that starts now reaches what runs. Raises PebbleError if another launcher has
-        taken the lock.
+        Return True if it did: programs that start now cannot reach those that run. Raises PebbleError if another
+        launcher has taken the lock.
         """
         lock, problem = self._lock, ""
         try:

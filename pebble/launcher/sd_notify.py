@@ -1,4 +1,4 @@
-"""Reports to systemd: sd_notify(3) in pure Python; does nothing where systemd does not listen."""
+"""Reports to systemd: sd_notify(3) in pure Python. They do nothing if systemd does not listen."""
 
 import logging
 import os
@@ -9,9 +9,9 @@ log = logging.getLogger(__name__)
 
 
 class SystemdNotifier:
-    """Sends state datagrams to ``$NOTIFY_SOCKET``; systemd's unit must say ``Type=notify``."""
+    """A sender of state datagrams to ``$NOTIFY_SOCKET``; the unit must say ``Type=notify``."""
 
-    #: For the process that systemd started alone, and not for its children.
+    #: Only for the process that systemd started, not for its children.
     VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:

@@ -1,4 +1,4 @@
-"""Publishes the robot's status, capabilities and logs through the announcer, and reports to systemd."""
+"""The robot's status, capabilities and logs, published through the announcer, and reports to systemd."""
 
 import logging
 import time
@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 class StatusPublisher:
-    """Turns the states of all supervisors into messages for operators and for systemd."""
+    """A publisher of the states of all supervisors, for operators and for systemd."""
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class StatusPublisher:
         self._ready_reported = False
 
     def connect_announcer(self) -> int:
-        """Return the standard input of a new announcer process: a descriptor, which the caller closes."""
+        """Return a descriptor for the standard input of a new announcer process; the caller closes it."""
         return self._pipe.connect(self._will())
 
     def start(self) -> None:
@@ -61,7 +61,7 @@ class StatusPublisher:
         self._reactor.every(interval_s, self._publish_status)
 
     def changed(self) -> None:
-        """Note that the state of a supervisor may have changed: publish soon."""
+        """Publish the status soon, because the state of a supervisor may have changed."""
         always = (supervisor for supervisor in self._supervisors if not supervisor.program.on_demand)
         if not self._ready_reported and all(supervisor.policy.first_attempt_done for supervisor in always):
             self._ready_reported = True
@@ -71,7 +71,7 @@ class StatusPublisher:
             self._reactor.after(_STATUS_PAUSE_S, self._publish_status)
 
     def capabilities_changed(self) -> None:
-        """Note that what the processes report has changed: publish soon."""
+        """Publish the capabilities soon, because the processes' reports have changed."""
         if self._config.services.launcher.enabled and not self._capabilities_due:
             self._capabilities_due = True
             self._reactor.after(_STATUS_PAUSE_S, self._publish_capabilities)
@@ -82,7 +82,7 @@ class StatusPublisher:
             self._pipe.record(self._message(LOGS, record))
 
     def stood_still(self) -> None:
-        """systemd's clock has run on."""
+        """Give systemd a sign of life after this process stood still: its clock has run on."""
         if self._systemd.watchdog_period_s is not None:
             self._systemd.watchdog()
 
@@ -90,7 +90,7 @@ class StatusPublisher:
         self._systemd.stopping()
 
     def publish_last(self) -> None:
-        """Before the announcer stops: the status with how all other programs ended."""
+        """Publish the status before the announcer stops: it says how all other programs ended."""
         if self._pipe.dropped:
             log.info(
                 "log records that were not published, because the announcer was away or busy: %d", self._pipe.dropped
@@ -103,21 +103,21 @@ class StatusPublisher:
     def _publish_status(self) -> None:
         self._status_due = False
         shown = [supervisor for supervisor in self._supervisors if supervisor.shown]
-        relevant = {s.program.name: self._state(s) for s in shown if not _rests(s)}
-        self._systemd.status(_summary(relevant))
-        states = {one.name: ServiceState(state="failed", last_exit="not installed") for one in self._config.missing}
+        in_use = {supervisor.program.name: self._state(supervisor) for supervisor in shown if not _rests(supervisor)}
+        self._systemd.status(_summary(in_use))
+        missing = ServiceState(state="failed", last_exit="not installed")
+        states = {extension.name: missing for extension in self._config.missing}
         states |= {supervisor.program.name: self._state(supervisor) for supervisor in shown}
-        url = next((one.program.webrtc_url for one in self._supervisors if one.program.webrtc_url), None)
-        self._publish_state(STATUS, self._status(states, self._driveable.mcus, url))
+        urls = (supervisor.program.webrtc_url for supervisor in self._supervisors)
+        self._publish_state(STATUS, self._status(states, self._driveable.mcus, next(filter(None, urls), None)))
 
     def _status(
         self, states: dict[str, ServiceState], mcus: dict[str, Any] | None = None, webrtc_url: str | None = None
     ) -> Status:
-        """Operator pages show what is at ``webrtc_url``."""
-        driveable = self._driveable.assessment({name: one.state for name, one in states.items()})
+        """Return the status message. ``webrtc_url``: of pictures that operator pages show."""
+        driveable = self._driveable.assessment({name: service.state for name, service in states.items()})
         more = {"mcu": mcus or None, "driveable": driveable, "webrtc_url": webrtc_url}
-        value = {"services": states, **{name: one for name, one in more.items() if one is not None}}
-        return Status(t=_now_ms(), value=value)
+        return Status(t=_now_ms(), value={"services": states, **{name: part for name, part in more.items() if part}})
 
     def _state(self, supervisor: ProcessSupervisor) -> ServiceState:
         policy = supervisor.policy
@@ -147,12 +147,12 @@ class StatusPublisher:
 
 
 def _rests(supervisor: ProcessSupervisor) -> bool:
-    """True if it is an on-demand program that is not requested: systemd's summary leaves it out."""
+    """True for an on-demand program that is not requested: systemd's summary leaves it out."""
     return supervisor.program.on_demand and not supervisor.requested and not supervisor.running
 
 
 def _summary(states: dict[str, ServiceState]) -> str:
-    """``3 of 4 ready; mqtt_bridge restarting``."""
+    """Return a line such as ``3 of 4 ready; mqtt_bridge restarting``."""
     others = [f"{name} {state.state}" for name, state in states.items() if state.state != "ready"]
     return "; ".join([f"{len(states) - len(others)} of {len(states)} ready", *others])
 

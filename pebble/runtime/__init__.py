@@ -1,1 +1,1 @@
-"""What every process of a robot is built on: service, inbox, timers, connections, and notifications to the launcher."""
+"""The base of every process of a robot: service, inbox, timers, connections, and notes to the launcher."""

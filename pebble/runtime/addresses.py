@@ -1,8 +1,9 @@
-"""The topic that one robot uses for each channel, after its config (paper Table A.6)."""
+"""The topic that a robot uses for each channel, by its config (paper Table A.6)."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from pebble.config import Config
+from pebble.config.rules.shared_topics import topic_at
 from pebble.contract import CHANNELS, Channel, channel_of
 
 
@@ -15,10 +16,7 @@ class Address(NamedTuple):
 
 
 class Addresses:
-    """Looks up the address of a channel, and the channel of a topic.
-
-    ``config``: that of the robot, or its base if it renames nothing.
-    """
+    """A table of the addresses of all channels. ``config``: of the robot, or its base if it renames nothing."""
 
     def __init__(self, config: Config | str) -> None:
         self.base = config if isinstance(config, str) else config.base
@@ -29,12 +27,12 @@ class Addresses:
         self._channels = {address.topic: channel for channel, address in self._of.items() if not channel.is_pattern}
 
     def __getitem__(self, channel: Channel) -> Address:
-        """Return where a channel travels; one that is made while running, in no contract, has its own defaults."""
-        found = self._of.get(channel)
-        return found if found is not None else _default(channel, self.base)
+        """Return the address of a channel; one that is made at run time, in no contract, has its own defaults."""
+        address = self._of.get(channel)
+        return address if address is not None else _default(channel, self.base)
 
     def channel(self, topic: str) -> Channel | None:
-        """Return the channel that travels under ``topic``, renamed or not; None for one the contract does not know."""
+        """Return the channel with this topic, renamed or not; None if the contract does not know it."""
         renamed = self._channels.get(topic)
         if renamed is not None or not topic.startswith(self.base + "/"):
             return renamed
@@ -44,18 +42,9 @@ class Addresses:
 
 def _address(channel: Channel, config: Config) -> Address:
     default = _default(channel, config.base)
-    topic = None if channel.override is None else _at(config, channel.override)
+    topic = None if channel.override is None else topic_at(config, channel.override.split("."))
     return default if topic is None else default._replace(topic=topic)
 
 
 def _default(channel: Channel, base: str) -> Address:
     return Address(channel.filter(base), channel.default_qos, channel.default_retain)
-
-
-def _at(config: Config, path: str) -> str | None:
-    """Return the topic at a dotted path of the config tree; None where the key was not set."""
-    value: Any = config
-    for name in path.split("."):
-        value = getattr(value, name, None)  # an extension's section is missing with it
-    topic: str | None = value
-    return topic

@@ -1,4 +1,4 @@
-"""The output of one program as lines for a log: bounded in length and number, and what is left out is counted."""
+"""The output of a program as lines for a log: bounded in length and number, and the missing lines are counted."""
 
 import re
 import time
@@ -10,22 +10,22 @@ from pebble.runtime.lines import LineSplitter
 
 LINES_PER_S: Final = 100.0
 _BURST_S = 2.0  # so many seconds' lines at once, after a silence
-KEPT: Final = 10  # of the lines that are left out, the last ones: a program that fails says why at its end
-PAUSE_S: Final = 0.02  # between two reads of a program that floods, which waits meanwhile
-_SKIM = 4096  # bytes of a chunk that are read of a flood
+KEPT: Final = 10  # last ones of the lines that are left out: a program that fails says why at its end
+PAUSE_S: Final = 0.02  # between two reads of a program that floods: it has to wait
+_SKIM = 4096  # bytes of a chunk that are read during a flood
 _REPEATS_S = 1.0  # within which the same line again is a repetition
-_QUIET_S, _REPORT_S = 0.5, 5.0  # what was left out is said when the flood has ended so long ago, or goes on
+_QUIET_S, _REPORT_S = 0.5, 5.0  # the missing lines are said so long after the end of the flood, or so often in it
 _clock = re.compile(rb"\d\d:\d\d:\d\d(?:[.,]\d+)? ").match
 
 
 class BoundedOutput:
-    """Takes chunks of a program's output, and passes ``rate`` lines a second to ``write``. Times are passed in.
+    """A filter of a program's output that passes ``rate`` lines a second to ``write``. Times are passed in.
 
-    A line that is repeated at once is written once. Lines that say how many are missing begin as those of our programs.
+    A line that is repeated at once is written once. Lines that count missing ones have the form of our programs' lines.
     """
 
     def __init__(self, write: Callable[[bytes], None], longest: int, now: float, *, rate: float = LINES_PER_S) -> None:
-        """``longest``: bytes of a line; the rest of a longer one is left out."""
+        """Make a filter. ``longest``: bytes of a line; the rest of a longer line is left out."""
         self.flooded = False  # by the newest chunk: the reader may take its time
         self._write, self._rate, self._most = write, rate, rate * _BURST_S
         self._lines = LineSplitter(longest, truncate=True)
@@ -37,10 +37,11 @@ class BoundedOutput:
 
     @property
     def waits(self) -> bool:
-        """True if something is to be said: call :meth:`tick` in time."""
+        """True if lines are missing that were not counted yet: call :meth:`tick` from time to time."""
         return self._left_out + self._repeats > 0
 
     def feed(self, data: bytes, now: float) -> None:
+        """Take a chunk of output."""
         self.tick(now)
         if self.flooded and len(data) > 2 * _SKIM and (end := data.rfind(b"\n", 0, -_SKIM)) >= 0:
             self._left_out, self._suppressed_at = self._left_out + data.count(b"\n", 0, end + 1), now
@@ -51,7 +52,7 @@ class BoundedOutput:
         self.flooded = self._suppressed_at == now
 
     def tick(self, now: float) -> None:
-        """Say what was left out, if it is time."""
+        """Write how many lines are missing, if it is time."""
         self._tokens = min(self._most, self._tokens + (now - self._filled_at) * self._rate)
         self._filled_at = now
         quiet = now - self._suppressed_at >= _QUIET_S
@@ -60,7 +61,7 @@ class BoundedOutput:
             self._say()
 
     def end(self) -> None:
-        """Pass on the last ones of the lines that were left out, and the unfinished line."""
+        """Write the last of the missing lines, and the unfinished line."""
         self._say()
         if rest := self._lines.rest().rstrip():
             self._write(rest)

@@ -1,4 +1,4 @@
-"""Makes a robot's transports from its config: the local transport and the connection to operators."""
+"""The transports of a robot, made from its config: the local transport and the connections to operators."""
 
 from collections.abc import Iterator
 from dataclasses import replace as replace_settings
@@ -18,17 +18,16 @@ from pebble.transports.hosts import SMALL_SEGMENT
 from pebble.transports.socket_paths import LONGEST_SOCKET, fits_socket
 
 _ANY = "+/+/+"  # the levels of any robot
-#: Topics of the robot's states, and of all commands, that are published even to a broker that hangs up on them.
+#: Topics of the robot's states, and of all commands: they are published even to a broker that hangs up on them.
 _VITAL_STATES = (
-    *(one.filter(_ANY) for one in (c.ONLINE, c.HEARTBEAT, c.CAPABILITIES, c.ESTOP_STATE)),
+    *(channel.filter(_ANY) for channel in (c.ONLINE, c.HEARTBEAT, c.CAPABILITIES, c.ESTOP_STATE)),
     f"{_ANY}/+/control/#",
 )
 ALL_VITAL = (*_VITAL_STATES, f"{_ANY}/{c.INCOMING}/#")
 
 LOCAL_RECONNECT_S, REMOTE_RECONNECT_S = 0.5, 2.0
 _BRIDGE, _STOPS = "remote-bridge", "remote-stops"
-_FRAMES = "pebble.transports.frames"  # makes sockets for pictures and sound
-#: RFC 4594: what must not wait, and what may be dropped last of what can. Where a link may be thin.
+#: Classes of RFC 4594 for links that may be thin: traffic that must not wait, and traffic that is dropped late.
 _EXPEDITED, _ASSURED = 46, 10
 
 
@@ -39,7 +38,7 @@ def local_transport(config: Config, name: str, *, will: Message | None = None, a
 
 
 def check_connections(config: Config) -> None:
-    """Raise ConfigError for what only the machine where the robot runs can know: installed transports, long paths."""
+    """Raise ConfigError for mistakes that only the robot's machine can know: missing transports, long paths."""
     remote = config.services.mqtt_bridge.remote
     places = {"transport.kind": config.transport.kind}
     if remote is not None:
@@ -51,7 +50,7 @@ def check_connections(config: Config) -> None:
         except TransportError as error:
             problems.append(f"{place}: {error}")
     added = programs_of(config.installed, config)
-    has_sockets = config.transport.kind == "zenoh" or any(_FRAMES in program.shares for program in added)
+    has_sockets = config.transport.kind == "zenoh" or any(program.has_sockets for program in added)
     if has_sockets and not fits_socket(config.run_dir() / LONGEST_SOCKET):
         problems.append(
             f"transport.run_dir: {config.run_dir()} is too long for the sockets in it, set it to a shorter path"
@@ -61,7 +60,7 @@ def check_connections(config: Config) -> None:
 
 
 def local_settings(config: Config, as_published: bool = False) -> Any:
-    """Return the settings of the local transport, by its kind; a third party's gets ``transport.settings`` as it is."""
+    """Return the settings of the local transport; for a third party's kind the section ``transport.settings``."""
     kind = config.transport.kind
     if kind == "mqtt":
         settings = mqtt_settings(config.local_mqtt, as_published=as_published, reconnect_max_s=LOCAL_RECONNECT_S)
@@ -72,7 +71,7 @@ def local_settings(config: Config, as_published: bool = False) -> Any:
 
 
 def remote_transport(config: Config, name: str, *, will: Message | None = None) -> Transport:
-    """Return the bridge's connection to operators, not yet opened: ``remote`` where it is set, else ``remote_mqtt``."""
+    """Return a connection to operators, not yet opened: to ``remote`` if it is set, else to ``remote_mqtt``."""
     bridge = config.services.mqtt_bridge
     if bridge.remote is None:
         remote, program = bridge.remote_mqtt, "" if name == _BRIDGE else name
@@ -86,11 +85,10 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
 
 
 def stops_transport(config: Config) -> Transport | None:
-    """Return the bridge's second connection to operators, on which only stops are received; None: it has none.
+    """Return the bridge's second connection to operators, only for stops; None: it has none.
 
-    Where the broker knows no accounts one connection is as good as another, unless the link may be thin: a client that
-    sends more than it carries fills it without meaning to. It receives the retain flag of old messages only: this is no
-    as-published connection.
+    Without accounts at the broker it would be no better than the first connection, unless the link may be thin: there
+    a client that sends too much fills the first connection. This is no as-published connection.
     """
     bridge = config.services.mqtt_bridge
     if config.security.level == "open" and (bridge.remote is not None or bridge.link.profile == "wide"):
@@ -98,13 +96,13 @@ def stops_transport(config: Config) -> Transport | None:
     if bridge.remote is None:
         settings = live_only(mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=_STOPS))
         return create("mqtt", _name(config, "mqtt", _STOPS), settings)
-    if bridge.remote.kind != "zenoh":  # what another transport makes of a second connection is not known
+    if bridge.remote.kind != "zenoh":  # other transports may not allow a second connection
         return None
     return create("zenoh", _name(config, "zenoh", _STOPS), _remote_settings(config, bridge.remote))
 
 
 def live_only(settings: MqttSettings) -> MqttSettings:
-    """Return the settings of a connection that no retained message holds up: MQTT 5 lets it ask for none."""
+    """Return the settings of a connection without retained messages, where MQTT 5 allows that: none delays others."""
     return replace_settings(settings, max_segment=SMALL_SEGMENT, sends_retained=False)
 
 
@@ -115,12 +113,12 @@ def mirror_transport(config: Config, mirror: Mqtt, name: str) -> Transport:
 
 
 def _name(config: Config, kind: str, name: str) -> str:
-    """Return what the transport of the robot's program ``name`` is called in logs, and of MQTT in client ids."""
+    """Return the name of a program's transport, for logs and MQTT's client ids."""
     return f"{config.base}/{name.replace('-', '_')}" if kind == "mqtt" else f"{config.base}-{name}"
 
 
 def _remote_settings(config: Config, remote: RemoteConnection) -> Any:
-    """Return the settings of an uplink; Zenoh's is a client of a hub elsewhere, apart from the local transport."""
+    """Return the settings of an uplink: with Zenoh a client of a hub elsewhere, apart from the local transport."""
     if remote.kind != "zenoh":
         return remote.settings
     return client_of_hub(config.run_dir() / "remote", remote, remote.lease_ms, remote.account)
@@ -139,12 +137,12 @@ def client_of_hub(run_dir: Path, hub: ZenohClient, lease_ms: int, account: str) 
 
 
 def zenoh_settings(config: Config, *, client: bool = False) -> ZenohSettings:
-    """Return a peer of this robot's processes; ``client`` for a short tool. Only the hub leaves the machine."""
+    """Return the settings of a Zenoh peer on this robot, or of a ``client`` for a short command."""
     return ZenohSettings(run_dir=config.run_dir(), lease_ms=config.transport.lease_ms, client=client)
 
 
 def hub_settings(config: Config) -> ZenohSettings:
-    """Return the hub of this robot's local transport, with its endpoints for other machines and its journal."""
+    """Return the settings of this robot's hub, with its endpoints for other machines and its journal."""
     transport = config.transport
     return ZenohSettings(
         run_dir=config.run_dir(),
@@ -156,15 +154,14 @@ def hub_settings(config: Config) -> ZenohSettings:
         lease_ms=transport.lease_ms,
         journal=transport.journal,
         of_robot=True,
-        wills=tuple(dict.fromkeys(_renamed_wills(config))),
+        wills=tuple(
+            dict.fromkeys(
+                (topic, channel.kind is c.Kind.FLAG)
+                for channel, topic in _renamed(config)
+                if channel.direction == c.INCOMING
+            )
+        ),
     )
-
-
-def _renamed_wills(config: Config) -> Iterator[tuple[str, bool]]:
-    """Yield the topics that this config renames, and True if the hub takes wills there."""
-    for channel, topic in _renamed(config):
-        if channel.direction == c.INCOMING:
-            yield topic, channel.kind is c.Kind.FLAG
 
 
 def _renamed_vital(config: Config) -> tuple[str, ...]:
@@ -173,9 +170,9 @@ def _renamed_vital(config: Config) -> tuple[str, ...]:
 
 
 def _renamed(config: Config) -> Iterator[tuple[c.Channel, str]]:
-    """Yield the channels that this config renames, and their topics, those of every serial line included."""
-    own = config.services.serial_mcu_bridge  # in the process of one line: that one
-    for line in (own, *config.serial_instances().values()):
+    """Yield the channels that this config renames, and their topics, for every serial line."""
+    section = config.services.serial_mcu_bridge  # in the process of a line: that line
+    for line in (section, *config.serial_instances().values()):
         addresses = Addresses(replace(config, services=replace(config.services, serial_mcu_bridge=line)))
         for channel in c.CHANNELS:
             topic = addresses[channel].topic
@@ -186,9 +183,9 @@ def _renamed(config: Config) -> Iterator[tuple[c.Channel, str]]:
 def mqtt_settings(
     mqtt: Mqtt, *, as_published: bool = False, reconnect_max_s: float, program: str = "tool"
 ) -> MqttSettings:
-    """Return one broker's section of a config as connection settings.
+    """Return the settings of a connection to a broker of the config.
 
-    If it sets a client id that is the bridge's (``program=""``), and others have one of their own that begins with it.
+    A client id in the config is that of the bridge (``program=""``); ids of other programs begin with it.
     """
     client_id = mqtt.client_id if isinstance(mqtt, RemoteMqtt) else None
     return MqttSettings(
@@ -208,12 +205,9 @@ def mqtt_settings(
 
 
 def tls_settings(tls: Tls) -> TlsSettings | None:
-    """Certificates, or None where TLS is off."""
+    """Return the certificates, or None if TLS is off."""
     if not tls.enabled:
         return None
     return TlsSettings(
-        ca_cert=tls.ca_cert,
-        client_cert=tls.client_cert,
-        client_key=tls.client_key,
-        insecure=tls.insecure,
+        ca_cert=tls.ca_cert, client_cert=tls.client_cert, client_key=tls.client_key, insecure=tls.insecure
     )

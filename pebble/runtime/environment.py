@@ -9,9 +9,9 @@ _LAUNCHERS = (ENCODING, LAUNCHER_PID, NOTIFY_FD, WANTED)  # between the launcher
 
 
 def withhold(passwords: Iterable[str]) -> None:
-    """Empty these variables of this process: what it starts from now on does not receive the passwords in them.
+    """Empty these variables of this process: programs that it starts do not receive the passwords.
 
-    They remain set, so that a program can still read a config that names them.
+    The variables remain set, so that such a program can read a config that names them.
     """
     for name in passwords:
         if name in os.environ:
@@ -19,7 +19,7 @@ def withhold(passwords: Iterable[str]) -> None:
 
 
 def child_environment(*more: Mapping[str, str]) -> dict[str, str]:
-    """This process's variables but the launcher's, and ``more`` of them; later ones replace earlier ones."""
+    """Return this process's variables without the launcher's, updated by ``more``."""
     merged = {name: value for name, value in os.environ.items() if name not in _LAUNCHERS}
     for variables in more:
         merged |= variables

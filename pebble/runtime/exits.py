@@ -1,4 +1,4 @@
-"""Notices the end of a child process: by a descriptor or, where the system denies that, by asking."""
+"""The end of a child process, noticed by a descriptor or, where the system denies that, by asking."""
 
 import errno
 import logging
@@ -12,7 +12,7 @@ log = logging.getLogger(__name__)
 
 
 def exit_descriptor(pid: int) -> int | None:
-    """Return what becomes readable when the child ``pid`` has ended; None: ask :func:`has_ended`. Raises OSError."""
+    """Return a descriptor that is readable after the end of a child; None: ask :func:`has_ended`. Raises OSError."""
     try:
         return os.pidfd_open(pid)
     except OSError as error:
@@ -23,7 +23,7 @@ def exit_descriptor(pid: int) -> int | None:
 
 
 def has_ended(pid: int) -> bool:
-    """Return True if the child has ended; it is not reaped."""
+    """True if the child has ended; it is not reaped."""
     return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
 
 

@@ -1,7 +1,7 @@
 """The Zenoh hub as a process: ``python -m pebble.runtime.hub SETTINGS``.
 
 SETTINGS is JSON with the fields of :class:`pebble.transports.ZenohSettings`; only ``run_dir`` is required. The launcher
-starts the hub of a robot with this command; on another machine a hub runs the same way. It avoids the imports of
+starts the hub of a robot with this command; on another machine a hub runs the same way. It does not import
 pebble.runtime.process, which would be a good part of this small process.
 """
 
@@ -25,7 +25,7 @@ from pebble.transports.zenoh.hub import ZenohHub
 log = logging.getLogger(__name__)
 
 _ANY: Final = "+/+/+"  # component
-#: What happens once must not be left as a will, neither what the contract names nor what it does not; flags may.
+#: Where wills are allowed: not on commands and actions, which happen once, known or unknown; but on flags.
 WILLS: Final = (
     (f"{_ANY}/{INCOMING}/#", False),
     (f"{_ANY}/{INCOMING}/flags/#", True),
@@ -34,11 +34,12 @@ WILLS: Final = (
 #: Nothing is retained where the sender's account stands in the topic.
 UNRETAINED: Final = (f"{_ANY}/{INCOMING}/{BY}/#",)
 
-# Made where the launcher imports this module: what msgspec finds out about the fields is then in memory that is shared.
+# Made when the launcher imports this module: its memory is then shared with the launcher.
 _decoder = msgspec.json.Decoder(ZenohSettings, dec_hook=lambda _kind, text: Path(text))
 
 
 def main(arguments: list[str]) -> int:
+    """Run a hub with the settings in the arguments; return the exit code."""
     set_up_logging("INFO")
     stop = EndSignal()
     try:

@@ -1,4 +1,4 @@
-"""The bounded queue of a service, in which a newer job can replace a waiting one of the same name."""
+"""The bounded queue of a service. A newer job can replace a waiting job of the same name."""
 
 import threading
 import time
@@ -14,12 +14,12 @@ LIMIT = 1000  # jobs that wait
 
 
 class Inbox:
-    """Jobs posted by any thread, taken by one. Beyond ``limit`` waiting jobs the oldest is dropped and counted.
+    """A queue of jobs, posted by any thread and taken by one. Beyond ``limit`` jobs the oldest is dropped and counted.
 
-    One that has a name is not dropped as long as there are others: no number of these keeps out the end of something.
+    Jobs without a name are dropped first: no number of them keeps out a command that ends something.
 
-    A signal handler may post while its own thread is inside any of these methods: the lock is reentrant, and so is the
-    wakeup.
+    A signal handler may post while its own thread is inside any of these methods: the lock and the wakeup are
+    reentrant.
     """
 
     def __init__(self, limit: int = LIMIT) -> None:
@@ -33,16 +33,17 @@ class Inbox:
         self.dropped = 0
 
     def post(self, job: Job, *, newest_of: Hashable = None, last_of: Hashable = None) -> None:
-        """Queue ``job``; with ``newest_of`` it takes the place of a waiting job of the same name.
+        """Queue ``job``. With ``newest_of`` it takes the place of a waiting job of that name.
 
-        With ``last_of`` it replaces that, too, but comes after all that wait.
+        With ``last_of`` it replaces such a job as well, but is queued behind all others.
         """
         with self._lock:
             if last_of is not None:
                 self._jobs.pop(last_of, None)
             name = newest_of if last_of is None else last_of
             if len(self._jobs) >= self._limit and name not in self._jobs:
-                del self._jobs[next((one for one in self._jobs if type(one) is int), next(iter(self._jobs)))]
+                unnamed = (waiting for waiting in self._jobs if type(waiting) is int)
+                del self._jobs[next(unnamed, next(iter(self._jobs)))]
                 self.dropped += 1
             self._jobs[next(self._numbers) if name is None else name] = job
         self._wakeup.set()
@@ -53,12 +54,12 @@ class Inbox:
         self._wakeup.set()
 
     def wake(self) -> None:
-        """Make `wait` return, without a job."""
+        """Let `wait` return without a job."""
         self._woken = True
         self._wakeup.set()
 
     def wait(self, timeout: float | None) -> None:
-        """Wait until there is a job, up to ``timeout`` seconds, or until `wake`."""
+        """Wait for a job or for `wake`, up to ``timeout`` seconds."""
         if self:
             return
         end = None if timeout is None else time.monotonic() + timeout
@@ -71,7 +72,7 @@ class Inbox:
         return bool(self._internal or self._jobs)
 
     def take(self, timeout: float | None = 0.0) -> Job | None:
-        """Return the next job, waiting up to ``timeout`` seconds for one; None when there was none, or on `wake`."""
+        """Return the next job, waiting up to ``timeout`` seconds; None if there was none, or on `wake`."""
         if timeout != 0.0:
             self.wait(timeout)
         if self._internal:

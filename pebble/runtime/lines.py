@@ -1,10 +1,10 @@
-"""Split a stream of bytes into lines, or frames, of limited length."""
+"""A splitter of a stream of bytes into lines, or frames, of limited length."""
 
 LINE_LIMIT = 256  # bytes; the longest line of any text protocol of an MCU is under 150
 
 
 class LineSplitter:
-    """Takes chunks of any size and returns complete lines; never holds more than ``limit`` bytes of an unfinished one.
+    """A splitter that takes chunks of any size and returns complete lines of up to ``limit`` bytes.
 
     A longer line is discarded up to the next ``end``. With ``truncate``, its first ``limit`` bytes are returned as
     soon as they are complete, and only the rest is discarded.
@@ -17,7 +17,7 @@ class LineSplitter:
         self._skipping = False  # inside the rest of a line that was too long
 
     def feed(self, chunk: bytes) -> list[bytes]:
-        """Return the lines that ``chunk`` completes, without their end; a CR stays, for the protocol to ignore."""
+        """Return the lines that ``chunk`` completes, without their end. A CR stays: the protocol ignores it."""
         lines: list[bytes] = []
         *complete, tail = chunk.split(self._separator)
         for part in complete:
@@ -33,13 +33,13 @@ class LineSplitter:
         return lines
 
     def rest(self) -> bytes:
-        """Return the unfinished line, at the end of the stream."""
+        """Return the unfinished line at the end of the stream."""
         left = self._tail
         self.reset()
         return left
 
     def reset(self) -> None:
-        """Forget an unfinished line, because the stream begins anew."""
+        """Forget an unfinished line, because the stream starts again."""
         self._tail = b""
         self._skipping = False
 

@@ -1,26 +1,26 @@
-"""What a process notifies its launcher of: one JSON object in a line, such as ``{"note":"ready"}``."""
+"""Notes from a process to its launcher: one JSON object in a line, such as ``{"note":"ready"}``."""
 
 from typing import Annotated, Literal, TypeAlias
 
 import msgspec
 from msgspec import Meta, Struct
 
-OFTEN = 3  # starts within a minute with which nothing that moves or senses is well, whatever it does in between
+OFTEN = 3  # starts within a minute: a program or board that starts so often is not well
 
 _Name: TypeAlias = Annotated[str, Meta(min_length=1, max_length=64)]
 _Why: TypeAlias = Annotated[str, Meta(max_length=200)]
 
 
 class Ready(Struct, frozen=True, tag_field="note", tag="ready"):
-    """The process works from now on."""
+    """A note that the process works from now on."""
 
 
 class Alive(Struct, frozen=True, tag_field="note", tag="alive"):
-    """The process lives; it says so every second."""
+    """A sign of life, every second."""
 
 
 class Wanted(Struct, frozen=True, tag_field="note", tag="wanted"):
-    """An on-demand program is to run, beginning with ``encoding`` (empty: as configured), or no longer."""
+    """A request that an on-demand program runs, beginning with ``encoding`` (empty: as configured), or its end."""
 
     program: _Name
     on: bool
@@ -28,37 +28,37 @@ class Wanted(Struct, frozen=True, tag_field="note", tag="wanted"):
 
 
 class Held(Struct, frozen=True, tag_field="note", tag="held"):
-    """An on-demand program is to wait, or no longer."""
+    """A request that an on-demand program waits, or its end."""
 
     program: _Name
     on: bool
 
 
 class Feature(Struct, frozen=True, tag_field="note", tag="feature"):
-    """The process has, or lacks, what the capabilities list: pebble.launcher.features."""
+    """A feature that the process has or lacks: pebble.launcher.features; the capabilities list it."""
 
     name: Annotated[str, Meta(pattern=r"^(estop|control|outlets/[^/]{1,64}/(status|power))$(?!\n)")]
     has: bool
 
 
 class Local(Struct, frozen=True, tag_field="note", tag="local"):
-    """The process is connected to its siblings, or not, and why."""
+    """The state of the connection to the robot's other processes."""
 
     connected: bool
     why: _Why = ""
 
 
 class Mcu(Struct, frozen=True, tag_field="note", tag="mcu"):
-    """The state of a serial line. ``silent``: its board used to send all the time, and has stopped."""
+    """The state of a serial line. ``silent``: a board that sends all the time has stopped."""
 
     state: Literal["absent", "booting", "ready", "silent"]
-    silent_ms: Literal[0, 1000, 10000] | None  # how long ago its board sent, at least; None: never since opening
-    why: _Why = ""  # it is absent, or was never heard
-    starts: Annotated[int, Meta(ge=0)] = 0  # how often the board has started again within the last minute
+    silent_ms: Literal[0, 1000, 10000] | None  # at least so long ago the board sent; None: never since opening
+    why: _Why = ""  # of an absent board, or one that was never heard
+    starts: Annotated[int, Meta(ge=0)] = 0  # further starts of the board within the last minute
 
 
 class Reach(Struct, frozen=True, tag_field="note", tag="reach"):
-    """What a motor owner publishes arrives in the process, or not."""
+    """A note whether messages of a motor owner arrive in the process."""
 
     owner: _Name
     reached: bool
@@ -67,5 +67,5 @@ class Reach(Struct, frozen=True, tag_field="note", tag="reach"):
 Note: TypeAlias = Ready | Alive | Wanted | Held | Feature | Local | Mcu | Reach
 
 encode = msgspec.json.Encoder().encode
-#: Returns the note in a line. Raises msgspec.DecodeError.
+#: Return the note in a line. Raises msgspec.DecodeError.
 decode = msgspec.json.Decoder(Note).decode

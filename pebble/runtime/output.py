@@ -1,4 +1,4 @@
-"""The output of commands: as wide as a terminal, without an end in a pipe, and discarded where nobody reads it."""
+"""The output of commands: as wide as the terminal, unfolded in a pipe, and discarded if no program reads it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _UNFOLDED = 10_000  # columns
 
 
 def console() -> Console:
-    """Return a console for tables. In a pipe no line is folded or cut, unless COLUMNS says how wide it is."""
+    """Return a console for tables. In a pipe no line is folded or cut, unless COLUMNS has a width."""
     from rich.console import Console
 
     is_wide = not sys.stdout.isatty() and "COLUMNS" not in os.environ
@@ -21,5 +21,5 @@ def console() -> Console:
 
 
 def discard_output(stream: TextIO) -> None:
-    """Discard what is still written to ``stream``: its reader has ended, or a disk is full."""
+    """Discard further output to ``stream``: its reader has ended, or a disk is full."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

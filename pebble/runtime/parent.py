@@ -1,4 +1,4 @@
-"""What a process owes the launcher that started it: end with it, notify it, and log in the format it reads."""
+"""The side of a process towards its launcher: it ends with it, notifies it, and logs in the format that it reads."""
 
 import ctypes
 import errno
@@ -20,7 +20,7 @@ from pebble.runtime import notes
 
 #: A pipe to the launcher, for the notes of :class:`Notifier`.
 NOTIFY_FD = "PEBBLE_NOTIFY_FD"
-WANTED = "PEBBLE_WANTED"  # "name=encoding …": running programs that a predecessor of this process requested
+WANTED = "PEBBLE_WANTED"  # "name=encoding …": programs that an earlier process of this program requested
 ENCODING = "PEBBLE_ENCODING"  # the encoding in the request that started this media program
 LAUNCHER_PID = "PEBBLE_LAUNCHER_PID"
 ALIVE_PERIOD_S = 1.0
@@ -34,31 +34,28 @@ log = logging.getLogger(__name__)
 
 def set_up_logging(level: str) -> None:
     """Write log lines to stderr in the format that the launcher forwards."""
-    new = None if _logs_from(level) else level
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(MaskingFormatter(LOG_FORMAT, "%H:%M:%S"))
-    logging.basicConfig(level=new, handlers=[handler])
+    if not logging.getLogger().handlers:
+        logging.getLogger().addHandler(handler)
+        set_log_level(level)
 
 
 class MaskingFormatter(logging.Formatter):
-    """Hides logins in lines and tracebacks, whatever program or library they come from, and what steers a terminal."""
+    """A formatter that hides logins in lines and tracebacks, and characters that steer a terminal."""
 
     def format(self, record: logging.LogRecord) -> str:
         return shown(without_secrets(super().format(record)))
 
 
 def set_log_level(level: str) -> None:
-    """Log from ``level`` on. Setting it writes into each logger, memory that this process shares with its launcher."""
-    if not _logs_from(level):
+    """Log from ``level`` on. A change writes into each logger, into memory that is shared with the launcher."""
+    if logging.getLevelName(logging.getLogger().level) != level:
         logging.getLogger().setLevel(level)
 
 
-def _logs_from(level: str) -> bool:
-    return logging.getLevelName(logging.getLogger().level) == level
-
-
 def tagged(part: str, pid: int, line: bytes) -> bytes:
-    """Return a line that a process of this process wrote, for stderr: the launcher logs it under ``part`` and ``pid``.
+    """Return a line of a child of this process, for stderr: the launcher logs it under ``part`` and ``pid``.
 
     ``part`` contains no ``]``.
     """
@@ -66,7 +63,7 @@ def tagged(part: str, pid: int, line: bytes) -> bytes:
 
 
 def die_with_launcher() -> None:
-    """Ask the kernel for SIGTERM when the launcher dies, so that a killed launcher leaves no orphans."""
+    """Ask the kernel for SIGTERM at the launcher's death, so that a killed launcher leaves no orphans."""
     launcher = os.environ.get(LAUNCHER_PID)
     if launcher is None:
         return
@@ -76,16 +73,16 @@ def die_with_launcher() -> None:
 
 
 def end_with_parent(number: int | None = None) -> None:
-    """Have the kernel send this process ``number``, SIGKILL unless given, when the thread that started it has ended."""
+    """Ask the kernel to send this process ``number``, else SIGKILL, when the thread that started it has ended."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL if number is None else number)
 
 
 def tied_to_parent(command: Sequence[str], number: signal.Signals | None = None) -> list[str]:
     """Extend ``command`` so that the process gets ``number``, else SIGKILL, when the thread that starts it has ended.
 
-    This holds from a few milliseconds after the start on, when setpriv has asked the kernel for it.
-    Raises FileNotFoundError if there is no such program. Not by ``preexec_fn``: between fork and exec, Python 3.11.2
-    may wait for ever for a lock that a thread of Zenoh held.
+    This holds from some milliseconds after the start, when setpriv has asked the kernel for it. Raises
+    FileNotFoundError if there is no such program. Not by ``preexec_fn``: between fork and exec, Python 3.11.2 may wait
+    for ever for a lock that a thread of Zenoh held.
     """
     if shutil.which(command[0]) is None:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), command[0])
@@ -104,25 +101,28 @@ def launcher_runs(run_dir: Path) -> bool:
 
 
 class ProgramRequest(NamedTuple):
-    """Whether an on-demand program is to run, and the encoding it begins with; empty: as configured."""
+    """A request that an on-demand program runs, or ends; ``encoding``: it begins with it; empty: as configured."""
 
     on: bool
     encoding: str = ""
 
 
 def earlier_requests() -> dict[str, ProgramRequest]:
-    """Return the on-demand programs that run because a predecessor of this process requested them."""
+    """Return the requests that an earlier process of this program made, by the requested program."""
     words = (word.partition("=") for word in os.environ.get(WANTED, "").split())
     return {name: ProgramRequest(on=True, encoding=encoding) for name, _, encoding in words}
 
 
 def requested_encoding() -> str | None:
-    """Return the encoding in the request that started this program; None: as configured. Later ones it hears itself."""
+    """Return the encoding in the request that started this program; None: as configured."""
     return os.environ.get(ENCODING) or None
 
 
 class Notifier:
-    """Notifies the launcher that this process is ready and alive; does nothing without a launcher."""
+    """A sender of notes to the launcher. It does nothing without a launcher.
+
+    A method returns False if the launcher was too busy: then call it again.
+    """
 
     def __init__(self) -> None:
         number = os.environ.get(NOTIFY_FD)
@@ -138,7 +138,7 @@ class Notifier:
         self._write(notes.Alive())
 
     def request(self, program: str, request: ProgramRequest) -> bool:
-        """Request or release an on-demand program. False: the launcher was too busy, repeat it.
+        """Request or release an on-demand program.
 
         Only programs with ``may_request`` (pebble.launcher.programs) may; their requests expire 5 s after their end.
         """
@@ -148,27 +148,24 @@ class Notifier:
         return self._write(notes.Wanted(program, request.on, request.encoding))
 
     def hold(self, program: str, on: bool) -> bool:
-        """Let an on-demand program wait, at most until this process ends, or no longer; as :meth:`request`."""
+        """Let an on-demand program wait, at most until this process ends, or no longer; see :meth:`request`."""
         return self._write(notes.Held(program, on))
 
     def feature(self, name: str, has: bool) -> bool:
-        """Report that this process can provide a feature, or cannot, until it ends; the capabilities follow.
-
-        Features are listed in pebble.launcher.features. False: the launcher was too busy, repeat it.
-        """
+        """Report that this process provides a feature of pebble.launcher.features, or not; capabilities follow."""
         return self._write(notes.Feature(name, has))
 
     def local(self, connected: bool, why: str = "") -> bool:
-        """Report whether this process is connected to its siblings. False: the launcher was too busy, repeat it."""
+        """Report whether this process is connected to the robot's other processes."""
         return self._write(notes.Local(connected, _one_line(why)))
 
     def mcu(self, state: str, silent_ms: int | None, why: str = "", starts: int = 0) -> bool:
-        """Report on this process's serial line, as :class:`notes.Mcu` has it. False: repeat it."""
+        """Report the state of this process's serial line: :class:`notes.Mcu`."""
         note = notes.Mcu(state, silent_ms, _one_line(why), starts)  # type: ignore[arg-type]  # the launcher checks
         return self._write(note)
 
     def reaches(self, owner: str, reached: bool) -> bool:
-        """Report whether what a motor owner publishes arrives here. False: the launcher was too busy, repeat it."""
+        """Report whether messages of a motor owner arrive here."""
         return self._write(notes.Reach(owner, reached))
 
     def _write(self, note: notes.Note) -> bool:
@@ -183,33 +180,18 @@ class Notifier:
 
 
 def _one_line(text: str) -> str:
-    """Return the text for an operator: on one line, without passwords, not too long."""
-    return "".join(one if one.isprintable() else " " for one in without_secrets(text))[:_WHY].strip()
+    """Return a text for an operator: in one line, without passwords, not too long."""
+    return "".join(char if char.isprintable() else " " for char in without_secrets(text))[:_WHY].strip()
 
 
 class Reported:
-    """A value that the launcher is told when it has changed, and again until it takes it."""
+    """A value that is sent to the launcher when it changes, and again until the launcher takes it."""
 
     def __init__(self, send: Callable[..., bool], *known: object) -> None:
-        """``known``: what the launcher takes for granted."""
+        """Make a reporter. ``known``: the value that the launcher assumes at first."""
         self._send, self._known = send, known
 
     def report(self, *value: object) -> None:
-        """Report ``value`` if the launcher does not know it; call it regularly."""
+        """Send ``value`` if the launcher does not know it. Call it regularly."""
         if value != self._known and self._send(*value):
             self._known = value
-
-
-class ProvidedFeatures:
-    """What this process provides at present, reported to the launcher: call :meth:`report` regularly."""
-
-    def __init__(self, notifier: Notifier) -> None:
-        self.names: set[str] = set()  # change it at will
-        self._notifier = notifier
-        self._reported: set[str] = set()
-
-    def report(self) -> None:
-        """Report what has changed, also what the launcher was too busy for before."""
-        for name in sorted(self._reported ^ self.names):
-            if self._notifier.feature(name, name in self.names):
-                self._reported ^= {name}

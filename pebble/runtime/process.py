@@ -1,4 +1,4 @@
-"""The outermost lines of a service process: arguments, logging, signals, and notifications to the launcher."""
+"""The outermost lines of a service process: arguments, logging, signals, and notes to the launcher."""
 
 from __future__ import annotations
 
@@ -13,13 +13,7 @@ from pebble.config import Config, config_of_process
 from pebble.errors import ConfigError, PebbleError
 from pebble.runtime.connections import local_transport
 from pebble.runtime.environment import withhold
-from pebble.runtime.parent import (
-    ALIVE_PERIOD_S,
-    Notifier,
-    Reported,
-    set_log_level,
-    set_up_logging,
-)
+from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, Reported, set_log_level, set_up_logging
 from pebble.runtime.service import Service
 from pebble.transports import State
 
@@ -34,9 +28,9 @@ def run(
     *,
     choose: Callable[[Config], type[Service]] | None = None,
 ) -> int:
-    """Run one service as this process: ``CONFIG [INSTANCE]``; returns the exit code.
+    """Run a service as this process, with the arguments ``CONFIG [INSTANCE]``; return the exit code.
 
-    ``choose`` picks the class for a config where there are several; ``service_class`` is their base then.
+    ``choose`` returns the class for a config; ``service_class`` is then the base of all.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if not 1 <= len(arguments) <= 2:
@@ -83,7 +77,7 @@ def _serve(service_class: type[Service], config: Config, instance: str) -> int:
 
 
 def view_of(config: Config, instance: str) -> Config:
-    """Return the config of one serial instance: its merged entry replaces the shared one."""
+    """Return the config of a serial line: its entry replaces the section of all lines."""
     if not instance:
         return config
     instances = config.serial_instances()

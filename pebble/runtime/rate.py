@@ -1,14 +1,7 @@
-"""What a connection makes of pictures and sound: what is unacknowledged, and how long to rest. Pure: times come in.
-
-What is reduced then differs: pictures by the time that each keeps the connection busy, sound by how long it waits.
-"""
+"""The unacknowledged messages of a connection, from which follows how fast it is. Pure: times are passed in."""
 
 from collections import deque
-from typing import Final, NamedTuple
-
-SLOW_S: Final = 0.25  # longer than a mere round trip: so much waits in the modem, in front of commands
-_TIMES: Final = 10  # as long as that: what is sent takes less than a tenth of the link
-_LONGEST_S: Final = 30.0  # the link may be a better one by then
+from typing import NamedTuple
 
 
 class Sent(NamedTuple):
@@ -56,22 +49,3 @@ class InFlight:
     def clear(self) -> None:
         """Forget all: the connection is lost, and all messages with it."""
         self._messages.clear()
-
-
-class Rests:
-    """After a slow picture or sound the next one waits: on a thin link commands share what the modem carries.
-
-    ``on`` False: there are none.
-    """
-
-    def __init__(self, on: bool) -> None:
-        self.on = on
-        self._until = float("-inf")
-
-    def note(self, took_s: float, now: float) -> None:
-        """Note for how long what was confirmed just now has kept the connection busy."""
-        if self.on and took_s > SLOW_S:
-            self._until = max(self._until, now + min(_TIMES * took_s, _LONGEST_S))
-
-    def lasts(self, now: float) -> bool:
-        return now < self._until

@@ -1,4 +1,4 @@
-"""Limits the rate of log lines about events that may happen a thousand times a second."""
+"""A log with a limited rate of lines, for events that may happen a thousand times a second."""
 
 import logging
 import threading
@@ -6,17 +6,17 @@ import time
 
 
 class RateLimitedLog:
-    """Writes at most ``burst`` lines per ``period_s`` and subject, each with the number of events so far.
+    """A log of at most ``burst`` lines per ``period_s`` and subject, each with the number of events so far.
 
-    A subject is a name from a fixed set, never text from the wire, unless ``most`` bounds how many there are in a
-    period: all beyond share one.
+    Subjects are names from a fixed set, never text from the wire, unless ``most`` bounds their number in a period:
+    further subjects share one.
     """
 
     def __init__(self, log: logging.Logger, *, burst: int = 1, period_s: float = 5.0, most: int | None = None) -> None:
         self._log, self._burst, self._period, self._most = log, burst, period_s, most
         self._lock = threading.Lock()
         self._totals: dict[str, int] = {}
-        self._windows: dict[str, tuple[float, int]] = {}  # when it began, lines written in it
+        self._windows: dict[str, tuple[float, int]] = {}  # start of a period, and lines in it
 
     def warning(self, subject: str, text: str, *values: object, times: int = 1) -> None:
         """Count ``times`` events, and log one line if the limit allows."""
@@ -41,7 +41,7 @@ class RateLimitedLog:
             return dict(self._totals)
 
     def _count(self, subject: str, times: int = 1) -> int:
-        """Return how often ``subject`` has come up if it may be logged now, else 0."""
+        """Count an event; return the number so far if it may be logged now, else 0."""
         now = time.monotonic()
         with self._lock:
             if self._most is not None and subject not in self._windows and len(self._windows) >= self._most:
@@ -56,7 +56,7 @@ class RateLimitedLog:
             return total
 
     def _make_room(self, subject: str, now: float) -> str:
-        """Forget the subjects whose period is over; the subject to count under, which is "" while there is no room."""
-        for one in [one for one, (began, _) in self._windows.items() if one and now - began >= self._period]:
-            del self._windows[one], self._totals[one]
+        """Forget subjects whose period is over; return the subject to count under, "" if there is no room."""
+        for old in [old for old, (began, _) in self._windows.items() if old and now - began >= self._period]:
+            del self._windows[old], self._totals[old]
         return subject if len(self._windows) < (self._most or 0) else ""

@@ -1,4 +1,4 @@
-"""Names and decodes the messages of a channel, and refuses what is stale or malformed: for services and scripts."""
+"""The decoding of a channel's messages for services and scripts; stale and malformed ones are refused."""
 
 from __future__ import annotations
 
@@ -16,21 +16,23 @@ Deliver = Callable[[Message, Any, dict[str, str]], None]
 
 
 class Refusals:
-    """Counts what is refused, and logs it at a limited rate."""
+    """A counter of refused messages, with a log of limited rate."""
 
     def __init__(self, log: RateLimitedLog, counters: Counters) -> None:
         self._log, self._counters = log, counters
 
-    def stale(self, what: str) -> None:
+    def stale(self, metric: str) -> None:
+        """Count a retained message of a channel whose messages happen once."""
         self._counters.add("stale")
-        self._log.warning(f"{what} retained", "refused a retained message on %s", what)
+        self._log.warning(f"{metric} retained", "refused a retained message on %s", metric)
 
     def malformed(self, channel: Channel, error: PayloadError) -> None:
+        """Count a message that does not follow the contract."""
         self._counters.add("refused")
         self._log.warning(channel.metric, "refused a message: %s", error)
 
     def reader(self, channel: Channel, deliver: Deliver, remark: codec.Remark | None = None) -> Handler:
-        """Return what a subscription to ``channel`` is to call: it passes what is valid to ``deliver``."""
+        """Return a handler for subscriptions to ``channel`` that passes valid messages to ``deliver``."""
         one_shot, is_pattern = channel.one_shot, channel.is_pattern
 
         def receive(message: Message) -> None:
@@ -40,8 +42,8 @@ class Refusals:
             names = channel.names(message.topic) if is_pattern else {}
             if is_pattern and not names:  # the filter's + also matches an empty level
                 self._counters.add("refused")
-                what = "refused a message with an empty level in its topic: %r"
-                self._log.warning(f"{channel.metric} unnamed", what, message.topic)
+                text = "refused a message with an empty level in its topic: %r"
+                self._log.warning(f"{channel.metric} unnamed", text, message.topic)
                 return
             try:
                 value = codec.decode(channel, message.payload, remark)

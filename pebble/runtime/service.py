@@ -1,4 +1,4 @@
-"""What every service shares: one thread, an inbox, timers, a lifecycle, and channels instead of topics."""
+"""The base class of services: one thread, an inbox, timers, a lifecycle, and channels instead of topics."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from pebble.runtime.work_lock import WorkLock
 from pebble.transports import Message, QoS, State, Subscription, Transport
 from pebble.transports.counters import Counters, bounds_reached
 
-_QOS = {int(one): one for one in QoS}  # to look one up costs a third of a call of the class
-_SENDERS = 16  # whose commands are remarked upon one by one
+_QOS = {int(qos): qos for qos in QoS}  # a lookup costs a third of a call of the class
+_SENDERS = 16  # of commands, each with remarks of its own
 _SENDER_SHOWN = 40  # characters
 WAIT_LIMIT_S = 0.5  # of a drive command in the inbox; with a transport's silence limit of 2 s, none acts after 2.5 s
 
@@ -32,10 +32,10 @@ Method = TypeVar("Method", bound=Callable[..., None])
 def on(channel: Channel, *, direct: bool = False) -> Callable[[Method], Method]:
     """Mark a method as the handler of ``channel``; it is called with the decoded payload.
 
-    For a pattern channel, the names in the topic are arguments too: ``def report(self, report, program)``.
-    ``direct`` is for a handler with an inbox of its own: it runs on the transport's thread, and must return at once. It
-    also receives when the message arrived, on ``clock``: ``def drive(self, drive, arrived)``.
-    Channels are subscribed to in the order of their methods.
+    For a pattern channel, the names in the topic are further arguments: ``def report(self, report, program)``.
+    ``direct`` is for a handler with its own inbox: it runs on the transport's thread and must return at once. It gets
+    the time of arrival on ``clock`` as well: ``def drive(self, drive, arrived)``. Channels are subscribed to in the
+    order of their methods.
     """
 
     def mark(method: Method) -> Method:
@@ -61,21 +61,21 @@ def _fail(failure: Exception) -> None:
 
 
 def _marked(cls: type, mark: str) -> list[str]:
-    """Return names of the methods that carry ``mark``, in the order of their definition, base classes first."""
+    """Return the names of the methods with this mark, in the order of definition, base classes first."""
     names = dict.fromkeys(name for base in reversed(cls.__mro__) for name in vars(base))
     return [name for name in names if mark in getattr(getattr(cls, name), "__dict__", ())]
 
 
 class Service:
-    """One process of a robot. Handlers and timers run one at a time, on the thread that called :meth:`run`: no locks.
+    """A process of a robot. Handlers and timers run one at a time, on the thread that called :meth:`run`: no locks.
 
-    Only two things run on other threads: what is given to :meth:`run_if_idle`, while that one has nothing to do; and
-    handlers marked ``direct``, at any time.
+    Only two things run on other threads: jobs for :meth:`run_if_idle`, while the service is idle, and handlers marked
+    ``direct``, at any time.
 
     A subclass gives ``name`` and ``publishes``, marks methods with ``@on`` and ``@every``, opens its device in
     ``start`` and leaves it safe in ``stop``. A reader thread of a blocking device only ever calls ``post`` or
     ``run_if_idle``.
-    Every attribute is set in ``__init__``; what ``start`` opens is closed by :meth:`on_stop`::
+    Every attribute is set in ``__init__``. ``start`` opens, and registers with :meth:`on_stop` what closes::
 
         def __init__(self, *arguments: Any, **options: Any) -> None:
             super().__init__(*arguments, **options)
@@ -91,7 +91,7 @@ class Service:
     name: ClassVar[str]
     publishes: ClassVar[tuple[Channel, ...]] = ()
     client_name: ClassVar[str] = ""  # of its transport, after the robot's base; empty: the service's name
-    as_published: ClassVar[bool] = False  # how its transport is opened, where there is a choice (T7)
+    as_published: ClassVar[bool] = False  # its transport shows retain flags as they were published (T7)
 
     def __init__(
         self, config: Config, transport: Transport, *, instance: str = "", clock: Callable[[], float] = time.monotonic
@@ -108,7 +108,7 @@ class Service:
         self._inbox = Inbox()
         self._work = WorkLock()
         self._states: dict[str, tuple[Channel, bytes]] = {}
-        self._handled: dict[Channel, Subscription] = {}  # of the methods marked with @on
+        self._handled: dict[Channel, Subscription] = {}  # of methods marked with @on
         self._on_stop = ExitStack()
         self.running = True
 
@@ -133,7 +133,7 @@ class Service:
         self._on_stop.callback(callback)
 
     def dropped(self) -> dict[str, int]:
-        """Return how many messages were dropped since the start because a bound was reached, by reason: for the log."""
+        """Return the numbers of messages that bounds dropped since the start, by reason: for the log."""
         return bounds_reached(self.transport.counters) | {"late": self.counters["late"]}
 
     def publish(self, channel: Channel, value: Any, **names: str) -> bool:
@@ -160,7 +160,7 @@ class Service:
             self._send(channel, topic, raw)
 
     def listen(self, channel: Channel, method: Callable[..., None], *, direct: bool = False) -> Subscription:
-        """Handle ``channel`` from now on, as ``@on`` does from the start; until the subscription is closed."""
+        """Handle ``channel``, as ``@on`` does from the start, until the subscription is closed."""
 
         def deliver_direct(message: Message, value: Any, names: dict[str, str]) -> None:
             method(value, self.clock() - message.waited_s, **names)
@@ -175,26 +175,25 @@ class Service:
         return channel in self._handled and self._handled[channel].refused
 
     def post(self, job: Callable[[], None], *, newest_of: str | None = None) -> None:
-        """Run ``job`` on the service's thread. With ``newest_of``, a waiting job of that name is replaced.
+        """Run ``job`` on the service's thread. With ``newest_of``, it replaces a waiting job of that name.
 
-        A failure ends the service: this is for what its device and its connections require.
+        A failure ends the service: this is for jobs of its device and its connections.
         """
         self._inbox.post(job, newest_of=newest_of)
 
     def post_message(self, channel: Channel, job: Callable[[], None], *, newest_of: str | None = None) -> None:
-        """Like :meth:`post`, for what a message on ``channel`` requires: a failure is counted as that of a handler."""
+        """Run ``job`` as :meth:`post` does, for a message on ``channel``: a failure is counted as one of a handler."""
         self._inbox.post(lambda: self._attempt(channel, job), newest_of=newest_of)
 
     def post_first(self, job: Callable[[], None]) -> None:
-        """Run ``job`` before everything that waits. It is never dropped, so at most one of a kind may wait."""
+        """Run ``job`` before all waiting jobs. It is never dropped, so only one job of a kind may wait."""
         self._inbox.post_internal(job)
 
     def run_if_idle(self, job: Callable[[], None]) -> bool:
-        """Run ``job`` now, on the calling thread, if the service is idle; False: it was not run, and is to be posted.
+        """Run ``job`` now, on the calling thread, if the service is idle; False: it was not run, so post it.
 
-        It saves a switch of threads, which costs more than most jobs. Idle is a service that does nothing and for which
-        nothing waits; if its thread hangs, it is not. ``job`` must neither block nor take long. A failure ends the
-        service, as that of a posted job.
+        This saves a switch of threads, which costs more than most jobs. A service is idle if it does nothing and no
+        job waits; a service that hangs is not. ``job`` must neither block nor take long. A failure ends the service.
         """
         work = self._work
         if not work.try_enter():
@@ -205,14 +204,14 @@ class Service:
             job()
             if self.timers.next_due < work.wakes_at:
                 self._inbox.wake()
-        except Exception as failure:  # noqa: BLE001 - it is raised again where it ends the service
+        except Exception as failure:  # noqa: BLE001 - raised again on the service's thread, which it ends
             self.post_first(partial(_fail, failure))
         finally:
             work.leave()
         return True
 
     def call_at(self, due: float, job: Callable[[], None]) -> Timer:
-        """Run ``job`` at ``due`` on ``clock``, on the service's thread (call from there, or from `run_if_idle`)."""
+        """Run ``job`` at ``due`` on ``clock``, on the service's thread. Call it there, or from `run_if_idle`."""
         return self.timers.add(due, job)
 
     def quit(self) -> None:
@@ -249,7 +248,7 @@ class Service:
         self._set_timers()
 
     def turn(self, timeout: float | None) -> bool:
-        """Do one job, if there is one within ``timeout`` seconds, and what is due; return whether there was one."""
+        """Do one job, if there is one within ``timeout`` seconds, and run due timers. True if there was a job."""
         self._inbox.wait(timeout)
         with self._work:
             job = self._inbox.take()
@@ -283,7 +282,7 @@ class Service:
 
     @property
     def republish_interval_s(self) -> float:
-        """How often retained state is published again; 0 for never."""
+        """The seconds between two publications of retained state; 0: it is not repeated."""
         return self.config.services.defaults.retained_publish_interval_seconds
 
     def _begin_connection(self) -> None:
@@ -298,7 +297,7 @@ class Service:
         return self.transport.publish(topic, raw, qos=_QOS[address.qos], retain=address.retain)
 
     def _handle(self, channel: Channel, method: Callable[[], None], arrived: float) -> None:
-        """Call the handler, unless the command has waited so long, in a hung or suspended process, that it is stale.
+        """Call the handler, unless a hung or suspended process has made the command late.
 
         Only commands that newer ones replace are dropped.
         """
@@ -308,22 +307,22 @@ class Service:
         self._attempt(channel, method)
 
     def _attempt(self, channel: Channel, method: Callable[[], None]) -> None:
-        """Try a message, and count what fails: a retained one would end the service again and again."""
+        """Call a handler, and count a failure: with a retained message it would end the service again and again."""
         try:
             method()
-        except Exception:  # a message comes from another process, and must not end this one
+        except Exception:  # a message of another process must not end this one
             self.counters.add("handler_errors")
             self.log_limited.exception(f"{channel.metric} failed", "failed on a message on %s", channel.metric)
 
     def count_late(self, channel: Channel) -> None:
-        """Count and log a command that waited longer than WAIT_LIMIT_S, and that the caller drops."""
+        """Count and log a command that the caller drops because it waited longer than WAIT_LIMIT_S."""
         self.counters.add("late")
         self.log_limited.warning(f"{channel.metric} late", "dropped a late %s", channel.metric)
 
     # -- the transport's threads: decode and post, nothing else
 
     def _deliver(self, channel: Channel, method: Callable[..., None], message: Message, value: Any, names: Any) -> None:
-        """Post a message that is neither stale nor malformed: it may replace another in the inbox."""
+        """Post a valid message, which may replace another in the inbox."""
         arrived = self.clock() - message.waited_s
 
         def handle() -> None:
@@ -336,7 +335,7 @@ class Service:
             self._inbox.post(handle, last_of=message.topic if channel.ends(value) else None)
 
     def _remark(self, channel: Channel, sender: str, text: str) -> None:
-        """Log what a command does that its sender may not mean, once a minute and sender."""
+        """Log a remark about a command that its sender may not mean, once a minute and sender."""
         known = f", from {sender[:_SENDER_SHOWN]!a}" if sender else ""
         self._remarks.warning(channel.metric + known, "%s%s: %s", channel.metric, known, text)
 

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, also after a power cut, and may hold secrets."""
+"""Files that exist whole or not at all, also after a power cut, and may hold secrets."""
 
 import errno
 import logging
@@ -9,9 +9,9 @@ from pebble.errors import PebbleError
 
 log = logging.getLogger(__name__)
 
-#: Errors of calls that a file system does not have (FAT, SMB, 9p), rather than of a file.
+#: Errors of calls that a file system lacks (FAT, SMB, 9p).
 _NOT_HERE = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
-_IN_USE = (errno.EACCES, errno.EPERM, errno.EBUSY, errno.ETXTBSY)  # a mount point, or open where that counts
+_IN_USE = (errno.EACCES, errno.EPERM, errno.EBUSY, errno.ETXTBSY)  # a mount point, or an open file on some systems
 
 
 def is_root() -> bool:
@@ -20,16 +20,16 @@ def is_root() -> bool:
 
 
 def _give(file: Path | int, owner: tuple[int, int]) -> None:
-    """Change the owner, but not where all files have that one anyway. Raises OSError."""
-    found = os.stat(file)  # noqa: PTH116
-    if (found.st_uid, found.st_gid) != owner:
+    """Change the owner, unless the file has that owner already. Raises OSError."""
+    state = os.stat(file)  # noqa: PTH116
+    if (state.st_uid, state.st_gid) != owner:
         os.chown(file, *owner)
 
 
 def set_mode(file: Path, mode: int, opened: Path | int | None = None) -> None:
-    """Set who may use ``file``, where its file system has that; else log that others can read it. Raises OSError.
+    """Set the mode of ``file``, or log that its file system lets others read it. Raises OSError.
 
-    ``opened`` is what has its content now.
+    ``opened``: the file or descriptor with its content, if that is another one.
     """
     opened = file if opened is None else opened
     try:
@@ -42,7 +42,7 @@ def set_mode(file: Path, mode: int, opened: Path | int | None = None) -> None:
 
 
 def sync_file(descriptor: int, *, data: bool = False) -> None:
-    """Make a file durable, or its ``data`` alone, where its file system can. Raises OSError for what is lost."""
+    """Make a file durable, or only its ``data``, if its file system can. Raises OSError if data may be lost."""
     try:
         (os.fdatasync if data else os.fsync)(descriptor)
     except OSError as error:
@@ -53,20 +53,20 @@ def sync_file(descriptor: int, *, data: bool = False) -> None:
 def write(
     file: Path, content: bytes, mode: int, error: type[PebbleError], owner: tuple[int, int] | None = None
 ) -> None:
-    """Replace the file at once: never half of it, never readable by others for a moment. Raises ``error``.
+    """Replace the file at once: it is never half written, and others can never read it. Raises ``error``.
 
-    After a power cut the file holds the old content or the new one.
-    ``owner`` None: for root it stays the file of its owner, who may be a broker that reads it.
+    After a power cut the file has the old content or the new one. ``owner`` None: a file that root writes keeps its
+    owner, who may be a broker that reads it.
     """
     temporary = file.with_name(f".{file.name}.new")
     try:
-        temporary.unlink(missing_ok=True)  # left by a power cut; to open a FIFO would wait for ever
+        temporary.unlink(missing_ok=True)  # left by a power cut; opening a FIFO would wait for ever
         with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as output:
-            # By the descriptor: in a folder of somebody else's its name may be a link by now.
+            # By the descriptor: in another user's folder its name may be a link by now.
             open_file = output.fileno() if os.chmod in os.supports_fd else temporary
             if owner is None and is_root() and file.exists():
-                found = file.lstat()
-                owner = found.st_uid, found.st_gid
+                state = file.lstat()
+                owner = state.st_uid, state.st_gid
             if owner is not None:
                 _give(open_file, owner)
             set_mode(file, mode, open_file)
@@ -85,7 +85,7 @@ def write(
 
 
 def _write_in_place(file: Path, content: bytes, mode: int) -> None:
-    """Write into a file whose name cannot be given to another, as of one in a container's mount. Raises OSError."""
+    """Write into a file that cannot be replaced, such as a container's mount. Raises OSError."""
     with os.fdopen(os.open(file, os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0)), "wb") as output:
         set_mode(file, mode, output.fileno())
         output.write(content)
@@ -93,28 +93,6 @@ def _write_in_place(file: Path, content: bytes, mode: int) -> None:
         output.flush()
         sync_file(output.fileno())
     file.with_name(f".{file.name}.new").unlink()
-
-
-def write_new(file: Path, content: bytes) -> None:
-    """Write a file for people that was not there before, where others cannot read it. Raises PebbleError."""
-    try:
-        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o600)
-    except OSError as error:
-        raise PebbleError(f"{file}: cannot be written: {error.strerror}") from None
-    try:
-        with os.fdopen(descriptor, "wb") as output:
-            if os.fstat(descriptor).st_mode & 0o077:
-                why = "others can read every file on its file system: name one on another, or mount it umask=077"
-                raise PebbleError(f"{file}: {why}")
-            output.write(content)
-            output.flush()
-            os.fsync(descriptor)
-        sync_folder(file.parent)
-    except BaseException as error:
-        file.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise PebbleError(f"{file}: {error.strerror}") from None
-        raise
 
 
 def make_folder(folder: Path) -> None:
@@ -126,7 +104,7 @@ def make_folder(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable, where the system can. Raises OSError."""
+    """Make the names in a folder durable, if the system can. Raises OSError."""
     if os.name != "posix":
         return
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

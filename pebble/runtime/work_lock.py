@@ -1,4 +1,4 @@
-"""The lock under which a service works: its own thread, or a thread that brings work and finds it idle."""
+"""The lock under which a service works, on its own thread or on a thread that finds it idle."""
 
 import threading
 from math import inf
@@ -6,13 +6,13 @@ from types import TracebackType
 
 
 class WorkLock:
-    """``with`` is for the service's own thread, and waits. Other threads only try, and never wait for anything here.
+    """A lock for which only the service's own thread waits, by ``with``. Other threads try, and never wait.
 
-    The own thread waits for one visitor at most: while it waits, no other one gets in.
+    The own thread waits for one other thread at most: meanwhile no further one gets the lock.
     """
 
     def __init__(self) -> None:
-        self.wakes_at = -inf  # when the own thread looks at its timers, on the service's clock; guarded by this lock
+        self.wakes_at = -inf  # when the own thread runs timers, on the service's clock; guarded by this lock
         self._lock = threading.Lock()
         self.awaited = False  # by the own thread
 

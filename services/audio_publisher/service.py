@@ -6,6 +6,8 @@ from typing import Any
 from pebble.contract import AUDIO, AUDIO_CONTROL, MEDIA_REPORT
 from pebble.contract.payloads import MediaReport, MediaRequest
 from pebble.errors import DeviceError, PebbleError
+from pebble.extensions.media.config import Media
+from pebble.extensions.media.frames import FrameInfo, FrameReader
 from pebble.extensions.media.rate_meter import RateMeter
 from pebble.extensions.media.sound import SOUND_ENCODINGS, SoundEncoder, make_sound_encoder, sequence_numbers
 from pebble.runtime.connections import remote_transport
@@ -13,7 +15,6 @@ from pebble.runtime.parent import requested_encoding
 from pebble.runtime.service import Service, every, on
 from pebble.services.audio_publisher.rate_control import RateController, Step
 from pebble.transports import QoS, State
-from pebble.transports.frames import FrameInfo, FrameReader
 
 _DEPTH = 10  # chunks of 20 ms that may wait for the sender: the rest of what may be late
 _QUIET_S = 2.0  # without sound from the microphone before that is reported
@@ -32,7 +33,7 @@ class AudioPublisher(Service):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._options = section = self.config.services.mqtt_bridge.media.audio_publisher
+        self._options = section = self.config.section(Media).audio_publisher
         self._stopping = False
         self._received_at = self.clock()
         self._remote = remote_transport(self.config, "audio-publisher")

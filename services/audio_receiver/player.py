@@ -11,9 +11,9 @@ import threading
 import time
 from contextlib import suppress
 
-from pebble.config.media import AudioReceiver
+from pebble.extensions.media.child import Child, how_ended
+from pebble.extensions.media.config import AudioReceiver
 from pebble.extensions.media.jitter import Chunk
-from pebble.runtime.child import Child, how_ended
 from pebble.runtime.environment import child_environment
 
 log = logging.getLogger(__name__)

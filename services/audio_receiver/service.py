@@ -9,6 +9,7 @@ from pebble.contract import AUDIO_STREAM, MEDIA_REPORT
 from pebble.contract.names import with_name
 from pebble.contract.payloads import MediaReport
 from pebble.errors import DeviceError
+from pebble.extensions.media.config import Media
 from pebble.extensions.media.jitter import JitterBuffer
 from pebble.extensions.media.rate_meter import RateMeter
 from pebble.runtime.connections import remote_transport
@@ -30,7 +31,7 @@ class AudioReceiver(Service):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        settings = self.config.services.mqtt_bridge.media.audio_receiver
+        settings = self.config.section(Media).audio_receiver
         self._stopping, self._wake = threading.Event(), threading.Event()
         self._meter = RateMeter()
         self._buffer = JitterBuffer(target_ms=settings.latency_ms)

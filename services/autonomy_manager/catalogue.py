@@ -15,8 +15,8 @@ from msgspec.structs import asdict, replace
 import pebble
 from pebble.config import Config
 from pebble.config.home import in_home
-from pebble.contract.forms import MAX_SETTINGS, Setting, form
 from pebble.contract.identity import meant
+from pebble.extensions.operator.client.forms import MAX_SETTINGS, Setting, form
 from pebble.extensions.scripts.config import AutonomyManager
 from pebble.extensions.scripts.config import Script as ScriptSection
 from pebble.services.autonomy_manager.describe import (

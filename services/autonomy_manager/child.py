@@ -16,8 +16,8 @@ from pathlib import Path
 from msgspec import Struct
 
 from pebble.errors import PebbleError
+from pebble.extensions.media.child import Child
 from pebble.runtime.bounded_output import PAUSE_S, BoundedOutput
-from pebble.runtime.child import Child
 from pebble.runtime.exits import ASKS_S, exit_descriptor, has_ended
 from pebble.runtime.parent import tagged
 from pebble.services.autonomy_manager.guard import Guard

@@ -10,9 +10,9 @@ import msgspec
 from msgspec import Struct
 
 from pebble.config.text_files import NotTextError, text_of
-from pebble.contract.forms import MAX_SETTINGS, Setting
 from pebble.contract.payloads import LONGEST_SUMMARY, MOST_MAIN
-from pebble.runtime.child import Child
+from pebble.extensions.media.child import Child
+from pebble.extensions.operator.client.forms import MAX_SETTINGS, Setting
 from pebble.services.autonomy_manager.script import Dependency
 
 MANIFEST = "script.json"

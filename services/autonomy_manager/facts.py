@@ -11,9 +11,11 @@ from msgspec.structs import replace
 
 import pebble
 from pebble.config import Config, load
-from pebble.contract.capabilities import CapabilitiesValue, offered
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS
+from pebble.contract.capabilities import CapabilitiesValue
 from pebble.errors import PebbleError
 from pebble.extension import Facts
+from pebble.extensions.media.offers import files_offer
 from pebble.extensions.scripts.config import AutonomyManager
 
 if TYPE_CHECKING:
@@ -25,7 +27,8 @@ def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
     enabled = config.section(AutonomyManager).enabled
     telemetry: Any = value.telemetry
     telemetry = replace(telemetry, wheel_odometry=enabled and telemetry.touch_sensors)
-    return replace(value, autonomy=offered(value.autonomy, enabled), telemetry=telemetry)
+    autonomy = files_offer(config, AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, enabled)
+    return replace(value, autonomy=autonomy, telemetry=telemetry)
 
 
 def facts(config: Config) -> Facts:

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from pebble.contract.forms import Value
 from pebble.errors import PebbleError
+from pebble.extensions.operator.client.forms import Value
 from pebble.extensions.scripts.runs import CONFIG, RUN
 from pebble.services.autonomy_manager.child import Launch, Process, Spawn
 from pebble.services.autonomy_manager.environment import environment

@@ -6,9 +6,9 @@ from typing import Any
 
 from msgspec import Struct
 
-from pebble.contract.forms import Setting, SettingError, Value, arguments, effective, shown
 from pebble.contract.identity import meant
 from pebble.errors import PebbleError
+from pebble.extensions.operator.client.forms import Setting, SettingError, Value, arguments, effective, shown
 
 
 class StartError(PebbleError):

@@ -4,10 +4,10 @@ import shutil
 import time
 
 from pebble.errors import DeviceError
+from pebble.extensions.media.frames import FrameInfo
 from pebble.services.av_daemon.capture_program import CaptureProgram
 from pebble.services.av_daemon.config import AvDaemon
 from pebble.services.av_daemon.source import Capture
-from pebble.transports.frames import FrameInfo
 
 CHUNK_S = 0.02  # of sound in one frame
 _BUFFER_S = 0.5  # what ALSA holds while this process is busy

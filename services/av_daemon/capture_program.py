@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from pebble.errors import DeviceError
-from pebble.runtime.child import Child, how_ended
+from pebble.extensions.media.child import Child, how_ended
 from pebble.runtime.environment import child_environment
 
 SILENCE_S = 3.0  # without output: the device hangs

@@ -10,10 +10,10 @@ import numpy as np
 from msgspec.structs import replace
 
 from pebble.errors import NotRunningError, PayloadError, PebbleError
+from pebble.extensions.media.frames import FrameInfo, FrameWriter
 from pebble.extensions.media.jpeg import jpeg_size
 from pebble.services.av_daemon.health import NOTHING, Health
 from pebble.services.av_daemon.source import Bytes, Capture, Source
-from pebble.transports.frames import FrameInfo, FrameWriter
 
 log = logging.getLogger(__name__)
 

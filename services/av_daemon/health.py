@@ -7,9 +7,9 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from pebble.contract.payloads import MediaReport
+from pebble.extensions.media.frames import FrameInfo
 from pebble.extensions.media.rate_meter import RateMeter
 from pebble.runtime.source_check import SourceCheck
-from pebble.transports.frames import FrameInfo
 
 _OPENING_S = 15.0  # a device that takes longer to open hangs
 _SILENCE_S = 4.0  # as does one without a frame for so long; a second more than the sources' own timeout

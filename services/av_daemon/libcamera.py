@@ -5,11 +5,11 @@ import shutil
 import time
 
 from pebble.errors import DeviceError
+from pebble.extensions.media.frames import FrameInfo
 from pebble.services.av_daemon.capture_program import CaptureProgram
 from pebble.services.av_daemon.config import AvDaemon
 from pebble.services.av_daemon.jpeg_splitter import JpegSplitter
 from pebble.services.av_daemon.source import Capture
-from pebble.transports.frames import FrameInfo
 
 log = logging.getLogger(__name__)
 

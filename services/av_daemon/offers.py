@@ -53,5 +53,5 @@ def loudspeaker_programs(config: Config) -> Iterator[Program]:
 
 def _programs(config: Config, name: str, has_device: bool) -> Iterator[Program]:
     if has_device and config.section(AvDaemon).enabled and config.services.mqtt_bridge.enabled:
-        shares = ("pebble.transports.frames", "pebble.extensions.media.sound")
+        shares = ("pebble.extensions.media.frames", "pebble.extensions.media.sound")
         yield Program(name, f"pebble.services.{name}", on_demand=True, preloaded=False, shares=shares)

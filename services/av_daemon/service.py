@@ -9,12 +9,12 @@ import msgspec
 from pebble.contract import MEDIA_REPORT, MEDIA_STATUS
 from pebble.contract.payloads import MediaReport, MediaStatus
 from pebble.errors import DeviceError
+from pebble.extensions.media.frames import FrameWriter
 from pebble.runtime.service import Service, every, on
 from pebble.services.av_daemon import sources
 from pebble.services.av_daemon.config import AvDaemon as AvDaemonSection
 from pebble.services.av_daemon.health import Asked
 from pebble.services.av_daemon.stream import Stream
-from pebble.transports.frames import FrameWriter
 
 CAMERA, MICROPHONE = "camera", "microphone"  # the names of the streams
 _NUMBERS_S = 5.0  # between messages that differ in numbers alone: once a second they filled a tenth of a 64 kbit/s link

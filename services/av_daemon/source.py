@@ -7,7 +7,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pebble.transports.frames import FrameInfo
+from pebble.extensions.media.frames import FrameInfo
 
 Bytes: TypeAlias = NDArray[np.uint8]  # of any shape
 

@@ -9,6 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from pebble.errors import DeviceError, PayloadError
+from pebble.extensions.media.frames.frame import picture
 from pebble.services.av_daemon.alsa import CHUNK_S, AlsaMicrophone
 from pebble.services.av_daemon.config import AvDaemon, CameraCapture, Microphone
 from pebble.services.av_daemon.health import Asked
@@ -16,7 +17,6 @@ from pebble.services.av_daemon.libcamera import LibcameraCamera
 from pebble.services.av_daemon.source import Bytes, Capture, Source, opencv
 from pebble.services.av_daemon.synthetic import SyntheticCamera, SyntheticMicrophone, WorldCamera
 from pebble.services.av_daemon.v4l2 import V4l2Camera, is_device
-from pebble.transports.frames.frame import picture
 
 Opener: TypeAlias = Callable[[], Source]
 

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from msgspec.structs import replace
 
 from pebble.contract.payloads import MediaReport
+from pebble.extensions.media.frames import FrameWriter
 from pebble.services.av_daemon.capturer import Capturer
 from pebble.services.av_daemon.health import FIRST_DELAY_S, Asked, Health
 from pebble.services.av_daemon.source import Source
-from pebble.transports.frames import FrameWriter
 
 log = logging.getLogger(__name__)
 

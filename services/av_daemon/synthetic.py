@@ -10,12 +10,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from pebble.errors import DeviceError
+from pebble.extensions.media.frames import FrameInfo
 from pebble.extensions.media.scene import Scene
 from pebble.extensions.media.speech import Speech
 from pebble.services.av_daemon.alsa import CHUNK_S
 from pebble.services.av_daemon.config import CameraCapture, Microphone
 from pebble.services.av_daemon.source import Bytes, Capture
-from pebble.transports.frames import FrameInfo
 
 if TYPE_CHECKING:
     from pebble.extensions.lab.simulation.world.robot_view import RobotView

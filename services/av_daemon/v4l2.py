@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pebble.errors import DeviceError
+from pebble.extensions.media.frames import FrameInfo
 from pebble.services.av_daemon.capture_program import SILENCE_S
 from pebble.services.av_daemon.config import CameraCapture
 from pebble.services.av_daemon.source import Bytes, Capture, opencv
-from pebble.transports.frames import FrameInfo
 
 log = logging.getLogger(__name__)
 

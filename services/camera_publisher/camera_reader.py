@@ -6,8 +6,8 @@ import time
 from collections.abc import Callable
 
 from pebble.errors import PebbleError
-from pebble.transports.frames import FrameReader
-from pebble.transports.frames.frame import Frame
+from pebble.extensions.media.frames import FrameReader
+from pebble.extensions.media.frames.frame import Frame
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 
-from pebble.runtime.rate import Rests
+from pebble.extensions.media.rests import Rests
 from pebble.services.camera_publisher.frame_selector import FrameSelector
 from pebble.services.camera_publisher.send_window import Acknowledged, SendWindow
 from pebble.transports.base import Outgoing

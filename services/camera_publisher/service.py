@@ -6,6 +6,9 @@ from typing import Any
 from pebble.contract import CAMERA, MEDIA_REPORT, VIDEO_CONTROL
 from pebble.contract.payloads import MediaReport, MediaRequest
 from pebble.errors import DeviceError, PebbleError
+from pebble.extensions.media.config import Media
+from pebble.extensions.media.frames import FrameReader
+from pebble.extensions.media.frames.frame import Frame
 from pebble.extensions.media.rate_meter import RateMeter
 from pebble.extensions.media.video import VIDEO_ENCODINGS, VideoEncoder, make_encoder
 from pebble.runtime.connections import remote_transport
@@ -17,8 +20,6 @@ from pebble.services.camera_publisher.frame_selector import KeyframeRequests
 from pebble.services.camera_publisher.rate_control import RateController, wire_size
 from pebble.services.camera_publisher.shape import Pixels, Shape
 from pebble.transports import QoS, State
-from pebble.transports.frames import FrameReader
-from pebble.transports.frames.frame import Frame
 
 _FPS = 15.0  # where the config names none; the camera's own default
 _POLL_S = 0.02  # between two measurements while a picture is in flight
@@ -37,7 +38,7 @@ class CameraPublisher(Service):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._options = video = self.config.services.mqtt_bridge.media.video_publisher
+        self._options = video = self.config.section(Media).video_publisher
         now = self.clock()
         self._fps = video.publish_fps or video.target_fps or video.fps or _FPS
         width, height = video.publish_width or video.width, video.publish_height or video.height

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from pebble.errors import PayloadError
-from pebble.transports.frames.frame import Frame
+from pebble.extensions.media.frames.frame import Frame
 
 Pixels = np.ndarray[Any, np.dtype[np.uint8]]
 

@@ -1,12 +1,14 @@
 """The config section of robots that hear and drive each other on a LAN."""
 
+import re
 from collections.abc import Iterator
 from typing import Annotated, ClassVar
 
 from pebble.config import Config
+from pebble.config.hosts import is_loopback
 from pebble.config.problems import Path
 from pebble.config.reader import Reader, Rule
-from pebble.config.rules.doors import place_of_endpoint, zenoh_endpoints
+from pebble.config.rules.doors import zenoh_endpoints
 from pebble.config.transport import ZenohClient
 from pebble.config.tree import Root
 from pebble.config.types import EMPTY, ONE_VALUE, Account, Level, Section, ServiceSection, Topic, doc
@@ -15,6 +17,7 @@ from pebble.extension import Facts
 
 MOST_NEIGHBOURS, MOST_METRICS = 16, 32  # of one robot; metrics of one neighbour
 _LAN: Path = ("services", "neighbours", "lan")
+_EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 -- compared only
 
 
 class Lan(ZenohClient, frozen=True, kw_only=True):
@@ -78,13 +81,20 @@ def _check(reader: Reader, section: Neighbours, path: Path) -> Neighbours:
 def _check_hub(reader: Reader, root: Root, _: Path) -> Root:
     """Note where the hub of the LAN is also that of the operators, or of the robot itself."""
     endpoints = list(zenoh_endpoints(root))
-    meets = {place_of_endpoint(endpoint): endpoint for path, endpoint in endpoints if path[:3] == _LAN}
+    meets = {_place_of(endpoint): endpoint for path, endpoint in endpoints if path[:3] == _LAN}
     for path, endpoint in endpoints:
-        mine = meets.get(place_of_endpoint(endpoint))
+        mine = meets.get(_place_of(endpoint))
         if mine is not None and path[:3] != _LAN:
             why = f"is also {'.'.join(map(str, path))}: what is shared would come twice, or without end"
             reader.notes.problem((*_LAN, "connect"), f"{mine} {why}; take another hub")
     return root
+
+
+def _place_of(endpoint: str) -> tuple[str, str]:
+    """Return host and port; all names of this machine are one."""
+    host, _, port = re.sub(r"[?#].*", "", endpoint.partition("/")[2]).rpartition(":")
+    host = host.strip("[]")
+    return ("" if host in _EVERYWHERE or is_loopback(host) else host), port
 
 
 RULES: tuple[Rule, ...] = ((Neighbours, _check), (Root, _check_hub))

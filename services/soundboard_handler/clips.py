@@ -10,7 +10,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from pebble.config.visible import is_text
-from pebble.runtime import pyav
+from pebble.extensions.media import pyav
 
 _WAV = ".wav"
 _NEED_PYAV = (".mp3", ".ogg", ".flac")

@@ -6,7 +6,8 @@ from msgspec.structs import replace
 
 from pebble.config import Config
 from pebble.config.types import COMMAND, ONE_VALUE, Command, File, HandlerTopics, Section, ServiceSection, doc
-from pebble.contract.capabilities import CapabilitiesValue, offered
+from pebble.contract import SOUNDBOARD_COMMAND, SOUNDBOARD_FILES, SOUNDBOARD_STATUS
+from pebble.contract.capabilities import CapabilitiesValue
 
 
 class Playback(Section, frozen=True, kw_only=True):
@@ -33,4 +34,8 @@ class SoundboardHandler(ServiceSection, frozen=True, kw_only=True):
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
     """Return ``value`` with the robot's sounds."""
-    return replace(value, soundboard=offered(value.soundboard, config.section(SoundboardHandler).enabled))
+    from pebble.extensions.media.offers import files_offer  # only the launcher needs it
+
+    enabled = config.section(SoundboardHandler).enabled
+    sounds = files_offer(config, SOUNDBOARD_COMMAND, SOUNDBOARD_FILES, SOUNDBOARD_STATUS, enabled)
+    return replace(value, soundboard=sounds)

@@ -12,7 +12,8 @@ from typing import IO, TYPE_CHECKING
 
 from pebble.config import Config
 from pebble.errors import PebbleError
-from pebble.runtime.child import Child
+from pebble.extensions.media.child import Child
+from pebble.extensions.media.config import Media
 from pebble.runtime.environment import child_environment
 from pebble.services.soundboard_handler.clips import Clip
 from pebble.services.soundboard_handler.config import SoundboardHandler
@@ -77,7 +78,7 @@ class Playback:
 
         file = SoundFile(self.clip.path)
         try:
-            words = self._config.services.mqtt_bridge.media.audio_receiver.words(file.rate, file.channels)
+            words = self._config.section(Media).audio_receiver.words(file.rate, file.channels)
             player = self._start_player(words, subprocess.PIPE)
         except (OSError, ValueError):
             file.close()

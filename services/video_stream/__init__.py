@@ -4,6 +4,7 @@ from pebble.extension import Extension
 
 EXTENSION = Extension(
     name="video_stream",
+    needs=("media",),
     sections={"services.video_stream": "pebble.services.video_stream.config:VideoStream"},
     rules="pebble.services.video_stream.config:RULES",
     programs="pebble.services.video_stream.offers:programs",

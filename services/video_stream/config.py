@@ -1,13 +1,13 @@
 """The config section of a third party's streaming program."""
 
+import re
 from typing import Annotated, ClassVar
 
 from msgspec.structs import replace
 
-from pebble.config.hosts import HostError, check_web_url
+from pebble.config.hosts import HostError, split
 from pebble.config.problems import Path
 from pebble.config.reader import Reader, Rule
-from pebble.config.secret_text import without_login
 from pebble.config.types import COMMAND, Command, ServiceSection, doc
 
 
@@ -21,19 +21,32 @@ class VideoStream(ServiceSection, frozen=True, kw_only=True):
 
 
 def _check(reader: Reader, stream: VideoStream, path: Path) -> VideoStream:
-    """Return every operator receives the address: a login in it would be no secret."""
+    """Check the address, which every operator receives: a login in it would be no secret."""
     if stream.enabled and not stream.command:
         reader.notes.doubt((*path, "command"), "is missing, write the program that streams the video")
     if stream.webrtc_url is None:
         return stream
-    public = without_login(stream.webrtc_url)
+    public = _without_login(stream.webrtc_url)
     if public != stream.webrtc_url:
         reader.notes.warning((*path, "webrtc_url"), "its login is left out, because the address is published")
     try:
-        check_web_url(public)
+        if public.lower().startswith(("http://", "https://")):
+            split(public)
     except HostError as error:
         reader.notes.warning((*path, "webrtc_url"), f"no page can show it: {error}")
     return replace(stream, webrtc_url=public)
+
+
+def _without_login(url: str) -> str:
+    """``url`` without its user and password, where they can be told from its path."""
+    before, slashes, after = url.partition("://")
+    authority = re.match(r"[^/?#\s]*", after)
+    place = authority[0] if authority else ""
+    if "@" in place:
+        return f"{before}{slashes}{place.rpartition('@')[2]}{after[len(place) :]}"
+    if "@" not in after or not re.search(r":(?!\d*$)", place):
+        return url  # an @ behind the port is part of a path
+    return f"{before}{slashes}{after.rpartition('@')[2]}"  # the password has a slash
 
 
 RULES: tuple[Rule, ...] = ((VideoStream, _check),)

@@ -4,7 +4,7 @@ import signal
 from typing import Any
 
 from pebble.errors import ConfigError, DeviceError
-from pebble.runtime.child import Child, how_ended
+from pebble.extensions.media.child import Child, how_ended
 from pebble.runtime.environment import child_environment
 from pebble.runtime.service import Service, every
 from pebble.services.video_stream.config import VideoStream as VideoStreamSection

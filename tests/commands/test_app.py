@@ -130,7 +130,7 @@ def test_a_wrong_command_line_is_one_line_and_exit_code_2(
         (("topic", "contract", "--base", "a/b"), "a/b"),
     ],
 )
-def test_what_cannot_be_done_is_one_line_and_exit_code_1(run: Run, arguments: tuple[str, ...], named: str) -> None:
+def test_a_failure_is_one_line_and_exit_code_1(run: Run, arguments: tuple[str, ...], named: str) -> None:
     assert run(*arguments) == 1
     assert run.err.startswith("pebble: ")
     assert run.err.count("\n") == 1

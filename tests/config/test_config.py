@@ -18,11 +18,11 @@ from msgspec.structs import asdict, replace
 
 from pebble.config import LAUNCHER_LOCK, Config, load, parse, resolved
 from pebble.config.config import file_name
-from pebble.config.media import Media
 from pebble.config.transport import Tls
 from pebble.config.tree import Heartbeat
 from pebble.contract import channel_of
 from pebble.errors import ConfigError
+from pebble.extensions.media.config import Media
 from pebble.extensions.page.config import WebHandler, WebInterface
 from pebble.extensions.recordings.config import Recorder
 from pebble.runtime.connections import hub_settings
@@ -185,7 +185,7 @@ class TestOriginal:
             "services.mqtt_bridge.heartbeat.{qos, retain}: no longer used, the contract fixes QoS and retain flag",
         )
 
-    def test_what_its_scripts_find_on_the_robot_is_offered(self) -> None:
+    def test_hall_memory_is_offered_to_its_scripts(self) -> None:
         services = load(ORIGINAL, env={}).services
         assert services.av_daemon.sockets() == {
             "video": Path("/run/pebble/video.sock"), "audio": Path("/run/pebble/audio.sock")
@@ -253,7 +253,7 @@ class TestOriginal:
             ("services.av_daemon.video.rotate_degrees", 45, 0, "not 45; 0 is used"),
         ],
     )
-    def test_what_the_original_accepts_and_ours_does_not_is_replaced_with_a_warning(
+    def test_a_form_of_the_original_is_replaced_with_a_warning(
         self, place: str, written: Any, value: Any, used: str
     ) -> None:
         config = read(at(place, written))
@@ -403,7 +403,7 @@ class TestOverridePoints:
         assert read(at("services.launcher.logs.topic", f"site/{metric}"))  # nobody's
 
     @given(st.text(st.characters(codec="utf-8"), min_size=1, max_size=260) | st.text("a/", min_size=190, max_size=260))
-    def test_what_is_accepted_every_transport_carries(self, topic: str) -> None:
+    def test_every_transport_carries_an_accepted_topic(self, topic: str) -> None:
         try:
             config = read(at("services.launcher.logs.topic", topic))
         except ConfigError:
@@ -538,7 +538,7 @@ class TestMistakes:
             ("services.serial_mcu_bridge.protocol", "goob", 'must be "goob_base_v1", "imu_mpu6050_v1"'),
         ],
     )
-    def test_one_wrong_value(self, path: str, value: Any, expected: str) -> None:
+    def test_a_wrong_value_is_named_with_what_to_write(self, path: str, value: Any, expected: str) -> None:
         found = problems(at(path, value))
         assert found[0].startswith(f"{path}: {expected}"), found
 
@@ -585,7 +585,7 @@ class TestMistakes:
              'services.mqtt_bridge.link.profile: cannot be "auto": only MQTT connections are measured'),
         ],
     )  # fmt: skip
-    def test_what_is_missing_or_does_not_fit_together(self, raw: dict[str, Any], expected: str) -> None:
+    def test_missing_and_contradicting_keys_are_named(self, raw: dict[str, Any], expected: str) -> None:
         assert only_problem(raw).startswith(expected)
 
     def test_two_sockets_cannot_have_one_path(self, tmp_path: Path) -> None:
@@ -1009,7 +1009,7 @@ def test_reading_a_config_imports_no_client_library_and_no_cli() -> None:
     assert loaded & heavy == set()
 
 
-def test_what_cannot_be_switched_off_gives_a_warning() -> None:
+def test_a_switch_without_effect_gives_a_warning() -> None:
     safety = {"ignore_retained_drive": False, "stop_on_shutdown": False}
     serial = {"enabled": True, "serial": {"port": "/dev/ttyACM0"}, "safety": safety}
     config = parse({"robot": {"id": "x"}, "services": {"serial_mcu_bridge": serial}}, folder=Path(), env={})

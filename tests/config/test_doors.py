@@ -146,7 +146,7 @@ def test_a_board_that_has_no_memory_for_tls_logs_in_without_it() -> None:
     ],
     ids=str,
 )
-def test_one_warning_of_a_robot_that_asks_for_no_name(change: dict[str, Any], where: str) -> None:
+def test_a_robot_that_asks_for_no_name_is_warned_of_once(change: dict[str, Any], where: str) -> None:
     warning = warning_of_open(parse(deep_merge(GOOD, change), folder=Path("/nowhere"), env={}))
     expected = f'security.level is "open": whoever may publish by {where} drives this robot (docs/ext/fleet.md)'
     assert warning == {True: expected, False: ""}[bool(where)]

@@ -25,7 +25,7 @@ from pebble.services.video_stream.config import VideoStream
         ("bro\u0308ker.example", "xn--brker-kua.example"),
     ],
 )
-def test_what_is_understood(text: str, host: str) -> None:
+def test_hosts_are_understood(text: str, host: str) -> None:
     assert broker_host(text) == host
 
 
@@ -43,7 +43,7 @@ def test_what_is_understood(text: str, host: str) -> None:
         *((f"b{char}", f"holds U+{ord(char):04X}, which is not shown") for char in "\t\n\0\u200b"),
     ],
 )  # fmt: skip
-def test_what_is_refused(text: str, instead: str) -> None:
+def test_other_texts_are_refused_with_what_to_write(text: str, instead: str) -> None:
     with pytest.raises(HostError) as caught:
         broker_host(text)
     assert str(caught.value).startswith(instead)

@@ -73,7 +73,7 @@ def test_a_character_that_is_not_seen_is_named_by_its_code(tmp_path: Path, char:
             assert ("starts or ends with a blank" if char == " " else f"U+{ord(char):04X}") in found, found
 
 
-def test_what_is_meant_stays(tmp_path: Path) -> None:
+def test_wanted_blanks_and_signs_stay(tmp_path: Path) -> None:
     meant = {
         f"{REMOTE}/username": "Rover One",
         f"{REMOTE}/password": "with blanks",
@@ -260,7 +260,7 @@ def _is_text(call: ast.Call) -> bool:
         ("no\u00a0break\tand\nlines", "no\u00a0break\tand\nlines"),
     ],
 )
-def test_what_is_not_seen_or_steers_a_terminal_is_shown_by_its_code(text: str, seen: str) -> None:
+def test_invisible_and_steering_characters_are_shown_as_codes(text: str, seen: str) -> None:
     assert shown(text) == seen
     assert shown(f"x {text}") == f"x {seen}"
     record = logging.LogRecord("a", logging.INFO, "", 0, "%s", (text,), None)

@@ -114,7 +114,7 @@ def test_delivery_rules_are_those_of_the_wire() -> None:
     assert rules(c.CAMERA) == (OUTGOING, 0, False)
 
 
-def test_what_stays_on_the_robot_and_what_never_passes_the_bridge() -> None:
+def test_local_channels_stay_on_the_robot_and_some_never_pass_the_bridge() -> None:
     inside = [channel.metric for channel in CHANNELS if not channel.remote]
     assert inside == [
         *("control-turn/{owner}", "control-vouched", "motor-power/{owner}", "sensors/imu-fast"),

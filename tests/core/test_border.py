@@ -35,7 +35,7 @@ def test_no_import_leaves_the_core(graph: grimp.ImportGraph) -> None:
     assert leaving == []
 
 
-def test_what_is_an_extension_is_named(graph: grimp.ImportGraph) -> None:
+def test_every_extension_is_named_in_ours(graph: grimp.ImportGraph) -> None:
     assert [name for name in graph.find_children("pebble.extensions") if name not in OURS] == []
 
 

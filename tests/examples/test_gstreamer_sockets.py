@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 import pytest
 
-from pebble.transports.frames import FrameInfo
+from pebble.extensions.media.frames import FrameInfo
 from pebble.transports.segments import SHM
 from tests.ext.av.media_rig import Device
 from tests.support import ROOT, Child, until

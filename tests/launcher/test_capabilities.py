@@ -223,7 +223,7 @@ OFFERS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize(("robot", "listed"), OFFERS.values(), ids=OFFERS)
-def test_what_a_robot_has_is_listed(robot: dict[str, Any], listed: dict[str, Any]) -> None:
+def test_parts_of_a_robot_are_listed(robot: dict[str, Any], listed: dict[str, Any]) -> None:
     value = of(**robot)
     assert {path: at(value, path) for path in listed} == listed
 
@@ -260,7 +260,7 @@ def test_a_system_action_can_be_asked_for_where_a_command_is_set(name: str) -> N
 
 
 def test_encodings_are_those_of_this_installation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pebble.runtime.pyav.find_spec", lambda _name: None)
+    monkeypatch.setattr("pebble.extensions.media.pyav.find_spec", lambda _name: None)
     value = of()
     assert (value["video"]["encodings"], value["audio"]["encodings"]) == (["json", "pbvd"], ["pcm"])
 

@@ -89,7 +89,7 @@ def test_a_process_that_is_not_ready_drives_nothing(program: str, state: str) ->
     assert robot.shows({**READY, program: state}).startswith(f"no {program} is ")
 
 
-def test_what_a_process_reported_ends_with_it() -> None:
+def test_reports_of_a_process_end_with_it() -> None:
     robot = Assessed()
     for note in WELL.values():
         robot.receive(*note)

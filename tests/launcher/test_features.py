@@ -25,7 +25,7 @@ HISTORIES: dict[str, tuple[str, list[set[str]]]] = {
 
 
 @pytest.mark.parametrize(("history", "changes"), HISTORIES.values(), ids=HISTORIES)
-def test_what_processes_report(history: str, changes: list[set[str]]) -> None:
+def test_reports_of_processes_are_merged(history: str, changes: list[set[str]]) -> None:
     seen: list[set[str]] = []
 
     def changed() -> None:

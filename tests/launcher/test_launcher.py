@@ -43,7 +43,7 @@ def test_children_start_in_order_and_their_readiness_is_published(launch: Launch
     assert (message["qos"], message["retain"]) == (1, True)
 
 
-def test_what_is_switched_off_is_not_published(launch: Launch) -> None:
+def test_switched_off_messages_are_not_published(launch: Launch) -> None:
     robot = launch(
         ("bridge", "talker", CONNECTION),
         restart_delay_seconds=0,
@@ -159,7 +159,7 @@ def test_a_robot_that_stood_still_as_a_whole_goes_on_with_the_same_processes(lau
     assert {**robot.children(), "serial": 0} == {**children, "serial": 0}
 
 
-def test_what_a_child_started_ends_with_it(launch: Launch) -> None:
+def test_children_of_a_child_end_with_it(launch: Launch) -> None:
     robot = launch(("player", "parent", CONNECTION), restart_delay_seconds=600)
 
     def grandchildren() -> list[int]:
@@ -273,7 +273,7 @@ def test_stages_stop_one_after_the_other_and_nothing_is_left(launch: Launch) -> 
     assert will["retain"]
 
 
-def test_who_ignores_the_request_to_stop_is_killed_and_takes_no_time_from_others(launch: Launch) -> None:
+def test_a_program_that_does_not_stop_is_killed_and_takes_no_time_from_others(launch: Launch) -> None:
     robot = launch(
         ("hub", "good", LOCAL_TRANSPORT),
         ("serial", "good", DEVICE),
@@ -289,7 +289,7 @@ def test_who_ignores_the_request_to_stop_is_killed_and_takes_no_time_from_others
     assert "did not stop in time: bridge" in robot.stderr()
 
 
-def test_what_ends_while_the_robot_stops_is_not_started_again(launch: Launch) -> None:
+def test_a_program_that_ends_while_the_robot_stops_is_not_started_again(launch: Launch) -> None:
     """All its processes may get the signal, by a service manager or `pkill`, and one may have just crashed."""
     robot = launch(
         ("hub", "good", LOCAL_TRANSPORT),
@@ -414,7 +414,7 @@ def test_a_program_is_started_as_the_table_says() -> None:
     assert (settings["run_dir"], settings["lease_ms"], settings["journal"]) == ("/run/rover", 700, "/robots/kept")
 
 
-MEDIA_MODULES = {"pebble.transports.frames", "pebble.extensions.media.sound"}
+MEDIA_MODULES = {"pebble.extensions.media.frames", "pebble.extensions.media.sound"}
 
 
 @pytest.mark.parametrize(
@@ -429,7 +429,7 @@ MEDIA_MODULES = {"pebble.transports.frames", "pebble.extensions.media.sound"}
         ({"mqtt_bridge": UPLINK, "av_daemon": ON}, MQTT, {"mqtt"}, MEDIA_MODULES),
     ],
 )
-def test_what_several_programs_share_is_known_beforehand(
+def test_modules_that_several_programs_share_are_known_beforehand(
     services: dict[str, Any], transport: dict[str, Any], kinds: set[str], media: set[str]
 ) -> None:
     expected = {f"pebble.transports.{kind}.transport" for kind in kinds} | media

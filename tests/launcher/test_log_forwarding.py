@@ -47,7 +47,7 @@ def test_a_childs_line_is_written_and_published_under_its_name(forwarded: Forwar
     assert forwarded.written().endswith("[ERROR] [mqtt_bridge] far away\n")
 
 
-def test_what_is_below_the_least_level_stays_here(forwarded: Forwarded) -> None:
+def test_lines_below_the_least_level_are_not_published(forwarded: Forwarded) -> None:
     forwarded.forwarder.child_line("mqtt_bridge", 42, "12:00:00 [INFO] routine")
     assert forwarded.records == []
     assert "routine" in forwarded.written()
@@ -117,7 +117,7 @@ def test_an_exception_is_one_record_and_several_lines(forwarded: Forwarded) -> N
     assert "[ERROR] [launcher] ValueError: seven" in forwarded.written()
 
 
-def test_what_publishing_itself_causes_is_not_published(forwarded: Forwarded) -> None:
+def test_lines_about_publishing_are_not_published(forwarded: Forwarded) -> None:
     forwarded.forwarder.child_line("announcer", 42, "12:00:00 [ERROR] broken pipe", published=False)
     assert forwarded.records == []
     assert "broken pipe" in forwarded.written()

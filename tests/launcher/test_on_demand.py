@@ -166,7 +166,7 @@ class TestBridgeThatDies:
 
 
 @pytest.mark.parametrize(("state", "releases"), [("init", 1), ("ready", 0)])
-def test_one_that_still_starts_begins_again_with_what_is_requested_now(state: str, releases: int) -> None:
+def test_a_starting_program_begins_again_with_the_newest_request(state: str, releases: int) -> None:
     """One that is ready receives the new request itself."""
     supervisor = StandIn(state)
     programs = OnDemand(Reactor(), [cast(ProcessSupervisor, supervisor)])

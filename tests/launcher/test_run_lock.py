@@ -64,7 +64,7 @@ def test_a_full_disk_does_not_keep_a_robot_from_starting(tmp_path: Path, monkeyp
         RunLock(tmp_path, "x/y/z", tmp_path / "state.lock").take()
 
 
-def test_what_is_in_the_place_of_the_lock_is_named(tmp_path: Path) -> None:
+def test_another_thing_in_the_place_of_the_lock_is_named(tmp_path: Path) -> None:
     (tmp_path / LAUNCHER_LOCK).mkdir()
     with pytest.raises(PebbleError, match=f"{LAUNCHER_LOCK} cannot be locked: Is a directory; remove it"):
         RunLock(tmp_path, "x/y/z", tmp_path / "state.lock").take()
@@ -79,7 +79,7 @@ def test_a_folder_for_everybody_is_not_closed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("remove", [lambda run: shutil.rmtree(run), lambda run: (run / LAUNCHER_LOCK).unlink()])
-def test_what_was_removed_is_locked_again(tmp_path: Path, remove: Callable[[Path], object]) -> None:
+def test_a_removed_lock_is_taken_again(tmp_path: Path, remove: Callable[[Path], object]) -> None:
     run, state_lock = tmp_path / "run", tmp_path / "state.lock"
     with RunLock(run, "x/y/z", state_lock) as lock:
         assert not lock.keep()
@@ -91,7 +91,7 @@ def test_what_was_removed_is_locked_again(tmp_path: Path, remove: Callable[[Path
             RunLock(run, "x/y/other", tmp_path / "other.lock").take()
 
 
-def test_what_cannot_be_locked_again_is_reported_once_and_tried_again(
+def test_a_lock_that_cannot_be_taken_again_is_reported_once_and_tried_again(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     run = tmp_path / "run"

@@ -30,7 +30,7 @@ POSTS = {
 
 
 @pytest.mark.parametrize(("posts", "runs", "dropped"), POSTS.values(), ids=POSTS)
-def test_what_runs_of_what_is_posted(posts: str, runs: str, dropped: int) -> None:
+def test_posted_jobs_run_in_order_and_newer_ones_replace_older_ones(posts: str, runs: str, dropped: int) -> None:
     inbox, ran = Inbox(limit=3), list[str]()
     for word in posts.split():
         kind = word.partition(".")[0]

@@ -236,7 +236,7 @@ def test_a_service_that_cannot_start_is_stopped_all_the_same() -> None:
     assert robot.service.life == ["stop closed"]
 
 
-def test_what_was_opened_is_closed_after_stop_in_reverse_order_even_if_one_fails() -> None:
+def test_opened_things_are_closed_after_stop_in_reverse_order_even_if_one_fails() -> None:
     class Opener(Recorder):
         def start(self) -> None:
             self.on_stop(lambda: self.life.append("close first"))
@@ -260,7 +260,7 @@ def test_quit_before_run_ends_at_once(robot: Robot) -> None:
     assert [entry.split()[0] for entry in robot.service.life] == ["start", "stop"]
 
 
-def test_what_waits_when_the_service_quits_is_not_executed(running: Robot) -> None:
+def test_waiting_jobs_are_not_executed_when_the_service_quits(running: Robot) -> None:
     running.keep_busy(DRIVE_TOPIC, '{"x": 0.5}', 0.5)
     running.publish(REBOOT_TOPIC, "true")
     assert until(lambda: running.service.transport.counters["delivered"] == 2)

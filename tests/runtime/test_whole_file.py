@@ -27,7 +27,7 @@ REFUSALS = {
 
 
 @pytest.mark.parametrize(("call", "number", "expected"), REFUSALS.values(), ids=REFUSALS)
-def test_what_a_file_system_lacks(
+def test_calls_that_a_file_system_lacks_are_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str, number: int, expected: str
 ) -> None:
     file = tmp_path / "state"
@@ -46,7 +46,7 @@ def test_what_a_file_system_lacks(
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
 
 
-def test_what_others_can_read_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any) -> None:
+def test_a_file_that_others_can_read_is_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any) -> None:
     def refuse(file: int, _mode: int) -> None:
         os.fchmod(file, 0o644)  # as all files have it there
         raise PermissionError(errno.EPERM, "Operation not permitted")

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from pebble.errors import TransportError
+from pebble.extensions.media.frames import FrameReader, FrameWriter
 from pebble.transports import ZenohSettings, create
-from pebble.transports.frames import FrameReader, FrameWriter
 from pebble.transports.peers import FileLock, PeerRegistry, prepare_run_dir
 from pebble.transports.zenoh.hub import ZenohHub
 from tests.support import refused

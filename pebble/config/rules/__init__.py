@@ -1,1 +1,1 @@
-"""What a config must keep to beyond the limits of each key, and what it is warned of."""
+"""Rules between the keys of a config, and warnings."""

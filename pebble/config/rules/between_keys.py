@@ -1,4 +1,4 @@
-"""Checks between the keys of a section, and of what only the machine knows: files and passwords."""
+"""Checks between keys, and of files and passwords on this machine."""
 
 import os
 import re
@@ -18,20 +18,20 @@ from pebble.config.types import Secret
 from pebble.contract.identity import GATEWAYS, SERVERS
 
 _TLS = ("tls/", "quic/")  # endpoints of Zenoh that are encrypted
-#: Words of commands as the original's configs have them, and why they do harm, or nothing, here.
+#: Words in commands of the original's configs, and why they do harm, or nothing, here.
 _OF_ORIGINAL = (
     (re.compile(r"\bpebble-control\b").search, "starts the original, too, at the same serial port"),
     (re.compile(r"(?:^|[\s/])(?:sudo|doas|pkexec)\b").search, "needs a right that our unit denies"),
     (re.compile(r"\bgit\b.*\b(?:pull|fetch|merge|reset)\b").search, "updates Pebble only if it runs from that folder"),
 )
-#: What belongs there, with our unit.
+#: The commands for our unit.
 _INSTEAD = {
     "reboot_control": "systemctl --no-ask-password reboot",
     "service_restart_control": "systemctl --no-block restart pebble.service",
     "git_pull_control": "systemctl --no-ask-password start pebble-update.service",
 }
 _LONGEST_TEXT = 65535  # bytes of a user name or password (MQTT 3.1.1, section 1.5.3)
-_VARIABLE = re.compile("[A-Z_][A-Z0-9_]*").fullmatch  # as they are usually written; else it may be a password
+_VARIABLE = re.compile("[A-Z_][A-Z0-9_]*").fullmatch  # the usual form; another text may be a password
 _INSTANCE_NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}").fullmatch  # it becomes part of a process's name and client id
 
 
@@ -56,10 +56,10 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
 
 
 def _transport(reader: Reader, transport: TransportSection, path: Path) -> TransportSection:
-    """Warn where certificates alone decide who may connect to a Zenoh robot from other machines."""
-    encrypted = next((one for one in transport.listen if one.startswith(_TLS)), None)
+    """Check the encryption of a Zenoh robot that other machines reach: certificates decide who may connect."""
+    encrypted = next((endpoint for endpoint in transport.listen if endpoint.startswith(_TLS)), None)
     if transport.allowed_names is not None and not any(
-        one.startswith(_TLS) for one in (*transport.listen, *transport.connect)
+        endpoint.startswith(_TLS) for endpoint in (*transport.listen, *transport.connect)
     ):
         reader.notes.warning((*path, "allowed_names"), "has no effect: no tls/ or quic/ endpoint is listed")
     if transport.allowed_names is not None and transport.access is not None:
@@ -112,9 +112,9 @@ def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
 
 
 def _without_uplink(notes: Notes, root: Root) -> Root:
-    """Let a bridge whose remote host is empty, as in the original's examples, serve the robot's own broker.
+    """Let a bridge without a remote host, as in the original's examples, use the robot's own broker.
 
-    Operators connect to that; a Zenoh robot has none, and runs without a bridge.
+    Operators connect to that broker. A Zenoh robot has none, and runs without a bridge.
     """
     bridge, transport = root.services.mqtt_bridge, root.transport
     if not bridge.enabled or bridge.remote_mqtt.host or (bridge.remote is not None and bridge.remote.kind != "mqtt"):
@@ -123,13 +123,13 @@ def _without_uplink(notes: Notes, root: Root) -> Root:
     if root.robot.platform != "linux":
         notes.doubt(path, "is missing, write the name of the remote broker")
         return root
-    own = root.local_mqtt if transport.kind == "mqtt" else transport.mqtt_mirror
-    if own is None:
+    local = root.local_mqtt if transport.kind == "mqtt" else transport.mqtt_mirror
+    if local is None:
         notes.warning(path, "is empty: there is no uplink, so no operator sees or drives this robot")
         bridge = replace(bridge, enabled=False)
     else:
-        notes.warning(path, f"is empty: there is no uplink, operators connect to the robot's own broker, {own.host}")
-        bridge = replace(bridge, remote_mqtt=RemoteMqtt(**asdict(own), client_id=bridge.remote_mqtt.client_id))
+        notes.warning(path, f"is empty: there is no uplink, operators connect to the robot's own broker, {local.host}")
+        bridge = replace(bridge, remote_mqtt=RemoteMqtt(**asdict(local), client_id=bridge.remote_mqtt.client_id))
     return replace(root, services=replace(root.services, mqtt_bridge=bridge))
 
 
@@ -217,7 +217,7 @@ def _variable(reader: Reader, name: str, path: Path) -> str | None:
 
 
 def _contents(reader: Reader, file: FilePath, path: Path) -> str | None:
-    """Return the file's text without its final newline; noted and None when it cannot be read."""
+    """Return the file's text without its final newline; if it cannot be read, note the problem and return None."""
     try:
         return read_text(file).rstrip("\n")
     except FileNotFoundError:
@@ -231,7 +231,7 @@ def _contents(reader: Reader, file: FilePath, path: Path) -> str | None:
     return None
 
 
-#: By the class of a section, subclasses included. Extensions add those of theirs.
+#: By the class of a section, subclasses included. Extensions add their own.
 CHECKS: tuple[Rule, ...] = (
     (Root, _root),
     (TransportSection, _transport),

@@ -1,4 +1,4 @@
-"""Refusals of the security level: ways to the robot without a login."""
+"""Checks of the security level: it refuses ways to the robot without a login."""
 
 import re
 from collections.abc import Iterator
@@ -12,12 +12,11 @@ from pebble.config.tree import Root
 
 _ZENOH_ENCRYPTED = ("tls/", "quic/")
 _ZENOH_LOCAL = ("unixsock-stream/", "unixpipe/", "vsock/")
-_EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 -- compared only
 _BARE_HOST = re.compile(r"^[a-z0-9-]+/\[?([^\]/]*?)\]?(?::\d+)?(?:[?#].*)?$")
 
 
 def check_doors(notes: Notes, root: Root) -> None:
-    """Note what the level refuses. ``open`` refuses nothing."""
+    """Note the connections that the level refuses. ``open`` refuses nothing."""
     if root.security.level == "open":
         return
     _check_links(notes, root)
@@ -26,10 +25,7 @@ def check_doors(notes: Notes, root: Root) -> None:
 
 
 def warning_of_open(root: Root) -> str:
-    """Return what the level ``open`` means where other machines reach the robot.
-
-    Empty: none does, or it is another level.
-    """
+    """Return a warning if the level is ``open`` and other machines reach the robot, or ""."""
     hosts = [f"broker {mqtt.host}" for _, mqtt in _robots_brokers(root) if not is_loopback(mqtt.host)]
     places = [*hosts, *(endpoint for _, endpoint in _endpoints(root))]
     if root.security.level != "open" or not places:
@@ -70,7 +66,7 @@ def _check_links(notes: Notes, root: Root) -> None:
 
 
 def _endpoints(root: Root) -> Iterator[tuple[Path, str]]:
-    """Return those of Zenoh that lead beyond this machine."""
+    """Return the Zenoh endpoints that lead beyond this machine, with their places in the config."""
     return (row for row in zenoh_endpoints(root) if not _is_near(row[1]))
 
 
@@ -82,20 +78,13 @@ def zenoh_endpoints(root: Root) -> Iterator[tuple[Path, str]]:
                 yield from (((*path, key), endpoint) for endpoint in getattr(section, key, ()))
 
 
-def place_of_endpoint(endpoint: str) -> tuple[str, str]:
-    """Return host and port; all names of this machine are one."""
-    host, _, port = re.sub(r"[?#].*", "", endpoint.partition("/")[2]).rpartition(":")
-    host = host.strip("[]")
-    return ("" if host in _EVERYWHERE or is_loopback(host) else host), port
-
-
 def _is_near(endpoint: str) -> bool:
     host = _BARE_HOST.match(endpoint)
     return endpoint.startswith(_ZENOH_LOCAL) or (host is not None and is_loopback(host[1]))
 
 
 def _check_sides(notes: Notes, root: Root) -> None:
-    """At ``named`` the bridge knows the names, so nothing may go past it."""
+    """Refuse ways past the bridge, which checks the names at the level ``named``."""
     bridge, transport = root.services.mqtt_bridge, root.transport
     why = 'at security.level "named" the bridge checks names'
     if not bridge.enabled:
@@ -115,5 +104,5 @@ def _check_sides(notes: Notes, root: Root) -> None:
 
 
 def place_of(mqtt: Mqtt) -> tuple[str, int]:
-    """Return host and port; all names of this machine are one."""
+    """Return host and port of a broker; "" for every name of this machine."""
     return ("" if is_loopback(mqtt.host) else mqtt.host), mqtt.port

@@ -1,4 +1,4 @@
-"""Warns of what in a config lets others read or overhear a secret."""
+"""Warnings of ways in which others can read or overhear a secret of a config."""
 
 import os
 import stat
@@ -13,7 +13,7 @@ from pebble.config.types import Section
 
 
 def warn_if_readable(notes: Notes, path: Path, file: FilePath, what: str) -> None:
-    """Warn if the mode of ``file``, which is or holds ``what``, lets every user of this machine read it."""
+    """Warn if every user of this machine can read ``file``, which is or holds ``what``."""
     if not hasattr(os, "getuid"):  # Windows has no such modes
         return
     try:
@@ -27,20 +27,15 @@ def warn_if_readable(notes: Notes, path: Path, file: FilePath, what: str) -> Non
 def warn_of_logins_in_clear(notes: Notes, root: Root) -> None:
     """Warn of each broker on the network that receives a user name and a password without encryption."""
     for path, mqtt in brokers(root):
-        if mqtt.username is not None and not mqtt.tls.enabled and not is_near(mqtt):
+        if mqtt.username is not None and not mqtt.tls.enabled and not is_loopback(mqtt.host):
             fix = "set tls.enabled"
             if root.robot.platform == "esp8266":
                 fix = "this board has no TLS, so give it a login of its own that may do nothing else"
             notes.warning((*path, "username"), f"its password crosses the network unencrypted: {fix}")
 
 
-def is_near(mqtt: Mqtt) -> bool:
-    """Return True if the broker of this section is on this machine."""
-    return is_loopback(mqtt.host)
-
-
 def warn_of_known_id(notes: Notes, root: Root) -> None:
-    """Warn where accounts are known, and one of them can end the robot's connection by logging in with its id."""
+    """Warn of a client id in the config: another account could log in with it, which ends the robot's connection."""
     bridge = root.services.mqtt_bridge
     path = ("services", "mqtt_bridge", "remote_mqtt", "client_id")
     if root.security.level != "open" and bridge.enabled and bridge.remote is None and bridge.remote_mqtt.client_id:
@@ -64,7 +59,7 @@ def connections(root: Root) -> Iterator[tuple[Path, Section]]:
 
 
 def core_connections(root: Root) -> Iterator[tuple[Path, Section]]:
-    """Yield those of the core: inside the robot, and to operators."""
+    """Yield the connections of the core: inside the robot, and to operators."""
     bridge, transport = root.services.mqtt_bridge, root.transport
     if transport.kind == "mqtt":
         yield ("local_mqtt",), root.local_mqtt

@@ -1,6 +1,6 @@
-"""Finds the keys of a config that give a channel another topic, or that of another one."""
+"""Renamed topics in a config, and two channels that share one."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from pebble.config.problems import Path
@@ -12,7 +12,7 @@ _SERIAL = ("services", "serial_mcu_bridge")
 
 
 def shared_topics(root: Root) -> Iterator[tuple[Path, Channel]]:
-    """Yield each key whose topic is that of another channel, too, with that channel.
+    """Yield each key whose topic belongs to another channel, too, with that channel.
 
     Several serial lines may share the topics of one channel: all of them obey a drive command.
     """
@@ -32,32 +32,30 @@ def shared_topics(root: Root) -> Iterator[tuple[Path, Channel]]:
 
 
 def renamed_commands(root: Root) -> Iterator[tuple[Path, str]]:
-    """Yield each key that gives something which a robot receives another topic, and that topic."""
+    """Yield each key that renames the topic of a command or flag, and its new topic."""
     for channel in CHANNELS:
         if channel.direction == INCOMING:
             yield from ((path, topic) for path, topic in _keys(channel, root) if topic is not None)
 
 
 def _keys(channel: Channel, root: Root) -> Iterator[tuple[Path, str | None]]:
-    """Yield the keys that may rename the channel, one for each serial line, and the topics there.
-
-    None: its own topic.
-    """
+    """Yield the keys that may rename the channel, one for each serial line, and its topic there; None: not renamed."""
     if channel.override is None:
         yield (), None
         return
     keys = tuple(channel.override.split("."))
     if keys[:2] != _SERIAL:
-        yield keys, _at(root, keys)
+        yield keys, topic_at(root, keys)
         return
-    own = root.services.serial_mcu_bridge
-    lines: dict[Path, SerialBridge] = {_SERIAL: own}
-    lines |= {(*_SERIAL, "instances", name): line for name, line in own.instances.items()}
+    section = root.services.serial_mcu_bridge
+    lines: dict[Path, SerialBridge] = {_SERIAL: section}
+    lines |= {(*_SERIAL, "instances", name): line for name, line in section.instances.items()}
     for path, line in lines.items():
-        yield (*path, *keys[2:]), _at(line, keys[2:])
+        yield (*path, *keys[2:]), topic_at(line, keys[2:])
 
 
-def _at(section: Any, keys: tuple[str, ...]) -> str | None:
+def topic_at(section: Any, keys: Iterable[str]) -> str | None:
+    """Return the topic at a path of keys; None where it is not set."""
     for key in keys:
         section = getattr(section, key, None)  # an extension's section is missing with it
     topic: str | None = section

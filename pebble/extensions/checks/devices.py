@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pebble.check_result import CheckResult, failed, ok, warn
 from pebble.config import Config
+from pebble.extensions.media.config import Media
 from pebble.services.av_daemon.config import AvDaemon
 from pebble.services.soundboard_handler.config import SoundboardHandler
 
@@ -84,7 +85,7 @@ def loudspeaker(config: Config) -> Iterator[CheckResult]:
     """Look for the players of sounds and of an operator's voice, if it plays them."""
     devices, sounds = config.section(AvDaemon), config.section(SoundboardHandler)
     talk_back = devices.enabled and devices.audio.enabled
-    wav, raw = sounds.playback.player_command, config.services.mqtt_bridge.media.audio_receiver.command
+    wav, raw = sounds.playback.player_command, config.section(Media).audio_receiver.command
     commands = [wav] * sounds.enabled + [raw] * talk_back
     for name in dict.fromkeys(command[0] for command in commands):
         if shutil.which(name) is not None:

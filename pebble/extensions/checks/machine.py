@@ -9,7 +9,7 @@ from typing import Any
 from pebble.check_result import CheckResult, failed, ok, warn
 from pebble.errors import PebbleError
 from pebble.extensions.checks.check import Check
-from pebble.runtime.child import run
+from pebble.extensions.checks.program import run
 
 _ENOUGH_LOCKED = 64 * 1024 * 1024  # a camera's pool of frames at 1080p
 _BUILT = 1735689600  # 2025: a clock before this has not been set

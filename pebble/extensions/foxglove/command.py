@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pebble.commands.options import BrokerUrl, CaCert, PasswordFile, host_of
 from pebble.config.hosts import is_loopback
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.connection import Target, resolve
+from pebble.extensions.operator.commands.options import BrokerUrl, CaCert, PasswordFile, host_of
 from pebble.runtime.connections import REMOTE_RECONNECT_S
 from pebble.transports import MqttSettings
 

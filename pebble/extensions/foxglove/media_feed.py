@@ -8,9 +8,10 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from pebble.contract import AUDIO, CAMERA
-from pebble.contract.packets import PBAT
 from pebble.errors import PebbleError
 from pebble.extensions.foxglove.server import MAX_BYTES, Server, protobuf_spec
+from pebble.extensions.media import pyav
+from pebble.extensions.media.packets import PBAT
 from pebble.extensions.media.picture_header import MAX_PAYLOAD, PictureSequence
 from pebble.extensions.operator.client.broker import Broker
 from pebble.extensions.operator.client.media_request.offer import Medium, offered, refusal
@@ -28,7 +29,6 @@ from pebble.extensions.recordings.exports.foxglove_messages import (
     stamped,
     time_of,
 )
-from pebble.runtime import pyav
 
 log = logging.getLogger(__name__)
 

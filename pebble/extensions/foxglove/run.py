@@ -10,8 +10,8 @@ from pebble.errors import TransportError
 from pebble.extensions.foxglove.robots import Robots, filters
 from pebble.extensions.foxglove.server import Server
 from pebble.extensions.operator.client.broker import Broker
+from pebble.extensions.operator.signals import handled_by
 from pebble.extensions.recordings.exports.foxglove_messages import Schemas
-from pebble.runtime.signals import handled_by
 from pebble.transports import MqttSettings
 
 _WITHDRAW_S, _CLOSE_S = 1.0, 0.5

@@ -2,4 +2,10 @@
 
 from pebble.extension import Extension
 
-EXTENSION = Extension(name="media", extra="media", page="docs/ext/media.md")
+EXTENSION = Extension(
+    name="media",
+    extra="media",
+    sections={"services.mqtt_bridge.media": "pebble.extensions.media.config:Media"},
+    offers="pebble.extensions.media.offers:offers",
+    page="docs/ext/media.md",
+)

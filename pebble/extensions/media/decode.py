@@ -3,14 +3,14 @@
 from dataclasses import dataclass
 from typing import Final
 
-from pebble.contract.packets import Picture
 from pebble.errors import PayloadError, PebbleError
+from pebble.extensions.media import pyav
 from pebble.extensions.media.h264 import H264Decoder
 from pebble.extensions.media.jpeg import MAX_BYTES, Pixels, decode_jpeg
 from pebble.extensions.media.jpeg_delta import add
 from pebble.extensions.media.json_video import inflate, jpeg_of
+from pebble.extensions.media.packets import Picture
 from pebble.extensions.media.picture_header import PictureHeader, follows, read_header
-from pebble.runtime import pyav
 
 MAX_PAYLOAD: Final = MAX_BYTES * 3 // 2  # base64 takes a third more
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final, cast
 import cv2
 
 from pebble.errors import PayloadError, PebbleError
+from pebble.extensions.media import pyav
 from pebble.extensions.media.jpeg import MAX_EDGE, Pixels
-from pebble.runtime import pyav
 
 if TYPE_CHECKING:
     import av

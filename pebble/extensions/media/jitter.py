@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from pebble.contract.packets import SEQUENCE_LIMIT, Sound
 from pebble.errors import PayloadError
+from pebble.extensions.media.packets import SEQUENCE_LIMIT, Sound
 from pebble.extensions.media.pcm import Samples, to_bytes, to_int16
 from pebble.extensions.media.sound import ReceivedSound, SoundDecoder, unpack
 from pebble.transports.counters import Counters
@@ -26,7 +26,7 @@ _DELAY_LIMIT_S: Final = 0.2  # a caller that takes this late does not have to ca
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """What to play next: (samples, channels)."""
+    """The samples to play next: (samples, channels)."""
 
     samples: Samples
     rate: int

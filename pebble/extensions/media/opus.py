@@ -16,8 +16,8 @@ from typing import Any, Final
 import numpy as np
 
 from pebble.errors import PayloadError, PebbleError
+from pebble.extensions.media import pyav
 from pebble.extensions.media.pcm import Resampler, Samples
-from pebble.runtime import pyav
 
 RATES: Final = (8000, 12000, 16000, 24000, 48000)
 FRAMES_MS: Final = (20, 40, 60)

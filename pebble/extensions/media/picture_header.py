@@ -4,8 +4,8 @@ from typing import Annotated, Final, NamedTuple
 
 import msgspec
 
-from pebble.contract.packets import KEY_FRAME, PBVD, SEQUENCE_LIMIT, Picture, PictureKind
 from pebble.errors import PayloadError
+from pebble.extensions.media.packets import KEY_FRAME, PBVD, SEQUENCE_LIMIT, Picture, PictureKind
 
 MAX_PAYLOAD: Final = 4 << 20  # bytes of one picture
 _HEADER_BYTES: Final = 19

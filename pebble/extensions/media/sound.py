@@ -7,12 +7,11 @@ from typing import Final
 import numpy as np
 
 from pebble.contract.encodings import ALL_SOUND
-from pebble.contract.packets import SEQUENCE_LIMIT, Codec, Sound
 from pebble.errors import PayloadError, PebbleError
-from pebble.extensions.media import opus
+from pebble.extensions.media import opus, pyav
 from pebble.extensions.media.opus import OpusDecoder, OpusEncoder
+from pebble.extensions.media.packets import SEQUENCE_LIMIT, Codec, Sound
 from pebble.extensions.media.pcm import Resampler, Samples, remix, to_bytes, to_samples
-from pebble.runtime import pyav
 from pebble.transports.counters import Counters
 
 #: Those this installation can make.

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Final, Self
 
 from pebble.errors import PebbleError
+from pebble.extensions.media import pyav
 from pebble.extensions.media.pcm import to_bytes
-from pebble.runtime import pyav
 
 #: PyAV's names of the formats, by the ending of the file: what a file holds does not choose its reader, because some
 #: formats of FFmpeg are lists of other files and hosts.

@@ -3,13 +3,12 @@
 from typing import Final
 
 from pebble.contract.encodings import ALL_VIDEO
-from pebble.contract.packets import KEY_FRAME, SEQUENCE_LIMIT, Picture, PictureKind
 from pebble.errors import ConfigError
-from pebble.extensions.media import json_video
+from pebble.extensions.media import json_video, pyav
 from pebble.extensions.media.h264 import H264Encoder
 from pebble.extensions.media.jpeg import Pixels
 from pebble.extensions.media.jpeg_delta import JpegDelta
-from pebble.runtime import pyav
+from pebble.extensions.media.packets import KEY_FRAME, SEQUENCE_LIMIT, Picture, PictureKind
 
 #: Those this installation can make.
 VIDEO_ENCODINGS: Final = pyav.available(ALL_VIDEO)

@@ -2,6 +2,8 @@
 
 from pebble.extension import Command, Extension
 
+_COMPLETION = "pebble.extensions.operator.commands.completion"
+
 EXTENSION = Extension(
     name="operator",
     needs=("media",),
@@ -20,5 +22,12 @@ EXTENSION = Extension(
         ),
     },
     former={"topics": "topic contract", "topic bw": "topic hz", "snapshot": "watch --picture FILE"},
+    completions={
+        "CONFIG": f"{_COMPLETION}:configs",
+        "CONFIG…": f"{_COMPLETION}:configs",
+        "ROBOT": f"{_COMPLETION}:robots",
+        "[SYSTEM/TYPE/]ID": f"{_COMPLETION}:robots",
+        "[reset|status] ROBOT": f"{_COMPLETION}:stops",
+    },
     page="docs/topics.md",
 )

@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Meta, Struct, ValidationError, convert
 
 from pebble import contract as c
-from pebble.contract import forms
+from pebble.extensions.operator.client import forms
 
 _Name = Annotated[str, Meta(min_length=1, max_length=255)]
 

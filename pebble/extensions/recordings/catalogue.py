@@ -1,4 +1,4 @@
-"""What recordings hold, without reading all of them where their summaries say it."""
+"""The contents of recordings, read from their summaries where they have them."""
 
 import json
 from collections import Counter
@@ -109,7 +109,7 @@ def events(paths: Iterable[Path]) -> Iterator[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """Which messages are wanted; without any condition all of robots, brokers and the recorder."""
+    """A choice of messages; without any condition all of robots, brokers and the recorder."""
 
     robot: str | None = None  # system/type/id
     topics: tuple[str, ...] = ()  # filters; one without the robot's identity begins at any robot's

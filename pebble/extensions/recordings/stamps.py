@@ -1,7 +1,7 @@
-"""What a payload says about itself: its own stamp, and whether it is media. Pure.
+"""The facts in a payload: its own stamp, and whether it is media. Pure.
 
 Stamps of JSON are ``t`` in milliseconds or ``timestamp`` in seconds (paper A.4.2); media have theirs in the header
-(``pebble.contract.packets``).
+(``pebble.extensions.media.packets``).
 """
 
 from dataclasses import replace
@@ -9,8 +9,8 @@ from typing import Any, Final
 
 import msgspec
 
-from pebble.contract.packets import PBAT, PBVD, Picture, Sound
 from pebble.errors import PayloadError
+from pebble.extensions.media.packets import PBAT, PBVD, Picture, Sound
 from pebble.extensions.media.picture_header import read_header
 
 _MILLISECONDS_FROM: Final = 10**11  # a stamp as large as this is in milliseconds

@@ -9,7 +9,7 @@ from typing import Any
 from pebble.contract import IMU, IMU_FAST, MCU_COMMAND, MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, Channel, Kind, codec
 from pebble.contract.payloads import McuManifest, McuSample
 from pebble.errors import DeviceError, PayloadError
-from pebble.runtime.parent import Notifier, ProvidedFeatures
+from pebble.runtime.parent import Notifier
 from pebble.runtime.service import every, on
 from pebble.runtime.timers import Timer
 from pebble.services.serial_mcu_bridge.devices.alias_use import AliasUse
@@ -73,7 +73,7 @@ class DescribedBridge(SerialService):
         self._published_states: dict[int, tuple[Reading, int]] = {}  # newest of each state interface, its epoch ms
         self._generic: list[Subscription] = []  # of the device that was described last, connected or not
         self.aliases = AliasUse(self.log, self._peers, self._begin_alias, self._end_alias, self.options.aliases)
-        self._features = ProvidedFeatures(Notifier())
+        self._features = _ProvidedFeatures(Notifier())
         self._timer: Timer | None = None
 
     def start(self) -> None:
@@ -350,3 +350,18 @@ class DescribedBridge(SerialService):
 
 def _now_ms() -> int:
     return time.time_ns() // 1_000_000
+
+
+class _ProvidedFeatures:
+    """The features that this process provides, reported to the launcher: call :meth:`report` regularly."""
+
+    def __init__(self, notifier: Notifier) -> None:
+        self.names: set[str] = set()  # change it at will
+        self._notifier = notifier
+        self._reported: set[str] = set()
+
+    def report(self) -> None:
+        """Report what has changed, also what the launcher was too busy for before."""
+        for name in sorted(self._reported ^ self.names):
+            if self._notifier.feature(name, name in self.names):
+                self._reported ^= {name}

@@ -6,10 +6,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+from pebble.extensions.media.frames import FrameInfo
 from pebble.extensions.media.sound import ReceivedSound, SoundDecoder
 from pebble.extensions.media.speech import Speech
 from pebble.transports import Message
-from pebble.transports.frames import FrameInfo
 from tests.ext.av.media_rig import Device, MediaProgram, Operator
 
 CHUNK_MS = 20

@@ -12,8 +12,8 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 import msgspec
 
 from pebble.contract.payloads import MediaReport
+from pebble.extensions.media.frames import FrameWriter
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
-from pebble.transports.frames import FrameWriter
 from tests.kit.robot import BASE as BASE
 from tests.kit.robot import ROBOT, SILENCE_S, Program, ProgramRobot
 from tests.support import until

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from pebble.contract import CAPABILITIES, STATUS, codec
-from pebble.contract.packets import PBAT
 from pebble.contract.payloads import Capabilities
 from pebble.extensions.foxglove.media_feed import MAX_WAITING, MAX_WAITING_BYTES, MediaFeed
 from pebble.extensions.foxglove.robots import Robots
 from pebble.extensions.foxglove.server import MAX_BYTES, ChannelSpec, Server
+from pebble.extensions.media.packets import PBAT
 from pebble.extensions.media.picture_header import MAX_PAYLOAD
 from pebble.extensions.media.scene import Scene
 from pebble.extensions.media.video import make_encoder

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
-from pebble.contract.packets import Picture, PictureKind
 from pebble.errors import PayloadError
 from pebble.extensions.media import json_video
 from pebble.extensions.media.decode import MAX_PAYLOAD, VideoDecoder
 from pebble.extensions.media.jpeg import decode_jpeg, jpeg_size
 from pebble.extensions.media.json_video import inflate
+from pebble.extensions.media.packets import Picture, PictureKind
 from pebble.extensions.media.scene import read_counter
 from pebble.extensions.media.video import make_encoder
 from tests.ext.recordings.demo_robots import FRED, MEDIA, recorded

@@ -17,10 +17,10 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from pebble.contract.packets import Picture, PictureKind
 from pebble.extensions.media import h264
 from pebble.extensions.media.decode import Decoded, VideoDecoder
 from pebble.extensions.media.jpeg import MAX_EDGE, Pixels
+from pebble.extensions.media.packets import Picture, PictureKind
 from pebble.extensions.media.video import make_encoder
 from tests.support import cases
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pebble.contract.packets import Codec, Sound
 from pebble.extensions.media.jitter import Chunk, JitterBuffer, ahead
+from pebble.extensions.media.packets import Codec, Sound
 from pebble.extensions.media.pcm import to_bytes
 from pebble.extensions.media.sound import make_sound_encoder, sequence_numbers
 from pebble.extensions.media.speech import Speech

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pebble.contract.packets import Codec, Sound
 from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.media import opus, sound
 from pebble.extensions.media.opus import milliseconds
+from pebble.extensions.media.packets import Codec, Sound
 from pebble.extensions.media.pcm import Resampler, Samples, remix, to_bytes, to_samples
 from pebble.extensions.media.sound import (
     SOUND_ENCODINGS,

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from pebble.errors import ConfigError, PebbleError
-from pebble.extensions.media import h264
+from pebble.extensions.media import h264, pyav
 from pebble.extensions.media.decode import VideoDecoder
 from pebble.extensions.media.jpeg import Pixels, decode_jpeg
 from pebble.extensions.media.jpeg_delta import add, subtract
 from pebble.extensions.media.scene import Scene
 from pebble.extensions.media.video import VIDEO_ENCODINGS, VideoEncoder, make_encoder
-from pebble.runtime import pyav
 
 T0 = 1_710_969_600_000
 FORMS = ("json", "pbvd", "h264")

@@ -32,8 +32,8 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from pebble.contract import channel_of
-from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.fleet.audit import Audit
+from pebble.extensions.media.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.media.speech import Speech
 from pebble.extensions.operator.client.drive_reasons import WORDS
 from pebble.extensions.page.access.guard import CONTENT_SECURITY_POLICY

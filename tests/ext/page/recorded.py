@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from pebble.contract.packets import Codec, Picture, PictureKind, Sound
+from pebble.extensions.media.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.media.speech import Speech
 from pebble.extensions.recordings.recorder.intake import EVENTS
 from tests.ext.page import states

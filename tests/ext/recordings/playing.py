@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pebble.contract.packets import Codec, Picture, PictureKind, Sound
+from pebble.extensions.media.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.recordings.files.recorded import Channel
 from pebble.extensions.recordings.files.writer import RecordingWriter
 from pebble.extensions.recordings.replay.player import BusOutput, Player

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pebble.contract.packets import KEY_FRAME, Codec, Picture, PictureKind, Sound
 from pebble.extensions.media import json_video
+from pebble.extensions.media.packets import KEY_FRAME, Codec, Picture, PictureKind, Sound
 from pebble.extensions.media.picture_header import read_header
 from pebble.extensions.recordings.stamps import is_keyframe, is_media, is_picture, shifted, stamp_ns
 

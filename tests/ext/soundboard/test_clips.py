@@ -88,7 +88,7 @@ def test_what_cannot_be_read_or_named_is_left_out_and_reported(tmp_path: Path) -
 def test_other_formats_are_clips_where_they_can_be_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     put(tmp_path, "a.wav", "b.mp3", "c.OGG", "d.flac", "e.m3u")
     assert Clips(tmp_path).scan() == ["a.wav", "b.mp3", "c.OGG", "d.flac"]
-    monkeypatch.setattr("pebble.runtime.pyav.find_spec", lambda _name: None)
+    monkeypatch.setattr("pebble.extensions.media.pyav.find_spec", lambda _name: None)
     clips = Clips(tmp_path)
     assert clips.scan() == ["a.wav"]
     assert clips.find("b.mp3") is None

@@ -10,7 +10,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.checks.commands.checks import Printer, is_clear
 from pebble.extensions.operator.client.connection import Target, target_of
 from pebble.extensions.operator.commands.target import with_target
-from pebble.runtime.signals import interrupted_by_signals
+from pebble.extensions.operator.signals import interrupted_by_signals
 
 _LOOKS_S = 4.0  # heartbeats of one a second need so long
 

@@ -8,17 +8,17 @@ from typing import Annotated
 
 import typer
 
-from pebble.commands.options import CaCert, PasswordFile, RootOption
 from pebble.config import load
 from pebble.config.hosts import is_loopback
 from pebble.errors import PebbleError
 from pebble.extensions.checks.commands.checks import Printer, is_clear
+from pebble.extensions.checks.new_file import write_new
 from pebble.extensions.operator.commands.estop import me
+from pebble.extensions.operator.commands.options import CaCert, PasswordFile, RootOption
 from pebble.extensions.operator.commands.target import broker_of
 from pebble.extensions.operator.places import Places
+from pebble.extensions.operator.signals import interrupted_by_signals
 from pebble.runtime.environment import withhold
-from pebble.runtime.signals import interrupted_by_signals
-from pebble.runtime.whole_file import write_new
 from pebble.transports import MqttSettings
 from pebble.transports.topics import check_topic
 

@@ -1,4 +1,4 @@
-"""What a robot owes everybody who watches and stops it, as a table: each check, and why. Nothing here turns a wheel."""
+"""The duties of a robot towards all who watch and stop it, as a table: each check, and why. No wheel turns here."""
 
 from __future__ import annotations
 

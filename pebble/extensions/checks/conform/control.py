@@ -1,4 +1,4 @@
-"""What a robot owes those who drive it by turns, as a table: control, and names where they are checked."""
+"""The duties of a robot towards drivers in turn, as a table: control, and names where they are checked."""
 
 from __future__ import annotations
 

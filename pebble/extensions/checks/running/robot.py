@@ -13,7 +13,6 @@ from pathlib import Path
 from pebble import contract as c
 from pebble.config import Config
 from pebble.config.hosts import is_loopback
-from pebble.config.rules.exposure import is_near
 from pebble.contract.identity import parse_topic
 from pebble.errors import PebbleError
 from pebble.extensions.checks.conform.motion import RESTS_S
@@ -46,7 +45,7 @@ class RobotSide(Observer):
         """True if it ends on this machine: what other robots have left there can only be left over."""
         if self.own:
             return config.transport.kind != "mqtt" or is_loopback(config.local_mqtt.host)
-        return is_near(config.services.mqtt_bridge.remote_mqtt)
+        return is_loopback(config.services.mqtt_bridge.remote_mqtt.host)
 
     def ask(self, patience_s: float) -> None:
         """Ask for what is retained by its name, which some brokers need; capabilities name some of it."""

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pebble.commands.options import ConfigArgument
+from pebble.commands.up import ConfigArgument
 from pebble.config import load
 from pebble.errors import PebbleError
 from pebble.extensions.fleet.robot_audit import files

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 import typer
 from msgspec.structs import replace
 
-from pebble.commands.options import host_of, split_names
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.extensions.fleet import applying, certificates, check, folder, pieces, plugin
@@ -20,6 +19,7 @@ from pebble.extensions.fleet.folder import CONF, ZENOH, Fleet, FleetError, Serve
 from pebble.extensions.fleet.people import People, has_user
 from pebble.extensions.fleet.roles import Account, ProgramRole, Role
 from pebble.extensions.operator.client.page_packages import require_packages
+from pebble.extensions.operator.commands.options import host_of, split_names
 from pebble.runtime.as_owner import as_before, as_owner
 
 _HELP = """The accounts of a broker: robots, people and page servers, and what each may do.

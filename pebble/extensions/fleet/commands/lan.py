@@ -14,13 +14,13 @@ from typing import Annotated, Any
 
 import typer
 
-from pebble.commands.options import host_of
 from pebble.errors import PebbleError
 from pebble.extensions.fleet import applying, certificates, folder, pieces
 from pebble.extensions.fleet.broker_files import new_password
 from pebble.extensions.fleet.folder import CONF, Fleet, FleetError, Server
 from pebble.extensions.fleet.roles import Account, ProgramRole
 from pebble.extensions.operator.client.page_packages import require_packages
+from pebble.extensions.operator.commands.options import host_of
 from pebble.extensions.operator.places import mosquitto_path
 from pebble.ownership import read_plain
 from pebble.runtime.as_owner import as_owner, require_own

@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
+from pebble.extensions.checks.new_file import write_new
 from pebble.extensions.operator.client.page_packages import require_packages
 from pebble.extensions.operator.places import Places
-from pebble.runtime.whole_file import write_new
 
 _Answers = Annotated[
     Path | None, typer.Option(help="File with the answers, as JSON; nothing is asked.", metavar="FILE")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 from pebble.errors import PebbleError
-from pebble.runtime.child import Finished, run
+from pebble.extensions.checks.program import Finished, run
 
 INSTALL = "pip install 'pebble-robot[flash]'"
 _LAST_LINES = 12

@@ -1,4 +1,4 @@
-"""What is at this machine: boards, which are listened to and never written to, cameras, and what a robot lacks."""
+"""Devices of this machine: boards, which are only listened to, cameras, and the parts that a robot lacks."""
 
 import re
 import shutil
@@ -13,9 +13,9 @@ import serial
 
 from pebble.check_result import State
 from pebble.extensions.checks.machine import clock, synchronised
+from pebble.extensions.checks.program import run
 from pebble.extensions.fleet.folder import PLAIN_PORT, PORT
 from pebble.extensions.operator.places import Places
-from pebble.runtime.child import run
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import FrameError, decode
 
 DEVICES, SERIAL_PORTS = Path("/dev"), Path("/dev/serial/by-id")

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pebble.errors import PebbleError
+from pebble.extensions.checks.program import run
 from pebble.extensions.operator.places import Places
 from pebble.runtime.as_owner import as_owner
-from pebble.runtime.child import run
 from pebble.runtime.whole_file import is_root, write
 
 ROBOTS = "root:pebble"  # what the robot reads, and only root changes

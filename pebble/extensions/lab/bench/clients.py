@@ -1,4 +1,4 @@
-"""Stock paho clients, of which operators are made: some drive robots, one watches a robot start and stream."""
+"""Operators from stock paho clients: some drive robots, one watches a robot start and stream."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
 from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble import contract
-from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.contract.payloads import Drive
 from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.lab.rig.robot import BASE, MEDIA, Robot, one_robot
+from pebble.extensions.media.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.operator.client.scripted_operator import ScriptedOperator
 from pebble.transports import Message
@@ -87,7 +87,7 @@ class StockClient:
         self.paho.publish(message.topic, message.payload, message.qos, message.retain)
 
     def driver(self, base: str, wait: Callable[[float], object] = time.sleep) -> ScriptedOperator:
-        """Return an operator of a robot of which it knows nothing, as the original page: without control."""
+        """Return an operator that knows nothing of its robot, as the original page: without control."""
         return ScriptedOperator(RobotView(base), self.publish, by="bench", wait=wait)
 
     def request_media(self, base: str, *encodings: str) -> None:

@@ -25,7 +25,7 @@ import numpy as np
 if __package__:
     from pebble.errors import TransportError
     from pebble.extensions.lab.rig import worker_end
-    from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter
+    from pebble.extensions.media.frames import FrameInfo, FrameReader, FrameWriter
 else:  # the system's Python runs plain files
     sys.path.append(str(Path(__file__).parents[1] / "rig"))
     import worker_end  # type: ignore[import-not-found, no-redef]

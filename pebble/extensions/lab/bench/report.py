@@ -17,7 +17,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.lab.bench.results import STAND_IN, Results, Value, check_folder, load, named
 from pebble.extensions.lab.bench.show import RATIOS, compared, middle
 from pebble.extensions.lab.rig.processes import Program, end_all, python
-from pebble.runtime.signals import interrupted_by_signals
+from pebble.extensions.operator.signals import interrupted_by_signals
 
 NAME: Final = "README.md"
 _HEADING = "# Results"  # the first line of every report

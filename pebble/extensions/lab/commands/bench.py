@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
-from pebble.commands.options import Output, Quick, split_names
 from pebble.errors import PebbleError
+from pebble.extensions.operator.commands.options import Output, Quick, split_names
 
 FOLDER, REPORT = Path("bench-results"), Path("build/report")
 _LONGEST_S = 3600.0  # of one phase
@@ -166,7 +166,7 @@ def _run(name: str, quick: bool, output: Path, **options: Any) -> int:
 
     from pebble.extensions.lab.bench.results import check_folder
     from pebble.extensions.lab.bench.show import finish
-    from pebble.runtime.signals import interrupted_by_signals
+    from pebble.extensions.operator.signals import interrupted_by_signals
     from pebble.transports.segments import sweep
 
     comparison = import_module(f"pebble.extensions.lab.bench.{_MODULES.get(name, name)}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from pebble.commands.options import CaCert, PasswordFile
+from pebble.extensions.operator.commands.options import CaCert, PasswordFile
 from pebble.extensions.operator.commands.target import broker_of
 
 if TYPE_CHECKING:

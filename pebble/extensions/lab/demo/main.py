@@ -29,8 +29,8 @@ from pebble.extensions.lab.rig.processes import HOST
 from pebble.extensions.lab.rig.robot import SimulatedRobot
 from pebble.extensions.lab.rig.testbed import ROBOTS, PageServer, Testbed
 from pebble.extensions.operator.client.page_packages import require_packages
+from pebble.extensions.operator.signals import handled_by
 from pebble.extensions.page.setting import DEFAULT_PORT
-from pebble.runtime.signals import handled_by
 
 SHORTEST_S = FIRST_ROUND_S
 _DISCOVERY_S = 30.0  # until all robots can be driven, on the smallest machine

@@ -18,6 +18,7 @@ from pebble.contract.payloads import AutonomyCommand, Drive, EstopCommand
 from pebble.errors import PayloadError
 from pebble.extensions.operator.client.driveable import Driveable, driveable_of
 from pebble.extensions.operator.client.estop_states import RobotEstop
+from pebble.extensions.operator.client.stamps import stamp_of
 from pebble.motion.latch import is_name, stop_of
 from pebble.transports import Message, QoS
 
@@ -160,7 +161,7 @@ class RobotStop:
 
     def _take_retained(self, message: Message) -> None:
         with suppress(PayloadError, ValueError, RecursionError):
-            self.stamp = max(self.stamp, codec.stamp_of(json.loads(message.payload)) or 0.0)
+            self.stamp = max(self.stamp, stamp_of(json.loads(message.payload)) or 0.0)
             if message.topic == self._online_topic:
                 self._is_offline = codec.decode(ONLINE, message.payload).online is False
 

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from pebble.contract import AUTONOMY_COMMAND, CAPABILITIES, CONTROL_STATE, DRIVE, ESTOP_STATE, Channel, codec
-from pebble.contract.identity import LEVEL, is_of_another
+from pebble.contract.identity import LEVEL
 from pebble.contract.payloads import EstopState
 from pebble.errors import PayloadError, TransportError
 from pebble.motion.latch import stop_of
@@ -168,3 +168,13 @@ def _clean(state: EstopState) -> EstopState:
     _, by, why = stop_of({"by": state.by, "why": state.why})
     since = state.since if 0 <= state.since < _LATEST_MS else 0
     return msgspec.structs.replace(state, by=by, why=why, since=since, recent=state.recent[:_NAMES])
+
+
+def is_of_another(topic: str, base: str) -> bool:
+    """True if ``topic`` begins as the topics of another component do.
+
+    Capabilities may name any topic, and whoever publishes them need not be allowed to publish on it: a client that
+    believed them would drive another robot.
+    """
+    levels = topic.split("/", 3)
+    return len(levels) == 4 and "/".join(levels[:3]) != base

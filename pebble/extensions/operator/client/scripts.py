@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
-from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CAPABILITIES, LINK, codec, forms
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CAPABILITIES, LINK, codec
 from pebble.contract.payloads import AutonomyCommand, AutonomyStatus
 from pebble.errors import PayloadError, PebbleError
+from pebble.extensions.operator.client import forms
 from pebble.extensions.operator.client.names import Names
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.transports import Message, QoS, Transport

@@ -39,7 +39,7 @@ from pebble.extensions.operator.client.robot_topics import SYNONYMS
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.operator.commands import show
 from pebble.extensions.operator.commands.target import with_target
-from pebble.runtime.signals import interrupted_by_signals
+from pebble.extensions.operator.signals import interrupted_by_signals
 from pebble.transports import Message, MqttSettings, QoS, State, Transport
 
 _VERBS = ("reset", "status")

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import typer
 
 from pebble.config.visible import shown
-from pebble.contract import codec
 from pebble.contract.identity import parse_topic
 from pebble.contract.payloads import EstopState
 from pebble.extensions.media.rate_meter import RateMeter
 from pebble.extensions.operator.client.discovery import Discovery
 from pebble.extensions.operator.client.estop_states import RobotEstop
 from pebble.extensions.operator.client.names import Names, id_of
+from pebble.extensions.operator.client.stamps import stamp_of
 from pebble.runtime.output import console
 from pebble.runtime.output import discard_output as discard_output
 from pebble.transports import Message
@@ -101,7 +101,7 @@ def headline(message: Message, now: float) -> str:
         parts.append("retained")
     elif message.retain_requested:
         parts.append("to be retained")
-    stamp = codec.stamp_of(parsed(message.payload))
+    stamp = stamp_of(parsed(message.payload))
     if stamp is not None:
         parts.append(f"stamped {age(now - stamp)}")
     return "  ".join(parts)
@@ -242,7 +242,7 @@ def _age(record: TopicRecord, last: Message, now: float, wall: float) -> str:
     """Since arrival for a live message; by the payload's stamp for a retained one."""
     if not last.retain:
         return duration(now - record.arrived)
-    stamp = codec.stamp_of(parsed(last.payload))
+    stamp = stamp_of(parsed(last.payload))
     return "?" if stamp is None else duration(max(0.0, wall - stamp))
 
 

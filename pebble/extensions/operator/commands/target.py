@@ -8,7 +8,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, RobotOption, UrlOption
+from pebble.extensions.operator.commands.options import (
+    CaCert,
+    ConfigOption,
+    PasswordFile,
+    RemoteOption,
+    RobotOption,
+    UrlOption,
+)
 
 if TYPE_CHECKING:
     from pebble.transports import MqttSettings

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pebble.commands.options import BrokerUrl, CaCert, PasswordFile
 from pebble.config import load
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.connection import Target, connected, put_names
-from pebble.runtime.signals import interrupted_by_signals
+from pebble.extensions.operator.commands.options import BrokerUrl, CaCert, PasswordFile
+from pebble.extensions.operator.signals import interrupted_by_signals
 
 if TYPE_CHECKING:
-    from pebble.cameras import Picture
+    from pebble.extensions.media.cameras import Picture
 
 _CAPABILITIES_TIMEOUT_S = 5.0  # for the robot's retained capabilities to arrive
 _FIRST_PICTURE_S = 15.0  # a camera that is off takes a moment to open
@@ -50,7 +50,7 @@ def watch(
     target = _target(robot, url, password_file, ca_cert)
     with interrupted_by_signals():  # else the camera would continue without a viewer
         if target.config is not None and not target.remote:
-            from pebble.cameras import camera  # its shared memory is of Linux only
+            from pebble.extensions.media.cameras import camera  # its shared memory is of Linux only
 
             typer.echo(f"pebble: {robot} names no remote broker: this machine's camera", err=True)
             with camera(target.config, timeout=_FIRST_PICTURE_S) as pictures:

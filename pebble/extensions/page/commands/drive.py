@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from pebble.commands.options import RobotArgument
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.assumed import RISK
 from pebble.extensions.operator.client.broker import problem_of
@@ -15,6 +14,7 @@ from pebble.extensions.operator.client.connection import Target, connected, put_
 from pebble.extensions.operator.client.terminal.key_decoder import END
 from pebble.extensions.operator.client.terminal.keys import Terminal, has_terminal, opened
 from pebble.extensions.operator.commands.estop import me
+from pebble.extensions.operator.commands.options import RobotArgument
 from pebble.extensions.operator.commands.target import with_target
 from pebble.extensions.page.commands.terminal_driver import PERIOD_S, TerminalDriver
 from pebble.transports import Message, QoS, Transport

@@ -13,7 +13,6 @@ import msgspec
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from pebble.commands.options import BrokerUrl, CaCert, PasswordFile, host_of
 from pebble.config import load
 from pebble.config.hosts import is_loopback, name_of_page
 from pebble.contract.names import NAME
@@ -21,6 +20,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.fleet.certificates import CA_CERT, SERVER_CERT, SERVER_KEY, own_names
 from pebble.extensions.fleet.people import has_user
 from pebble.extensions.operator.client.page_packages import require_packages
+from pebble.extensions.operator.commands.options import BrokerUrl, CaCert, PasswordFile, host_of
 from pebble.extensions.operator.commands.target import broker_of
 from pebble.extensions.page.commands.people import PEOPLE, TLS, PeopleOption, default_folder, register_people
 from pebble.extensions.page.config import WebInterface, WebTls

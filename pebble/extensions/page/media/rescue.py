@@ -11,7 +11,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from pebble.runtime import pyav
+from pebble.extensions.media import pyav
 
 if TYPE_CHECKING:
     from pebble.extensions.media.decode import Decoded, VideoDecoder

@@ -11,9 +11,9 @@ import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from pebble.contract import AUDIO, AUDIO_STREAM
-from pebble.contract.packets import Codec, Sound
 from pebble.errors import PayloadError
 from pebble.extensions.fleet.roles import Session, page_rights
+from pebble.extensions.media.packets import Codec, Sound
 from pebble.extensions.operator.client.broker import Broker
 from pebble.extensions.operator.client.media_request.offer import BEST_FIRST, best, offered, refusal
 from pebble.extensions.page.media.stream import MediaStream, Streams

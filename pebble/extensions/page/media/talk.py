@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from pebble.contract.packets import SEQUENCE_LIMIT, Codec, Sound
+from pebble.extensions.media.packets import SEQUENCE_LIMIT, Codec, Sound
 
 RATE: Final = 16_000  # Hz, mono, s16le
 PIECES_PER_S: Final = 50

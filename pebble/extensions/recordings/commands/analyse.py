@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from pebble.commands.options import Output
+from pebble.extensions.operator.commands.options import Output
 from pebble.extensions.recordings.commands.options import RecordingsArgument, Since, Until, period
 from pebble.extensions.recordings.commands.report import errors_of_files
 from pebble.runtime.as_owner import as_owner

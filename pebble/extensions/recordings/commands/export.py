@@ -30,7 +30,7 @@ from pebble.extensions.recordings.library import Damages, files, merged, problem
 
 
 class Form(StrEnum):
-    """What recordings can be exported to."""
+    """The forms of exports."""
 
     LINES = "lines"
     FOXGLOVE = "foxglove"

@@ -15,13 +15,13 @@ from pebble.errors import PebbleError
 from pebble.extensions.operator.client.connection import Target, resolve
 from pebble.extensions.operator.commands import show
 from pebble.extensions.operator.commands.target import with_target
+from pebble.extensions.operator.signals import interrupted_by_signals
 from pebble.extensions.recordings.recorder import metrics
 from pebble.extensions.recordings.recorder.recorder import Recorder
 from pebble.extensions.recordings.recorder.settings import EVERYTHING, Options
 from pebble.extensions.recordings.recorder.source import Source
 from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.runtime.as_owner import as_owner
-from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.topics import check_filter
 
 _TURN_S = 0.25

@@ -14,13 +14,14 @@ from typing import Annotated
 
 import typer
 
-from pebble.commands.options import CaCert, PasswordFile
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.connection import password
 from pebble.extensions.operator.client.terminal.key_decoder import END, LEFT, RIGHT, SPACE
 from pebble.extensions.operator.client.terminal.keys import Terminal, has_terminal, opened
 from pebble.extensions.operator.client.url import settings_of
+from pebble.extensions.operator.commands.options import CaCert, PasswordFile
+from pebble.extensions.operator.signals import handled_by
 from pebble.extensions.recordings.catalogue import check_name, look_at
 from pebble.extensions.recordings.commands.options import Since, Until, period
 from pebble.extensions.recordings.commands.report import report_unread
@@ -30,7 +31,6 @@ from pebble.extensions.recordings.replay.player import BusOutput, Player
 from pebble.extensions.recordings.replay.robots import Make, ReplayedRobots
 from pebble.extensions.recordings.replay.rules import SYSTEM, Options, Rules
 from pebble.extensions.recordings.replay.source import ReplaySource
-from pebble.runtime.signals import handled_by
 from pebble.transports import Message, Transport, create
 from pebble.transports.topics import matches
 

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from pebble.contract import OUTGOING
-from pebble.contract.packets import PBAT
+from pebble.extensions.media import pyav
+from pebble.extensions.media.packets import PBAT
 from pebble.extensions.recordings.exports.film_sound import RATE, SoundResult, SoundTrack
 from pebble.extensions.recordings.exports.lines import Progress
 from pebble.extensions.recordings.exports.unfinished import unfinished
 from pebble.extensions.recordings.files.recorded import Recorded, RecordingError
 from pebble.extensions.recordings.stamps import is_picture
-from pebble.runtime import pyav
 
 #: By the ending of the film: FFmpeg's names of the container and of the encoder of its sound.
 _FORMATS: Final = {".mkv": ("matroska", "libopus"), ".mp4": ("mp4", "aac")}
@@ -31,7 +31,7 @@ _BITRATE: Final = 64_000  # bits per second of each channel
 
 @dataclass(frozen=True, slots=True)
 class FilmResult:
-    """What a film is made of."""
+    """The contents of a film."""
 
     seconds: float
     pictures: int

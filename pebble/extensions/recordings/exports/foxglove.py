@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from pebble.contract.packets import PBAT
+from pebble.extensions.media.packets import PBAT
 from pebble.extensions.recordings.exports.foxglove_messages import (
     Converted,
     Media,

@@ -16,9 +16,9 @@ import msgspec
 from pebble import contract as c
 from pebble.contract import codec
 from pebble.contract.channels import channel_of
-from pebble.contract.packets import PBAT, PBVD, Picture, PictureKind
 from pebble.contract.payloads import Corners, LogRecord, TagData, TagLocations, VideoOverlays
 from pebble.errors import PayloadError, PebbleError
+from pebble.extensions.media.packets import PBAT, PBVD, Picture, PictureKind
 from pebble.extensions.recordings.stamps import CLOCK_FROM_NS, stamp_ns
 
 if TYPE_CHECKING:

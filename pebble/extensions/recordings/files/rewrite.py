@@ -23,7 +23,7 @@ Keeps = Callable[[Recorded], bool]
 
 @dataclass(frozen=True, slots=True)
 class Rewritten:
-    """What a copy holds."""
+    """The contents of a copy."""
 
     messages: int
     left_out: int

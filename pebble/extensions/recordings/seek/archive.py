@@ -29,7 +29,7 @@ _NAME: Final = re.compile(r"(?P<stamp>\d{8}T\d{6}Z)-\d{6,}\.(?P<lane>.+?)\.mcap(
 
 
 class _Named(NamedTuple):
-    """What a file's name says about it; of other programs' files nothing."""
+    """The facts in a file's name; files of other programs have none."""
 
     path: Path
     lane: str  # "": any
@@ -116,7 +116,7 @@ class Archive:
         return []
 
     def next_ns(self, robot: str, at_ns: int) -> int | None:
-        """When the robot's next message from ``at_ns`` on was received; None if there is none."""
+        """Return the time of the robot's next message from ``at_ns`` on; None if there is none."""
         found: int | None = None
         for file in sorted(self.files(robot, at_ns, 1 << 63), key=lambda one: one.first_ns):
             if found is not None and file.first_ns >= found:

@@ -17,7 +17,7 @@ from msgspec import Struct
 
 from pebble.contract.channels import HEARTBEAT, ONLINE
 from pebble.contract.identity import parse_topic
-from pebble.contract.packets import PBAT
+from pebble.extensions.media.packets import PBAT
 from pebble.extensions.recordings.files.reader import RecordingFile
 from pebble.extensions.recordings.files.recorded import SUFFIX, Channel, Recorded
 from pebble.extensions.recordings.recorder.intake import EVENTS
@@ -78,7 +78,7 @@ _COPY: Final = """
 
 
 class About(Struct):
-    """What an index says of its recording."""
+    """The facts of an index about its recording."""
 
     recording: str  # its name
     size: int  # of the file, when it was indexed

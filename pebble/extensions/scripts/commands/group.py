@@ -8,14 +8,14 @@ from typing import Annotated
 
 import typer
 
-from pebble.commands.options import RobotArgument
 from pebble.config.visible import shown
-from pebble.contract import forms
 from pebble.contract.payloads import AutonomyStatus
 from pebble.errors import PebbleError, TransportError
+from pebble.extensions.operator.client import forms
 from pebble.extensions.operator.client.connection import Target, connected, put_names, target_of, wait_for
 from pebble.extensions.operator.client.names import id_of
 from pebble.extensions.operator.client.scripts import RobotScripts, options_of
+from pebble.extensions.operator.commands.options import RobotArgument
 from pebble.extensions.operator.commands.target import with_target
 from pebble.transports import Transport
 

@@ -12,7 +12,7 @@ import msgspec
 from msgspec import NODEFAULT, inspect
 from msgspec.structs import replace
 
-from pebble.contract.forms import Setting, SettingError, Value, accepted
+from pebble.extensions.operator.client.forms import Setting, SettingError, Value, accepted
 
 Options = TypeVar("Options", bound=msgspec.Struct)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from weakref import WeakSet
 
 if TYPE_CHECKING:
-    from pebble.cameras import Camera, Picture
+    from pebble.extensions.media.cameras import Camera, Picture
 
 
 class Pictures:
@@ -50,7 +50,7 @@ class Pictures:
             view.close()
 
     def _open(self, **options: Any) -> Camera:
-        from pebble.cameras import camera
+        from pebble.extensions.media.cameras import camera
 
         view = camera(self._run_dir, **options)
         with self._changing:

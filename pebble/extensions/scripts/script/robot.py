@@ -36,7 +36,7 @@ from pebble.transports.counters import Counters
 from pebble.transports.topics import matches
 
 if TYPE_CHECKING:
-    from pebble.cameras import Picture
+    from pebble.extensions.media.cameras import Picture
 
 #: What no script publishes, and why.
 _REFUSED = {

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 
 from pebble.config import parse
-from pebble.contract.packets import Sound
+from pebble.extensions.media.frames import FrameInfo
+from pebble.extensions.media.packets import Sound
 from pebble.services.audio_publisher import service
 from pebble.services.audio_publisher.service import AudioPublisher
 from pebble.transports import Message, State, Transport
 from pebble.transports.base import Outgoing, Subscription
-from pebble.transports.frames import FrameInfo
 from pebble.transports.memory import MemoryHub, MemoryTransport
 
 CHUNK_S = 0.02

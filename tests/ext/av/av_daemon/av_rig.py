@@ -10,11 +10,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from pebble.extensions.media.frames import FrameInfo
 from pebble.extensions.media.speech import Speech
 from pebble.services.av_daemon.config import AvDaemon
 from pebble.services.av_daemon.source import Source
 from pebble.transports.counters import Counters
-from pebble.transports.frames import FrameInfo
 
 
 def options(*, video: dict[str, Any] | None = None, audio: dict[str, Any] | None = None, **more: Any) -> AvDaemon:

@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 from pebble.errors import DeviceError
+from pebble.extensions.media.frames import FrameInfo
+from pebble.extensions.media.frames.frame import picture
 from pebble.extensions.media.scene import Scene, read_counter
 from pebble.extensions.media.speech import Speech
 from pebble.services.av_daemon import alsa, capture_program, sources
@@ -25,8 +27,6 @@ from pebble.services.av_daemon.source import Capture, Source
 from pebble.services.av_daemon.sources import Rotated
 from pebble.services.av_daemon.synthetic import Pacer, SyntheticCamera, SyntheticMicrophone
 from pebble.services.av_daemon.v4l2 import V4l2Camera
-from pebble.transports.frames import FrameInfo
-from pebble.transports.frames.frame import picture
 from tests.ext.av.av_daemon.av_rig import grabbed, is_speech, options
 from tests.fakes.installed import Installed
 from tests.support import until

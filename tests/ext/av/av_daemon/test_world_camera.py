@@ -14,11 +14,11 @@ from pebble.errors import DeviceError, NotRunningError
 from pebble.extensions.lab.simulation.world.pose_page import PosePage, page_path
 from pebble.extensions.lab.simulation.world.poses import RobotPose
 from pebble.extensions.lab.simulation.world.world_file import read_world
+from pebble.extensions.media.frames.frame import picture
 from pebble.services.av_daemon import sources
 from pebble.services.av_daemon.config import CameraCapture
 from pebble.services.av_daemon.health import Health
 from pebble.services.av_daemon.synthetic import WorldCamera
-from pebble.transports.frames.frame import picture
 from tests.ext.av.av_daemon.av_rig import grabbed, options
 from tests.ext.lab.simulation.world.worlds import CLEAR, projected, tags_in
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from pebble.extensions.media.decode import VideoDecoder
+from pebble.extensions.media.frames import FrameInfo
 from pebble.extensions.media.scene import Scene, read_counter
 from pebble.transports import Message
-from pebble.transports.frames import FrameInfo
 from tests.ext.av.media_rig import Device, MediaProgram, Operator
 
 

@@ -17,6 +17,7 @@ import pytest
 from pebble.config import parse
 from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.media.decode import VideoDecoder
+from pebble.extensions.media.frames import Frame, FrameInfo
 from pebble.extensions.media.video import make_encoder
 from pebble.services.camera_publisher import service as module
 from pebble.services.camera_publisher.frame_selector import KeyframeRequests
@@ -26,7 +27,6 @@ from pebble.services.camera_publisher.shape import Shape
 from pebble.transports import Message, QoS
 from pebble.transports.base import Outgoing
 from pebble.transports.counters import Counters
-from pebble.transports.frames import Frame, FrameInfo
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.kit.robot import BASE, ROBOT, Listener, Running
 from tests.support import until

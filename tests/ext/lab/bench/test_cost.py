@@ -2,11 +2,11 @@
 
 import pytest
 
-from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.lab.bench.clients import encoding_of
 from pebble.extensions.lab.bench.cost import ALL, CPU, IDLE, MEMORY, THREADS, cells_of
 from pebble.extensions.lab.bench.results import Results
 from pebble.extensions.lab.bench.rounds import add_round
+from pebble.extensions.media.packets import Codec, Picture, PictureKind, Sound
 
 
 def measured(*scales: float) -> Results:

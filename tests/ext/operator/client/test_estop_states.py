@@ -7,6 +7,7 @@ import json
 import pytest
 
 from pebble.extensions.operator.client.estop_states import MAX_OWNERS, Reset, RobotEstop
+from pebble.extensions.operator.client.robot_estop import is_of_another
 from pebble.transports import Message
 from tests.ext.operator.client.estop_robot import Robot, capabilities, outgoing
 
@@ -138,3 +139,17 @@ def test_only_stopped_owners_are_reset() -> None:
     assert latch.reset(latch.boot, latch.count, age=0, now=0)
     publish(estop, [robot.owners[0].state()])
     assert list(Reset(estop, "").shown) == ["right"]
+
+
+@pytest.mark.parametrize(
+    ("topic", "another"),
+    [
+        ("pebble/robots/goob/incoming/drive-values", False),
+        ("pebble/robots/goob/drive", False),
+        ("goob/drive", False),
+        ("pebble/robots/fred/incoming/drive-values", True),
+        ("pebble/robots/goob2/drive", True),
+    ],
+)
+def test_topics_of_another_robot_are_told_by_their_base(topic: str, another: bool) -> None:
+    assert is_of_another(topic, "pebble/robots/goob") is another

@@ -16,8 +16,8 @@ from typing import Any, ClassVar, cast
 import numpy as np
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from pebble.contract.packets import Sound
 from pebble.extensions.fleet.roles import Role, Session
+from pebble.extensions.media.packets import Sound
 from pebble.extensions.media.scene import Scene
 from pebble.extensions.media.sound import make_sound_encoder
 from pebble.extensions.media.speech import Speech

@@ -10,8 +10,8 @@ from itertools import pairwise
 import pytest
 
 from pebble.contract import LINK, codec
-from pebble.contract.packets import Codec, Sound
 from pebble.contract.payloads import LinkState
+from pebble.extensions.media.packets import Codec, Sound
 from pebble.extensions.page.media.sound import MAX_PACKETS, WINDOW, SoundQueue
 from pebble.extensions.page.media.talk import LATE_S, PIECE_BYTES, PIECES_PER_S, SILENT_S, Talk, Voice
 from pebble.transports import Message

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from pebble.contract.forms import Setting
+from pebble.extensions.operator.client.forms import Setting
 from tests.ext.page.in_node import Rows, Script, evaluate, rows
 
 _STORED = """

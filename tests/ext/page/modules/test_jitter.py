@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pebble.contract.packets import Codec, Sound
 from pebble.errors import PayloadError
 from pebble.extensions.media.jitter import JitterBuffer
+from pebble.extensions.media.packets import Codec, Sound
 from pebble.extensions.media.pcm import Resampler
 from pebble.extensions.media.sound import make_sound_encoder, unpack
 from pebble.extensions.media.speech import Speech

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Route
 
-from pebble.contract.packets import Picture, PictureKind
 from pebble.extensions.media.decode import VideoDecoder
+from pebble.extensions.media.packets import Picture, PictureKind
 from pebble.extensions.media.picture_header import read_header
 from pebble.extensions.media.scene import Scene, noise, read_counter
 from pebble.extensions.media.video import make_encoder

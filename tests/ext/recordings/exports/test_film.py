@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pebble.contract.packets import Picture
 from pebble.extensions.media.h264 import seal
+from pebble.extensions.media.packets import Picture
 from pebble.extensions.media.pcm import to_bytes
 from pebble.extensions.media.scene import Scene, read_counter
 from pebble.extensions.media.sound import make_sound_encoder

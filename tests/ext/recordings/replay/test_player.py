@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.contract.packets import KEY_FRAME, Picture, PictureKind
+from pebble.extensions.media.packets import KEY_FRAME, Picture, PictureKind
 from pebble.extensions.recordings.replay.rules import Options, zero
 from pebble.extensions.recordings.replay.source import ReplaySource
 from pebble.extensions.recordings.stamps import stamp_ns

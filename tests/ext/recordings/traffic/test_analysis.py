@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.errors import PebbleError
+from pebble.extensions.media.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.recordings.files.recorded import Recorded
 from pebble.extensions.recordings.library import merged
 from pebble.extensions.recordings.traffic.analysis import analyse

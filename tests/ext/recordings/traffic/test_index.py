@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.contract.packets import Codec, Sound
+from pebble.extensions.media.packets import Codec, Sound
 from pebble.extensions.recordings.traffic.activity import Activity
 from pebble.extensions.recordings.traffic.index import COLUMNS, PICTURE, SOUND, index_path, write_index
 from pebble.extensions.recordings.traffic.sources import sources

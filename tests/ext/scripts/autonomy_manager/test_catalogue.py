@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from pebble.config import Config, parse
-from pebble.contract.forms import Setting, form
+from pebble.extensions.operator.client.forms import Setting, form
 from pebble.services.autonomy_manager import interpreter as interpreter_module
 from pebble.services.autonomy_manager.catalogue import MAX_SCRIPTS, Catalogue, files, roots
 from pebble.services.autonomy_manager.environment import environment

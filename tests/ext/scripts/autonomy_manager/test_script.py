@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from msgspec import structs
 
-from pebble.contract.forms import Setting
+from pebble.extensions.operator.client.forms import Setting
 from pebble.services.autonomy_manager.script import Dependency, Script, StartError, plan
 
 

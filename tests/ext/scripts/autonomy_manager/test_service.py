@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from pebble.contract.forms import Setting
+from pebble.extensions.operator.client.forms import Setting
 from pebble.extensions.scripts.runs import SUPERSEDED
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN
 from pebble.services.autonomy_manager.script import Dependency, Script

@@ -27,7 +27,7 @@ def test_the_camera_does_not_bring_scripts() -> None:
 def test_scripts_bring_a_transport_or_pictures_only_when_they_use_them() -> None:
     loaded = modules_after("from pebble import Robot, run, Stopped, Channel, Kind")
     assert "pebble.extensions.scripts.script.program" in loaded
-    assert loaded.isdisjoint({"zenoh", "paho", "numpy", "cv2", "pebble.cameras"})
+    assert loaded.isdisjoint({"zenoh", "paho", "numpy", "cv2", "pebble.extensions.media.cameras"})
 
 
 def test_what_is_not_there_is_named() -> None:

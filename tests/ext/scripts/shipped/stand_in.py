@@ -11,8 +11,8 @@ from typing import Any
 
 from pebble.contract import MOTOR_POWER, TOUCH_SENSORS, Channel, codec
 from pebble.contract.payloads import MotorPower, TouchSensors, TouchValues
+from pebble.extensions.media.frames import FrameInfo, FrameWriter
 from pebble.transports import Message, QoS
-from pebble.transports.frames import FrameInfo, FrameWriter
 from tests.ext.scripts.perception.test_tags import SIZE, picture
 from tests.ext.scripts.script.station import Station
 from tests.support import ROOT

@@ -84,7 +84,7 @@ class NamespaceNetwork(Worker):
 
 
 class _Side:
-    """One of the namespaces, configured with the system's tools."""
+    """A namespace, configured with the system's tools."""
 
     def __init__(self, path: str, address: str) -> None:
         self._path, self._address = path, address

@@ -14,7 +14,7 @@ from typing import Any
 
 from pebble.config.visible import shown
 from pebble.extensions.operator.client.terminal.key_decoder import END, KeyDecoder
-from pebble.runtime.signals import handled_by
+from pebble.extensions.operator.signals import handled_by
 
 _READ = 4096
 _SHOW_PERIOD_S = 0.1

@@ -6,7 +6,7 @@ import { plain } from "../parts/more-words.js";
 const MOST_MAIN = 3; // settings of a script before the others
 
 /**
- * One setting, as pebble/contract/forms.py lists it. ``default`` is null where there is none.
+ * One setting, as pebble/extensions/operator/client/forms.py lists it. ``default`` is null where there is none.
  * @typedef {{key: string, label: string, type: "string" | "int" | "float" | "bool" | "enum",
  *   default: string | number | boolean | null, required?: boolean, min?: number, max?: number, step?: number,
  *   options?: string[]}} Field

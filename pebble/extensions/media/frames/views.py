@@ -19,7 +19,7 @@ import zenoh.shm
 
 log = logging.getLogger(__name__)
 
-#: Versions of eclipse-zenoh whose buffers this module was tested with: tests/transports/frames/test_views.py.
+#: Versions of eclipse-zenoh whose buffers this module was tested with: tests/ext/media/frames/test_views.py.
 KNOWN_VERSIONS = frozenset({"1.10.2"})
 
 _TEST_SIZES = (1, 100, 4096, 50_000)  # bytes

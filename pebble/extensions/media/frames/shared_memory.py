@@ -15,7 +15,7 @@ import zenoh
 import zenoh.shm
 
 from pebble.errors import TransportError
-from pebble.transports.frames import views
+from pebble.extensions.media.frames import views
 
 Bytes = np.ndarray[Any, np.dtype[np.uint8]]
 

@@ -14,7 +14,7 @@ import zenoh
 import zenoh.shm
 
 from pebble.errors import TransportError
-from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter, views
+from pebble.extensions.media.frames import FrameInfo, FrameReader, FrameWriter, views
 from tests.locking import needs_shared_memory
 from tests.support import ROOT, Child, until
 
@@ -156,7 +156,7 @@ def test_slots_that_are_dropped_or_forgotten_are_free_again(tmp_path: Path) -> N
 
 
 HOLDER = """
-import sys; from pathlib import Path; from pebble.transports.frames import *
+import sys; from pathlib import Path; from pebble.extensions.media.frames import *
 with FrameReader(Path(sys.argv[1]), "camera", views=True) as reader:
     frame = reader.read(10); data = frame.data
     print(frame.valid(), set(data.tolist()), flush=True); sys.stdin.readline()

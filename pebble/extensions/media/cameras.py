@@ -16,7 +16,7 @@ from pebble.config import default_run_folder, load
 from pebble.config.tree import Robot
 from pebble.contract.identity import Identity
 from pebble.errors import ConfigError, DeviceError, PayloadError, PebbleError
-from pebble.transports.frames import Frame, FrameReader
+from pebble.extensions.media.frames import Frame, FrameReader
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ class Camera:
 
     @property
     def counters(self) -> dict[str, int]:
-        """How many frames were read, skipped and lost so far: see `FrameReader`."""
+        """The numbers of frames that were read, skipped and lost so far: see `FrameReader`."""
         return self._reader.counters.snapshot()
 
     def __iter__(self) -> Self:

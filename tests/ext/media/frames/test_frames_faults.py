@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.transports.frames.frames_faults import Faults
-from tests.transports.frames.frames_net import FramesNet
+from tests.ext.media.frames.frames_faults import Faults
+from tests.ext.media.frames.frames_net import FramesNet
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def net(tmp_path: Path) -> Iterator[FramesNet]:
 
 @pytest.mark.thorough
 def test_the_others_get_what_is_written_and_nothing_is_left(net: FramesNet) -> None:
-    """A short form of `python -m tests.transports.frames.frames_faults 50`."""
+    """A short form of `python -m tests.ext.media.frames.frames_faults 50`."""
     figures = Faults(net, seed=3).run(6)
     assert figures.wrong == 0
     assert min(figures.shares) >= 0.95, figures

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pebble.errors import PayloadError
-from pebble.transports.frames import Frame
-from pebble.transports.frames.frame import PICTURE_FORMATS, FrameInfo, picture
+from pebble.extensions.media.frames import Frame
+from pebble.extensions.media.frames.frame import PICTURE_FORMATS, FrameInfo, picture
 
 WIDTH, HEIGHT = 64, 48
 

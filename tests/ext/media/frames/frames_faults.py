@@ -1,4 +1,4 @@
-"""Kills and stops readers and the writer in a random order: `python -m tests.transports.frames.frames_faults 50`."""
+"""Kills and stops readers and the writer in a random order: `python -m tests.ext.media.frames.frames_faults 50`."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from typing import Any
 import msgspec
 
 from pebble.transports import segments
+from tests.ext.media.frames.frames_net import FramesNet, Peer
 from tests.support import Child, until
-from tests.transports.frames.frames_net import FramesNet, Peer
 
 VGA = 640 * 480 * 3
 RATE = 30.0  # Hz

@@ -15,12 +15,12 @@ import numpy as np
 import zenoh
 
 from pebble.errors import TransportError
+from pebble.extensions.media.frames import shared_memory, views
+from pebble.extensions.media.frames.frame import FrameInfo, encode
+from pebble.extensions.media.frames.session import METADATA, SharingError, StreamNames, open_writing
+from pebble.extensions.media.frames.shared_memory import MARGIN, Chunk, SharedPool
 from pebble.transports import segments
 from pebble.transports.counters import Counters
-from pebble.transports.frames import shared_memory, views
-from pebble.transports.frames.frame import FrameInfo, encode
-from pebble.transports.frames.session import METADATA, SharingError, StreamNames, open_writing
-from pebble.transports.frames.shared_memory import MARGIN, Chunk, SharedPool
 from pebble.transports.peers import FileLock, prepare_run_dir
 from pebble.transports.zenoh.session import check_process, close_at_exit, close_session
 
@@ -181,7 +181,7 @@ class FrameWriter:
 
     @property
     def readers(self) -> int:
-        """How many readers there are. A stopped one counts until its connection is closed, two seconds later."""
+        """The number of readers. A stopped one counts until its connection is closed, two seconds later."""
         return len(self._readers)
 
     def _on_reader(self, sample: zenoh.Sample) -> None:

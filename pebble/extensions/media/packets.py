@@ -22,14 +22,14 @@ _PICTURE = struct.Struct(">4sBBBIQ")  # 19 bytes
 
 
 class Codec(IntEnum):
-    """What the body of a PBAT packet is."""
+    """The encoding of the body of a PBAT packet."""
 
     PCM16LE = 1  # interleaved samples
     OPUS = 2  # one or more Opus packets; see pebble.extensions.media.opus
 
 
 class PictureKind(IntEnum):
-    """What the body of a PBVD packet is. Old decoders ignore flags, so every new meaning is a new kind."""
+    """The kind of the body of a PBVD packet. Old decoders ignore flags, so every new meaning is a new kind."""
 
     JPEG = 1  # a full picture
     DELTA_JPEG = 2  # reference + (decoded - 128)

@@ -13,9 +13,9 @@ from typing import Any
 import msgspec
 
 from pebble.transports.segments import SHM
+from tests.ext.media.frames.frames_peer import Options
 from tests.support import until
 from tests.transports.forked import Forked
-from tests.transports.frames.frames_peer import Options
 
 
 class Peer:
@@ -23,7 +23,7 @@ class Peer:
 
     def __init__(self, role: str, folder: Path, options: Options) -> None:
         arguments = (role, str(folder), msgspec.json.encode(options).decode())
-        self._process = Forked("tests.transports.frames.frames_peer", *arguments)
+        self._process = Forked("tests.ext.media.frames.frames_peer", *arguments)
         assert self._line() == "up"
 
     def ask(self) -> dict[str, Any]:

@@ -18,15 +18,15 @@ import numpy as np
 import pytest
 
 from pebble.errors import TransportError
+from pebble.extensions.media.frames import FrameInfo, FrameReader, FrameWriter
+from pebble.extensions.media.frames import reader as frame_reader
+from pebble.extensions.media.frames.frame import encode
+from pebble.extensions.media.frames.session import METADATA, StreamNames, open_writing
 from pebble.transports import segments
-from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter
-from pebble.transports.frames import reader as frame_reader
-from pebble.transports.frames.frame import encode
-from pebble.transports.frames.session import METADATA, StreamNames, open_writing
 from pebble.transports.peers import prepare_run_dir
+from tests.ext.media.frames.frames_net import FramesNet
 from tests.locking import needs_shared_memory
 from tests.support import THOROUGH, needs_root, some, until
-from tests.transports.frames.frames_net import FramesNet
 
 SMALL = 160 * 120 * 3  # to be shared all the same
 VGA = 640 * 480 * 3 if THOROUGH else SMALL
@@ -161,7 +161,7 @@ def test_a_reader_without_shared_memory_gets_bytes_and_reports_it(unprivileged_n
 
 def test_a_process_that_ends_with_an_open_writer_or_reader_ends(tmp_path: Path) -> None:
     program = (
-        "import sys; from pathlib import Path; from pebble.transports.frames import *\n"
+        "import sys; from pathlib import Path; from pebble.extensions.media.frames import *\n"
         "folder = Path(sys.argv[1]); w = FrameWriter(folder, 'camera', capacity=1 << 20).open()\n"
         "r = FrameReader(folder, 'camera').open(); r.read(0.2); raise SystemExit(3)"
     )
@@ -171,7 +171,7 @@ def test_a_process_that_ends_with_an_open_writer_or_reader_ends(tmp_path: Path) 
 def test_a_fork_of_a_writer_or_reader_may_not_use_it(tmp_path: Path) -> None:
     program = (
         "import os, sys; from pathlib import Path; from pebble.errors import TransportError\n"
-        "from pebble.transports.frames import *\n"
+        "from pebble.extensions.media.frames import *\n"
         "folder = Path(sys.argv[1]); w = FrameWriter(folder, 'camera', capacity=1 << 20).open()\n"
         "r = FrameReader(folder, 'camera').open()\n"
         "if os.fork():\n"
@@ -226,8 +226,8 @@ def test_a_writer_knows_when_its_memory_was_removed(tmp_path: Path) -> None:
 def test_frames_are_shared_once_there_is_room(tmp_path: Path, at_first: str, then: str) -> None:
     """The writer is opened again for it, as av_daemon is; a reader that had no room either finds it by itself."""
     program = (
-        "import subprocess, sys, time; from pathlib import Path; from pebble.transports.frames import *\n"
-        "from pebble.transports.frames import writer; writer.RETRY_S = 0\n"
+        "import subprocess, sys, time; from pathlib import Path; from pebble.extensions.media.frames import *\n"
+        "from pebble.extensions.media.frames import writer; writer.RETRY_S = 0\n"
         "folder = Path(sys.argv[1]); w = FrameWriter(folder, 'camera', capacity=900_000).open()\n"
         "with FrameReader(folder, 'camera') as r:\n"
         "    before = w.may_share, r.shared\n"
@@ -332,7 +332,7 @@ def test_anything_with_bytes_can_be_written(tmp_path: Path) -> None:
 def test_a_reader_may_choose_bytes_and_then_maps_nothing(tmp_path: Path) -> None:
     program = (
         "import sys; from pathlib import Path; from pebble.transports import segments\n"
-        "from pebble.transports.frames import *\n"
+        "from pebble.extensions.media.frames import *\n"
         "with FrameReader(Path(sys.argv[1]), 'camera', sharing=False) as reader:\n"
         "    frame = reader.read(10)\n"
         "    print(frame.data.tobytes() == bytes([7]) * 60_000, frame.shared, reader.shared, repr(reader.problem))\n"

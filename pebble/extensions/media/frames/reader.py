@@ -15,11 +15,11 @@ import numpy as np
 import zenoh
 
 from pebble.errors import TransportError
+from pebble.extensions.media.frames import shared_memory, views
+from pebble.extensions.media.frames.frame import Frame, FrameInfo, decode
+from pebble.extensions.media.frames.session import METADATA, SharingError, StreamNames, open_reading
 from pebble.transports import segments
 from pebble.transports.counters import Counters
-from pebble.transports.frames import shared_memory, views
-from pebble.transports.frames.frame import Frame, FrameInfo, decode
-from pebble.transports.frames.session import METADATA, SharingError, StreamNames, open_reading
 from pebble.transports.peers import prepare_run_dir
 from pebble.transports.wakeup import Wakeup
 from pebble.transports.zenoh.callbacks import direct
@@ -136,7 +136,7 @@ class FrameReader:
 
     @property
     def writers(self) -> int:
-        """How many writers the stream has now: 0 or 1, and 2 for a moment when one replaces another."""
+        """The number of writers of the stream now: 0 or 1, and 2 for a moment when one replaces another."""
         return len(self.running)
 
     def read(self, timeout: float | None = None) -> Frame | None:

@@ -1,19 +1,15 @@
-"""Arguments and options that several commands share."""
+"""Arguments and options that several commands of extensions share."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from pebble.errors import PebbleError
 
-if TYPE_CHECKING:
-    pass
-
-ConfigArgument = Annotated[Path, typer.Argument(help="A robot's config file.", metavar="CONFIG", show_default=False)]
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", "-c", help="A robot's config file: use its own transport.", metavar="CONFIG")
 ]

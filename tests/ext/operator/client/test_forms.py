@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pebble.contract.forms import MAX_TEXT, Setting, SettingError, arguments, effective, form
+from pebble.extensions.operator.client.forms import MAX_TEXT, Setting, SettingError, arguments, effective, form
 
 SPEED = Setting(key="speed", type="float", default=0.5, arg="--speed", min=0.05, max=1)
 LAPS = Setting(key="laps", type="int", default=3, arg="--laps", min=0)

@@ -18,7 +18,7 @@ import pytest
 from pebble import camera
 from pebble.config import default_run_folder
 from pebble.errors import PebbleError
-from pebble.transports.frames import FrameInfo, FrameWriter
+from pebble.extensions.media.frames import FrameInfo, FrameWriter
 from tests.locking import needs_shared_memory
 from tests.support import ROOT
 

@@ -1,4 +1,4 @@
-"""Processes that write or read frames: `python -m tests.transports.frames.frames_peer ROLE FOLDER JSON`.
+"""Processes that write or read frames: `python -m tests.ext.media.frames.frames_peer ROLE FOLDER JSON`.
 
 Each says `up` when it is ready, answers a line on stdin with what it knows as a line of JSON, and ends with stdin.
 """
@@ -19,9 +19,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from pebble.extensions.media.frames import Frame, FrameInfo, FrameReader, FrameWriter, views
 from pebble.runtime.parent import end_with_parent as die_with_parent
 from pebble.transports import segments
-from pebble.transports.frames import Frame, FrameInfo, FrameReader, FrameWriter, views
 
 FORMAT = "bgr24"
 _PR_SET_DUMPABLE = 4

@@ -1,0 +1,29 @@
+"""New files for people, such as reports and backups, which others cannot read."""
+
+import os
+from pathlib import Path
+
+from pebble.errors import PebbleError
+from pebble.runtime.whole_file import sync_folder
+
+
+def write_new(file: Path, content: bytes) -> None:
+    """Write a new file for people, which others cannot read. Raises PebbleError."""
+    try:
+        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o600)
+    except OSError as error:
+        raise PebbleError(f"{file}: cannot be written: {error.strerror}") from None
+    try:
+        with os.fdopen(descriptor, "wb") as output:
+            if os.fstat(descriptor).st_mode & 0o077:
+                why = "others can read every file on its file system: name one on another, or mount it umask=077"
+                raise PebbleError(f"{file}: {why}")
+            output.write(content)
+            output.flush()
+            os.fsync(descriptor)
+        sync_folder(file.parent)
+    except BaseException as error:
+        file.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise PebbleError(f"{file}: {error.strerror}") from None
+        raise

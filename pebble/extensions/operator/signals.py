@@ -1,0 +1,31 @@
+"""The signals that end a command: handled in a ``with`` block, or raised as KeyboardInterrupt."""
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+from pebble.runtime.signals import ending_signals
+
+
+@contextmanager
+def handled_by(handler: Callable[[int, FrameType | None], Any], *more: int) -> Iterator[None]:
+    """Call ``handler`` for signals that end a program, and for ``more``, inside the block. Main thread only."""
+    before = {number: signal.signal(number, handler) for number in (*ending_signals(), *more)}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+@contextmanager
+def interrupted_by_signals() -> Iterator[None]:
+    """Raise KeyboardInterrupt in the main thread also on SIGTERM and SIGHUP: a command cleans up as after Ctrl-C."""
+
+    def interrupt(_signal: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    with handled_by(interrupt):
+        yield
