@@ -19,8 +19,8 @@ from pebble.extensions.lab.bench.results import STAND_IN
 from pebble.extensions.lab.bench.usage import cpu_s
 from pebble.extensions.lab.rig.processes import python
 from pebble.extensions.lab.rig.robot import BASE, Robot, one_robot
+from pebble.extensions.lab.rig.scripted_operator import paced
 from pebble.extensions.lab.simulation.trace import Entry
-from pebble.extensions.operator.client.scripted_operator import paced
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch, parse
 
 ALL = "all"  # processes of a robot; and those that forward, by the names of their services

@@ -21,10 +21,10 @@ from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, Lights
 from pebble.errors import PayloadError
 from pebble.extensions.lab.demo.outcome import Driven, Wheels
 from pebble.extensions.lab.demo.visitors import Visitors
+from pebble.extensions.lab.rig.scripted_operator import ScriptedOperator, paced
 from pebble.extensions.lab.rig.testbed import CLIP, TAG_ID
 from pebble.extensions.operator.client.discovery import ALL_OUTGOING, Discovery
 from pebble.extensions.operator.client.robot_view import RobotView
-from pebble.extensions.operator.client.scripted_operator import ScriptedOperator, paced
 from pebble.motion.arbiter import HOLD_MS
 from pebble.transports import Message, MqttSettings, QoS, create
 

@@ -25,13 +25,13 @@ from pebble.extensions.lab.bench.bridge_operator import wheels
 from pebble.extensions.lab.bench.clients import all_ready, drive_of
 from pebble.extensions.lab.bench.impair.metrics import Arrival, Command, Plan, Report, Window, heard, seen
 from pebble.extensions.lab.bench.usage import wall_clock_ahead_ns
+from pebble.extensions.lab.rig.scripted_operator import ScriptedOperator, paced
 from pebble.extensions.lab.rig.worker_end import answer, serve_on_thread
 from pebble.extensions.media.decode import Decoded
 from pebble.extensions.media.sound import ReceivedSound
 from pebble.extensions.operator.client.media_receiver import MediaReceiver
 from pebble.extensions.operator.client.media_request.offer import Medium
 from pebble.extensions.operator.client.robot_view import RobotView
-from pebble.extensions.operator.client.scripted_operator import ScriptedOperator, paced
 from pebble.transports import Message, MqttSettings, State, Transport, create
 
 _RATE_HZ = 10.0  # of drive commands
