@@ -160,7 +160,6 @@ async def _estop(request: Request) -> Response:
         return answer(request, 400, str(error))
     address = "" if request.client is None else request.client.host
     server = _server_of(request)
-    await asyncio.sleep(server.stops.waits_s(session.user, time.monotonic()))
     server.stop(op.ref, op.stop, session, "", op.why, address)
     if answer is _plain:
         return _plain(request, 202, "sent")

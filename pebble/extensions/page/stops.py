@@ -12,7 +12,6 @@ from pebble.extensions.operator.client.estop import COLLECT_S, Progress, RobotSt
 from pebble.extensions.operator.client.robot_estop import RobotEstop
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.page import messages as m
-from pebble.extensions.page.pace import STOP_WAITS_S, Pace
 from pebble.transports import Message
 
 log = logging.getLogger(__name__)
@@ -35,7 +34,6 @@ class Stops:
         self._names: dict[str, str] = {}  # the stop of each robot, or of all
         self._crowded_at = float("-inf")  # when one was ended for lack of room
         self._shown: dict[str, tuple[str, str]] = {}  # by robot: progress and words, as pages see them
-        self._paces: dict[str, Pace] = {}  # by person
 
     def press(
         self,
@@ -64,10 +62,6 @@ class Stops:
                 sender.receive(message, now)
         self.changed |= set(sender.robots)
         return self.tick(now)
-
-    def waits_s(self, user: str, now: float) -> float:
-        """Return how long a stop of this person waits that comes without a control socket, as it would on one."""
-        return min(self._paces.setdefault(user, Pace(now)).take(1, now), STOP_WAITS_S)
 
     def end(self, name: str) -> None:
         """Send this stop no more."""

@@ -14,7 +14,7 @@ _KEY = re.compile(
     re.DOTALL,
 )
 _ARROWS = {b"A": UP, b"B": DOWN, b"C": RIGHT, b"D": LEFT}
-_NAMED = {b"\x1b": ESCAPE, b" ": SPACE, b"\x04": END}  # Ctrl-D
+_NAMED = {b"\x1b": ESCAPE, b" ": SPACE, b"\x04": END, b"\x1a": END}  # Ctrl-D, Ctrl-Z
 _NAMED |= {begin + end: arrow for begin in (b"\x1b[", b"\x1bO") for end, arrow in _ARROWS.items()}
 
 
