@@ -1,4 +1,4 @@
-"""Which scripts there are: folders with an entry point, what the config lists, what they publish about themselves."""
+"""The catalogue of scripts: folders with an entry point, as the config and they themselves describe them."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class _Answer(NamedTuple):
 
 
 class Catalogue:
-    """Scans the folders. For one thread, because to ask a script takes up to 20 s."""
+    """The scripts in the folders. It belongs to one thread, because to ask a script takes up to 20 s."""
 
     def __init__(self, config: Config, *, asks: bool = True, clock: Callable[[], float] = time.monotonic) -> None:
         """``asks`` is False for a list of scripts without the settings of ours."""
@@ -211,7 +211,7 @@ class Catalogue:
     def _settings(
         self, name: str, section: ScriptSection, described: Description, *, ours: bool
     ) -> tuple[Setting, ...]:
-        """By key: the config's, then the script's own. One of ours knows its options best."""
+        """Return the config's settings, then the script's own, each key once. One of ours knows its options best."""
         configured = [Setting(**asdict(argument)) for argument in section.args]
         own = {setting.key: setting for setting in described.configs}
         if ours and own:

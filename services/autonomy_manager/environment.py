@@ -12,7 +12,7 @@ from pebble.services.autonomy_manager.interpreter import SYSTEM
 
 
 def environment(*more: Mapping[str, str], ours: bool = True) -> dict[str, str]:
-    """This process's variables and ``more`` of them; later ones replace earlier ones.
+    """Return this process's variables and ``more`` of them; later ones replace earlier ones.
 
     For scripts of others, with ``ours`` False, ``python3`` is the system's, also where Pebble's is in its place.
     """

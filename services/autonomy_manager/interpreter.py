@@ -74,7 +74,7 @@ def lacking(command: Sequence[str], folder: Path, variables: Mapping[str, str]) 
 
 
 def _sources(entry: Path) -> Iterator[bytes]:
-    """Yield the text of a script, and of the files beside it of which it has the names."""
+    """Yield the text of a script, and of the files beside it that it names."""
     try:
         text = _read(entry)
         yield text

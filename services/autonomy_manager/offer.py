@@ -12,7 +12,7 @@ log = logging.getLogger(__name__)
 
 
 class Offer:
-    """All but the listing itself runs on the service's thread; ``on_change`` gets the new `autonomy-files`."""
+    """The scripts on offer. All but their listing runs on the service's thread; ``on_change`` gets `autonomy-files`."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Runs one script at a time with the scripts it needs: start, stop, and what follows when one of them ends."""
+"""The run of a script with the scripts it needs: start, stop, and what follows when one of them ends."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Run:
 
 
 class Runner:
-    """All methods belong to the service's thread."""
+    """The runner of scripts, one at a time. All methods belong to the service's thread."""
 
     def __init__(self, service: AutonomyManager, spawn: Spawn, stop_timeout_s: float) -> None:
         self.error: str | None = None

@@ -1,4 +1,4 @@
-"""Cuts a stream of JPEG pictures into pictures. Bytes in, bytes out."""
+"""A splitter of a stream of JPEG pictures into pictures. Bytes in, bytes out."""
 
 from typing import Final
 
@@ -8,7 +8,7 @@ _BARE = frozenset((0x01, *range(0xD0, 0xD8)))  # markers without a length: TEM a
 
 
 class JpegSplitter:
-    """Takes bytes as they are read. A picture longer than ``limit`` bytes, or bytes that are none, are skipped."""
+    """A splitter of bytes as they are read. Pictures longer than ``limit`` bytes, and bytes of none, are skipped."""
 
     def __init__(self, limit: int = 16 << 20) -> None:
         self._limit = limit

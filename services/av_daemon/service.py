@@ -1,4 +1,4 @@
-"""Owns camera and microphone, and publishes the status of everything that handles pictures and sound."""
+"""The owner of camera and microphone; it publishes the status of everything that handles pictures and sound."""
 
 import re
 import time

@@ -114,7 +114,7 @@ class V4l2Camera:
 
 
 def is_device(name: str) -> bool:
-    """True for a camera of this machine; other names are of files and network streams."""
+    """True if it is a camera of this machine; other names are of files and network streams."""
     return name.isdecimal() or name.startswith("/dev/")
 
 

@@ -1,4 +1,4 @@
-"""Between a robot and the hub of its LAN: what others may hear of it, and what their scripts may have it do."""
+"""The service between a robot and the hub of its LAN: what others hear of it, and what their scripts have it do."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MOST_BYTES = 16 * 1024  # of a message of another robot
 
 
 class NeighboursService(Service):
-    """``lan`` replaces the connection to the hub in tests."""
+    """The neighbours of one robot. ``lan`` replaces the connection to the hub in tests."""
 
     name = "neighbours"
     publishes = (DRIVE, NEIGHBOURS, NEIGHBOUR_VALUE)
@@ -92,7 +92,7 @@ class NeighboursService(Service):
 
     @every(HEARTBEAT_S)
     def _announce(self) -> None:
-        """To the hub again and again; to operators when it changes."""
+        """Publish this robot's state: to the hub again and again, to operators when it changes."""
         now = self.clock()
         state = Neighbours(
             shares=list(self._section.shares),

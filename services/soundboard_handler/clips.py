@@ -87,7 +87,7 @@ class Clips:
         return os.path.isfile(path)  # noqa: PTH113
 
     def _can_be_named(self, name: str) -> bool:
-        """Commands are UTF-8, and a backslash in them is a slash."""
+        """True if a command can name it: commands are UTF-8, and a backslash in them is a slash."""
         if "\\" not in name and is_text(name):
             return True
         self.problem = self.problem or f"{name!r} cannot be named in commands: rename it"

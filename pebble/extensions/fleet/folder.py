@@ -35,7 +35,7 @@ class FleetError(PebbleError):
 
 
 class Server(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Where a broker of the fleet listens. ``unencrypted``: a port for boards that have no TLS.
+    """The place where a broker of the fleet listens. ``unencrypted``: a port for boards that have no TLS.
 
     ``included``: it is the mosquitto of its machine, which reads `mosquitto.conf` as a part of its own, and which
     programs of that machine reach at ``PLAIN_PORT`` of loopback: there TLS would keep out a robot whose clock is unset.
@@ -80,7 +80,7 @@ class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def load(folder: Path) -> Fleet:
-    """Raises FleetError with the mistake in it."""
+    """Read the fleet of a folder. Raises FleetError with the mistake in it."""
     file = folder / FLEET
     try:
         fleet = msgspec.json.decode(read_plain(file), type=Fleet)
@@ -111,7 +111,7 @@ def save(folder: Path, fleet: Fleet) -> None:
 
 
 def refused(fleet: Fleet, name: str, account: Account) -> str:
-    """Empty if this account may be added, else why not."""
+    """Return why this account may not be added; empty if it may."""
     if not NAME.fullmatch(name):
         return f"{name!r} is no name: use 1 to 32 of a-z, 0-9, _ and -"
     if name in fleet.accounts:

@@ -72,7 +72,7 @@ class Rule(NamedTuple):
 
 
 class Account(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """What `fleet.json` has of one account. ``bases``: of a robot its own, of a gateway those that it carries.
+    """One account in `fleet.json`. ``bases``: of a robot its own, of a gateway those that it carries.
 
     ``plain``: a robot that does not know names, so its topics stay as they are without them. ``people``: the database
     of a page server's own people, if that is on this machine.
@@ -122,7 +122,7 @@ def right_of(channel: Channel) -> str:
 
 
 def add_up(roles: Sequence[str]) -> str:
-    """Empty if one account may have these roles, else why not."""
+    """Return why no account may have these roles together; empty if one may."""
     unknown = [role for role in roles if role not in _RIGHTS]
     if unknown or not roles:
         return f"{unknown[0] if unknown else ''!r} is no role: use {', '.join(ROLES)}"

@@ -167,7 +167,7 @@ class MediaFeed:
         self._report(self._request.problem or self._request.waits or self._why_nothing_is_shown())
 
     async def _request_keyframe(self) -> None:
-        """Not while another encoding still arrives: the one that was requested begins with a key frame."""
+        """Request a key frame, unless another encoding still arrives: the one that was requested begins with one."""
         if self._arriving and self._request.encoding in (_AS_CONFIGURED, self._arriving):
             await self._request.request_keyframe(self._arriving)
 

@@ -53,7 +53,7 @@ class Robots:
 
     @property
     def refused(self) -> int:
-        """What is none of these: no JSON, damaged, or a picture without those that it builds on."""
+        """Payloads that cannot be shown: no JSON, damaged, or a picture without those that it builds on."""
         return self._refused + sum(feed.refused for feed in self._feeds.values())
 
     def receive(self, message: Message, at: float) -> None:

@@ -37,7 +37,7 @@ _BALL_BGR = np.array((60, 90, 220), np.uint8)
 
 
 def noise(seed: int, count: int) -> NDArray[np.float32]:
-    """``count`` pseudo-random numbers, 0 to 1, the same on every machine; ``seed``: 32 bits.
+    """Return ``count`` pseudo-random numbers, 0 to 1, the same on every machine; ``seed``: 32 bits.
 
     Splitmix64 (Steele, Lea, Flood 2014), which needs no import of numpy.random.
     """
@@ -135,7 +135,7 @@ def _samples(length: int, cells: int) -> NDArray[np.intp]:
 
 
 def _swing(number: int, period: int, room: int) -> int:
-    """To and fro between 0 and ``room``."""
+    """Return a position that goes to and fro between 0 and ``room``."""
     phase = number % period / period
     return int(max(0, room) * abs(2 * phase - 1))
 
@@ -155,7 +155,7 @@ def _landscape(width: int, height: int) -> Picture:
 
 
 def _grids(seed: int, *, octaves: int, contrast: float) -> list[NDArray[np.float32]]:
-    """Random points, from few and strong to many and weak."""
+    """Return grids of random points, from few and strong to many and weak."""
     shapes = [((3 << octave) + 1, 4 << octave) for octave in range(octaves)]
     return [
         (noise(seed + octave, rows * columns).reshape(rows, columns) - 0.5) * np.float32(contrast / 1.6**octave)
@@ -169,7 +169,7 @@ def _texture(grids: list[NDArray[np.float32]], rows: NDArray[np.float32], width:
 
 
 def _stretched(grid: NDArray[np.float32], rows: NDArray[np.float32], width: int) -> NDArray[np.float32]:
-    """Linear between the grid's points; it wraps around from right to left."""
+    """Return the grid's values over the picture, linear between its points; it wraps around from right to left."""
     x = np.arange(width, dtype=np.float32) * grid.shape[1] / width
     y = rows * (grid.shape[0] - 1)
     left, top = x.astype(np.intp), y.astype(np.intp)

@@ -26,7 +26,7 @@ _GAP_MS = 60  # a capture time further than this from where the last chunk ended
 
 
 def sequence_numbers() -> Iterator[int]:
-    """1, 2, 3 … 0xFFFFFFFF, 1 …: one for each packet of a process, whatever its encoding."""
+    """Yield 1, 2, 3 … 0xFFFFFFFF, 1 …: one for each packet of a process, whatever its encoding."""
     while True:
         yield from range(1, SEQUENCE_LIMIT)
 
@@ -42,14 +42,14 @@ class _Intake:
         self._next_ms: float | None = None  # when the first sample of the next chunk should have been captured
 
     def has_gap(self, captured_ms: int) -> bool:
-        """Is sound missing before ``captured_ms``? Then the samples left over are dropped."""
+        """Return True if sound is missing before ``captured_ms``; then the samples left over are dropped."""
         if self._next_ms is None or abs(captured_ms - self._next_ms) <= _GAP_MS:
             return False
         self._left = self._left[:0]
         return True
 
     def frames(self, pcm: bytes, captured_ms: int, size: int) -> Iterator[tuple[Samples, int]]:
-        """Frames of ``size`` samples, each with the epoch milliseconds of its first one."""
+        """Yield frames of ``size`` samples, each with the epoch milliseconds of its first one."""
         fed = to_samples(pcm, self._fed_channels)
         start_ms = captured_ms - 1000 * len(self._left) / self.rate
         held = np.concatenate((self._left, self._resampler.feed(remix(fed, self.channels))))

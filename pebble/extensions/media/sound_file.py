@@ -43,7 +43,7 @@ class SoundFile:
         self._container.close()
 
     def chunks(self) -> Iterator[bytes]:
-        """Interleaved s16le until the end. Raises PebbleError where it cannot be decoded."""
+        """Yield interleaved s16le until the end. Raises PebbleError where it cannot be decoded."""
         layout = "mono" if self.channels == 1 else "stereo"
         try:
             resampler = self._av.AudioResampler(format="s16", layout=layout, rate=self.rate)

@@ -134,7 +134,7 @@ async def _authority(request: Request) -> Response:
 
 
 async def _health(request: Request) -> Response:
-    """200 while there is a broker; says nothing else, because it needs no login."""
+    """Answer 200 while there is a broker, and say nothing else, because it needs no login."""
     connected = request.app.state.broker.connected
     return PlainTextResponse("ok" if connected else "no broker", 200 if connected else 503, headers=NO_STORE)
 

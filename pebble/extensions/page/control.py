@@ -38,7 +38,7 @@ _decoder = msgspec.json.Decoder(m.FromPage)
 
 
 class Leave(Exception):  # noqa: N818 - not an error
-    """The server ends this connection; the page may connect anew."""
+    """An end of this connection by the server; the page may connect again."""
 
 
 class Control:
@@ -60,7 +60,7 @@ class Control:
         self._moved: set[str] = set()  # robots that this lease has moved, for the audit
 
     async def serve(self) -> None:
-        """Until the page or the server ends it. What the page moved has been stopped then."""
+        """Serve until the page or the server ends it. What the page moved has been stopped then."""
         sender: asyncio.Task[None] | None = None
         try:
             self._begin(await asyncio.wait_for(self._receive(), HELLO_S))
@@ -242,7 +242,7 @@ class Control:
             self._audit("drive", op.ref)
 
     def _end_stop(self, op: m.EstopEndOp) -> None:
-        """One's own, or with the right to reset: a viewer must not end the stop of another person."""
+        """End one's own stop, or any with the right to reset: a viewer must not end the stop of another person."""
         user = self._server.stops.user(op.stop)
         if user is not None and (user == self._session.user or self._may("reset", op)):
             self._server.stops.end(op.stop)
@@ -331,7 +331,7 @@ class Control:
         self._wake.set()
 
     async def _send_all(self) -> None:
-        """States at most every 50 ms, pings twice a second."""
+        """Send states at most every 50 ms, and pings twice a second."""
         ping_at, check_at = time.monotonic() + PING_S, time.monotonic() + CHECK_S
         people = self._server.people_version
         while self._websocket.application_state is WebSocketState.CONNECTED:

@@ -1,4 +1,4 @@
-"""What a page asks of a robot, besides driving: which right it needs, and what is then published. Pure."""
+"""Requests of pages to robots, besides driving: the right that each needs, and what is then published. Pure."""
 
 from typing import Any, NamedTuple
 

@@ -78,7 +78,7 @@ def _ms(seconds: float | None) -> float | None:
 
 
 class Interest:
-    """What one page has not received yet, and which component it has open."""
+    """One page's view: what it has not received yet, and which component it has open."""
 
     def __init__(self, changed: Callable[[], None]) -> None:
         self.watched = ""
@@ -89,7 +89,7 @@ class Interest:
 
 
 class Robots:
-    """All components. Only the event loop calls it."""
+    """The table of all components. Only the event loop calls it."""
 
     def __init__(self) -> None:
         self.components: dict[str, Component] = {}
@@ -112,7 +112,7 @@ class Robots:
         return None if component is None else component.robot
 
     def capabilities(self, ref: str) -> dict[str, Any]:
-        """Empty until they are known."""
+        """Return the component's capabilities; empty until they are known."""
         component = self.components.get(ref)
         return {} if component is None else component.robot.capabilities
 
@@ -193,7 +193,7 @@ class Robots:
             self._mark(ref, metric, everybody=True)
 
     def remove_server_metric(self, ref: str, metric: str) -> None:
-        """Pages have its last value until they receive another one."""
+        """Remove one of the server's own metrics; pages have its last value until they receive another one."""
         self._server.pop((ref, metric), None)
 
     def receive(self, message: Message, now: float) -> None:

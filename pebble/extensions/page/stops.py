@@ -89,13 +89,13 @@ class Stops:
         return any(ref in sender.robots for sender, _ in self._senders.values())
 
     def holds(self, ref: str) -> bool:
-        """True while a stop is repeated to a robot that cannot latch it: what drives it would end that."""
+        """True if a stop is being repeated to a robot that cannot latch it: what drives it would end that."""
         stop = self._newest(ref)[1]
         return stop is not None and stop.sending and not stop.estop.available
 
     @property
     def collecting(self) -> bool:
-        """True while a stop of all goes to further robots."""
+        """True if a stop of all still goes to further robots."""
         return "" in self._names and self._senders[self._names[""]][0].collecting
 
     def omitted(self, now: float) -> bool:
@@ -167,7 +167,7 @@ class Stops:
         return is_own
 
     def _worth(self, name: str) -> tuple[bool, bool, bool]:
-        """Of equal ones the oldest goes: what is over, what nothing was heard of, what is of one robot alone."""
+        """Return how much a stop is worth, smallest first: one that is over, unheard of, of one robot alone."""
         robots = self._senders[name][0].robots.values()
         heard = not self._refs[name] or any(robot.live or robot.estop.has_capabilities for robot in robots)
         return name not in self._over, heard, not self._refs[name]

@@ -1,4 +1,4 @@
-"""Owns the serial line to a self-describing MCU (``pebble_serial_v1``), whose manifest defines its topics."""
+"""The owner of the serial line to a self-describing MCU (``pebble_serial_v1``), whose manifest defines its topics."""
 
 import logging
 import time
@@ -52,7 +52,7 @@ _UID_QUERY = Channel(
 
 
 class DescribedBridge(SerialService):
-    """Publishes the topics of one MCU while it is connected, and clears its retained messages when it has gone."""
+    """The bridge of one MCU: it publishes its topics while connected, and clears what is retained when it goes."""
 
     publishes = (MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, IMU_FAST, IMU)
     end = END

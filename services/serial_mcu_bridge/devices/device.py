@@ -42,7 +42,7 @@ class Route:
 
 
 class Device:
-    """``payload`` is the manifest to publish: as the MCU sent it, with channels renamed as in the robot's config."""
+    """A device. ``payload`` is the manifest to publish: as the MCU sent it, with channels renamed as in the config."""
 
     def __init__(self, manifest: Manifest, addresses: Addresses, reports: imu.ImuReports) -> None:
         self._addresses, self._reports = addresses, reports
@@ -60,7 +60,7 @@ class Device:
 
     @property
     def local_only(self) -> McuLocalOnly:
-        """Return the topics of its interfaces that stay on the robot."""
+        """The topics of its interfaces that stay on the robot."""
         routes = [route for route in self.routes.values() if route.interface.local_only]
         aliases = [route.alias.claim for route in routes if route.alias is not None]
         return McuLocalOnly(topics=[*(route.generic.suffix for route in routes), *aliases])
@@ -110,7 +110,7 @@ class Device:
         return Alias(claim, own, interface.profile if fits else "")
 
     def _renamed(self, interface: Interface) -> Interface:
-        """Return it with the channel's effective name, if the config sets one and the name is valid as a channel."""
+        """Return the interface with the channel's effective name, if the config sets one that is valid as a channel."""
         if interface.direction is Direction.IN:
             return interface
         channel = c.channel_of(f"{c.OUTGOING}/{interface.channel}")

@@ -16,7 +16,7 @@ class _PeerDevice:
 
 
 class PeerDevices:
-    """Claims by device. A retained manifest counts too, until its confirmation times out."""
+    """The claims of other devices. A retained manifest counts too, until its confirmation times out."""
 
     def __init__(self) -> None:
         self._of: dict[str, _PeerDevice] = {}
@@ -35,7 +35,7 @@ class PeerDevices:
 
     @property
     def due(self) -> float | None:
-        """When the next confirmation times out; None if none is pending."""
+        """The time at which the next confirmation times out; None if none is pending."""
         return min((one.confirm_by for one in self._of.values() if one.confirm_by is not None), default=None)
 
     def left_over(self, now: float) -> list[str]:

@@ -56,7 +56,7 @@ class Frame:
 
 
 def crc(body: bytes) -> int:
-    """CRC-16/CCITT-FALSE; of ``123456789`` it is 0x29B1."""
+    """Return the CRC-16/CCITT-FALSE; of ``123456789`` it is 0x29B1."""
     return binascii.crc_hqx(body, _CRC_START)
 
 

@@ -131,7 +131,7 @@ class Session:
 
     @property
     def due(self) -> float | None:
-        """When :meth:`tick` has something to do; None for never."""
+        """The time at which :meth:`tick` has something to do; None for never."""
         times = [] if self._ask_at is None else [self._ask_at]
         if self._commands:
             times.append(next(iter(self._commands.values())).due)

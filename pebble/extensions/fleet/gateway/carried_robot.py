@@ -1,4 +1,4 @@
-"""A robot that the gateway carries: a forwarder and the subscriptions of one time, made anew when it begins again.
+"""A robot that the gateway carries: a forwarder and its subscriptions, which are new whenever it begins again.
 
 So what hub and broker retain then counts, as at the start of a bridge.
 """

@@ -46,7 +46,7 @@ class SecondGatewayError(PebbleError):
 
 
 def will(name: str) -> Message:
-    """Return what tells the others that this gateway has gone."""
+    """Return the message that tells other gateways that this one has gone."""
     return Message(ONLINE.topic(Identity("pebble", GATEWAYS, name).base), b"", QoS.DELIVERED, True)
 
 

@@ -1,4 +1,4 @@
-"""What a robot without capabilities offers, by the subscriptions that its heartbeat or status lists. Pure."""
+"""The offer of a robot without capabilities, by the subscriptions that its heartbeat or status lists. Pure."""
 
 from typing import Any
 

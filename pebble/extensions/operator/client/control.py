@@ -34,7 +34,7 @@ _NAME, _DEVICE = 40, 20  # characters, as robots cut them
 
 
 class RobotControl:
-    """Who has control of one robot, by the states of its motor owners; ``estop`` knows which of them it lists."""
+    """The control of one robot, by the states of its motor owners; ``estop`` knows which of them it lists."""
 
     def __init__(self, estop: RobotEstop) -> None:
         self.base = estop.base
@@ -44,18 +44,18 @@ class RobotControl:
 
     @property
     def states(self) -> list[ControlState]:
-        """They are in the order of the owners' names; with capabilities only those that these list."""
+        """The states in the order of the owners' names; with capabilities only those that these list."""
         names = self._estop.owners if self._estop.has_capabilities else self._states
         return [self._states[name] for name in sorted(names) if name in self._states]
 
     @property
     def state(self) -> ControlState | None:
-        """The one that decides; None: nothing is known."""
+        """The state that decides; None: nothing is known."""
         return next(iter(self.states), None)
 
     @property
     def who(self) -> str:
-        """Who has control, for people; "" nobody has."""
+        """The name of the one who has control, for people; "" if nobody has."""
         state = self.state
         return "" if state is None or not state.id else state.by or "somebody"
 
@@ -80,7 +80,7 @@ class RobotControl:
 
 
 class ControlClient:
-    """What one tab, or one process, wants of one robot. Call :meth:`update` after each state, and :meth:`tick` often.
+    """One tab, or process, that asks for control of a robot. Call :meth:`update` after each state, :meth:`tick` often.
 
     ``held``: the robot has answered that it has control. ``failed``: why it no longer asks for it, for people.
     """
@@ -117,7 +117,7 @@ class ControlClient:
         self.decided = ""
 
     def keep(self) -> None:
-        """Do not let drive who asks now."""
+        """Refuse the one who asks now."""
         state = self.robot.state
         self.passed_over = state.asks_id if state is not None else ""
 
@@ -164,13 +164,13 @@ class ControlClient:
 
     @property
     def key(self) -> str:
-        """What a drive command needs: the keys of all motor owners that this client has control of."""
+        """The keys for a drive command: of all motor owners that this client has control of."""
         keys = [one.key for one in self.robot.states if one.id == self.id]
         return " ".join(keys[:_KEYS]) if self.held else ""
 
     @property
     def asked_by(self) -> str:
-        """Who asks for it, and was not refused; "" nobody does, or it is not held."""
+        """The name of the one who asks for it and was not refused; "" if nobody does, or it is not held."""
         state = self.robot.state
         if not self.held or state is None or state.asks_id in ("", self.id, self.passed_over):
             return ""

@@ -1,4 +1,4 @@
-"""What a robot's status reports: whether it can be driven, and stopped, and what waits while it is driven. Pure."""
+"""The facts in a robot's status: can it be driven, and stopped, and what waits while it is driven. Pure."""
 
 from typing import Any, NamedTuple
 

@@ -47,7 +47,7 @@ class Progress(Enum):
 
 
 class Order(NamedTuple):
-    """What is the same for every robot that one stop is sent to."""
+    """The part of a stop that is the same for every robot that it is sent to."""
 
     name: str
     payload: bytes
@@ -78,7 +78,7 @@ class RobotStop:
 
     @property
     def progress(self) -> Progress:
-        """How far its stop is."""
+        """The progress of its stop."""
         if self.confirmed_s is not None:
             return Progress.CONFIRMED
         if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._order.named):
@@ -102,12 +102,12 @@ class RobotStop:
 
     @property
     def unconfirmed(self) -> dict[str, str]:
-        """Why, by owner; owners that are confirmed are not in it."""
+        """The reasons by owner; owners that are confirmed are not among them."""
         return {owner: why for owner in self.estop.owners if (why := self._lacks(owner))}
 
     @property
     def why(self) -> str:
-        """Why it is not confirmed, in words; empty if it is. Names of owners in it come from the robot."""
+        """The reason why it is not confirmed, in words; empty if it is. Names of owners in it come from the robot."""
         if self.progress in (Progress.CONFIRMED, Progress.SPARED):
             return ""
         if self.estop.old:
@@ -261,7 +261,7 @@ class StopSender:
 
     @property
     def due(self) -> float | None:
-        """When to call ``tick`` next; None: not before a message."""
+        """The time to call ``tick`` next; None: not before a message."""
         if self.finished:
             return None
         times = [robot.next for robot in self.robots.values() if robot.sending]
@@ -308,7 +308,7 @@ class StopSender:
 
     @property
     def _collect_s(self) -> float:
-        """A robot that is not in ``robots`` gets the stop again only when anything arrives from it: for a minute."""
+        """The seconds for which further robots are stopped: a minute if some get it only when anything arrives."""
         return GIVE_UP_S if self.omitted else COLLECT_S
 
     def _receive_first(self, base: str, message: Message, now: float) -> None:
@@ -334,7 +334,7 @@ def send(publish: Callable[..., bool], messages: Iterable[Message]) -> None:
 
 
 def _is_incoming(topic: str, base: str) -> bool:
-    """Also one that the contract calls otherwise: a stop does no harm there, and it may be what drives this robot."""
+    """True for any incoming topic of the robot: a stop does no harm there, and it may be what drives this robot."""
     return topic.startswith(f"{base}/{Direction.INCOMING}/") and not topic.endswith("/")
 
 

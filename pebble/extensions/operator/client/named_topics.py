@@ -62,7 +62,7 @@ class NamedTopics:
             raise NoNameError(command.identity.id, self.account)
 
     def signed(self, topic: str, payload: bytes, person: str) -> bytes:
-        """Return the payload with the person for whom this client acts, where the robot puts the account before."""
+        """Return the payload with the person for whom this client acts, if the robot puts the account before it."""
         command = _command(topic) if person else None
         if command is None or not self._is_named(command.identity.base):
             return payload

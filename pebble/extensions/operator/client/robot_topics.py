@@ -1,4 +1,4 @@
-"""Which topics of robots an operator's program subscribes to, and which of them capabilities may name. Pure."""
+"""The topics of robots that an operator's program subscribes to, and those that capabilities may name. Pure."""
 
 from typing import Any
 

@@ -39,7 +39,7 @@ def document() -> str:
 
 
 def _name(channel: Channel) -> str:
-    """``incoming.drive-values``; the names of a family are its parameters."""
+    """Return such as ``incoming.drive-values``; the names of a family are its parameters."""
     return channel.suffix.replace("/", ".").translate({ord("{"): None, ord("}"): None})
 
 

@@ -85,14 +85,14 @@ def _travel_row(channel: Channel) -> tuple[str, ...]:
 
 
 def rate(channel: Channel) -> str:
-    """Nominal rate in words."""
+    """Return the nominal rate in words."""
     if channel.rate_hz:
         return f"{channel.rate_hz:g} Hz"
     return {Kind.STATE: "on change", Kind.STREAM: "varies", Kind.FEED: "varies"}.get(channel.kind, "on demand")
 
 
 def payload_name(channel: Channel) -> str:
-    """``boolean``, ``binary``, or the name of the struct."""
+    """Return ``boolean``, ``binary``, or the name of the struct."""
     return {bool: "boolean", bytes: "binary"}.get(channel.payload) or str(channel.payload.__name__)
 
 

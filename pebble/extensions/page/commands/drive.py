@@ -37,7 +37,7 @@ def drive(
     *,
     target: Target,
 ) -> int:
-    """Drive a robot with the keys of this terminal, which it prints. What interrupts a drive ends it: press anew.
+    """Drive a robot with the keys of this terminal, which it prints. What interrupts a drive ends it: press again.
 
     \b
         pebble drive goob.json

@@ -109,7 +109,7 @@ class TerminalDriver:
 
     @property
     def unconfirmed(self) -> str:
-        """It is why an emergency stop from here is not confirmed; empty if none is pending."""
+        """The reason why an emergency stop from here is not confirmed; empty if none is pending."""
         return "" if self.stop is None or self.stop.confirmed else self.stop.robots[self.robot.base].why
 
     def status(self) -> str:

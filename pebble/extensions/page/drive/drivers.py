@@ -1,4 +1,4 @@
-"""What pages and robots want of driving, and what is published for it."""
+"""The driven robots of one server: requests of pages, answers of robots, and what is published for them."""
 
 from collections.abc import Callable
 from functools import partial
@@ -17,7 +17,7 @@ MOST_WISHES = 16  # of one tab: robots of which it has control, or asks for it
 
 
 class Drivers:
-    """It belongs to one server. What a method decides is published at once."""
+    """The driven robots of one server. What a method decides is published at once."""
 
     def __init__(self, broker: Broker, robots: Robots) -> None:
         self._broker, self._robots = broker, robots
@@ -26,7 +26,7 @@ class Drivers:
         self.refusals = Refusals(broker, lambda ref: self.robot(ref).moved_by, robots.view)
 
     def robot(self, ref: str) -> DrivenRobot:
-        """Return who drives that robot; of one that rests nothing is remembered."""
+        """Return that robot; nothing is remembered of one that rests."""
         robot = self._driven.get(ref)
         if robot is None:
             robot = self._driven[ref] = DrivenRobot(ref, partial(self._robots.view, ref), self._changed)

@@ -48,7 +48,7 @@ _export_decoder = msgspec.json.Decoder(ExportRequest)
 
 @dataclass(slots=True)
 class _Timeline:
-    """One that is being made, or was made; ``made``: JSON, while a newer one is made that of before."""
+    """A timeline that is being made, or was made; ``made``: JSON, that of before while a newer one is made."""
 
     paths: list[str]
     active: bool
@@ -66,7 +66,7 @@ class _Timeline:
 
 @dataclass(slots=True)
 class _Export:
-    """The one export that there is."""
+    """The export that runs or is ready; there is one at most."""
 
     id: str
     name: str
@@ -79,7 +79,7 @@ class BadQuestionError(PebbleError):
 
 
 class Recordings:
-    """What one server offers of a folder of recordings. Everything runs on the event loop."""
+    """A folder of recordings at one server. Everything runs on the event loop."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -91,7 +91,7 @@ class Recordings:
 
     @property
     def scratch(self) -> Path:
-        """Where jobs write."""
+        """The folder in which jobs write."""
         return Path(self._scratch.name)
 
     async def close(self) -> None:
@@ -103,7 +103,7 @@ class Recordings:
         self._scratch.cleanup()
 
     async def timeline(self, day: str, robot: str, *, again: bool = False) -> bytes | float:
-        """JSON, or the share of the work that is done. Raises PebbleError.
+        """Return JSON, or the share of the work that is done. Raises PebbleError.
 
         What has failed is done anew only ``again``, or for other recordings.
         """

@@ -51,6 +51,6 @@ def _room() -> str:
 
 
 def _robot(target: Path) -> str:
-    """Return the config names absolute paths, so that `pebble up` finds them from everywhere."""
+    """Return the robot's config; it names absolute paths, so that `pebble up` finds them from everywhere."""
     world = Path(tempfile.gettempdir(), "pebble-world-room")
     return _text("goob.json").replace("{folder}", str(target.absolute())).replace("{world}", str(world))

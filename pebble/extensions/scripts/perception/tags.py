@@ -15,7 +15,7 @@ _HINTS = {(4,): ": leave out the last with picture[:, :, :3]", (1,): ": use pict
 
 
 class Place(NamedTuple):
-    """Where the middle of a tag is, seen from the camera; ``angle_rad`` is positive to the right."""
+    """The place of a tag's middle, seen from the camera; ``angle_rad`` is positive to the right."""
 
     distance_m: float
     angle_rad: float
@@ -56,7 +56,10 @@ class TagGeometry:
         self._camera = camera or CameraModel.of_hfov()
 
     def place(self, corners: Floats, width: int, height: int) -> Place | None:
-        """``corners`` as in :class:`Tag`, in a picture of this size. None: they are no square in front of a camera."""
+        """Return the place of a tag by its ``corners``; None if they are no square in front of a camera.
+
+        ``corners`` are those of :class:`Tag`, in a picture of this size.
+        """
         import cv2
 
         matrix, distortion = self._camera.matrix(width, height), self._camera.distortion

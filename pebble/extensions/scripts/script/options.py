@@ -93,10 +93,7 @@ def _setting(field: inspect.Field, hint: Any) -> Setting:
 
 
 def _plain(kind: inspect.Type, name: str) -> tuple[Any, dict[str, Any], bool]:
-    """Return the type inside of Meta and ``| None``.
-
-    Title, description and extras of the Meta; whether None is allowed.
-    """
+    """Return the type inside of Meta and ``| None``, what the Meta says beside it, and whether None is allowed."""
     meta: dict[str, Any] = {}
     optional = False
     while True:
@@ -189,7 +186,7 @@ def _converter(setting: Setting) -> Callable[[str], object]:
 
 
 def _joined(arguments: list[str], settings: list[Setting]) -> list[str]:
-    """``--x -1e-05`` as ``--x=-1e-05``: argparse takes some numbers for options."""
+    """Return words with ``--x=-1e-05`` for ``--x -1e-05``: argparse takes some numbers for options."""
     valued = {setting.arg for setting in settings if setting.type != "bool"}
     joined: list[str] = []
     words = iter(arguments)

@@ -69,7 +69,7 @@ class _Latest:
         self._arrived: dict[Channel, _Arrived | None] = {}
 
     def of(self, channel: Channel, max_age: float) -> Any:
-        """Return the first call subscribes."""
+        """Return the newest payload that is not older than ``max_age`` seconds; the first call subscribes."""
         if channel not in self._arrived:
             self._arrived[channel] = None
             self._subscribe(channel, lambda value, **_: self._receive(channel, value))
@@ -174,7 +174,7 @@ class Robot:
 
     @property
     def why_refused(self) -> str:
-        """Why :meth:`drive` would have no effect now, in words; empty: it would, as far as is known."""
+        """The reason why :meth:`drive` would have no effect now; empty: it would have one, as far as is known."""
         return self._wheels.refusal()
 
     def publish(self, channel: Channel, value: Any, **names: str) -> bool:
@@ -190,7 +190,7 @@ class Robot:
         self._last_values[channel] = value
 
     def neighbour(self, name: str) -> Neighbour:
-        """Another robot of the LAN, which ``services.neighbours.listens`` names. Raises PebbleError for others."""
+        """Return another robot of the LAN, named in ``services.neighbours.listens``. Raises PebbleError for others."""
         self._check()
         found = self._neighbours.get(name)
         if found is None:
@@ -277,7 +277,7 @@ class Robot:
 
 
 def _axis(name: str, value: Any) -> float:
-    """Raises ValueError or TypeError that names the axis."""
+    """Return a number as a float. Raises ValueError or TypeError that names the axis."""
     try:
         return float(value)
     except (TypeError, ValueError) as error:

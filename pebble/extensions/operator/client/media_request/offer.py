@@ -1,4 +1,4 @@
-"""What of a robot's pictures and sound may be requested, by its capabilities. Pure."""
+"""The pictures and sound that may be requested of a robot, by its capabilities. Pure."""
 
 from collections.abc import Collection, Sequence
 from typing import Any, Final, Literal, NamedTuple
@@ -19,7 +19,7 @@ BEST_FIRST: Final[dict[Medium, tuple[str, ...]]] = {"video": ("h264", "pbvd", "j
 
 
 class Words(NamedTuple):
-    """How people are told of a medium."""
+    """The words for a medium."""
 
     lacking: str
     fixed: str

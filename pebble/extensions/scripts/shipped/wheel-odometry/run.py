@@ -66,13 +66,13 @@ def main(robot: Robot, options: OdometrySettings) -> None:
 
 
 def tuned(robot: Robot, options: OdometrySettings) -> OdometrySettings:
-    """With use_tune_state, the track width of the original's tuning program wins over the geometry."""
+    """Return the settings; with use_tune_state the track width of the original's tuning program wins."""
     width = tune_state(robot).get("track_width_mm") if options.use_tune_state else None
     return replace(options, track_width_mm=options.track_width_mm if width is None else width)
 
 
 def tune_state(robot: Robot) -> dict[str, float]:
-    """Return its numbers but for the lengths of a step: its counter counts steps twice, and no factor repairs that."""
+    """Return the tuning program's numbers but for the lengths of a step: it counts steps twice, beyond repair."""
     try:
         values = convert(
             json.loads((robot.config.folder / TUNE_STATE).read_text(encoding="utf-8"))["current_values"], dict[str, Any]
