@@ -62,7 +62,7 @@ def _motion(before: Pose, now: Pose) -> tuple[complex, float]:
 
 
 def main(robot: Robot, options: Options) -> None:
-    """Both robots head in the same direction at the start."""
+    """Follow the other robot. Both head in the same direction at the start."""
     other, log = robot.neighbour(options.robot), RateLimitedLog(robot.log, period_s=10.0)
     follower = Follower(convert(options, FollowSettings, from_attributes=True))
     companion = Companion(options.ahead_m, options.left_m)

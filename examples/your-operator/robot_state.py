@@ -1,4 +1,4 @@
-"""What an operator knows of a robot, by the messages that it publishes."""
+"""A robot's state as an operator knows it by the messages that it publishes."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Who drives a robot: one has control until it ends, is released or is taken; one who asks meanwhile is shown.
+"""Control of a robot: one program has it until it ends, is released or is taken; others who ask are shown.
 
 Times are milliseconds of a clock that is never set.
 """

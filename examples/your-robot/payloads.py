@@ -1,4 +1,4 @@
-"""What arrives may be anything: here it becomes JSON objects, numbers and short texts, or nothing."""
+"""Readers of payloads, which may be anything: they return JSON objects, numbers and short texts, or nothing."""
 
 import binascii
 import json

@@ -1,4 +1,4 @@
-"""What a robot on Wi-Fi announces about itself (paper A.8.6). Pure."""
+"""The capabilities that a robot on Wi-Fi announces (paper A.8.6). Pure."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Where Fred's motor board, a Seeed XIAO SAMD21, is wired: all eleven pins. Names are the MCU's own.
+"""The wiring of Fred's motor board, a Seeed XIAO SAMD21: all eleven pins. Names are the MCU's own.
 
 Fred needs seven PWM signals and the header has six timer channels. So the two inputs of a motor, of which only one
 is ever driven, share one: PA04 and PA08 are both on channel 0 of TCC0, PA05 and PA09 on channel 1 (see robot.py).

@@ -1,4 +1,4 @@
-"""Where Goob's motor board, a Seeed XIAO SAMD21, is wired. Names are the MCU's own, valid for every MicroPython.
+"""The wiring of Goob's motor board, a Seeed XIAO SAMD21. Names are the MCU's own, valid for every MicroPython.
 
 A PWM pin outputs one channel of a timer, and pins on one channel output the same signal. MicroPython assigns the
 first timer of a pin that is unused, else its first timer (ports/samd/pin_af.c, get_pwm_config). So the order in which

@@ -1,4 +1,4 @@
-"""Where Goob's second XIAO SAMD21 is wired: an MPU-6050, and the serial line to the robot's computer.
+"""The wiring of Goob's second XIAO SAMD21: an MPU-6050, and the serial line to the robot's computer.
 
 The line is the USB port if the board's MicroPython can use it for bytes, that is if it has select and
 sys.stdin.buffer. The official image has neither (1.29: MICROPY_HW_CODESIZE is 184 KB, so SAMD21_EXTRA_FEATURES is 0 in

@@ -51,7 +51,7 @@ class V4l2Camera:
         self._capture.release()
 
     def interrupt(self) -> None:
-        """OpenCV has no safe way while another thread reads."""
+        """Do nothing: OpenCV has no safe way while another thread reads."""
 
     def _open(self, video: CameraCapture) -> Any:
         cv2, device = self._cv2, self._device

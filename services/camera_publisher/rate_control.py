@@ -38,7 +38,7 @@ def wire_size(topic: str, payload: bytes) -> int:
 
 
 class RateController:
-    """A controller of which frames are encoded, and how: ``step``. No picture is sent that would wait behind another.
+    """A controller of frames, and of how they are encoded: ``step``. No picture waits behind another on its way.
 
     ``outgoing()`` says what is unacknowledged on the connection. A frame that was due and not encoded because of that
     is counted as ``held_back``. ``thin``: the connection may carry very little, so pictures begin small, and a slow one

@@ -113,7 +113,7 @@ class _Page:
         return code if self._served else 1
 
     def _end(self, _signal: int, _frame: object) -> None:
-        """Called before the server has its own handlers, and by the server when it has ended."""
+        """End the server, by a signal before the server has its own handlers, or by the server when it has ended."""
         self._ended = True
         exit_at_the_latest()
 

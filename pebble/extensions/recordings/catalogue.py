@@ -1,4 +1,4 @@
-"""What recordings hold, without reading all of them where their summaries say it."""
+"""A catalogue of what recordings hold, by their summaries where they have some."""
 
 import json
 from collections import Counter
@@ -109,7 +109,7 @@ def events(paths: Iterable[Path]) -> Iterator[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """Which messages are wanted; without any condition all of robots, brokers and the recorder."""
+    """The conditions of wanted messages; without any, all of robots, brokers and the recorder."""
 
     robot: str | None = None  # system/type/id
     topics: tuple[str, ...] = ()  # filters; one without the robot's identity begins at any robot's
@@ -125,7 +125,7 @@ class Query:
 
 
 def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> None:
-    """Raises RecordingError if the recordings of ``places`` have no such robot or topic, which may be a mistake.
+    """Raise RecordingError if the recordings of ``places`` have no such robot or topic, which may be a mistake.
 
     Where a file cannot be read completely, names are not known: it is the file's problem that is to be said.
     """
@@ -150,7 +150,7 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
 
 
 def check_name(kind: str, name: str | None, known: Collection[str], places: Iterable[Path]) -> None:
-    """Raises RecordingError, which says what there is, if ``name`` is none of the ``known`` ones."""
+    """Raise RecordingError, which says what there is, if ``name`` is none of the ``known`` ones."""
     if name is not None and name not in known:
         listed = [shown(one) for one in sorted(known)[:_LISTED]] or ["none"]
         more = f" and {len(known) - _LISTED} more" if len(known) > _LISTED else ""

@@ -1,4 +1,4 @@
-"""What robots need of a broker, as a table: each probe, and what it costs them where the broker lacks it."""
+"""A table of what robots need of a broker: each probe, and what it costs them where the broker lacks it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a robot owes everybody who watches and stops it, as a table: each check, and why. Nothing here turns a wheel."""
+"""A table of what a robot owes all who watch and stop it: each check, and why. Nothing here turns a wheel."""
 
 from __future__ import annotations
 

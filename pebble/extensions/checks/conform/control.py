@@ -1,4 +1,4 @@
-"""What a robot owes those who drive it by turns, as a table: control, and names where they are checked."""
+"""A table of what a robot owes those who drive it by turns: control, and names where they are checked."""
 
 from __future__ import annotations
 

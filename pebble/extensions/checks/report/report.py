@@ -1,4 +1,4 @@
-"""What helps to find a fault from elsewhere, in one zip file without a password or key."""
+"""A zip file that helps to find a fault from elsewhere, without a password or key."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ for folder in {folders}:
 
 @dataclass(frozen=True, slots=True)
 class BoardInfo:
-    """What a board reports about itself."""
+    """A board's report about itself."""
 
     text: str  # version and machine, for messages
     binary: bool  # whether USB carries bytes (``sys.stdin.buffer``)

@@ -1,4 +1,4 @@
-"""What makes a robot of a machine, in order. Each step is looked at first, and done only where it is not so yet."""
+"""The steps that make a robot of a machine, in order. Each is looked at first, and done only if it is not so yet."""
 
 import json
 import os
@@ -135,7 +135,7 @@ class Job:
                 yield self._new_password("password of the page at the robot's broker", page)
 
     def _new_password(self, what: str, file: Path, *, known: bool = True) -> Step:
-        """``known``: what is in the file is of this broker."""
+        """Make a new password. ``known``: what is in the file is of this broker."""
         write = partial(self.system.write, file)
         return Step(what, lambda: known and file.exists(), lambda: write(f"{new_password()}\n".encode()))
 
@@ -234,7 +234,7 @@ class Job:
         return [step for step in self.steps() if not step.is_done()]
 
     def do(self, steps: list[Step]) -> bool:
-        """Do the steps, then start anew the services that read what was written.
+        """Do the steps, then restart the services that read what was written.
 
         Returns True if the robot was started. Raises SetupError at the first failure.
         """

@@ -1,1 +1,1 @@
-"""What makes a newer version safe to take: signed releases."""
+"""Signed releases: they make a newer version safe to take."""

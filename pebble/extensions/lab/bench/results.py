@@ -54,7 +54,7 @@ class Cell(msgspec.Struct, kw_only=True):
 
     @property
     def lost(self) -> int | None:
-        """How many messages were sent and never arrived; None if they are not counted."""
+        """The number of messages that were sent and never arrived; None if they are not counted."""
         return self.total("sent") - len(self.samples) if "sent" in self.figures else None
 
     def total(self, name: str) -> int:

@@ -152,7 +152,7 @@ class Viewer:
         return len(self._online)
 
     def wait_until(self, condition: Callable[[], bool], what: str) -> None:
-        """Raises PebbleError if the page never shows it."""
+        """Wait until the page shows it. Raises PebbleError if it never does."""
         end = time.monotonic() + _UP_S
         while not condition():
             if time.monotonic() > end:

@@ -1,4 +1,4 @@
-"""Whether a robot moved when it was driven and stood when it was let go, by the trace of its motors. Pure."""
+"""Judgement of a step: did the robot move when driven and stand when let go, by the trace of its motors? Pure."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Driven(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a robot did in one step; ``wrong`` is empty if that is what it was commanded to do."""
+    """A robot's behaviour in one step; ``wrong`` is empty if it did what it was commanded to do."""
 
     robot: str
     step: str

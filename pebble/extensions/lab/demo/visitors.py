@@ -1,4 +1,4 @@
-"""Which robots people have taken from the demo's operator: driven by any program, or stopped. Pure."""
+"""Robots that people have taken from the demo's operator: driven by any program, or stopped. Pure."""
 
 import math
 from collections import defaultdict, deque

@@ -185,13 +185,13 @@ class Testbed(Processes):
         return self.server
 
     def start_recorder(self, into: Path, *options: object) -> Program:
-        """``pebble record`` of everything at the operators' broker, which is starting; ``options`` are further ones."""
+        """Start ``pebble record`` of everything at the operators' broker, which is starting; ``options`` are added."""
         url = f"mqtt://{HOST}:{self.broker_port}"
         command = python("pebble.cli", "record", "--url", url, "--into", into, *options)
         return self.add(Program("pebble record", command, self.folder / "record.log"), OPERATORS)
 
     def start_robots(self) -> None:
-        """Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""
+        """Start the robots. Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""
         for robot in self.robots.values():
             robot.bring_up(self._ending)
 

@@ -22,7 +22,7 @@ _DEADLINES_S = 2.0  # simulated part of a longer pause: all deadlines of the fir
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """How to run a board: ``turn_s`` is the period of its firmware's loop, ``tick_s`` that of calling ``tick``."""
+    """A board's timing: ``turn_s`` is the period of its firmware's loop, ``tick_s`` that of calling ``tick``."""
 
     turn_s: float
     tick_s: float
@@ -70,7 +70,7 @@ class SimulatedMcu:
 
     @property
     def resets(self) -> int:
-        """How often the board has restarted by itself."""
+        """The number of times that the board has restarted by itself."""
         return self.board.resets
 
     def boot(self, now: float) -> None:

@@ -63,7 +63,7 @@ class _StoppedError(Exception):
 
 
 class _Sound(msgspec.Struct):
-    """Where sound comes from: ``read(count)`` returns at most that many frames, b"" at the end."""
+    """A source of sound: ``read(count)`` returns at most that many frames, b"" at the end."""
 
     file: str
     rate: int

@@ -87,7 +87,7 @@ class WirelessRobot:
 
     @property
     def problem(self) -> str:
-        """Why the robot is not online; "" if unknown."""
+        """The reason why the robot is not online; "" if unknown."""
         reason = str(self.firmware.session.connection.reason)
         return reason if "refused by the broker" in reason else self.network.problem or reason
 

@@ -30,7 +30,7 @@ from pebble.extensions.recordings.library import Damages, files, merged, problem
 
 
 class Form(StrEnum):
-    """What recordings can be exported to."""
+    """A form to which recordings can be exported."""
 
     LINES = "lines"
     FOXGLOVE = "foxglove"

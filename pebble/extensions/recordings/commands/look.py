@@ -136,7 +136,7 @@ def _looked_at(
 
 
 def _lane(path: Path) -> str:
-    """``state`` or ``media of goob``, from the name of a recorder's file; else that name."""
+    """Return ``state`` or ``media of goob``, from the name of a recorder's file; else that name."""
     parts = path.name.removesuffix(".active").removesuffix(".mcap").split(".", 1)
     if len(parts) == 1:
         return shown(path.name)

@@ -189,7 +189,7 @@ class _Console:
             typer.echo(f"pebble: {shown(problem) or 'it goes on'}", err=True)
 
     def on_signal(self, number: int, _frame: object) -> None:
-        """Signals end the replay; until all is cleaned up no further one ends this process."""
+        """End the replay; until all is cleaned up no further signal ends this process."""
         self.ended = self.ended or signal.Signals(number).name
 
     def _press(self, key: str, player: Player) -> None:

@@ -67,7 +67,7 @@ Chooses = Callable[[Channel], bool]
 
 
 class Chunk(NamedTuple):
-    """Where a chunk is, and what it holds; ``channels`` empty: not known, so it may hold any."""
+    """A chunk's place and contents; ``channels`` empty: not known, so it may hold any."""
 
     start_ns: int
     end_ns: int
@@ -114,7 +114,7 @@ class RecordingFile:
 
     @property
     def first_ns(self) -> int:
-        """When the first message was received; 0: there is none."""
+        """The time at which the first message was received; 0: there is none."""
         return min((chunk.start_ns for chunk in self.chunks if chunk.start_ns), default=0)
 
     @property
@@ -132,7 +132,7 @@ class RecordingFile:
 
     @property
     def problem(self) -> str:
-        """What could not be read of it, in words; "" if all was, as far as that is known."""
+        """The part that could not be read, in words; "" if all was, as far as that is known."""
         return self.damage.report(active=self.path.name.endswith(ACTIVE))
 
     def reaches_into(self, since_ns: int, until_ns: int) -> bool:
@@ -215,7 +215,7 @@ class RecordingFile:
             self._look_through()
 
     def _summary(self) -> Summary | None:
-        """None: it is not finished, its end is damaged, or it has none."""
+        """Return the summary; None: it is not finished, its end is damaged, or it has none."""
         tail = FOOTER.size + len(MAGIC)
         file_size = self.size
         footer = self._read(max(0, file_size - tail), tail)

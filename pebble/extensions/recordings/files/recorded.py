@@ -1,4 +1,4 @@
-"""What a recording holds: messages of channels, and what is wrong with it."""
+"""A recording's contents: messages of channels, and its damage."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Recorded(msgspec.Struct, frozen=True):
 
 @dataclass(slots=True)
 class Damage:
-    """What is wrong with a file, as far as it was read."""
+    """The damage of a file, as far as it was read."""
 
     parts: set[int] = field(default_factory=set)  # where chunks are damaged, and where bytes between records begin
     missing: int = 0  # messages; those at a torn end are not known

@@ -19,7 +19,7 @@ _CHUNK: Final = b"\x06"
 
 
 class File(Protocol):
-    """Where the bytes go: an unbuffered file. ``write`` may take a part of them."""
+    """An unbuffered file for the bytes. ``write`` may take a part of them."""
 
     def write(self, data: memoryview, /) -> int | None: ...
 

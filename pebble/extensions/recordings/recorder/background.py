@@ -1,4 +1,4 @@
-"""What a recorder does beside writing: makes files durable, and finishes them."""
+"""A recorder's work beside writing: it makes files durable, and finishes them."""
 
 import logging
 import os

@@ -1,4 +1,4 @@
-"""Which recordings make room for new ones. Pure."""
+"""The choice of recordings that make room for new ones. Pure."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,10 +1,10 @@
-"""What is to be done again after some time. Pure."""
+"""Timers of tasks that are done again after some time. Pure."""
 
 from collections.abc import Callable
 
 
 class Due:
-    """What is to be done again after some time."""
+    """Timers of tasks that are done again after some time."""
 
     def __init__(self, boot_ns: Callable[[], int]) -> None:
         self._boot_ns = boot_ns

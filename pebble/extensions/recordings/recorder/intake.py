@@ -1,4 +1,4 @@
-"""What waits to be written into files."""
+"""Messages that wait to be written into files."""
 
 import json
 import threading
@@ -25,7 +25,7 @@ _MOST_ROBOTS: Final = 1000  # whose newest message is remembered
 
 
 class Clocks(NamedTuple):
-    """What the time is, in nanoseconds."""
+    """The clocks, in nanoseconds."""
 
     wall_ns: Callable[[], int] = time.time_ns
     boot_ns: Callable[[], int] = lambda: time.clock_gettime_ns(time.CLOCK_BOOTTIME)  # a clock that only Linux has
@@ -33,7 +33,7 @@ class Clocks(NamedTuple):
 
 
 class Intake:
-    """What waits to be written: bounded, and pictures and sound never in the way of state. Any thread may add to it."""
+    """Messages that wait to be written: bounded; media are never in the way of state. Any thread may add to it."""
 
     def __init__(self, limit: int, clocks: Clocks, clock: RecordingClock, counters: Counter[str]) -> None:
         self.robots: dict[str, float] = {}  # when each was received last, seconds since 1970
@@ -80,7 +80,7 @@ class Intake:
             self._counters["dropped"] += messages
 
     def add_order(self, topic: str, source: str) -> None:
-        """Something for the writer to do between the messages before and after: ``topic`` says what."""
+        """Add something for the writer to do between the messages before and after: ``topic`` says what."""
         self._events.append(Item(self._boot_ns(), topic, b"", None, None, "", source))
 
     def take(self) -> list[Item]:

@@ -1,4 +1,4 @@
-"""What a recorder does, as numbers in a file: for ``pebble doctor``, and for programs that watch machines."""
+"""A recorder's numbers in a file: for ``pebble doctor``, and for programs that watch machines."""
 
 import json
 import os

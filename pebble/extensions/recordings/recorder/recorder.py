@@ -52,7 +52,7 @@ class Recorder:
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
 
     def start(self) -> None:
-        """Raises RecordingError if the folder cannot be used, or the package ``mcap`` is not installed."""
+        """Start. Raises RecordingError if the folder cannot be used, or the package ``mcap`` is not installed."""
         require_package()
         self.folder.take()
         left = self._writing.mend_leftovers()
@@ -90,12 +90,12 @@ class Recorder:
             self._intake.add(topic, payload, qos, retain, "1" if retained else "", source)
 
     def forget_retained(self, source: str) -> None:
-        """Forget the retained values of a connection: they are fetched anew."""
+        """Forget the retained values of a connection: they are fetched again."""
         self._intake.add_order(FORGET, source)
 
     @property
     def blocked(self) -> str:
-        """Why nothing is written at present; empty if it is."""
+        """The reason why nothing is written at present; empty if something is."""
         return self._writing.blocked
 
     @property
@@ -108,7 +108,7 @@ class Recorder:
 
     @property
     def robots(self) -> dict[str, float]:
-        """When each robot was received last, in seconds since 1970."""
+        """The times at which each robot was received last, in seconds since 1970."""
         return dict(self._intake.robots)
 
     # -- the writer's thread

@@ -1,4 +1,4 @@
-"""What a recorder records, and how."""
+"""Options of a recorder: what it records, and how."""
 
 from typing import Final
 
@@ -9,7 +9,7 @@ EVERYTHING: Final = ("+/+/+/#", "+/infrastructure")
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True):
-    """How a recorder records; sizes in bytes. 0 in ``keep_…``: no limit; ``free_bytes`` stay free on the disk."""
+    """The options of a recorder; sizes in bytes. 0 in ``keep_…``: no limit; ``free_bytes`` stay free on the disk."""
 
     rotate_seconds: float = 3600.0
     keep_bytes: int = 0

@@ -1,4 +1,4 @@
-"""Where a recorder's messages come from: a broker, or a robot's local transport."""
+"""The source of a recorder's messages: a broker, or a robot's local transport."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator

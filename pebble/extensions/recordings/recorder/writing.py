@@ -1,4 +1,4 @@
-"""What the recorder's writer thread does: messages into files, room for them, and what happens when there is none."""
+"""The work of the recorder's writer thread: messages into files, room for them, and losses when there is none."""
 
 import errno
 import logging
@@ -34,7 +34,7 @@ _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 
 
 class _Blocked(NamedTuple):
-    """Why nothing is written, and since when."""
+    """The reason why nothing is written, and since when."""
 
     why: str
     since_ns: int
@@ -43,7 +43,7 @@ class _Blocked(NamedTuple):
 
 
 class Context(NamedTuple):
-    """What the parts of one recorder share."""
+    """The things that the parts of one recorder share."""
 
     folder: Folder
     options: Options
@@ -210,7 +210,7 @@ class Writing:
         log.warning("recording again")
 
     def give_up(self) -> None:
-        """At the end: count what no file has taken."""
+        """Count, at the end, what no file has taken."""
         self._intake.drop(len(self._lacking))
         self._lacking = []
         self._finisher.retry()

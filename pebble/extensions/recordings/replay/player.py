@@ -19,7 +19,7 @@ _LATE_S: Final = 0.5
 
 
 class Source(Protocol):
-    """What a player reads."""
+    """A source of a player's messages."""
 
     def messages(self, since_ns: int, until_ns: int) -> Iterator[Recorded]:
         """Yield those of a period by the time at which they were received."""
@@ -31,7 +31,7 @@ class Source(Protocol):
 
 
 class Output(Protocol):
-    """Where a player sends messages."""
+    """A target of a player's messages."""
 
     sent: int
     skipped: int
@@ -87,7 +87,7 @@ class BusOutput:
 
 
 class Reading:
-    """Where a replay is in its recording, in what is published; ``skipped`` counts the messages between."""
+    """The place of a replay in its recording, among what is published; ``skipped`` counts the messages between."""
 
     def __init__(self, source: Source, publishes: Chooses, until_ns: int) -> None:
         self.next: Recorded | None = None

@@ -29,7 +29,7 @@ _NAME: Final = re.compile(r"(?P<stamp>\d{8}T\d{6}Z)-\d{6,}\.(?P<lane>.+?)\.mcap(
 
 
 class _Named(NamedTuple):
-    """What a file's name says about it; of other programs' files nothing."""
+    """The facts that a file's name says; of other programs' files none."""
 
     path: Path
     lane: str  # "": any
@@ -116,7 +116,7 @@ class Archive:
         return []
 
     def next_ns(self, robot: str, at_ns: int) -> int | None:
-        """When the robot's next message from ``at_ns`` on was received; None if there is none."""
+        """Return when the robot's next message from ``at_ns`` on was received; None if there is none."""
         found: int | None = None
         for file in sorted(self.files(robot, at_ns, 1 << 63), key=lambda one: one.first_ns):
             if found is not None and file.first_ns >= found:
@@ -164,7 +164,7 @@ class Archive:
         return self._named
 
     def _opened(self, path: Path) -> SeekableFile | None:
-        """None for one that has gone meanwhile, or is no recording."""
+        """Return None for one that has gone meanwhile, or is no recording."""
         file = self._open.pop(path, None)
         try:
             if file is not None and file.is_replaced():

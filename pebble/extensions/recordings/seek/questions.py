@@ -1,4 +1,4 @@
-"""What a process asks another one about recordings: functions that take and return plain data.
+"""Questions that a process asks another one about recordings: functions that take and return plain data.
 
 The process that answers (:class:`pebble.extensions.page.recordings.archive_process.ArchiveProcess`) has one archive;
 unpacking files would otherwise delay the loop that passes on drive commands.
@@ -57,7 +57,7 @@ def begin(folder: Path) -> None:
 
 
 def days() -> bytes:
-    """JSON."""
+    """Return JSON."""
     return msgspec.json.encode(_days.all())
 
 

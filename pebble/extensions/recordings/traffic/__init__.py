@@ -1,1 +1,1 @@
-"""What recordings say about robots and networks: index, analysis, report."""
+"""Traffic of robots and networks by recordings: index, analysis, report."""

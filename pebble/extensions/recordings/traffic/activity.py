@@ -1,4 +1,4 @@
-"""What a message shows about the use of a robot: it is driven, watched, plays a sound, runs a script. Pure."""
+"""A robot's activity as a message shows it: it is driven, watched, plays a sound, runs a script. Pure."""
 
 import re
 from collections.abc import Callable

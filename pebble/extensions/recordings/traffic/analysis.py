@@ -27,14 +27,14 @@ _EVENTS: Final = """
 
 
 class RecorderEvents(Struct):
-    """What recorders noted about themselves."""
+    """The notes of recorders about themselves."""
 
     gaps: list[Gap]
     starts: list[int]  # ns; what was before is not known
     dropped: int = 0
 
     def breaks(self) -> list[tuple[int, int]]:
-        """Times that no heartbeat interval can be measured across."""
+        """Return times that no heartbeat interval can be measured across."""
         return [*((gap.since_ns, gap.until_ns) for gap in self.gaps), *((ns, ns) for ns in self.starts)]
 
 

@@ -118,7 +118,7 @@ def _bandwidth(robot: RobotTraffic) -> Figure | None:
 
 
 def draw_bandwidth(axes: Axes, shown: Sequence[Bandwidth]) -> None:
-    """Median and 95th percentile of each family, in sessions and while idle."""
+    """Draw the median and the 95th percentile of each family, in sessions and while idle."""
     names = [family for family in reversed(FAMILIES) if any(one.family == family for one in shown)]
     for time, label, colour, offset, marker in _TIMES:
         mine = [one for one in shown if one.time == time]
@@ -144,7 +144,7 @@ def draw_bandwidth(axes: Axes, shown: Sequence[Bandwidth]) -> None:
 
 
 def _legend(axes: Axes) -> None:
-    """Above the drawing, where it hides nothing."""
+    """Draw the legend above the drawing, where it hides nothing."""
     axes.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.2)
 
 
@@ -163,7 +163,7 @@ def _short(value: float) -> str:
 
 
 def _svg(draw: Any, robot: RobotTraffic, name: str) -> str:
-    """Without ids that two figures of a page could share, and without names of other hosts."""
+    """Return SVG without ids that two figures of a page could share, and without names of other hosts."""
     import matplotlib as mpl
     from matplotlib.figure import Figure as Drawing
 

@@ -165,7 +165,7 @@ class RobotQueries:
         self._connection.execute(_SESSIONS)
 
     def totals(self) -> tuple[int, int, int, int]:
-        """Messages, bytes, times of the first and of the last one."""
+        """Return the numbers of messages and bytes, and the times of the first and the last message."""
         messages, size, first, last = self._row(_TOTALS)
         return messages, size, first, last
 

@@ -26,7 +26,7 @@ def tables(traffic: Traffic) -> list[Table]:
 
 
 def media_bandwidth(traffic: Traffic) -> Table:
-    """Table 4.1 of the paper."""
+    """Return table 4.1 of the paper."""
     columns = [
         ("robot", "robot"), ("video_median_kbps", "video, median kbit/s"), ("video_p95_kbps", "video, p95"),
         ("audio_median_kbps", "audio, median kbit/s"), ("audio_p95_kbps", "audio, p95"),
@@ -78,13 +78,13 @@ def _outages(traffic: Traffic) -> Table:
 
 
 def moment(seconds: float) -> str:
-    """``2026-11-20T10:00:00Z``; with milliseconds if it is no whole second."""
+    """Return ``2026-11-20T10:00:00Z``; with milliseconds if it is no whole second."""
     spec = "seconds" if seconds == int(seconds) else "milliseconds"
     return datetime.fromtimestamp(seconds, UTC).replace(tzinfo=None).isoformat(timespec=spec) + "Z"
 
 
 def write_csv(table: Table, folder: Path) -> Path:
-    """Raises OSError."""
+    """Write a table as CSV. Raises OSError."""
     path = folder / f"{table.name}.csv"
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -94,5 +94,5 @@ def write_csv(table: Table, folder: Path) -> Path:
 
 
 def _cell(value: Any) -> Any:
-    """Spreadsheets take text for a formula that begins like one; anyone may choose the names in topics."""
+    """Return a cell that no spreadsheet takes for a formula; anyone may choose the names in topics."""
     return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value

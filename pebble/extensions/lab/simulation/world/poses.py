@@ -1,4 +1,4 @@
-"""Where a robot was during the last second, and at any moment in between."""
+"""A robot's poses during the last second, and at any moment in between."""
 
 import math
 from bisect import bisect_right

@@ -98,7 +98,7 @@ class SimulatedRobot(Robot):
 
     @property
     def body(self) -> LockstepRobot:
-        """Where it really is, and its motor board."""
+        """The robot as it really is: its place, and its motor board."""
         return self._body
 
     def receive(self, channel: Channel, value: Any) -> None:

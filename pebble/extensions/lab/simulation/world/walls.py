@@ -17,7 +17,7 @@ _ROUNDING_MM = 1e-6
 
 
 class Floor:
-    """Where all robots of a world are. Safe from any thread, as each robot's motion has its own."""
+    """A world's walls and the places of its robots. Safe from any thread, as each robot's motion has its own."""
 
     def __init__(self, world: World) -> None:
         self._lock = threading.Lock()

@@ -30,7 +30,7 @@ def main(robot: Robot, options: OdometrySettings) -> None:
     log = RateLimitedLog(robot.log)
 
     def take(method: Callable[..., None]) -> Callable[..., None]:
-        """Commands and samples wait in one queue: a sample gets its direction from the commands before it."""
+        """Return a handler that queues: a sample gets its direction from the commands that came before it."""
 
         def receive(value: Any, **_: str) -> None:
             try:
