@@ -39,13 +39,13 @@ class Step:
 
 def steps(bundle: int, bitrate: int) -> tuple[Step, ...]:
     """Return the steps from as configured to as little as still makes sense; only those that save something."""
-    found = [Step(bundle, bitrate)]
+    steps = [Step(bundle, bitrate)]
     if bundle < BUNDLE_LIMIT:
-        found.append(Step(BUNDLE_LIMIT, bitrate, f"{BUNDLE_LIMIT} parts a packet"))
+        steps.append(Step(BUNDLE_LIMIT, bitrate, f"{BUNDLE_LIMIT} parts a packet"))
     if bitrate > LEAST_BITRATE:
         reduced = f"{BUNDLE_LIMIT} parts a packet, {LEAST_BITRATE // 1000} kbit/s"
-        found.append(Step(BUNDLE_LIMIT, LEAST_BITRATE, reduced))
-    return tuple(found)
+        steps.append(Step(BUNDLE_LIMIT, LEAST_BITRATE, reduced))
+    return tuple(steps)
 
 
 class RateController:

@@ -31,8 +31,8 @@ class MotorOwners:
         if self._takes(owner, self._controls):
             self._controls[owner] = state
 
-    def _takes(self, owner: str, known: Collection[str]) -> bool:
-        return owner in self._names or (not self._names and (owner in known or len(known) < _MOST))
+    def _takes(self, owner: str, owners: Collection[str]) -> bool:
+        return owner in self._names or (not self._names and (owner in owners or len(owners) < _MOST))
 
     def holder_beside(self, by: str) -> str:
         """Return who has control, if it is not the account of ``by``; else empty. The first owner decides."""

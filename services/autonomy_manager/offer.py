@@ -60,7 +60,7 @@ class Offer:
 
     def _found(self, scripts: Mapping[str, Script]) -> None:
         self.scripts = dict(scripts)
-        found = files(scripts.values())
-        if found != self._files:
-            self._files = found
-            self._on_change(found)
+        listed = files(scripts.values())
+        if listed != self._files:
+            self._files = listed
+            self._on_change(listed)

@@ -155,12 +155,12 @@ class Runner:
     def _started(self, run: Run, step: Step) -> Part:
         script = step.script
         path = str(self._service.config_path)
-        own = {CONFIG: path, **({RUN: str(run.number)} if script.ours else {})}
+        variables = {CONFIG: path, **({RUN: str(run.number)} if script.ours else {})}
         launch = Launch(
             file=script.file,
             command=(*script.command, "--config", path, *step.options),
             folder=script.folder,
-            environment=environment(script.environment, own, ours=script.ours),
+            environment=environment(script.environment, variables, ours=script.ours),
             tie=signal.SIGTERM if script.ours else signal.SIGKILL,
         )
         part: Part

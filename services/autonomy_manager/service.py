@@ -277,5 +277,5 @@ class AutonomyManager(Service):
             return replace(status, drives=False)
         return replace(status, overridden=True) if self.clock() < self._overridden_until else status
 
-    def _publish_files(self, found: list[dict[str, object]]) -> None:
-        self.publish(AUTONOMY_FILES, AutonomyFiles(files=found, timestamp=time.time()))
+    def _publish_files(self, listed: list[dict[str, object]]) -> None:
+        self.publish(AUTONOMY_FILES, AutonomyFiles(files=listed, timestamp=time.time()))

@@ -43,6 +43,6 @@ def _end(buffer: bytearray) -> int:
             return -1
         at += 2 if kind in _BARE else 2 + int.from_bytes(buffer[at + 2 : at + 4])
         if kind == _SCAN:
-            found = buffer.find(_END, at)
-            return found + len(_END) if found >= 0 else 0
+            end = buffer.find(_END, at)
+            return end + len(_END) if end >= 0 else 0
     return 0

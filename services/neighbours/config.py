@@ -64,7 +64,7 @@ def _check(reader: Reader, section: Neighbours, path: Path) -> Neighbours:
     for name, granted in section.commanded.items():
         if any(metric != DRIVE.metric for metric in granted):
             problem((*path, "commanded", name), f'must be ["{DRIVE.metric}"]: nothing else can be granted')
-    named = [(("shares",), section.shares), *((("listens", name), found) for name, found in section.listens.items())]
+    named = [(("shares",), section.shares), *((("listens", name), heard) for name, heard in section.listens.items())]
     for place, metrics in named:
         if len(metrics) > MOST_METRICS:
             problem((*path, *place), f"has {len(metrics)} metrics: {MOST_METRICS} are the most")
@@ -80,10 +80,10 @@ def _check_hub(reader: Reader, root: Root, _: Path) -> Root:
     endpoints = list(zenoh_endpoints(root))
     meets = {place_of_endpoint(endpoint): endpoint for path, endpoint in endpoints if path[:3] == _LAN}
     for path, endpoint in endpoints:
-        mine = meets.get(place_of_endpoint(endpoint))
-        if mine is not None and path[:3] != _LAN:
+        place = meets.get(place_of_endpoint(endpoint))
+        if place is not None and path[:3] != _LAN:
             why = f"is also {'.'.join(map(str, path))}: what is shared would come twice, or without end"
-            reader.notes.problem((*_LAN, "connect"), f"{mine} {why}; take another hub")
+            reader.notes.problem((*_LAN, "connect"), f"{place} {why}; take another hub")
     return root
 
 

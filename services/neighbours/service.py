@@ -68,8 +68,8 @@ class NeighboursService(Service):
         for channel in (ESTOP_STATE, CAPABILITIES):
             self.transport.subscribe(channel.filter(self.config.base), self._on_owner, direct=True)
         for metric in self._section.shares:
-            known = channel_of(f"{OUTGOING}/{metric}")
-            topic = self._me.outgoing(metric) if known is None else self.addresses[known].topic
+            declared = channel_of(f"{OUTGOING}/{metric}")
+            topic = self._me.outgoing(metric) if declared is None else self.addresses[declared].topic
             self.transport.subscribe(topic, partial(self._share, metric), direct=True)
         for name, granted in self._section.commanded.items():
             if DRIVE.metric in granted:

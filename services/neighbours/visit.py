@@ -91,8 +91,8 @@ class Visit:
         barred = newest(state.last_barred for state in self._states.values())
         number = None if why else self._number(barred, self._received)
         if number is None:
-            known = self._refused.get(name)
-            if known is None or known.run != run:  # else the first reason is the one to know
+            refused = self._refused.get(name)
+            if refused is None or refused.run != run:  # else the first reason is the one to know
                 self._refused[name] = NeighbourRefusal(run=run, why=why or LOCAL)
             return False
         self.end(SUPERSEDED, now)

@@ -80,14 +80,14 @@ def passwords_text(passwords: Mapping[str, Hashed]) -> str:
 
 def passwords_in(text: str) -> dict[str, Hashed]:
     """Return the passwords in such a file, by account. Raises ValueError for what is none."""
-    found = {}
+    passwords = {}
     for line in filter(None, map(str.strip, text.splitlines())):
         name, _, rest = line.partition(":")
         _, kind, iterations, salt, hash_ = rest.split("$")
         if kind != "7":
             raise ValueError(f"{name}: a password of kind {kind}")
-        found[name] = Hashed(salt, hash_, int(iterations))
-    return found
+        passwords[name] = Hashed(salt, hash_, int(iterations))
+    return passwords
 
 
 def rules_in(acl: str) -> Iterator[str]:

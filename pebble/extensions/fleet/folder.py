@@ -71,7 +71,7 @@ class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return replace(self, accounts={**self.accounts, name: account})
 
     def without(self, name: str) -> "Fleet":
-        return replace(self, accounts={one: account for one, account in self.accounts.items() if one != name})
+        return replace(self, accounts={other: account for other, account in self.accounts.items() if other != name})
 
     def _plain_bases(self) -> Sequence[str]:
         if self.plain:
@@ -129,7 +129,7 @@ def refused(fleet: Fleet, name: str, account: Account) -> str:
     for base in account.bases:
         if why := _refused_base(base, several=gateway):
             return why
-        same = (one for one, other in fleet.accounts.items() if base in other.bases and other.roles == account.roles)
+        same = (user for user, other in fleet.accounts.items() if base in other.bases and other.roles == account.roles)
         if robot and (owner := next(same, None)) is not None:
             return f"{base} belongs to {owner}"
     return ""
@@ -138,7 +138,7 @@ def refused(fleet: Fleet, name: str, account: Account) -> str:
 def _refused_base(base: str, *, several: bool) -> str:
     levels = base.split("/")
     try:
-        Identity(*(one if one != "+" or not several else "any" for one in levels))
+        Identity(*(level if level != "+" or not several else "any" for level in levels))
     except (ConfigError, TypeError):
         return f"{base!r} is no base: write SYSTEM/TYPE/ID, such as pebble/robots/goob"
     if any(character.isspace() or character == "%" for character in base):

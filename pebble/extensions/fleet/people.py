@@ -139,17 +139,17 @@ class People:
         others cannot keep a person out.
         """
         self._count_try(name, address)
-        known = name if NAME.fullmatch(name) else ""
-        rows = self._rows("SELECT name, role, salt, hash FROM people WHERE name = ?", known)
-        found, role, salt, expected = rows[0] if rows else ("", "", b"no such person..", self._no_hash)
+        looked_up = name if NAME.fullmatch(name) else ""
+        rows = self._rows("SELECT name, role, salt, hash FROM people WHERE name = ?", looked_up)
+        stored_name, role, salt, expected = rows[0] if rows else ("", "", b"no such person..", self._no_hash)
         typed = password[: 2 * MAX_PASSWORD]  # so long may one be whose accents are letters of their own
         given = [_hash(spelling, salt) for spelling in _spellings(typed)]
-        is_right = any(hmac.compare_digest(one, expected) for one in given)
-        if not is_right or not found or len(normalize("NFC", typed)) > MAX_PASSWORD:
+        is_right = any(hmac.compare_digest(digest, expected) for digest in given)
+        if not is_right or not stored_name or len(normalize("NFC", typed)) > MAX_PASSWORD:
             return None
         self._addresses.give_back(network_of(address))
         self._names.give_back(name)
-        return User(found, Role(role))
+        return User(stored_name, Role(role))
 
     def start_session(self, user: User, address: str = "") -> str:
         """Return a new session's token; the only copy of it."""

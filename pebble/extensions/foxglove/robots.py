@@ -30,7 +30,7 @@ _MEDIA: Final[tuple[Medium, ...]] = ("video", "audio")
 def filters(base: str) -> list[str]:
     """Return what to subscribe to: the telemetry of these robots, without pictures and sound."""
     every = list(dict.fromkeys(channel.filter(base) for channel in (*FLEET, *WATCHED, *SYNONYMS)))
-    return [one for one in every if not any(other != one and matches(other, one) for other in every)]
+    return [filter_ for filter_ in every if not any(other != filter_ and matches(other, filter_) for other in every)]
 
 
 class Robots:

@@ -124,9 +124,9 @@ def make_sound_encoder(
         rate_out = rate_out if rate_out <= _HIGHEST_PCM_RATE else opus.RATES[-1]
         return SoundEncoder(_Intake(rate, channels, rate_out, channels_out), numbers, chunk_ms)
     if name == "opus":
-        rate_out = next((known for known in opus.RATES if known >= rate_out), opus.RATES[-1])
+        rate_out = next((rate for rate in opus.RATES if rate >= rate_out), opus.RATES[-1])
         intake = _Intake(rate, channels, rate_out, channels_out if channels_out <= 2 else 1)
-        frame_ms = next((known for known in opus.FRAMES_MS if known >= chunk_ms), opus.FRAMES_MS[-1])
+        frame_ms = next((ms for ms in opus.FRAMES_MS if ms >= chunk_ms), opus.FRAMES_MS[-1])
         codec = OpusEncoder(rate_out, intake.channels, frame_ms=frame_ms, bitrate=bitrate)
         return SoundEncoder(intake, numbers, frame_ms, codec, min(max(bundle, 1), opus.BUNDLE_LIMIT))
     raise PebbleError(f'there is no sound encoding "{name}": use {" or ".join(SOUND_ENCODINGS)}')

@@ -252,7 +252,7 @@ class Control:
         if not self._may("reset", op) or robot is None:
             return
         reset = Reset(robot.estop, self._session.user)
-        shown = {one.owner: (one.boot, one.count) for one in op.owners}
+        shown = {owner.owner: (owner.boot, owner.count) for owner in op.owners}
         reset.shown = {
             owner: msgspec.structs.replace(state, boot=shown[owner][0], count=shown[owner][1])
             for owner, state in reset.shown.items()
@@ -351,13 +351,13 @@ class Control:
     async def _flush(self, now: float) -> None:
         while self._waiting:
             await self._websocket.send_text(encode(self._waiting.popleft()))
-        drivers = {one for one in self._interest.dirty if one[1] == "web/driver"}
+        drivers = {key for key in self._interest.dirty if key[1] == "web/driver"}
         self._interest.dirty -= drivers
-        found, large = self._server.robots.take(self._interest, now, large=self._large_due)
+        taken, large = self._server.robots.take(self._interest, now, large=self._large_due)
         self._large_due = self._large_due and not large
         if self._interest.more:
             self._wake.set()
-        values = found + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)
+        values = taken + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)
         gone, self._interest.gone = tuple(self._interest.gone), set()
         if values or gone:
             await self._websocket.send_text(encode(m.State(now=1000 * time.time(), set=values, gone=gone)))

@@ -82,5 +82,5 @@ class PageClock:
         return min(high for _, high, _ in self._bounds)
 
     def _check(self, low: float, high: float) -> None:
-        if self._bounds and (low > self._highest() + _JUMP_S or high < max(one[0] for one in self._bounds) - _JUMP_S):
+        if self._bounds and (low > self._highest() + _JUMP_S or high < max(self._bounds)[0] - _JUMP_S):
             raise ClockJumpError("a clock has jumped: one of the two machines was suspended")

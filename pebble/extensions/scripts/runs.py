@@ -84,7 +84,7 @@ class LocalScripts:
 
 def newest(runs: Iterable[int]) -> int:
     """Return the newest of ``runs``, where 0 stands for none."""
-    return reduce(lambda one, run: run if newer(run, one) else one, runs, 0)
+    return reduce(lambda newest, run: run if newer(run, newest) else newest, runs, 0)
 
 
 def following(run: int) -> int:

@@ -51,7 +51,7 @@ class Device:
         interfaces = tuple(map(self._renamed, manifest.interfaces))
         self.payload: McuManifest = Manifest(manifest.hello, interfaces).payload()
         self.claims: Claims = claims(self.payload, self._robots_channel)
-        self.routes = {one.id: self._route(one) for one in interfaces}
+        self.routes = {interface.id: self._route(interface) for interface in interfaces}
 
     @property
     def has_motion(self) -> bool:
@@ -103,11 +103,11 @@ class Device:
         channel = self._robots_channel(claim)
         if channel in (c.IMU_FAST, c.IMU):
             return Alias(claim, channel, interface.profile)
-        own = _channel(interface.channel, interface.kind, payload, retain=interface.retain)
+        raw = _channel(interface.channel, interface.kind, payload, retain=interface.retain)
         # a payload that must stay on the robot names its device, so that the MQTT bridge recognises it
         profiled = interface.profile in (imu.MOTION, imu.SUMMARY) and not interface.local_only
         fits = profiled and imu.fits(interface.profile, {field.name for field in interface.fields})
-        return Alias(claim, own, interface.profile if fits else "")
+        return Alias(claim, raw, interface.profile if fits else "")
 
     def _renamed(self, interface: Interface) -> Interface:
         """Return the interface with the channel's effective name, if the config sets one that is valid as a channel."""

@@ -159,7 +159,7 @@ class Gateway:
     @property
     def _is_connected(self) -> bool:
         """True if robots can be carried, as far as this depends on connections."""
-        return all(one.state is State.CONNECTED for one in (self._hub, self._broker, self._presence))
+        return all(transport.state is State.CONNECTED for transport in (self._hub, self._broker, self._presence))
 
     def _leave_to_others(self, now: float) -> None:
         for base in list(self._heard):

@@ -155,8 +155,8 @@ class Broker:
         """Hand over what has arrived, in its order; the rest after whatever else is due, if that takes long."""
         self._woken = False
         end = time.monotonic() + _DELIVER_S
-        while (one := self._arrived.get()) is not None:
-            handler, message, at = one
+        while (arrived := self._arrived.get()) is not None:
+            handler, message, at = arrived
             try:
                 handler(message, at)
             except Exception:  # one message must not hold back the others

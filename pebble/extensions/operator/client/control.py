@@ -128,18 +128,18 @@ class ControlClient:
         state = self.robot.state
         if not self.wanted or state is None:
             return
-        mine = state.id == self.id
-        if self.held and not mine and state.id:  # it was taken over, or ended while this client was not heard
+        is_ours = state.id == self.id
+        if self.held and not is_ours and state.id:  # it was taken over, or ended while this client was not heard
             self._give_up(f"{self.robot.who} has control now")
             return
-        if self.held and not mine:  # free: it has ended, or the motor owner was started again
+        if self.held and not is_ours:  # free: it has ended, or the motor owner was started again
             self._asked_at = self._answered_at = self._due_at = now
-        self.held, self.decided = mine, state.key if mine else ""
-        if mine:
+        self.held, self.decided = is_ours, state.key if is_ours else ""
+        if is_ours:
             self._take = False
         elif state.asks_id:  # of this client, or of another: then it waits for its turn
             self._answered_at = now
-        if not mine and state.id and self._has_any():
+        if not is_ours and state.id and self._has_any():
             self._out = [self._message(CONTROL, want="release")]
             self._due_at = max(self._due_at, now + APART * self._pace_of().control_s)
 
@@ -165,7 +165,7 @@ class ControlClient:
     @property
     def key(self) -> str:
         """The keys for a drive command: of all motor owners that this client has control of."""
-        keys = [one.key for one in self.robot.states if one.id == self.id]
+        keys = [state.key for state in self.robot.states if state.id == self.id]
         return " ".join(keys[:_KEYS]) if self.held else ""
 
     @property
@@ -181,7 +181,7 @@ class ControlClient:
         self.failed = why
 
     def _has_any(self) -> bool:
-        return any(one.id == self.id for one in self.robot.states)
+        return any(state.id == self.id for state in self.robot.states)
 
     def _hopeless(self, now: float) -> str:
         """Return why it is given up; empty: it is not."""

@@ -176,7 +176,9 @@ class RobotStop:
             messages.append(_message(AUTONOMY_COMMAND, self.estop.script_topic, _END_SCRIPT))
         topics = dict.fromkeys((self.estop.drive_topic, *self.estop.zeros))
         messages += [_message(DRIVE, topic, _ZERO) for topic in topics]
-        return [one for one in messages if not self._order.own_only or _is_incoming(one.topic, self.estop.base)]
+        return [
+            message for message in messages if not self._order.own_only or _is_incoming(message.topic, self.estop.base)
+        ]
 
     def give_up(self) -> None:
         """Send no more."""
@@ -256,8 +258,8 @@ class StopSender:
     @property
     def confirmed(self) -> bool:
         """True if at least one robot is stopped, and every other one, except components that do not drive."""
-        found = {robot.progress for robot in self.robots.values()}
-        return Progress.CONFIRMED in found and found <= {Progress.CONFIRMED, Progress.SPARED} and not self.omitted
+        progress = {robot.progress for robot in self.robots.values()}
+        return Progress.CONFIRMED in progress and progress <= {Progress.CONFIRMED, Progress.SPARED} and not self.omitted
 
     @property
     def due(self) -> float | None:

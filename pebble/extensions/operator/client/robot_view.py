@@ -157,8 +157,8 @@ class RobotView:
     def _announce(self, payload: bytes) -> None:
         """Take what a heartbeat or status lists, unless it publishes capabilities."""
         if not self.capabilities or "announced" in self.capabilities:
-            found = announced(self.base, payload)
-            self.capabilities = self.capabilities if found == self.capabilities else found or self.capabilities
+            value = announced(self.base, payload)
+            self.capabilities = self.capabilities if value == self.capabilities else value or self.capabilities
 
     def _receive_stop(self, channel: c.Channel, message: Message, now: float) -> None:
         """Take capabilities, or the state of a motor owner. Empty capabilities take nothing away."""
@@ -180,10 +180,10 @@ class RobotView:
 
     def _remember(self, message: Message) -> None:
         """Keep it for an emergency stop that begins later; invented owners keep no capabilities out."""
-        known = (*self.remembered, c.CAPABILITIES.topic(self.base))
+        topics = (*self.remembered, c.CAPABILITIES.topic(self.base))
         if not message.payload:
             self.remembered.pop(message.topic, None)
-        elif len(self.remembered) < MAX_REMEMBERED or message.topic in known:
+        elif len(self.remembered) < MAX_REMEMBERED or message.topic in topics:
             self.remembered[message.topic] = message
 
     # -- what is assumed

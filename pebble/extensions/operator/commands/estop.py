@@ -312,7 +312,7 @@ def _reset(target: Target) -> int:
         robot = view.estop
         put_names(transport, names, lambda base: base == robot.base and robot.named)
         robot.subscribe(second)
-        second.subscribe(LINK.topic(robot.base), lambda one: view.receive(LINK, one, 0.0, 0.0), direct=True)
+        second.subscribe(LINK.topic(robot.base), lambda message: view.receive(LINK, message, 0.0, 0.0), direct=True)
         wait_for(lambda: robot.has_capabilities, _ANSWER_S)
         second.ask(robot.missing)  # the capabilities may have come after the subscription
         wait_for(lambda: not robot.missing, _ANSWER_S)
@@ -353,7 +353,7 @@ def _status(target: Target, *, every: bool) -> int:
         if is_remote:
             found, began = discovery.all_robots, time.monotonic()
             wait_for(lambda: not discovery.awaits_heartbeat(time.monotonic() - began), float("inf"))
-            wait_for(lambda: not any(one.liveness.received_at and one.estop.lacks for one in found()), _ANSWER_S)
+            wait_for(lambda: not any(robot.liveness.received_at and robot.estop.lacks for robot in found()), _ANSWER_S)
         robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
     for robot in robots:
         _print_states(robot.estop, robot.driveable, silent=is_remote and robot.liveness.received_at is None)

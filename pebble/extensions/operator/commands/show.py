@@ -64,10 +64,10 @@ def body(payload: bytes, width: int) -> str:
         with suppress(RecursionError):
             line = json.dumps(plain, ensure_ascii=False)
             return shown(line if len(line) <= width else json.dumps(plain, ensure_ascii=False, indent=2))
-    known = recognised(payload)
-    if known is None and _is_text(payload):
+    value = recognised(payload)
+    if value is None and _is_text(payload):
         return shown(payload.decode())
-    return f"{known or 'binary'}, {len(payload)} bytes\n{hex_dump(payload[:_DUMPED], width)}"
+    return f"{value or 'binary'}, {len(payload)} bytes\n{hex_dump(payload[:_DUMPED], width)}"
 
 
 def parsed(payload: bytes) -> Any:

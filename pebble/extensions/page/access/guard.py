@@ -122,8 +122,8 @@ def host_names(settings: WebSettings) -> frozenset[str]:
     names |= {parts[1] for name in settings.names if (parts := _split(name)) is not None}  # behind a forwarded port
     if not is_loopback(settings.host):
         names.add(settings.host)
-        own = socket.gethostname()
-        of_machine = (own, f"{own.partition('.')[0]}.local")
+        hostname = socket.gethostname()
+        of_machine = (hostname, f"{hostname.partition('.')[0]}.local")
         names |= {*(of_machine if settings.certificate is None else certificates.show(settings.certificate).names)}
     return frozenset(map(canonical, names))
 

@@ -39,7 +39,7 @@ class Drivers:
     ) -> None:
         """Take control for a page; ``granted``, or ``failed`` with the reason, is called as soon as that is known."""
         now, robot = clock(), self.robot(view.base)
-        wanted = sum(one.wanted_by(tab) for one in self._driven.values())
+        wanted = sum(robot.wanted_by(tab) for robot in self._driven.values())
         if why := self.refusals.nameless(view):
             failed(why)
         elif wanted >= MOST_WISHES and not robot.wanted_by(tab):
@@ -67,9 +67,9 @@ class Drivers:
         """
         now = clock()
         old = {robot.tab for robot in self._driven.values() if robot.tab is not None and robot.tab.token == token}
-        for stalled in [one for one in old if one.clock.problem(now)]:
+        for stalled in [robot for robot in old if robot.clock.problem(now)]:
             self.closed(stalled)
-        for robot in [one for one in self._driven.values() if one.awaits(token, now)]:
+        for robot in [robot for robot in self._driven.values() if robot.awaits(token, now)]:
             if (view := self._robots.view(robot.ref)) is not None:
                 self.take(tab, view, lambda: None, lambda _why: None, over=False)
 

@@ -176,7 +176,6 @@ class _Console:
         else:
             for key in self._terminal.keys(seconds):
                 self._press(key, player)
-            self._terminal.suspend(player.pause)
             self.ended = self.ended or self._terminal.ended
             self._terminal.show(lambda: status(player, robots.problem), at_once=False)
         if self.ended and not player.ended:

@@ -39,7 +39,7 @@ def _alike(target: Path) -> Path | None:
     """Return what exists with this name, whatever its case: many file systems make no difference."""
     if not target.parent.is_dir():
         return None
-    return next((one for one in target.parent.iterdir() if one.name.lower() == target.name.lower()), None)
+    return next((path for path in target.parent.iterdir() if path.name.lower() == target.name.lower()), None)
 
 
 def _text(file: str) -> str:

@@ -41,9 +41,9 @@ def pose_of(odometry: WheelOdometry | None) -> Pose | None:
 
 
 def _number(value: dict[str, Any], *names: str) -> float | None:
-    found = next((value[name] for name in names if value.get(name) is not None), None)
-    usable = isinstance(found, int | float) and math.isfinite(found)
-    return float(found) if usable else None  # type: ignore[arg-type]
+    number = next((value[name] for name in names if value.get(name) is not None), None)
+    usable = isinstance(number, int | float) and math.isfinite(number)
+    return float(number) if usable else None  # type: ignore[arg-type]
 
 
 class OdomFollower:

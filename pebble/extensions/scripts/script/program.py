@@ -71,10 +71,10 @@ def _options_of(main: Callable[..., None]) -> type[msgspec.Struct] | None:
         raise TypeError(f"{main.__name__}: write main(robot) or main(robot, options)")
     if len(parameters) == 1:
         return None
-    found = parameters[1].annotation
-    if not (isinstance(found, type) and issubclass(found, msgspec.Struct)):
+    struct = parameters[1].annotation
+    if not (isinstance(struct, type) and issubclass(struct, msgspec.Struct)):
         raise TypeError(f"{main.__name__}: annotate {parameters[1].name} with a msgspec Struct of yours")
-    return found
+    return struct
 
 
 def _name() -> str:

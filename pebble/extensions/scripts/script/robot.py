@@ -192,15 +192,15 @@ class Robot:
     def neighbour(self, name: str) -> Neighbour:
         """Return another robot of the LAN, named in ``services.neighbours.listens``. Raises PebbleError for others."""
         self._check()
-        found = self._neighbours.get(name)
-        if found is None:
+        neighbour = self._neighbours.get(name)
+        if neighbour is None:
             section = getattr(self.config.services, "neighbours", None)  # with its extension
             if section is None or not section.enabled or name not in section.listens:
                 raise PebbleError(f'robot.neighbour: {name!r} is not in services.neighbours.listens: add "{name}": []')
             latest = _Latest(partial(self._subscribe_to, name), self._clock)
             way = Way(self._transport, self._wheels, latest.of, self._check, self._check_drives, self._clock)
-            found = self._neighbours[name] = Neighbour(name, self.config.identity, way)
-        return found
+            neighbour = self._neighbours[name] = Neighbour(name, self.config.identity, way)
+        return neighbour
 
     def sleep(self, seconds: float) -> None:
         """Wait; the wheels stop after 0.75 s without a command."""
@@ -218,8 +218,8 @@ class Robot:
             self._exit_code = exit_code
         self._stopped.set()
         self._wheels.end(why)
-        for one in list(self._neighbours.values()):
-            one.end()
+        for neighbour in list(self._neighbours.values()):
+            neighbour.end()
         locked = self._publishing.acquire(timeout=_STUCK_S)
         try:
             values, self._last_values = self._last_values, {}

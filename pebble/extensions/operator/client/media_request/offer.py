@@ -60,5 +60,5 @@ def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
 
 def best(medium: Medium, encodings: Collection[str], viewers: Sequence[frozenset[str]]) -> str | None:
     """Return the best of what most viewers can show or play; None: whatever the robot sends, as it lists none."""
-    known = [encoding for encoding in BEST_FIRST[medium] if encoding in encodings]
-    return max(known, key=lambda encoding: sum(encoding in can for can in viewers), default=None)
+    readable = [encoding for encoding in BEST_FIRST[medium] if encoding in encodings]
+    return max(readable, key=lambda encoding: sum(encoding in can for can in viewers), default=None)
