@@ -75,7 +75,7 @@ def acl_text(fleet: Fleet) -> str:
 
 def passwords_text(passwords: Mapping[str, Hashed]) -> str:
     """Return the file `passwords`, as `mosquitto_passwd` writes it."""
-    return "".join(f"{name}:$7${one.iterations}${one.salt}${one.hash}\n" for name, one in passwords.items())
+    return "".join(f"{name}:$7${hashed.iterations}${hashed.salt}${hashed.hash}\n" for name, hashed in passwords.items())
 
 
 def passwords_in(text: str) -> dict[str, Hashed]:

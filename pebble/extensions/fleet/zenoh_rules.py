@@ -22,7 +22,7 @@ from pebble.transports.zenoh.keymap import filter_to_key
 
 _ANY = "+/+/+"  # the levels of any robot
 _STOP = ESTOP.topic(_ANY)
-_FLAGS = tuple(f"/{one.suffix}" for one in CHANNELS if one.kind is Kind.FLAG)
+_FLAGS = tuple(f"/{channel.suffix}" for channel in CHANNELS if channel.kind is Kind.FLAG)
 
 
 def zenoh_text(fleet: Fleet) -> bytes:

@@ -57,7 +57,7 @@ class Control:
         self._why_not = ""  # why this page may not drive at all
         self._logs = LogReader()
         self._large_due = False  # whether the page has received the last large value
-        self._moved: set[str] = set()  # robots that this lease has moved, for the audit
+        self._moved: set[str] = set()  # robots moved since this page has control, for the audit
 
     async def serve(self) -> None:
         """Serve until the page or the server ends it. What the page moved has been stopped then."""
@@ -137,14 +137,14 @@ class Control:
                 self._server.unwatch(self._interest.watched)
 
     async def _leave(self, reason: Leave) -> None:
-        self._end_leases()
+        self._end_control()
         try:
             await self._websocket.send_text(encode(m.Bye(why=str(reason), again=True)))
             await self._websocket.close(4000)
         except (WebSocketDisconnect, RuntimeError):
             pass  # it has gone already
 
-    def _end_leases(self) -> None:
+    def _end_control(self) -> None:
         self._server.drivers.closed(self._tab, for_good=True)
 
     def _is_secure(self) -> bool:
@@ -193,7 +193,7 @@ class Control:
                 if op.ref == self._interest.watched:
                     self._logs.begin(op.origin, op.after, on=op.on)
             case m.Lease():
-                self._lease(op)
+                self._control(op)
             case m.PictureFromOp():
                 if self._may("drive", op):
                     self._server.sources.choose(op.ref, op.source)
@@ -282,7 +282,7 @@ class Control:
         if before:
             self._server.unwatch(before)
 
-    def _lease(self, op: m.Lease) -> None:
+    def _control(self, op: m.Lease) -> None:
         server = self._server
         self._moved.discard(op.ref)
         if not op.take:
@@ -380,7 +380,7 @@ class Control:
     async def _check_session(self) -> None:
         session = await asyncio.to_thread(self._check)
         if session is None or session.role != self._session.role:
-            self._end_leases()
+            self._end_control()
             await self._websocket.send_text(encode(m.Bye(why="logged out", again=False)))
             await self._websocket.close(4001)
 

@@ -27,7 +27,7 @@ class _FromPage(Struct, frozen=True, kw_only=True, tag_field="op"):
 
 
 class Hello(_FromPage, frozen=True, kw_only=True, tag="hello"):
-    """The first message. ``token`` is the one of the page's last connection; it restores a lease within 5 s."""
+    """The first message. ``token`` is the one of the page's last connection; within 5 s it restores control."""
 
     version: Short  # of the page; another one than the server's may not drive
     device: Short = ""  # what others see beside the user's name: "phone"
@@ -81,7 +81,7 @@ class DriveOp(_FromPage, frozen=True, kw_only=True, tag="drive"):
 
 
 class StopOp(_FromPage, frozen=True, kw_only=True, tag="stop"):
-    """The space bar: a zero, from everybody, with or without a lease. It does not latch."""
+    """The space bar: a zero, from everybody, with or without control. It does not latch."""
 
     ref: Ref
 

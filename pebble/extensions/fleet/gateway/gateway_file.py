@@ -70,7 +70,7 @@ def load_gateway(path: Path, env: Mapping[str, str] = os.environ) -> tuple[Gatew
     _check_sides(reader.notes, gateway, operators)
     _check_neighbours(reader.notes, gateway)
     if reader.notes.problems:
-        raise ConfigError(list(dict.fromkeys(f"{path.name}: {one}" for one in reader.notes.problems)))
+        raise ConfigError(list(dict.fromkeys(f"{path.name}: {problem}" for problem in reader.notes.problems)))
     return gateway, name, default_run_folder(f"gateway {path}", env)
 
 
