@@ -67,7 +67,7 @@ def main(robot: Robot, options: Options) -> None:
     follower = Follower(convert(options, FollowSettings, from_attributes=True))
     companion = Companion(options.ahead_m, options.left_m)
     while True:
-        mine, its = (pose_of(one.latest(WHEEL_ODOMETRY, POSE_AGE_S)) for one in (robot, other))
+        mine, its = (pose_of(seen.latest(WHEEL_ODOMETRY, POSE_AGE_S)) for seen in (robot, other))
         if mine is None or its is None:
             log.warning("odometry", "waits for the odometry of %s", options.robot if its is None else "this robot")
             robot.stop()

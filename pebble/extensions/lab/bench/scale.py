@@ -73,8 +73,8 @@ def run(settings: Settings, console: Console) -> Shown:
             yield from measure(boards, settings.seconds)
 
     measure_rounds(results, 1, measure_all, console)
-    own = [cell for cell in results.cells if cell.params.get("process") in (None, PAGE)]
-    return Shown(results, [table(results)], plots.lines("scale", "What boards cost", own, over="boards"))
+    cells = [cell for cell in results.cells if cell.params.get("process") in (None, PAGE)]
+    return Shown(results, [table(results)], plots.lines("scale", "What boards cost", cells, over="boards"))
 
 
 def table(results: Results) -> Table:

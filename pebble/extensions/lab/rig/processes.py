@@ -234,7 +234,7 @@ class Processes:
 
     def __exit__(self, *_: object) -> None:
         for kind, within_s in enumerate(self.ends_s):
-            end_all([program for program, one in self._kinds.items() if one == kind], within_s)
+            end_all([program for program, its_kind in self._kinds.items() if its_kind == kind], within_s)
         if not self.keep:
             shutil.rmtree(self.folder, ignore_errors=True)
 

@@ -46,16 +46,16 @@ class LinuxRobot(Robot):
     has_media = True
 
     def __init__(self, running: Testbed, name: str) -> None:
-        own = _config(name)
+        config = _config(name)
         remote, folder = (HOST, running.broker_port), running.folder / name
-        super().__init__(running, own["transport"]["kind"], remote, name=name, folder=folder)
+        super().__init__(running, config["transport"]["kind"], remote, name=name, folder=folder)
         self.local_port = running.local_broker.port
         self.voice = folder / "voice"  # where its loudspeaker records what it plays of operators' voices
         self._imu = folder / "imu"  # a serial port
         self.instances: dict[str, Config] = {}
         if name == "goob":
             self.instances["imu"] = {"protocol": "pebble_serial_v1", "serial": {"port": str(self._imu)}}
-        self._own = own | {"services": own["services"] | {"av_daemon": {}}}
+        self._own = config | {"services": config["services"] | {"av_daemon": {}}}
         raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
         self._services = {
             "mqtt_bridge": {
@@ -199,7 +199,7 @@ class Testbed(Processes):
         """Wait until all robots can be driven. Raises PebbleError after that time, or if a process ends."""
         discovery, end = Discovery(), time.monotonic() + timeout
         with create("mqtt", "testbed", MqttSettings(host=HOST, port=self.broker_port)) as transport:
-            transport.subscribe(ALL_OUTGOING, lambda one: discovery.receive(one, time.monotonic(), time.time()))
+            transport.subscribe(ALL_OUTGOING, lambda message: discovery.receive(message, time.monotonic(), time.time()))
             while sum(robot.ready(time.monotonic()) for robot in discovery.all_robots()) < len(self.robots):
                 if (problems := self.unexpected_exits()) or time.monotonic() > end:
                     raise PebbleError("; ".join(problems) or "the robots did not become ready to drive")

@@ -304,4 +304,6 @@ def _id(topic: str) -> str:
 def _number(value: dict[str, Any], *names: str) -> float | None:
     """Return the first of the named fields that is a number; None if none is."""
     found = (value.get(name) for name in names)
-    return next((float(one) for one in found if isinstance(one, int | float) and not isinstance(one, bool)), None)
+    return next(
+        (float(number) for number in found if isinstance(number, int | float) and not isinstance(number, bool)), None
+    )

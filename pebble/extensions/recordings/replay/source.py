@@ -69,7 +69,7 @@ class ReplaySource:
                 found[message.channel.topic] = [message]
             elif message.channel.topic in found and is_picture(message.payload):
                 found[message.channel.topic].append(message)
-        pictures = [message for each in found.values() if len(each) <= _PICTURES for message in each]
+        pictures = [message for messages in found.values() if len(messages) <= _PICTURES for message in messages]
         return sorted(pictures, key=lambda message: message.log_ns)
 
     def _having(self, chooses: Callable[[Channel], bool], since_ns: int, until_ns: int) -> list[Path]:

@@ -94,6 +94,6 @@ def recorder_events(connection: Any, indexes: Sequence[Path], since_ns: int, unt
         elif event == "dropped" and since_ns <= ns < until_ns:
             found.dropped += messages
     connection.execute("CREATE TEMP TABLE breaks (since_ns BIGINT, until_ns BIGINT)")
-    for one in found.breaks():
-        connection.execute("INSERT INTO breaks VALUES (?, ?)", one)
+    for pause in found.breaks():
+        connection.execute("INSERT INTO breaks VALUES (?, ?)", pause)
     return found
