@@ -1,8 +1,7 @@
-"""Compressed sound files as samples, a piece at a time, by PyAV; and a writer of wav files."""
+"""Compressed sound files as samples, a piece at a time, by PyAV."""
 
 from __future__ import annotations
 
-import wave
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
@@ -55,12 +54,3 @@ class SoundFile:
 
     def _undecodable(self, error: Exception) -> PebbleError:
         return PebbleError(f"{self._name} cannot be decoded: {getattr(error, 'strerror', None) or error}")
-
-
-def write_wav(path: Path, samples: bytes, rate: int) -> None:
-    """Write one channel of s16le as a wav file."""
-    with wave.open(str(path), "wb") as file:
-        file.setnchannels(1)
-        file.setsampwidth(2)
-        file.setframerate(rate)
-        file.writeframes(samples)

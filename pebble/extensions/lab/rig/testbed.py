@@ -6,6 +6,7 @@ import json
 import struct
 import threading
 import time
+import wave
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -19,7 +20,6 @@ from pebble.extensions.lab.rig.page import Ready
 from pebble.extensions.lab.rig.processes import HOST, OPERATORS, Processes, Program, python
 from pebble.extensions.lab.rig.robot import MEDIA, START_S, Config, Robot, SimulatedRobot
 from pebble.extensions.lab.simulation.world.program import port_path, trace_path
-from pebble.extensions.media.sound_file import write_wav
 from pebble.extensions.operator.client.discovery import ALL_OUTGOING, Discovery
 from pebble.extensions.operator.client.page_packages import require_packages
 from pebble.transports import MqttSettings, create
@@ -98,7 +98,7 @@ class RoomRobot(LinuxRobot):
         sounds = self.folder / "sounds"
         (sounds / "signals").mkdir(parents=True)
         for clip, seconds in {CLIP: 1.0, "signals/beep.wav": 0.15, "signals/long.wav": 0.6}.items():
-            write_wav(sounds / clip, HORN[: 2 * round(seconds * _RATE)], _RATE)
+            _write_wav(sounds / clip, HORN[: 2 * round(seconds * _RATE)])
         playback = {"directory": str(sounds), "player_command": _loudspeaker(self.played)}
         self._services |= {
             "av_daemon": deep_merge(MEDIA["av_daemon"], {"video": {"device": f"{self.room}#{name}"}}),
@@ -111,6 +111,15 @@ class RoomRobot(LinuxRobot):
 
 def _config(name: str) -> Any:
     return json.loads((files("pebble") / "configs" / f"{name}.json").read_text())
+
+
+def _write_wav(path: Path, samples: bytes) -> None:
+    """Write one channel of s16le."""
+    with wave.open(str(path), "wb") as file:
+        file.setnchannels(1)
+        file.setsampwidth(2)
+        file.setframerate(_RATE)
+        file.writeframes(samples)
 
 
 def _loudspeaker(record: Path) -> list[str]:
