@@ -1,6 +1,7 @@
 """The owner of the serial line to a self-describing MCU (``pebble_serial_v1``), whose manifest defines its topics."""
 
 import logging
+import secrets
 import time
 from functools import partial
 from typing import Any
@@ -42,7 +43,8 @@ from pebble.transports import Message, Subscription
 CLAIM_S = 0.25  # between publishing claims and using them: another device has objected by then
 _WATCH_S = 0.5
 
-#: Published to check a retained manifest; the process that has the device publishes it again.
+#: Published to check a retained manifest: the process that has the device publishes it again. With a token it is from the
+#: process that has the device: another one with a device of this uid warns.
 _UID_QUERY = Channel(
     metric=MCU_COMMAND.metric.replace("{name}", RESERVED),
     kind=Kind.COMMAND,
@@ -64,6 +66,7 @@ class DescribedBridge(SerialService):
         self._session = Session(self.config.base)
         self.watchdog = ImuWatchdog(self.options, self.instance)
         self._peers = PeerDevices()
+        self._token = secrets.token_hex(8)
         self._conflict_logged = False  # another device has the same uid
         self.device: Device | None = None
         self._published_states: dict[int, tuple[Reading, int]] = {}  # newest of each state interface, its epoch ms
@@ -181,9 +184,16 @@ class DescribedBridge(SerialService):
     # -- the device appears and leaves
 
     @on(_UID_QUERY)
-    def on_question(self, _question: dict[str, Any], uid: str) -> None:
-        if self.device is not None and uid == self.device.uid:
+    def on_question(self, question: dict[str, Any], uid: str) -> None:
+        if self.device is None or uid != self.device.uid:
+            return
+        token = question.get("from")
+        if not token:
             self.publish(MCU_DESCRIBE, self.device.payload, uid=uid)
+        elif token != self._token and not self._conflict_logged:
+            self._conflict_logged = True
+            text = "%s: another device has this uid, too: both obey its commands; append the chip's own number"
+            self.log.warning(text, uid)
 
     def _publish_device(self, manifest: Manifest) -> None:
         port = str(self.options.serial.port)
@@ -205,6 +215,7 @@ class DescribedBridge(SerialService):
         self._listen_generic(device, private=False)  # a reader of the manifest may send commands at once
         self.publish(MCU_LOCAL_ONLY, device.local_only, uid=device.uid)
         self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)
+        self.publish(MCU_COMMAND, {"from": self._token}, uid=device.uid, name=RESERVED)
         self._listen_generic(device, private=True)
         self.aliases.announce(device)
         self.call_at(self.clock() + CLAIM_S, partial(self.aliases.permit, device))
@@ -292,10 +303,6 @@ class DescribedBridge(SerialService):
         if self.device is not None and uid == self.device.uid:
             if manifest is None:
                 self.republish()  # another process removed it, for example that of a device with the same uid
-            elif not retained and not self._conflict_logged:
-                self._conflict_logged = True
-                text = "%s: another device has this uid, too: both obey its commands; append the chip's own number"
-                self.log.warning(text, uid)
             return
         if manifest is None:
             self._peers.forget(uid)

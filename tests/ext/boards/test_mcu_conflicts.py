@@ -98,10 +98,11 @@ def test_a_second_device_with_one_uid_is_warned_of_and_takes_nothing_along(
     other = rig.mcu(LAMP, "two")
     rig.bridge("one")
     rig.described("lamp-1")
+    assert "another device" not in caplog.text
     rig.bridge("two")
     assert until(lambda: "lamp-1: another device has this uid, too" in caplog.text)
     other.unplug()
-    assert until(lambda: rig.world.newest_raw("mcu/lamp-1/describe") == [])
+    assert until(lambda: b"" in [message.payload for message in rig.world.on("mcu/lamp-1/describe")])
     rig.listener("late").described("lamp-1")
 
 
