@@ -43,8 +43,8 @@ from pebble.transports import Message, Subscription
 CLAIM_S = 0.25  # between publishing claims and using them: another device has objected by then
 _WATCH_S = 0.5
 
-#: Published to check a retained manifest: the process that has the device publishes it again. With a token it is from the
-#: process that has the device: another one with a device of this uid warns.
+#: Published to check a retained manifest: the process that has the device publishes it again. With a token it is from a
+#: process that has a device of this uid: another one that has warns.
 _UID_QUERY = Channel(
     metric=MCU_COMMAND.metric.replace("{name}", RESERVED),
     kind=Kind.COMMAND,
