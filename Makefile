@@ -61,7 +61,7 @@ check: .venv/.ready-dev
 docs: .venv/.ready-dev
 	@$(VENV) -m pebble.extensions.operator.contract.docs build/docs
 	@$(VENV) tools/schema.py build/docs
-	@$(VENV) -m pebble.extensions.page.messages_docs build/docs
+	@$(VENV) tools/messages_docs.py build/docs
 	@$(VENV) tools/bounds.py build/docs
 
 long: .venv/.ready-dev

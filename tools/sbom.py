@@ -18,7 +18,7 @@ SBOM = ROOT / "build" / "sbom.cdx.json"
 
 
 def vendored(entries: list[dict[str, str]]) -> list[dict[str, Any]]:
-    """Components of npm's packages, each once, with their files."""
+    """Return the components of npm's packages, each once, with their files."""
     packages: dict[str, dict[str, Any]] = {}
     for entry in entries:
         purl = f"pkg:npm/{entry['name'].replace('@', '%40')}@{entry['version']}"

@@ -62,12 +62,12 @@ def _motion(before: Pose, now: Pose) -> tuple[complex, float]:
 
 
 def main(robot: Robot, options: Options) -> None:
-    """Both robots head in the same direction at the start."""
+    """Follow the other robot. Both head in the same direction at the start."""
     other, log = robot.neighbour(options.robot), RateLimitedLog(robot.log, period_s=10.0)
     follower = Follower(convert(options, FollowSettings, from_attributes=True))
     companion = Companion(options.ahead_m, options.left_m)
     while True:
-        mine, its = (pose_of(one.latest(WHEEL_ODOMETRY, POSE_AGE_S)) for one in (robot, other))
+        mine, its = (pose_of(seen.latest(WHEEL_ODOMETRY, POSE_AGE_S)) for seen in (robot, other))
         if mine is None or its is None:
             log.warning("odometry", "waits for the odometry of %s", options.robot if its is None else "this robot")
             robot.stop()

@@ -20,7 +20,7 @@ class DeadMan:
         self._armed = False
 
     def expired(self, now: int) -> bool:
-        """True once, when the limit has passed since the last ``feed``: the motors must stop."""
+        """True if the limit has passed since the last ``feed``, and once only: the motors must stop."""
         if not self._armed or diff(now, self._fed) < self.limit_ms:
             return False
         self._armed = False

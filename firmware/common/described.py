@@ -71,7 +71,7 @@ class Described:
         return b"unknown_interface"
 
     def send(self, kind: int, interface: int, sequence: int, data: bytes | bytearray) -> bool:
-        """False: there was no room for the frame."""
+        """Return False if there was no room for the frame."""
         sent = self.out.send(kind, interface, sequence, self.now, data)
         self._lost += not sent
         return sent

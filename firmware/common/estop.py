@@ -158,7 +158,7 @@ class EmergencyStop:
             self._saves = error.errno not in (_EROFS, _ENODEV)
 
     def _restore(self) -> None:
-        """No file: free. One that cannot be read: latched."""
+        """Restore the latch: free without a file, latched if it cannot be read."""
         try:
             if _FILE[1:] not in os.listdir("/"):
                 return

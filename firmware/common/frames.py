@@ -22,7 +22,7 @@ _CRC = (
 
 
 def crc16(data: bytes | bytearray, size: int) -> int:
-    """CRC-16/CCITT-FALSE of the first ``size`` bytes."""
+    """Return the CRC-16/CCITT-FALSE of the first ``size`` bytes."""
     crc, table = 0xFFFF, _CRC
     for index in range(size):
         crc ^= data[index] << 8

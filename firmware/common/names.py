@@ -10,7 +10,7 @@ ANY = b"by/+/"
 
 
 def sender(data: memoryview, at: int, stop: int) -> tuple[str, int]:
-    """``(account, place of the topic)`` behind the "by/" that ends at ``at``; "": what is there is no account.
+    """Return ``(account, place of the topic)`` behind the "by/" that ends at ``at``; "": no account is there.
 
     An account is up to 32 of a-z, 0-9, _ and -, which is none in front.
     """

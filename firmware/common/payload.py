@@ -107,7 +107,7 @@ def _axis(body: dict, name: str) -> float:
 
 
 def _number(text: str) -> float:
-    """0 for what is none, as Linux reads it: a board's float() would also accept 1_0, and "." and "e5" as 0."""
+    """Return 0 for what is none, as Linux reads it: a board's float() also accepts 1_0, and "." and "e5" as 0."""
     if "nan" in text or "inf" in text:
         raise ValueError
     if text.strip("0123456789+-.e") or not text.split("e")[0].strip("+-."):
@@ -124,5 +124,5 @@ def clamp(value: float) -> float:
 
 
 def mix(x: float, z: float) -> tuple[float, float]:
-    """Left and right wheel, -1..1, + = forward, for steering ``x`` (+ = right) and throttle ``z`` (+ = forward)."""
+    """Return left and right wheel, -1..1, + = forward, for steering ``x``, + = right, and throttle ``z``, + = ahead."""
     return clamp(z + x), clamp(z - x)

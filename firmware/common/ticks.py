@@ -11,7 +11,7 @@ _HALF = const(1 << 29)
 
 
 def diff(now: int, since: int) -> int:
-    """Milliseconds from ``since`` to ``now``; correct while they are less than 6.2 days apart."""
+    """Return the milliseconds from ``since`` to ``now``; correct while they are less than 6.2 days apart."""
     ahead = (now - since) & _MASK
     return ahead if ahead < _HALF else ahead - _HALF - _HALF
 

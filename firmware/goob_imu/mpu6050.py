@@ -31,5 +31,5 @@ class Mpu6050:
         return True
 
     def read(self, data: bytearray) -> None:
-        """Fourteen bytes, big-endian i16: acceleration x y z, temperature, gyroscope x y z."""
+        """Read fourteen bytes, big-endian i16: acceleration x y z, temperature, gyroscope x y z."""
         self._i2c.readfrom_mem_into(self._address, _ACCEL_XOUT_H, data)

@@ -27,7 +27,7 @@ class Clock:
         self._due = now
 
     def step(self, now: int, server: str) -> None:
-        """``server`` is the DNS server; "": there is no network. Failures are retried later."""
+        """Go on. ``server`` is the DNS server; "": there is no network. Failures are retried later."""
         if not server or not self.host:
             self._close(now)
             return

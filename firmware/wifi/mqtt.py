@@ -178,7 +178,7 @@ def text(data: bytes) -> bytes:
 
 
 def login(name: bytes, user: bytes, password: bytes, topic: bytes, will: bytes, alive_s: int) -> tuple:
-    """CONNECT for ``send``: a clean session, and a retained ``will`` of QoS 1 on ``topic`` (3.1)."""
+    """Return CONNECT for ``send``: a clean session, and a retained ``will`` of QoS 1 on ``topic`` (3.1)."""
     # clean session 2, will 4, its QoS 8, its retain flag 32, password 64, user 128
     # a password needs a user, whose name may be empty (3.1.2.9)
     flags = 0x2E | (0xC0 if password else 0x80 if user else 0)

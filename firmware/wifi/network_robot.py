@@ -136,7 +136,7 @@ class NetworkRobot:
             self._obey(raw if kind == "publication" else None, now)
 
     def _obey(self, raw: memoryview | None, now: int) -> None:
-        """``raw`` None: the payload is too long."""
+        """Obey a command. ``raw`` None: the payload is too long."""
         topic = self.session.client.topic
         stops = self.stops
         by = self.session.client.by

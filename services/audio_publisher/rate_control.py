@@ -1,4 +1,4 @@
-"""What is reduced when the connection is slow: first headers, then bits. Pure: times are passed in."""
+"""The reduction of sound on a slow connection: first headers, then bits. Pure: times are passed in."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ _LIMIT = 256  # packets in flight that are remembered; far more than may wait
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """How Opus is encoded; ``reduced`` is for display."""
+    """One way to encode Opus; ``reduced`` is for display."""
 
     bundle: int
     bitrate: int
@@ -40,17 +40,17 @@ class Step:
 
 def steps(bundle: int, bitrate: int) -> tuple[Step, ...]:
     """Return the steps from as configured to as little as still makes sense; only those that save something."""
-    found = [Step(bundle, bitrate)]
+    steps = [Step(bundle, bitrate)]
     if bundle < BUNDLE_LIMIT:
-        found.append(Step(BUNDLE_LIMIT, bitrate, f"{BUNDLE_LIMIT} parts a packet"))
+        steps.append(Step(BUNDLE_LIMIT, bitrate, f"{BUNDLE_LIMIT} parts a packet"))
     if bitrate > LEAST_BITRATE:
         reduced = f"{BUNDLE_LIMIT} parts a packet, {LEAST_BITRATE // 1000} kbit/s"
-        found.append(Step(BUNDLE_LIMIT, LEAST_BITRATE, reduced))
-    return tuple(found)
+        steps.append(Step(BUNDLE_LIMIT, LEAST_BITRATE, reduced))
+    return tuple(steps)
 
 
 class RateController:
-    """Decides how Opus is encoded, ``step``, and which packets are sent. ``outgoing()`` says what is unacknowledged.
+    """A controller of how Opus is encoded, ``step``, and which packets are sent. ``outgoing()``: the unacknowledged.
 
     ``thin``: after one that was slow, none is sent for a while.
     """
@@ -83,7 +83,7 @@ class RateController:
         return self.step if encoding == "opus" and self._levels.poll(self._age_s, now) else None
 
     def may_send(self, encoding: str) -> bool:
-        """Would another packet arrive in time, by the last poll?"""
+        """True if another packet would arrive in time, by the last poll."""
         return not self._is_resting and self._age_s <= (OPUS_WAITING_LIMIT_S if encoding == "opus" else WAITING_LIMIT_S)
 
     def sent(self, size: int, now: float) -> None:
@@ -95,8 +95,8 @@ class RateController:
 
 
 class LevelControl:
-    """Begins with the last step, because the connection is not known yet. Goes up while packets do not wait, more
-    slowly after each try that failed, and down while they do.
+    """A choice of step. It begins with the last one, because the connection is not known yet, goes up while packets do
+    not wait, more slowly after each try that failed, and down while they do.
     """
 
     def __init__(self, last: int, now: float) -> None:

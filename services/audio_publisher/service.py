@@ -1,4 +1,4 @@
-"""Sends the microphone's sound to operators: as few late packets as possible."""
+"""The sender of the microphone's sound: as few late packets as possible."""
 
 import threading
 from typing import Any
@@ -22,7 +22,7 @@ _END_S = 1.0  # for the microphone's thread to end
 
 
 class AudioPublisher(Service):
-    """A thread reads, encodes and sends; the service's thread handles requests and reports.
+    """The sender of sound. A thread reads, encodes and sends; the service's thread handles requests and reports.
 
     ``counters``: packets, bytes (sent), dropped (no connection, or one that is too slow), refused (not sound).
     """

@@ -1,4 +1,4 @@
-"""Plays an operator's voice."""
+"""The service that plays an operator's voice."""
 
 import threading
 import time
@@ -23,7 +23,7 @@ _WAITING_PACKETS = 48  # that wait to be played
 
 
 class AudioReceiver(Service):
-    """Its own connection receives packets, its own thread plays them; the service's thread only reports."""
+    """The player of voices: a connection receives packets, a thread plays them, the service's thread only reports."""
 
     name = "audio_receiver"
     publishes = (MEDIA_REPORT,)

@@ -1,4 +1,4 @@
-"""Which scripts there are: folders with an entry point, what the config lists, what they publish about themselves."""
+"""The catalogue of scripts: folders with an entry point, as the config and they themselves describe them."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class _Answer(NamedTuple):
 
 
 class Catalogue:
-    """Scans the folders. For one thread, because to ask a script takes up to 20 s."""
+    """The scripts in the folders. It belongs to one thread, because to ask a script takes up to 20 s."""
 
     def __init__(self, config: Config, *, asks: bool = True, clock: Callable[[], float] = time.monotonic) -> None:
         """``asks`` is False for a list of scripts without the settings of ours."""
@@ -154,8 +154,8 @@ class Catalogue:
     def _answer(self, name: str, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
         """Return what its files say; remembered until they change, a failure for a minute."""
         version = entry, stamp(entry), stamp(folder / MANIFEST)
-        known, before, until = self._answers.get(name, (None, _Answer(Description()), 0.0))
-        if (known == version and self._clock() < until) or (known is not None and not asks):
+        command, before, until = self._answers.get(name, (None, _Answer(Description()), 0.0))
+        if (command == version and self._clock() < until) or (command is not None and not asks):
             return before
         answer = self._asked(folder, entry, section, asks=asks)
         if not answer.asked:
@@ -187,8 +187,8 @@ class Catalogue:
             return _Answer(described, True, problem, asked=False)
         command = self._command(folder, entry, section, described, ours=True)
         try:
-            own = ask(command, folder, environment(section.env))
-            return _Answer(_merged(described, own), True, problem, measures=not own.drives)
+            answer = ask(command, folder, environment(section.env))
+            return _Answer(_merged(described, answer), True, problem, measures=not answer.drives)
         except DescribeError as error:
             return _Answer(described, True, str(error), isinstance(error, BrokenScriptError))
 
@@ -211,16 +211,18 @@ class Catalogue:
     def _settings(
         self, name: str, section: ScriptSection, described: Description, *, ours: bool
     ) -> tuple[Setting, ...]:
-        """By key: the config's, then the script's own. One of ours knows its options best."""
+        """Return the config's settings, then the script's own, each key once. One of ours knows its options best."""
         configured = [Setting(**asdict(argument)) for argument in section.args]
-        own = {setting.key: setting for setting in described.configs}
-        if ours and own:
-            unknown = [setting.key for setting in configured if setting.key not in own]
+        options = {setting.key: setting for setting in described.configs}
+        if ours and options:
+            unknown = [setting.key for setting in configured if setting.key not in options]
             if unknown:
                 self._complain(name, "%s has no setting %s: ignored", name, ", ".join(unknown))
-            configured = [_with_option(setting, own[setting.key]) for setting in configured if setting.key in own]
+            configured = [
+                _with_option(setting, options[setting.key]) for setting in configured if setting.key in options
+            ]
         merged = {setting.key: setting for setting in configured}
-        for setting in own.values():
+        for setting in options.values():
             merged.setdefault(setting.key, setting)
         settings = tuple(merged.values())
         if len(settings) > MAX_SETTINGS:
@@ -277,16 +279,16 @@ def _merged(first: Description, second: Description) -> Description:
     )
 
 
-def _with_option(configured: Setting, own: Setting) -> Setting:
-    return replace(configured, arg=own.arg, arg_false=own.arg_false, mode=own.mode)
+def _with_option(configured: Setting, option: Setting) -> Setting:
+    return replace(configured, arg=option.arg, arg_false=option.arg_false, mode=option.mode)
 
 
 def _dependencies(name: str, section: ScriptSection, described: Description) -> tuple[Dependency, ...]:
     """Return the config's, else the script's own; each script once, and never itself."""
     chosen: Iterable[tuple[str, Mapping[str, object]]]
     if section.dependencies:
-        chosen = ((each.file, each.config) for each in section.dependencies if each.enabled)
+        chosen = ((dependency.file, dependency.config) for dependency in section.dependencies if dependency.enabled)
     else:
-        chosen = ((each.file, each.config) for each in described.dependencies)
+        chosen = ((dependency.file, dependency.config) for dependency in described.dependencies)
     by_file = {file: Dependency(file, dict(config)) for file, config in chosen if file != name}
     return tuple(by_file.values())

@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 class Launch(Struct, frozen=True):
-    """What to start: ``file`` names the script in the log, ``tie`` ends it with this process."""
+    """A process to start: ``file`` names the script in the log, ``tie`` ends it with this process."""
 
     file: str
     command: tuple[str, ...]
@@ -42,7 +42,7 @@ class Launch(Struct, frozen=True):
 
 
 class Processes:
-    """Starts real processes. Only on the main thread: the kernel ties a process to the thread that starts it."""
+    """A starter of real processes. Main thread only: the kernel ties a process to the thread that starts it."""
 
     def __init__(self, lock: Path) -> None:
         self._guard = Guard(lock)
@@ -145,7 +145,7 @@ class Process:
 
 
 def _check_program(path: Path) -> None:
-    """Raises PebbleError for what the kernel reports as a missing file, although it is there."""
+    """Raise PebbleError for what the kernel reports as a missing file, although it is there."""
     if not path.is_file():
         return
     if not os.access(path, os.X_OK):

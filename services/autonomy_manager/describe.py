@@ -1,4 +1,4 @@
-"""Asks a script what it is: its `script.json`, or the script itself with `--describe` if it is one of ours."""
+"""The description of a script: by its `script.json`, or by the script itself with `--describe` if it is ours."""
 
 import ast
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +24,7 @@ _NICE = "10"  # lower than the robot's own processes
 
 
 class Description(Struct, frozen=True):
-    """What a script publishes about itself; ``command`` only in a manifest.
+    """The description that a script gives of itself; ``command`` only in a manifest.
 
     ``summary`` says in one sentence what it does; ``main`` are the keys of the settings that operators see first.
     ``drives`` is False for one that only measures; it counts only where ``pebble.script`` refuses to drive then.
@@ -62,11 +62,11 @@ def _texts(description: Description) -> Iterator[str]:
 
 
 class DescribeError(Exception):
-    """Why a script has no form."""
+    """The reason why a script has no form."""
 
 
 class BrokenScriptError(DescribeError):
-    """Why it cannot be started either."""
+    """The reason why a script cannot be started either."""
 
 
 def is_ours(entry: Path) -> bool:
@@ -135,7 +135,7 @@ def answer_of(command: Sequence[str], folder: Path, environment: Mapping[str, st
 
 
 def _shown(text: str) -> str:
-    """Fit for a log: what a terminal would obey is left out."""
+    """Return a text that is fit for a log: what a terminal would obey is left out."""
     return "".join(letter for letter in text if letter.isprintable())
 
 
@@ -156,7 +156,7 @@ def _parse(raw: bytes, source: str) -> Description:
 
 
 def stamp(file: Path) -> tuple[int, int] | None:
-    """Differs when the file has changed; None: there is none."""
+    """Return what differs when the file has changed; None if there is none."""
     try:
         status = file.stat()
     except OSError:

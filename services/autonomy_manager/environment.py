@@ -12,7 +12,7 @@ from pebble.services.autonomy_manager.interpreter import SYSTEM
 
 
 def environment(*more: Mapping[str, str], ours: bool = True) -> dict[str, str]:
-    """This process's variables and ``more`` of them; later ones replace earlier ones.
+    """Return this process's variables and ``more`` of them; later ones replace earlier ones.
 
     For scripts of others, with ``ours`` False, ``python3`` is the system's, also where Pebble's is in its place.
     """
@@ -20,9 +20,9 @@ def environment(*more: Mapping[str, str], ours: bool = True) -> dict[str, str]:
     for name in (RUN, CONFIG):
         merged.pop(name, None)
     if not ours and sys.prefix != sys.base_prefix and SYSTEM.is_file():
-        own = str(Path(sys.prefix, "bin"))
+        pebbles = str(Path(sys.prefix, "bin"))
         places = merged.get("PATH", "").split(os.pathsep)
-        merged["PATH"] = os.pathsep.join(sorted(places, key=lambda place: place == own))  # ours last: pebble is there
+        merged["PATH"] = os.pathsep.join(sorted(places, key=lambda place: place == pebbles))  # last: pebble is there
         merged.pop("VIRTUAL_ENV", None)
     for variables in more:
         merged |= variables

@@ -1,4 +1,4 @@
-"""What the scripts of a robot add to its capabilities, to ``pebble check`` and to what Tab completes."""
+"""Facts about a robot's scripts, for its capabilities, for ``pebble check`` and for what Tab completes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ends all processes of all scripts when this process has ended, however it ended, before the next one begins."""
+"""A guard that ends all processes of all scripts when this process has ended, before the next one begins."""
 
 import fcntl
 import logging

@@ -67,14 +67,14 @@ def lacking(command: Sequence[str], folder: Path, variables: Mapping[str, str]) 
     wanted = [name for name in names if name not in sys.stdlib_module_names and not _is_in(places, name)]
     wanted += needs
     try:
-        found = answer_of((command[0], "-c", _PROBE, *wanted), folder, variables) if wanted else b""
+        answer = answer_of((command[0], "-c", _PROBE, *wanted), folder, variables) if wanted else b""
     except DescribeError as error:
         return [str(error)]
-    return found.decode().splitlines()
+    return answer.decode().splitlines()
 
 
 def _sources(entry: Path) -> Iterator[bytes]:
-    """Yield the text of a script, and of the files beside it of which it has the names."""
+    """Yield the text of a script, and of the files beside it that it names."""
     try:
         text = _read(entry)
         yield text

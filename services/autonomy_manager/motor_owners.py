@@ -1,4 +1,4 @@
-"""What the motor owners publish: whether a script may start, and why one that runs has to end. Pure."""
+"""The motor owners' states: whether a script may start, and why one that runs has to end. Pure."""
 
 from collections.abc import Collection, Iterator
 
@@ -31,8 +31,8 @@ class MotorOwners:
         if self._takes(owner, self._controls):
             self._controls[owner] = state
 
-    def _takes(self, owner: str, known: Collection[str]) -> bool:
-        return owner in self._names or (not self._names and (owner in known or len(known) < _MOST))
+    def _takes(self, owner: str, owners: Collection[str]) -> bool:
+        return owner in self._names or (not self._names and (owner in owners or len(owners) < _MOST))
 
     def holder_beside(self, by: str) -> str:
         """Return who has control, if it is not the account of ``by``; else empty. The first owner decides."""
@@ -48,11 +48,11 @@ class MotorOwners:
 
     @property
     def barred(self) -> int:
-        """No run up to this one moves anything."""
+        """The newest run that moves nothing any more."""
         return newest(state.last_barred for state in self._states.values())
 
     def steps_to(self, run: int) -> Iterator[int]:
-        """Numbers by whose zeros every owner comes to take ``run`` as newer.
+        """Yield numbers by whose zeros every owner comes to take ``run`` as newer.
 
         One that was away while a stranger sent numbers far ahead may be more than half of all numbers behind.
         """
@@ -62,11 +62,11 @@ class MotorOwners:
 
     @property
     def refusal(self) -> str:
-        """Why no script may start; empty if one may."""
+        """The reason why no script may start; empty if one may."""
         return next((_stopped(owner, state) for owner, state in self._states.items() if state.latched), "")
 
     def baseline(self) -> Baseline:
-        """Return what must not change while a script runs."""
+        """Return boot, count of stops and last barred run of each owner, to compare while a script runs."""
         return {owner: (state.boot, state.count, state.last_barred) for owner, state in self._states.items()}
 
     @property

@@ -12,7 +12,7 @@ log = logging.getLogger(__name__)
 
 
 class Offer:
-    """All but the listing itself runs on the service's thread; ``on_change`` gets the new `autonomy-files`."""
+    """The scripts on offer. All but their listing runs on the service's thread; ``on_change`` gets `autonomy-files`."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class Offer:
 
     def _found(self, scripts: Mapping[str, Script]) -> None:
         self.scripts = dict(scripts)
-        found = files(scripts.values())
-        if found != self._files:
-            self._files = found
-            self._on_change(found)
+        listed = files(scripts.values())
+        if listed != self._files:
+            self._files = listed
+            self._on_change(listed)

@@ -1,4 +1,4 @@
-"""Runs one script at a time with the scripts it needs: start, stop, and what follows when one of them ends."""
+"""The run of a script with the scripts it needs: start, stop, and what follows when one of them ends."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Run:
 
 
 class Runner:
-    """All methods belong to the service's thread."""
+    """The runner of scripts, one at a time. All methods belong to the service's thread."""
 
     def __init__(self, service: AutonomyManager, spawn: Spawn, stop_timeout_s: float) -> None:
         self.error: str | None = None
@@ -155,12 +155,12 @@ class Runner:
     def _started(self, run: Run, step: Step) -> Part:
         script = step.script
         path = str(self._service.config_path)
-        own = {CONFIG: path, **({RUN: str(run.number)} if script.ours else {})}
+        variables = {CONFIG: path, **({RUN: str(run.number)} if script.ours else {})}
         launch = Launch(
             file=script.file,
             command=(*script.command, "--config", path, *step.options),
             folder=script.folder,
-            environment=environment(script.environment, own, ours=script.ours),
+            environment=environment(script.environment, variables, ours=script.ours),
             tie=signal.SIGTERM if script.ours else signal.SIGKILL,
         )
         part: Part

@@ -1,4 +1,4 @@
-"""What is known of one script, and how it is started."""
+"""A script of the catalogue, and the plan of its start."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Offers the robot's scripts to operators, and runs one at a time."""
+"""The service that offers the robot's scripts to operators, and runs one at a time."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _CLOSE_S = 1.0  # for scripts to end after SIGTERM when this process ends; it is
 
 
 class AutonomyManager(Service):
-    """``spawn`` and ``scripts`` replace processes and folders in tests."""
+    """The manager of scripts. ``spawn`` and ``scripts`` replace processes and folders in tests."""
 
     name = "autonomy_manager"
     publishes = (AUTONOMY_FILES, AUTONOMY_STATUS, DRIVE)
@@ -277,5 +277,5 @@ class AutonomyManager(Service):
             return replace(status, drives=False)
         return replace(status, overridden=True) if self.clock() < self._overridden_until else status
 
-    def _publish_files(self, found: list[dict[str, object]]) -> None:
-        self.publish(AUTONOMY_FILES, AutonomyFiles(files=found, timestamp=time.time()))
+    def _publish_files(self, listed: list[dict[str, object]]) -> None:
+        self.publish(AUTONOMY_FILES, AutonomyFiles(files=listed, timestamp=time.time()))

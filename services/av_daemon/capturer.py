@@ -22,7 +22,7 @@ _POLL_S = 0.1  # how soon the first reader is noticed
 
 
 class Capturer:
-    """Captures until :meth:`end`, which does not wait, because a device can hang.
+    """A thread that captures until :meth:`end`, which does not wait, because a device can hang.
 
     After that it neither writes nor reports, even if its device answers at last.
     """
@@ -50,7 +50,7 @@ class Capturer:
         return self._thread.is_alive()
 
     def end(self) -> None:
-        """Returns at once, whatever the device does."""
+        """End soon, and return at once, whatever the device does."""
         self._ended.set()
         source = self._source
         if source is not None:

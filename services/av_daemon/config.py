@@ -96,7 +96,7 @@ class AvDaemon(ServiceSection, frozen=True, kw_only=True):
 
 
 def _check(reader: Reader, devices: AvDaemon, path: problems.Path) -> AvDaemon:
-    """Return the sockets for programs of the original. Without a folder for them the robot runs, and they wait."""
+    """Check the sockets for programs of the original. Without a folder for them the robot runs, and they wait."""
     sockets = devices.sockets()
     for section, file in sockets.items():
         if not file.parent.is_dir():

@@ -30,7 +30,7 @@ class Asked(Struct, frozen=True):
 
 
 class Health:
-    """Written by one thread at a time, read by any. The delay before a failed device is opened again doubles."""
+    """The health of a device. One thread at a time writes, any reads. The delay after a failure doubles."""
 
     def __init__(self, first_delay_s: float = FIRST_DELAY_S, asked: Asked | None = None) -> None:
         """``asked`` is None for a device that is computed: it may repeat itself."""
@@ -58,7 +58,7 @@ class Health:
         self._deadline = now + _OPENING_S
 
     def frame(self, info: FrameInfo, now: float, *, skipped: int = 0, content: int | str | None = None) -> None:
-        """``content`` differs from that of a frame with other bytes; None: it was not looked at."""
+        """Note a frame. ``content`` differs from that of a frame with other bytes; None: it was not looked at."""
         self._dropped += skipped
         if content is not None or self._info is None:
             self._info = info
@@ -72,7 +72,7 @@ class Health:
             self._failures = 0
 
     def failed(self, why: str, *, expected: bool = False) -> float:
-        """Returns how long to wait before the device is opened again; not longer each time for one that is expected."""
+        """Note a failure, and return how long to wait before the next try: the first delay if it was expected."""
         doublings = 0 if expected else self._failures
         delay: float = min(self._first_delay_s * 2**doublings, max(_LONGEST_DELAY_S, self._first_delay_s))
         self._failures = min(doublings + 1, 32)
@@ -83,13 +83,13 @@ class Health:
     # -- the service's thread
 
     def overdue(self, now: float) -> bool:
-        """Should the device have opened, or given a frame, by now?"""
+        """True if the device should have opened, or given a frame, by now."""
         deadline = self._deadline
         return deadline is not None and now > deadline
 
     @property
     def problems(self) -> dict[str, str]:
-        """Problems of the frames that come, by kind."""
+        """The problems of the frames that come, by kind."""
         info, asked = self._info, self._asked
         return {} if info is None or asked is None else dict(self._problems(info, asked))
 

@@ -1,4 +1,4 @@
-"""Cuts a stream of JPEG pictures into pictures. Bytes in, bytes out."""
+"""A splitter of a stream of JPEG pictures into pictures. Bytes in, bytes out."""
 
 from typing import Final
 
@@ -8,7 +8,7 @@ _BARE = frozenset((0x01, *range(0xD0, 0xD8)))  # markers without a length: TEM a
 
 
 class JpegSplitter:
-    """Takes bytes as they are read. A picture longer than ``limit`` bytes, or bytes that are none, are skipped."""
+    """A splitter of bytes as they are read. Pictures longer than ``limit`` bytes, and bytes of none, are skipped."""
 
     def __init__(self, limit: int = 16 << 20) -> None:
         self._limit = limit
@@ -43,6 +43,6 @@ def _end(buffer: bytearray) -> int:
             return -1
         at += 2 if kind in _BARE else 2 + int.from_bytes(buffer[at + 2 : at + 4])
         if kind == _SCAN:
-            found = buffer.find(_END, at)
-            return found + len(_END) if found >= 0 else 0
+            end = buffer.find(_END, at)
+            return end + len(_END) if end >= 0 else 0
     return 0

@@ -1,4 +1,4 @@
-"""What a robot with a camera and a microphone offers operators."""
+"""Offers of a robot with a camera and a microphone to operators, and the programs for them."""
 
 from collections.abc import Iterator
 from typing import Any

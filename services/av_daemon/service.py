@@ -1,4 +1,4 @@
-"""Owns camera and microphone, and publishes the status of everything that handles pictures and sound."""
+"""The owner of camera and microphone; it publishes the status of everything that handles pictures and sound."""
 
 import re
 import time
@@ -92,8 +92,8 @@ class AvDaemon(Service):
     def publish_status(self) -> None:
         """Publish changes at most once a second, and changes of mere numbers every few seconds."""
         now = self.clock()
-        own = {stream.name: stream.report(now) for stream in self._streams}
-        self._publish(self._reports.current(now) | own)
+        streams = {stream.name: stream.report(now) for stream in self._streams}
+        self._publish(self._reports.current(now) | streams)
 
     def _publish(self, value: dict[str, MediaReport]) -> None:
         now = self.clock()

@@ -55,7 +55,7 @@ class Source(Protocol):
 
 
 def opencv() -> Any:
-    """OpenCV on one thread, because one picture is too small a job for several.
+    """Return OpenCV on one thread, because one picture is too small a job for several.
 
     Imported only where a camera needs it: it is 16 MB, which a robot without one does not pay.
     """

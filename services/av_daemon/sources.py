@@ -1,4 +1,4 @@
-"""Which camera and microphone a config means, and a camera that is mounted at an angle."""
+"""The camera and the microphone that a config names, and a camera that is mounted at an angle."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ _BEHIND = 10  # chunks of sound that are made up for after a delay
 
 
 class Pacer:
-    """Waits for turn ``n``, which is due at ``start + n / rate``, however long the turns before it took.
+    """A steady pace: turn ``n`` is due at ``start + n / rate``, however long the turns before it took.
 
     A caller that is more than ``behind`` turns late skips to the present one. :meth:`interrupt` ends the wait.
     """
@@ -57,7 +57,7 @@ class Pacer:
 
 
 class ComputedDevice:
-    """A camera or microphone of which nothing is ever open."""
+    """A camera or microphone that is computed: nothing is ever open."""
 
     _pacer: Pacer
 
@@ -69,7 +69,7 @@ class ComputedDevice:
 
 
 class ComputedCamera(ComputedDevice, ABC):
-    """Draws a picture at each turn; turns are counted without readers, too."""
+    """A camera that draws a picture at each turn; turns are counted without readers, too."""
 
     def __init__(self, video: CameraCapture, start: float) -> None:
         self._shape = (video.height, video.width, 3)
@@ -112,7 +112,7 @@ class SyntheticCamera(ComputedCamera):
 
 
 class WorldCamera(ComputedCamera):
-    """What is seen from the robot that ``device`` (``world.json#goob``) names, in a world whose program shares poses.
+    """The view from the robot that ``device`` (``world.json#goob``) names, in a world whose program shares poses.
 
     The moment of a picture is when the robots were where it shows them. Raises NotRunningError while there is no world.
     """

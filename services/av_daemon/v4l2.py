@@ -51,7 +51,7 @@ class V4l2Camera:
         self._capture.release()
 
     def interrupt(self) -> None:
-        """OpenCV has no safe way while another thread reads."""
+        """Do nothing: OpenCV has no safe way while another thread reads."""
 
     def _open(self, video: CameraCapture) -> Any:
         cv2, device = self._cv2, self._device
@@ -76,10 +76,10 @@ class V4l2Camera:
         code = int(self._capture.get(self._cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
         has = code.to_bytes(4, "little").decode("latin-1")
         wanted = video.capture_format
-        own = _PASSED_ON.get(has) if self._capture.getBackendName() == "V4L2" else None  # others decode regardless
-        if own is None or wanted not in (own, "auto") or (wanted == "auto" and own != "mjpeg"):
+        encoding = _PASSED_ON.get(has) if self._capture.getBackendName() == "V4L2" else None  # others decode regardless
+        if encoding is None or wanted not in (encoding, "auto") or (wanted == "auto" and encoding != "mjpeg"):
             return "bgr24"
-        return own if self._capture.set(self._cv2.CAP_PROP_CONVERT_RGB, 0) else "bgr24"
+        return encoding if self._capture.set(self._cv2.CAP_PROP_CONVERT_RGB, 0) else "bgr24"
 
     def _first_picture(self) -> FrameInfo:
         self._wait()
@@ -114,7 +114,7 @@ class V4l2Camera:
 
 
 def is_device(name: str) -> bool:
-    """True for a camera of this machine; other names are of files and network streams."""
+    """True if it is a camera of this machine; other names are of files and network streams."""
     return name.isdecimal() or name.startswith("/dev/")
 
 

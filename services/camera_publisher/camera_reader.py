@@ -1,4 +1,4 @@
-"""Reads the camera's frames on a thread of its own and holds the newest one for the service."""
+"""A reader of the camera's frames, on a thread of its own, that holds the newest one for the service."""
 
 import logging
 import threading
@@ -17,7 +17,7 @@ _RETRY_S = 2.0
 
 
 class CameraReader:
-    """Reads while ``enabled``. ``on_frame()`` runs on the reader's thread for every frame and must only hand over.
+    """A reader that is ``enabled`` or not. ``on_frame()`` runs on its thread for every frame and must only hand over.
 
     ``on_end()`` runs there if the thread ends before :meth:`close`.
     """

@@ -1,4 +1,4 @@
-"""Which of a camera's frames are sent, and which of them as full pictures. Pure: times are passed in."""
+"""The choice of a camera's frames that are sent, and of those sent as full pictures. Pure: times are passed in."""
 
 _EARLY = 0.25  # of a period: how far ahead of its turn a frame may be, because cameras have jitter
 _LATE = 1.0  # periods that may be made up for; a longer pause is not
@@ -6,7 +6,7 @@ PERIOD_S = 1.0  # full pictures are large: one per second, however many receiver
 
 
 class FrameSelector:
-    """Turns come at the configured rate, on the clock of the capture times; a frame that is due uses up one turn.
+    """The turns of frames, at the configured rate on the clock of capture times; a frame that is due uses up one.
 
     Comparing each frame with the one sent before it would round every wait up to the camera's next frame: 15 frames per
     second thinned out to 10 would become 7.5. Turns do not drift: a frame sent late leaves the next one its time.
@@ -28,7 +28,7 @@ class FrameSelector:
             self._turn = min(self._turn, self._captured + self._period)
 
     def due(self, captured_s: float) -> bool:
-        """Is it the turn of a frame captured at ``captured_s``? A clock that went back begins anew."""
+        """True if it is the turn of a frame captured at ``captured_s``. A clock that went back starts again."""
         if captured_s < self._captured:
             self._turn = None
         self._captured = captured_s
@@ -58,7 +58,7 @@ class KeyframeRequests:
         self._required = True
 
     def due(self, now: float) -> bool:
-        """Has the next picture to be a full one?"""
+        """True if the next picture has to be a full one."""
         return self._required or (self._requested and now - self._sent_at >= PERIOD_S)
 
     def sent(self, now: float) -> None:

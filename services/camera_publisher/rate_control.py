@@ -1,4 +1,4 @@
-"""How many frames a connection gets and how large they are: first less quality, then less size, then fewer frames.
+"""The reduction of pictures on a slow connection: first less quality, then less size, then fewer frames.
 
 What counts is how long the connection was busy with each frame, compared with the time between two frames. Nothing is
 ever measured by sending more than is configured. Pure: times are passed in.
@@ -38,7 +38,7 @@ def wire_size(topic: str, payload: bytes) -> int:
 
 
 class RateController:
-    """Decides which frames are encoded, and how: ``step``. No picture is sent that would wait behind another.
+    """A controller of frames, and of how they are encoded: ``step``. No picture waits behind another on its way.
 
     ``outgoing()`` says what is unacknowledged on the connection. A frame that was due and not encoded because of that
     is counted as ``held_back``. ``thin``: the connection may carry very little, so pictures begin small, and a slow one
@@ -56,16 +56,16 @@ class RateController:
 
     @property
     def step(self) -> Step:
-        """How the next frame is to be encoded."""
+        """The way to encode the next frame."""
         return self._levels.step
 
     @property
     def in_flight(self) -> bool:
-        """Is a picture in flight? Then :meth:`poll` has to be called every 20 ms, to measure how long it takes."""
+        """True if a picture is in flight: :meth:`poll` has to be called every 20 ms then, to measure its time."""
         return len(self._window) > 0
 
     def may_encode(self, captured_s: float, now: float) -> bool:
-        """Is the frame captured at ``captured_s`` due, and would its picture wait for no other? Uses up its turn."""
+        """Return True if a frame captured at ``captured_s`` is due, and waits for no other; it uses up its turn."""
         if not self._selector.due(captured_s):
             return False
         round_trip_s = self._update(now)
@@ -108,7 +108,7 @@ class RateController:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What is sent, as shares of what is configured."""
+    """One way to send pictures, as shares of what is configured."""
 
     quality: Fraction
     size: Fraction  # of width and of height
@@ -117,7 +117,7 @@ class Step:
 
     @property
     def cost(self) -> float:
-        """Share of the bytes per second. Fewer frames differ more from each other."""
+        """The share of the bytes per second. Fewer frames differ more from each other."""
         return self.bytes * math.pow(self.rate, 0.9)
 
     def __str__(self) -> str:
@@ -127,7 +127,7 @@ class Step:
 
 
 def _step(quality: str, size: str, rate: str) -> Step:
-    """Costs as JPEG has them: half the quality is two thirds of the bytes, and small pictures are denser."""
+    """Return a step with the costs of JPEG: half the quality is two thirds of the bytes, small pictures are denser."""
     q, s, r = Fraction(quality), Fraction(size), Fraction(rate)
     return Step(q, s, r, math.pow(q, 0.6) * math.pow(s, 1.6))
 
@@ -150,7 +150,7 @@ SMALL = 6  # of them: small pictures, as many as are configured
 
 
 class LevelControl:
-    """Chooses one of STEPS: down at once and as far as it takes, up one step at a time, and more slowly each time that
+    """A choice among STEPS: down at once and as far as it takes, up one step at a time, and more slowly each time that
     went wrong.
     """
 
@@ -168,12 +168,12 @@ class LevelControl:
         return STEPS[self.level]
 
     def lost(self, turns: float, now: float) -> None:
-        """So many frames could not be sent just now because those before them were late."""
+        """Note how many frames could not be sent just now because those before them were late."""
         if now - (turns + 1) * self._frame_s > self._changed_at:  # else those before them were of another step
             self._lost.append((now, turns))
 
     def poll(self, acknowledged: list[Acknowledged], age_s: float, now: float) -> bool:
-        """Frames were ``acknowledged``; the oldest in flight is ``age_s`` old. True: another step from now on."""
+        """Note the frames ``acknowledged``, and the age of the oldest in flight. True: another step from now on."""
         self._seen.extend((now, frame.took_s) for frame in acknowledged if frame.sent_at >= self._changed_at)
         for memory in (self._seen, self._lost):
             while memory and now - memory[0][0] > _WINDOW_S:
@@ -195,12 +195,12 @@ class LevelControl:
 
     @property
     def _frame_s(self) -> float:
-        """Seconds from one frame to the next at this step."""
+        """The seconds from one frame to the next at this step."""
         return self._period / float(self.step.rate)
 
     @property
     def _load(self) -> float:
-        """Share of the time the connection is busy if every due frame is sent: may well be above 1."""
+        """The share of the time the connection is busy if every due frame is sent: may well be above 1."""
         if not self._seen:
             return 0.0
         frames = len(self._seen)
@@ -209,7 +209,7 @@ class LevelControl:
         return max(busy, 1.0 + lost) if lost > _LOST else busy
 
     def _go_down(self, load: float, now: float) -> bool:
-        """Reduces as far as necessary; what was just restored is reduced again, and restored later next time."""
+        """Reduce as far as necessary; what was just restored is reduced again, and restored later next time."""
         lower = range(self.level + 1, len(STEPS))
         affordable = self.step.cost * _AIM / load
         if self._rose_at is not None and now - self._rose_at < _PROBATION_S:

@@ -1,4 +1,4 @@
-"""How many frames may be in flight, and how long the connection was busy with each. Pure: times and bytes come in."""
+"""The frames in flight: how many may be, and how long the connection was busy with each. Pure."""
 
 from dataclasses import dataclass
 
@@ -75,7 +75,7 @@ class SendWindow:
         return acknowledged
 
     def full(self, round_trip_s: float, now: float) -> bool:
-        """Would another frame have to wait for those before it?"""
+        """True if another frame would have to wait for those before it."""
         if len(self._frames) >= self._limit:
             return True
         late_s = self.age_s(round_trip_s, now)
@@ -89,7 +89,7 @@ class SendWindow:
         return max(0.0, self._frames.age_s(now) - round_trip_s - self._slack_s(now))
 
     def _slack_s(self, now: float) -> float:
-        """By how much an acknowledgement may be late and say nothing about the connection."""
+        """Return by how much an acknowledgement may be late and say nothing about the connection."""
         return BEACON_SLACK_S if now < self._beacon_until else SLACK_S
 
 

@@ -1,4 +1,4 @@
-"""Sends the camera's pictures to operators: at the configured rate, never old ones, over a connection of its own."""
+"""The sender of the camera's pictures: at the configured rate, never old ones, over a connection of its own."""
 
 from functools import partial
 from typing import Any
@@ -30,7 +30,7 @@ _WORST_QUALITY = 3  # of a JPEG: below it nothing gets smaller
 
 
 class CameraPublisher(Service):
-    """Encodes nothing while the remote broker is away, and soon reads nothing either."""
+    """The sender of pictures. It encodes nothing while the remote broker is away, and soon reads nothing either."""
 
     name = "camera_publisher"
     publishes = (MEDIA_REPORT, CAMERA)

@@ -50,9 +50,9 @@ def of_board(
 ) -> BoardNeighbours:
     """Make those of the robot ``base`` at ``broker``; they do not run yet."""
     system, kind, name = base.split("/")
-    own = run_dir / f"{zlib.crc32(base.encode()):08x}"  # short, because of sockets in it
-    own.mkdir(mode=0o700, parents=True, exist_ok=True)
-    raw = {"robot": {"system": system, "type": kind, "id": name}, "transport": {"kind": "mqtt", "run_dir": str(own)}}
+    folder = run_dir / f"{zlib.crc32(base.encode()):08x}"  # short, because of sockets in it
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    raw = {"robot": {"system": system, "type": kind, "id": name}, "transport": {"kind": "mqtt", "run_dir": str(folder)}}
     plain: Config = parse(raw, folder=run_dir, env=env)
     config = replace(plain, local_mqtt=broker, services=replace(plain.services, neighbours=section))
     return BoardNeighbours(config, local_transport(config, BoardNeighbours.name))

@@ -1,4 +1,4 @@
-"""Between a robot and the hub of its LAN: what others may hear of it, and what their scripts may have it do."""
+"""The service between a robot and the hub of its LAN: what others hear of it, and what their scripts have it do."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MOST_BYTES = 16 * 1024  # of a message of another robot
 
 
 class NeighboursService(Service):
-    """``lan`` replaces the connection to the hub in tests."""
+    """The neighbours of one robot. ``lan`` replaces the connection to the hub in tests."""
 
     name = "neighbours"
     publishes = (DRIVE, NEIGHBOURS, NEIGHBOUR_VALUE)
@@ -68,8 +68,8 @@ class NeighboursService(Service):
         for channel in (ESTOP_STATE, CAPABILITIES):
             self.transport.subscribe(channel.filter(self.config.base), self._on_owner, direct=True)
         for metric in self._section.shares:
-            known = channel_of(f"{OUTGOING}/{metric}")
-            topic = self._me.outgoing(metric) if known is None else self.addresses[known].topic
+            declared = channel_of(f"{OUTGOING}/{metric}")
+            topic = self._me.outgoing(metric) if declared is None else self.addresses[declared].topic
             self.transport.subscribe(topic, partial(self._share, metric), direct=True)
         for name, granted in self._section.commanded.items():
             if DRIVE.metric in granted:
@@ -92,7 +92,7 @@ class NeighboursService(Service):
 
     @every(HEARTBEAT_S)
     def _announce(self) -> None:
-        """To the hub again and again; to operators when it changes."""
+        """Publish this robot's state: to the hub again and again, to operators when it changes."""
         now = self.clock()
         state = Neighbours(
             shares=list(self._section.shares),

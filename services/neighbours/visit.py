@@ -1,4 +1,4 @@
-"""Which run of which other robot drives this one, and under which number of its own. Pure.
+"""The run of another robot that drives this one, and its number here. Pure.
 
 A run of another robot is here a script like any other: it gets one number, once, and :class:`DriveSender`, which every
 script has, ends it by what motor owners publish. A person ends it by any command. What has ended never goes on.
@@ -16,7 +16,7 @@ LOCAL, PERSON = "a script of its own runs", "a person drives it"
 
 
 class Visit:
-    """``begin`` returns why a run cannot begin, ``number`` gives it a number above those of these, ``publish`` drives.
+    """A run of another robot here. ``begin`` returns why it cannot begin, ``number`` numbers it, ``publish`` drives.
 
     ``local_runs``: whether a script of this robot's own runs; it comes first. One thread; times are of one clock.
     """
@@ -72,27 +72,27 @@ class Visit:
 
     @property
     def due(self) -> float | None:
-        """When to call :meth:`tick`; None: not before something happens."""
+        """The time to call :meth:`tick`; None: not before something happens."""
         return self._sender.due
 
     def driver(self, now: float) -> str:
-        """Return whose run drives this robot; empty: none does."""
+        """Return the robot whose run drives this one; empty: none does."""
         return "" if self._sender.ended(now) else self._who[0]
 
     def refused(self, now: float) -> dict[str, NeighbourRefusal]:
-        """By robot its newest run here, while that has no effect."""
+        """Return the refusals by robot, of its newest run here while that has no effect."""
         name, run = self._who
         why = self._sender.refusal(now) if name else ""
         return self._refused | ({name: NeighbourRefusal(run=run, why=why)} if why else {})
 
     def _starts(self, name: str, run: int, now: float) -> bool:
-        """True if this run drives from now on."""
+        """Return True if this run drives from now on."""
         why = self._begin(name, run) or (PERSON if now - self._person_at < HOLD_S else "")
         barred = newest(state.last_barred for state in self._states.values())
         number = None if why else self._number(barred, self._received)
         if number is None:
-            known = self._refused.get(name)
-            if known is None or known.run != run:  # else the first reason is the one to know
+            refused = self._refused.get(name)
+            if refused is None or refused.run != run:  # else the first reason is the one to know
                 self._refused[name] = NeighbourRefusal(run=run, why=why or LOCAL)
             return False
         self.end(SUPERSEDED, now)

@@ -1,4 +1,4 @@
-"""Checks of a robot's own recorder: does it run, and is any file damaged?"""
+"""Checks of a robot's own recorder: whether it runs, and whether any file is damaged."""
 
 import json
 import time

@@ -1,4 +1,4 @@
-"""Records the robot on the robot."""
+"""The service that records the robot on the robot."""
 
 import os
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ _METRICS_S: Final = 10.0
 
 
 class RobotRecorder(Service):
-    """Subscribes to everything on the local transport, and on the remote side where the config says so."""
+    """A recorder of everything on the local transport, and on the remote side where the config says so."""
 
     name = "recorder"
 
@@ -55,7 +55,7 @@ class RobotRecorder(Service):
             self.log.debug("the recorder's numbers cannot be written: %s", error)
 
     def _connections(self) -> Iterator[tuple[str, str, Any]]:
-        """Name, kind and settings of each."""
+        """Yield name, kind and settings of each connection."""
         section, bridge = self.config.section(RecorderSection), self.config.services.mqtt_bridge
         yield "", self.config.transport.kind, local_settings(self.config)
         if not section.remote:

@@ -48,12 +48,12 @@ class Clips:
         self.problem = ""
         root = self._folder.resolve()
         names = (path[len(str(root)) :].lstrip("/") for path in islice(self._files(root), _MOST) if self._is_clip(path))
-        found = sorted(filter(self._can_be_named, names), key=lambda name: (name.lower(), name))
-        sizes = accumulate(len(name.encode()) for name in found)
+        clips = sorted(filter(self._can_be_named, names), key=lambda name: (name.lower(), name))
+        sizes = accumulate(len(name.encode()) for name in clips)
         listed = sum(size <= _LONGEST_LIST for size in sizes)
-        if listed < len(found):
-            self.problem = self.problem or f"only the first {listed} of {len(found)} are listed"
-        return found[:listed]
+        if listed < len(clips):
+            self.problem = self.problem or f"only the first {listed} of {len(clips)} are listed"
+        return clips[:listed]
 
     def find(self, name: str) -> Clip | None:
         """Return the clip that a command names: relative to the folder, or absolute inside it.
@@ -63,10 +63,10 @@ class Clips:
         root = self._folder.resolve()
         try:
             path = (root / _expanded(name.replace("\\", "/"))).resolve()
-            found = path.is_relative_to(root) and path.suffix.lower() in self._endings and path.is_file()
+            is_clip = path.is_relative_to(root) and path.suffix.lower() in self._endings and path.is_file()
         except (OSError, RuntimeError, ValueError):  # too long, links in a circle, no text of a path
             return None
-        if not found:
+        if not is_clip:
             return None
         inside = path.relative_to(root).as_posix()
         return Clip(inside if is_text(inside) else name, path)  # a link may have a name that can be published
@@ -87,7 +87,7 @@ class Clips:
         return os.path.isfile(path)  # noqa: PTH113
 
     def _can_be_named(self, name: str) -> bool:
-        """Commands are UTF-8, and a backslash in them is a slash."""
+        """True if a command can name it: commands are UTF-8, and a backslash in them is a slash."""
         if "\\" not in name and is_text(name):
             return True
         self.problem = self.problem or f"{name!r} cannot be named in commands: rename it"

@@ -11,7 +11,7 @@ from pebble.contract.capabilities import CapabilitiesValue
 
 
 class Playback(Section, frozen=True, kw_only=True):
-    """Where sounds are and what plays them; decoded ones are played by the audio receiver's command."""
+    """Sounds and their player; decoded ones are played by the audio receiver's command."""
 
     retired: ClassVar = {
         **dict.fromkeys(("stop_timeout", "scan_interval"), ONE_VALUE),

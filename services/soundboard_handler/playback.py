@@ -25,7 +25,7 @@ Post = Callable[[Callable[[], None]], None]
 
 
 class Playback:
-    """Plays ``clip`` once. All methods are for the service's thread; ``on_change`` is posted there by ``post``.
+    """A playback of ``clip``. All methods are for the service's thread; ``on_change`` is posted there by ``post``.
 
     It is called when the player runs (``process`` is set), and when the playback has ended.
     """
@@ -61,7 +61,7 @@ class Playback:
             self.process.signal(signal.SIGKILL)
 
     def wait(self, timeout: float) -> None:
-        """Until the player has ended, or killed after ``timeout`` seconds."""
+        """Wait until the player has ended; kill it after ``timeout`` seconds."""
         if self.process is not None:
             self.process.finish(timeout)
 

@@ -1,4 +1,4 @@
-"""Plays the clips of a folder when commands name them (paper A.8.10)."""
+"""The service that plays the clips of a folder when commands name them (paper A.8.10)."""
 
 import math
 import time
@@ -26,7 +26,7 @@ _LONGEST_NAME = 300  # characters in an error
 
 
 class _Request(Struct):
-    """What to play next, and how often."""
+    """A clip to play next, and how often."""
 
     clip: Clip
     times: float
@@ -34,7 +34,7 @@ class _Request(Struct):
 
 
 class SoundboardHandler(Service):
-    """Plays one clip at a time; the next one starts when the player of the one before has ended."""
+    """The player of clips, one at a time: the next one starts when the player of the one before has ended."""
 
     name = "soundboard_handler"
     publishes = (SOUNDBOARD_FILES, SOUNDBOARD_STATUS)
@@ -134,7 +134,7 @@ class SoundboardHandler(Service):
             self._publish_status()
 
     def _changed(self, playback: Playback) -> None:
-        """Note that the player runs, or has ended."""
+        """Follow the player, which runs now or has ended."""
         if playback is not self._playback:
             return
         request = self._request

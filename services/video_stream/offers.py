@@ -1,4 +1,4 @@
-"""What a robot with a third party's streaming program offers operators."""
+"""Offers of a robot with a third party's streaming program, and the process that runs it."""
 
 from collections.abc import Iterator
 

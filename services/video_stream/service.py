@@ -1,4 +1,4 @@
-"""Runs a foreign streaming program while video is requested."""
+"""The service that runs a foreign streaming program while video is requested."""
 
 import signal
 from typing import Any

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from pebble.extensions.media.decode import Decoded, VideoDecoder
-from pebble.extensions.media.scene import read_counter
 from pebble.extensions.media.sound import SoundDecoder
 from pebble.extensions.media.video import VIDEO_ENCODINGS
+from tests.kit.scene import read_counter
 from tests.robot.operator import ReceivedMessage
 from tests.robot.rig import DEVICES, Rig
 from tests.support import further, until

@@ -16,7 +16,7 @@ _BUILT = 1735689600  # 2025: a clock before this has not been set
 
 
 def memory_lock(limit: int, *, root: bool) -> CheckResult:
-    """``limit`` in bytes, or RLIM_INFINITY. A reader that cannot lock a shared segment loses every frame silently."""
+    """Judge the memory ``limit`` (bytes, or RLIM_INFINITY): readers that cannot lock shared memory lose all frames."""
     if limit == RLIM_INFINITY or limit >= _ENOUGH_LOCKED or root:
         return ok("no limit that matters")
     return warn(
@@ -26,7 +26,7 @@ def memory_lock(limit: int, *, root: bool) -> CheckResult:
 
 
 def clock(now: float, synchronised: bool | None) -> CheckResult:
-    """``now`` in epoch seconds; ``synchronised`` None if unknown."""
+    """Judge the clock. ``now`` in epoch seconds; ``synchronised`` None if unknown."""
     fix = "sudo timedatectl set-ntp true"
     if now < _BUILT:
         return failed(f"is set to {time.gmtime(now).tm_year}: stamps will be wrong", fix)

@@ -126,14 +126,14 @@ def _is_broker(pid: int) -> bool:
 
 def obeys_plugin(folder: Path) -> bool:
     """Return True if mosquitto has the dynamic-security plugin: by its configuration, or in the process that runs."""
-    found, pid = "", pid_of(folder)
+    configured, pid = "", pid_of(folder)
     with suppress(FileNotFoundError):
         lines = read_plain(folder / CONF).decode().splitlines()
-        found = "\n".join(line for line in lines if line.startswith("plugin "))
+        configured = "\n".join(line for line in lines if line.startswith("plugin "))
     # Where it runs as somebody else this may fail, and SIGHUP by this process does not reach it either.
     with suppress(OSError), as_before():
-        found += Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")
-    return _PLUGIN in found
+        configured += Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")
+    return _PLUGIN in configured
 
 
 def passwords_of(folder: Path) -> dict[str, broker_files.Hashed]:

@@ -47,7 +47,7 @@ class Entry(Struct, frozen=True):
 
 
 class Audit:
-    """Thread-safe; :meth:`write` never blocks."""
+    """The audit log of a page server. Thread-safe; :meth:`write` never blocks."""
 
     def __init__(self, path: Path | None) -> None:
         self._database = Database(path, _TABLES, _take_over)

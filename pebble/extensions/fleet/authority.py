@@ -85,8 +85,9 @@ def certificate_in(file: Path) -> x509.Certificate:
 
 def names_of(certificate: x509.Certificate) -> tuple[str, ...]:
     """Return the hosts that a certificate is for."""
-    found = [one.value for one in certificate.extensions if isinstance(one.value, x509.SubjectAlternativeName)]
-    return tuple(shown(str(name.value)) for names in found for name in names)
+    values = (extension.value for extension in certificate.extensions)
+    names = (name for value in values if isinstance(value, x509.SubjectAlternativeName) for name in value)
+    return tuple(shown(str(name.value)) for name in names)
 
 
 def fingerprint(certificate: x509.Certificate) -> str:

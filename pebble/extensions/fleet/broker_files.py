@@ -33,7 +33,7 @@ class Hashed(NamedTuple):
 
 
 def new_password() -> str:
-    """Four groups of four that can be typed on a phone."""
+    """Return four groups of four letters that can be typed on a phone."""
     return "-".join("".join(secrets.choice(_ALPHABET) for _ in range(4)) for _ in range(4))
 
 
@@ -44,7 +44,7 @@ def hashed(password: str) -> Hashed:
 
 
 def conf_text(fleet: Fleet, folder: Path, user: str) -> str:
-    """`mosquitto.conf`; all paths are absolute."""
+    """Return `mosquitto.conf`; all paths are absolute."""
     server = fleet.brokers[0]
     where = f" {server.host}" if is_loopback(server.host) else ""
     tls = [f"cafile {folder / CA_CERT}", f"certfile {folder / SERVER_CERT}", f"keyfile {folder / SERVER_KEY}"]
@@ -66,7 +66,7 @@ def conf_text(fleet: Fleet, folder: Path, user: str) -> str:
 
 
 def acl_text(fleet: Fleet) -> str:
-    """`acl`, of all accounts."""
+    """Return the file `acl`, with the rules of all accounts."""
     return "".join(
         f"user {name}\n" + "".join(f"topic {access} {filter_}\n" for access, filter_ in fleet.rules_of(name)) + "\n"
         for name in fleet.accounts
@@ -74,20 +74,20 @@ def acl_text(fleet: Fleet) -> str:
 
 
 def passwords_text(passwords: Mapping[str, Hashed]) -> str:
-    """`passwords`, as `mosquitto_passwd` writes it."""
-    return "".join(f"{name}:$7${one.iterations}${one.salt}${one.hash}\n" for name, one in passwords.items())
+    """Return the file `passwords`, as `mosquitto_passwd` writes it."""
+    return "".join(f"{name}:$7${hashed.iterations}${hashed.salt}${hashed.hash}\n" for name, hashed in passwords.items())
 
 
 def passwords_in(text: str) -> dict[str, Hashed]:
-    """Raises ValueError for what is no such file."""
-    found = {}
+    """Return the passwords in such a file, by account. Raises ValueError for what is none."""
+    passwords = {}
     for line in filter(None, map(str.strip, text.splitlines())):
         name, _, rest = line.partition(":")
         _, kind, iterations, salt, hash_ = rest.split("$")
         if kind != "7":
             raise ValueError(f"{name}: a password of kind {kind}")
-        found[name] = Hashed(salt, hash_, int(iterations))
-    return found
+        passwords[name] = Hashed(salt, hash_, int(iterations))
+    return passwords
 
 
 def rules_in(acl: str) -> Iterator[str]:

@@ -54,22 +54,22 @@ class Database:
 
     @property
     def removed(self) -> str:
-        """An error if its file is not where others find it; else empty."""
+        """The error if its file is not where others find it; else empty."""
         gone = self._own is not None and not self._own.in_place
         return f"{self._path} was removed or replaced: put it back, or start the page again" if gone else ""
 
     def rows(self, statement: str, values: Sequence[Any] = ()) -> list[Any]:
-        """Raises DatabaseError."""
+        """Return the rows that a statement yields. Raises DatabaseError."""
         with self._errors():
             return self._connection.execute(statement, values).fetchall()
 
     def execute(self, statement: str, values: Sequence[Any] = ()) -> sqlite3.Cursor:
-        """Raises DatabaseError; IntegrityError for what the tables forbid."""
+        """Execute a change. Raises DatabaseError; IntegrityError for what the tables forbid."""
         with self._errors():
             return self._connection.execute(statement, values)
 
     def version(self) -> tuple[int, int]:
-        """Another one after each change, by this process or any other. Raises DatabaseError."""
+        """Return a number that differs after each change, by this process or any other. Raises DatabaseError."""
         with self._errors():
             (by_others,) = self._connection.execute("PRAGMA data_version").fetchone()
             return by_others, self._connection.total_changes

@@ -35,7 +35,7 @@ class FleetError(PebbleError):
 
 
 class Server(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Where a broker of the fleet listens. ``unencrypted``: a port for boards that have no TLS.
+    """The place where a broker of the fleet listens. ``unencrypted``: a port for boards that have no TLS.
 
     ``included``: it is the mosquitto of its machine, which reads `mosquitto.conf` as a part of its own, and which
     programs of that machine reach at ``PLAIN_PORT`` of loopback: there TLS would keep out a robot whose clock is unset.
@@ -71,7 +71,7 @@ class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return replace(self, accounts={**self.accounts, name: account})
 
     def without(self, name: str) -> "Fleet":
-        return replace(self, accounts={one: account for one, account in self.accounts.items() if one != name})
+        return replace(self, accounts={other: account for other, account in self.accounts.items() if other != name})
 
     def _plain_bases(self) -> Sequence[str]:
         if self.plain:
@@ -80,7 +80,7 @@ class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def load(folder: Path) -> Fleet:
-    """Raises FleetError with the mistake in it."""
+    """Read the fleet of a folder. Raises FleetError with the mistake in it."""
     file = folder / FLEET
     try:
         fleet = msgspec.json.decode(read_plain(file), type=Fleet)
@@ -111,7 +111,7 @@ def save(folder: Path, fleet: Fleet) -> None:
 
 
 def refused(fleet: Fleet, name: str, account: Account) -> str:
-    """Empty if this account may be added, else why not."""
+    """Return why this account may not be added; empty if it may."""
     if not NAME.fullmatch(name):
         return f"{name!r} is no name: use 1 to 32 of a-z, 0-9, _ and -"
     if name in fleet.accounts:
@@ -129,7 +129,7 @@ def refused(fleet: Fleet, name: str, account: Account) -> str:
     for base in account.bases:
         if why := _refused_base(base, several=gateway):
             return why
-        same = (one for one, other in fleet.accounts.items() if base in other.bases and other.roles == account.roles)
+        same = (user for user, other in fleet.accounts.items() if base in other.bases and other.roles == account.roles)
         if robot and (owner := next(same, None)) is not None:
             return f"{base} belongs to {owner}"
     return ""
@@ -138,7 +138,7 @@ def refused(fleet: Fleet, name: str, account: Account) -> str:
 def _refused_base(base: str, *, several: bool) -> str:
     levels = base.split("/")
     try:
-        Identity(*(one if one != "+" or not several else "any" for one in levels))
+        Identity(*(level if level != "+" or not several else "any" for level in levels))
     except (ConfigError, TypeError):
         return f"{base!r} is no base: write SYSTEM/TYPE/ID, such as pebble/robots/goob"
     if any(character.isspace() or character == "%" for character in base):

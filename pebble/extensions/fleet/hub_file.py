@@ -43,7 +43,7 @@ def load_hub(path: Path, env: Mapping[str, str] = os.environ) -> tuple[HubFile, 
     if not hub.listen:
         reader.notes.problem(("listen",), 'is missing: a hub is reached there, such as ["tls/0.0.0.0:7447"]')
     if reader.notes.problems:
-        raise ConfigError(list(dict.fromkeys(f"{path.name}: {one}" for one in reader.notes.problems)))
+        raise ConfigError(list(dict.fromkeys(f"{path.name}: {problem}" for problem in reader.notes.problems)))
     return hub, hub.run_dir or default_run_folder(f"hub {path}", env)
 
 

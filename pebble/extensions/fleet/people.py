@@ -91,7 +91,7 @@ class People:
     # -- people
 
     def add(self, name: str, password: str, role: Role) -> None:
-        """Raises PeopleError."""
+        """Add a person. Raises PeopleError."""
         self.check_name(name)
         salt = secrets.token_bytes(16)
         values = (name, role.value, salt, _hash(usable(password), salt))
@@ -108,25 +108,25 @@ class People:
             raise _exists(name)
 
     def remove(self, name: str) -> None:
-        """Ends the person's sessions, too. Raises PeopleError."""
+        """Remove a person, and end the person's sessions. Raises PeopleError."""
         self._change_one(name, "DELETE FROM people WHERE name = ?", name)
 
     def set_password(self, name: str, password: str) -> None:
-        """Ends the person's sessions, too. Raises PeopleError."""
+        """Change a password, and end the person's sessions. Raises PeopleError."""
         salt = secrets.token_bytes(16)
         hashed = _hash(usable(password), salt)
         self._change_one(name, "UPDATE people SET salt = ?, hash = ? WHERE name = ?", salt, hashed, name)
         self._change("DELETE FROM sessions WHERE name = ?", name)
 
     def set_role(self, name: str, role: Role) -> None:
-        """Counts for running sessions, too. Raises PeopleError."""
+        """Change what a person may do, in running sessions as well. Raises PeopleError."""
         self._change_one(name, "UPDATE people SET role = ? WHERE name = ?", role.value, name)
 
     def list(self) -> list[User]:
         return [User(name, Role(role)) for name, role in self._rows("SELECT name, role FROM people ORDER BY name")]
 
     def version(self) -> tuple[int, int]:
-        """Another one after each change of people and sessions, by whatever process. Raises DatabaseError."""
+        """Return what differs after each change of people and sessions, by any process. Raises DatabaseError."""
         with self._lock:
             return self._database.version()
 
@@ -139,17 +139,17 @@ class People:
         others cannot keep a person out.
         """
         self._count_try(name, address)
-        known = name if NAME.fullmatch(name) else ""
-        rows = self._rows("SELECT name, role, salt, hash FROM people WHERE name = ?", known)
-        found, role, salt, expected = rows[0] if rows else ("", "", b"no such person..", self._no_hash)
+        looked_up = name if NAME.fullmatch(name) else ""
+        rows = self._rows("SELECT name, role, salt, hash FROM people WHERE name = ?", looked_up)
+        stored_name, role, salt, expected = rows[0] if rows else ("", "", b"no such person..", self._no_hash)
         typed = password[: 2 * MAX_PASSWORD]  # so long may one be whose accents are letters of their own
         given = [_hash(spelling, salt) for spelling in _spellings(typed)]
-        is_right = any(hmac.compare_digest(one, expected) for one in given)
-        if not is_right or not found or len(normalize("NFC", typed)) > MAX_PASSWORD:
+        is_right = any(hmac.compare_digest(digest, expected) for digest in given)
+        if not is_right or not stored_name or len(normalize("NFC", typed)) > MAX_PASSWORD:
             return None
         self._addresses.give_back(network_of(address))
         self._names.give_back(name)
-        return User(found, Role(role))
+        return User(stored_name, Role(role))
 
     def start_session(self, user: User, address: str = "") -> str:
         """Return a new session's token; the only copy of it."""
@@ -223,7 +223,7 @@ class People:
             raise TooManyTriesError(wait_s)
 
     def _rows(self, statement: str, *values: Any) -> Sequence[Any]:
-        """Raises DatabaseError, as all methods do."""
+        """Return the rows that a statement yields. Raises DatabaseError, as all methods do."""
         with self._lock:
             self._note_place()
             return self._database.rows(statement, values)
@@ -282,7 +282,7 @@ def usable(password: str) -> str:
 
 
 def _spellings(password: str) -> set[str]:
-    """Return how it is stored, and how earlier versions stored it: as typed, on macOS with accents of their own."""
+    """Return the spelling that is stored, and those that earlier versions stored: as typed, on macOS decomposed."""
     return {normalize("NFC", password), password, normalize("NFD", password)}
 
 

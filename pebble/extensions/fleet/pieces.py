@@ -1,4 +1,4 @@
-"""What belongs into the configs and files of a fleet's accounts: where they connect, and as whom."""
+"""Pieces of configs for a fleet's accounts: where they connect, and as whom."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def of_broker(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str,
 
 
 def of_certificate(fleet: Fleet, name: str) -> dict[str, Any]:
-    """Return what who has a certificate needs in its config, or as a file of its own.
+    """Return what the holder of a certificate needs in its config, or as a file of its own.
 
     Keys and authority lie beside it.
     """

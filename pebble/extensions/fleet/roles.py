@@ -72,7 +72,7 @@ class Rule(NamedTuple):
 
 
 class Account(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """What `fleet.json` has of one account. ``bases``: of a robot its own, of a gateway those that it carries.
+    """One account in `fleet.json`. ``bases``: of a robot its own, of a gateway those that it carries.
 
     ``plain``: a robot that does not know names, so its topics stay as they are without them. ``people``: the database
     of a page server's own people, if that is on this machine.
@@ -107,8 +107,8 @@ LOCAL = Session("local", "local", Role.ADMIN)
 
 def rights(roles: Iterable[str], level: SecurityLevel) -> frozenset[Right]:
     """Return what a person with these roles may do, which add up. Below ``named`` those who drive also reset."""
-    found = frozenset[Right]().union(*(_RIGHTS[role] for role in roles))
-    return found | {Right.RESET} if level != "named" and Right.DRIVE in found else found
+    held = frozenset[Right]().union(*(_RIGHTS[role] for role in roles))
+    return held | {Right.RESET} if level != "named" and Right.DRIVE in held else held
 
 
 def page_rights(role: Role, level: SecurityLevel = "open") -> frozenset[str]:
@@ -122,7 +122,7 @@ def right_of(channel: Channel) -> str:
 
 
 def add_up(roles: Sequence[str]) -> str:
-    """Empty if one account may have these roles, else why not."""
+    """Return why no account may have these roles together; empty if one may."""
     unknown = [role for role in roles if role not in _RIGHTS]
     if unknown or not roles:
         return f"{unknown[0] if unknown else ''!r} is no role: use {', '.join(ROLES)}"
@@ -144,32 +144,32 @@ def rules(
     ``at_hub``: what a Zenoh hub lets it do. That differs for a gateway, whose robots are at the hub, and their
     operators at the broker.
     """
-    found = [
+    all_rules = [
         *_of_bases(name, account, at_hub=at_hub),
         *_of_rights(name, rights(account.roles, level), level, plain, extra or Extra()),
     ]
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(all_rules))
 
 
 def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
     """Return what the right may write below ``incoming/``, as parts of filters."""
-    own = (one if isinstance(one, str) else one.metric for one in WRITES.get(right, ()))
-    return (*(re.sub(r"{[^}]*}", "+", one) for one in own), *getattr(extra, right, ()))
+    declared = (channel if isinstance(channel, str) else channel.metric for channel in WRITES.get(right, ()))
+    return (*(re.sub(r"{[^}]*}", "+", metric) for metric in declared), *getattr(extra, right, ()))
 
 
 def covered(right: Right, metric: str) -> str:
     """Return a metric of the contract that a filter of ``extra`` covers, with any name, and another right writes."""
     for channel in c.CHANNELS:
         if channel.direction == INCOMING and channel not in WRITES[right]:
-            own = re.sub(r"{[^}]*}", "+", channel.metric)
-            if any(_overlap(metric, known) for known in (own, f"{BY}/+/{own}")):
+            declared = re.sub(r"{[^}]*}", "+", channel.metric)
+            if any(_overlap(metric, filter_) for filter_ in (declared, f"{BY}/+/{declared}")):
                 return channel.metric
     return ""
 
 
-def _overlap(one: str, other: str) -> bool:
+def _overlap(filter_: str, other: str) -> bool:
     """True if some topic is covered by both of two filters without #."""
-    levels = one.split("/"), other.split("/")
+    levels = filter_.split("/"), other.split("/")
     same = all("+" in pair or pair[0] == pair[1] for pair in zip(*levels, strict=False))
     return len(levels[0]) == len(levels[1]) and same
 
@@ -185,7 +185,7 @@ def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
         else:
             yield from (Rule("read", f"{base}/{direction}/#") for direction in (INCOMING, OUTGOING))
             yield Rule("write", f"{base}/{INCOMING if at_hub else OUTGOING}/#")
-            yield from (Rule("write", one.filter(base)) for one in c.CHANNELS if one.kind is Kind.FLAG)
+            yield from (Rule("write", channel.filter(base)) for channel in c.CHANNELS if channel.kind is Kind.FLAG)
     if ProgramRole.GATEWAY in account.roles and not at_hub:
         yield Rule("read", c.ONLINE.filter(f"+/{GATEWAYS}/+"))
         yield Rule("write", c.ONLINE.filter(f"+/{GATEWAYS}/{name}"))

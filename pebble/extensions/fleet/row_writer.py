@@ -63,7 +63,7 @@ class RowWriter:
         self._wake.set()
 
     def _end_window(self, now: float) -> None:
-        """Let what was counted wait as well, and begin anew."""
+        """Queue a row for each kind that was only counted, and start new counts."""
         for row, count in self._counts.values():
             if count:
                 self._put({**row, "count": count})

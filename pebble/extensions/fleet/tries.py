@@ -42,7 +42,7 @@ class Tries:
 
 @lru_cache(maxsize=256)
 def network_of(address: str) -> str:
-    """Return what counts as one address: with IPv6 the /64, of which one machine can use every address."""
+    """Return what counts as one address: with IPv6 the /64, because one machine can use every address in it."""
     try:
         parsed = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:

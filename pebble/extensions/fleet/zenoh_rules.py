@@ -22,7 +22,7 @@ from pebble.transports.zenoh.keymap import filter_to_key
 
 _ANY = "+/+/+"  # the levels of any robot
 _STOP = ESTOP.topic(_ANY)
-_FLAGS = tuple(f"/{one.suffix}" for one in CHANNELS if one.kind is Kind.FLAG)
+_FLAGS = tuple(f"/{channel.suffix}" for channel in CHANNELS if channel.kind is Kind.FLAG)
 
 
 def zenoh_text(fleet: Fleet) -> bytes:
@@ -42,8 +42,8 @@ def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
     writes = [rule.filter for rule in held if rule.access == "write"]
     robot = ProgramRole.ROBOT in account.roles
     wills = [f"{base}/{OUTGOING}/#" for base in account.bases if robot]
-    whole = [one for one in writes if robot and one.endswith("/#")]
-    flags = [one for one in writes if one.endswith(_FLAGS)]
+    whole = [filter_ for filter_ in writes if robot and filter_.endswith("/#")]
+    flags = [filter_ for filter_ in writes if filter_.endswith(_FLAGS)]
     return HubAccount(tuple(wills), tuple(dict.fromkeys((*wills, *whole, *flags))))
 
 
@@ -52,8 +52,8 @@ def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: 
     if is_hub:
         yield from EVERYTHING
         return
-    reads, writes = (_keys(rule.filter for rule in held if rule.access == one) for one in ("read", "write"))
-    asks = tuple(wire.asked(one, name) for one in (wire.HELLO, wire.BYE))
+    reads, writes = (_keys(rule.filter for rule in held if rule.access == access) for access in ("read", "write"))
+    asks = tuple(wire.asked(kind, name) for kind in (wire.HELLO, wire.BYE))
     retained, hubs, counts = _retained(reads), (f"{wire.UP}*",), (f"{wire.SYNC}*",)
     yield Grant(OUT, ("put",), reads)
     yield Grant(IN, ("declare_subscriber",), reads)

@@ -41,13 +41,13 @@ def _value(schema: dict[str, Any], definitions: dict[str, Any], depth: int) -> d
     if "$ref" in schema:
         return _value(definitions[schema["$ref"].rpartition("/")[2]], definitions, depth + 1)
     if "anyOf" in schema:
-        some = [one for one in schema["anyOf"] if one.get("type") != "null"]
-        return _value(some[0], definitions, depth + 1) if len(some) == 1 else None
+        kinds = [kind for kind in schema["anyOf"] if kind.get("type") != "null"]
+        return _value(kinds[0], definitions, depth + 1) if len(kinds) == 1 else None
     kind = schema.get("type")
     if kind in _PLAIN:
         return {"type": kind}
     if kind == "object" and schema.get("properties"):
-        fields = {name: _value(one, definitions, depth + 1) for name, one in schema["properties"].items()}
+        fields = {name: _value(field, definitions, depth + 1) for name, field in schema["properties"].items()}
         return None if None in fields.values() else {"type": "object", "properties": fields}
     if kind == "array" and isinstance(schema.get("items"), dict):
         item = _value(schema["items"], definitions, depth + 1)

@@ -88,8 +88,8 @@ class MediaFeed:
             tasks.create_task(self._run_conversion())
 
     def receive(self, payload: bytes) -> None:
-        known = self._take_picture(payload) if self._medium == "video" else payload.startswith(PBAT)
-        if not known or len(payload) > MAX_PAYLOAD:
+        is_readable = self._take_picture(payload) if self._medium == "video" else payload.startswith(PBAT)
+        if not is_readable or len(payload) > MAX_PAYLOAD:
             self.refused += 1
             return
         self.waiting.append(Waiting(payload, time.time_ns(), self._sequence.complete))
@@ -111,12 +111,12 @@ class MediaFeed:
 
     def encoding(self) -> str | None:
         """Return the encoding to request: H.264 where a client wants it as it is, else what any viewer already gets."""
-        known = offered(self._robot.capabilities, self._medium)
-        if self._subscribed(VIDEO[1]) and "h264" in known:
+        encodings = offered(self._robot.capabilities, self._medium)
+        if self._subscribed(VIDEO[1]) and "h264" in encodings:
             return "h264"
         if pyav.installed():
             return _AS_CONFIGURED
-        return next((name for name in _WITHOUT_PYAV[self._medium] if name in known), _AS_CONFIGURED)
+        return next((name for name in _WITHOUT_PYAV[self._medium] if name in encodings), _AS_CONFIGURED)
 
     def _take_picture(self, payload: bytes) -> bool:
         """True if it is a picture. One that is missing before it is noticed, and a key frame wanted."""
@@ -167,7 +167,7 @@ class MediaFeed:
         self._report(self._request.problem or self._request.waits or self._why_nothing_is_shown())
 
     async def _request_keyframe(self) -> None:
-        """Not while another encoding still arrives: the one that was requested begins with a key frame."""
+        """Request a key frame, unless another encoding still arrives: the one that was requested begins with one."""
         if self._arriving and self._request.encoding in (_AS_CONFIGURED, self._arriving):
             await self._request.request_keyframe(self._arriving)
 

@@ -30,7 +30,7 @@ _MEDIA: Final[tuple[Medium, ...]] = ("video", "audio")
 def filters(base: str) -> list[str]:
     """Return what to subscribe to: the telemetry of these robots, without pictures and sound."""
     every = list(dict.fromkeys(channel.filter(base) for channel in (*FLEET, *WATCHED, *SYNONYMS)))
-    return [one for one in every if not any(other != one and matches(other, one) for other in every)]
+    return [filter_ for filter_ in every if not any(other != filter_ and matches(other, filter_) for other in every)]
 
 
 class Robots:
@@ -53,7 +53,7 @@ class Robots:
 
     @property
     def refused(self) -> int:
-        """What is none of these: no JSON, damaged, or a picture without those that it builds on."""
+        """Payloads that cannot be shown: no JSON, damaged, or a picture without those that it builds on."""
         return self._refused + sum(feed.refused for feed in self._feeds.values())
 
     def receive(self, message: Message, at: float) -> None:

@@ -28,7 +28,7 @@ class Settings(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """What was done, for the last line."""
+    """The numbers of the last line."""
 
     robots: int
     published: int
@@ -68,7 +68,7 @@ async def serve(
 
 
 async def _show(settings: Settings, broker: Broker, robots: Robots, on_ready: Callable[[], None]) -> None:
-    """Until it is cancelled. Raises TransportError without a broker."""
+    """Show the robots until it is cancelled. Raises TransportError without a broker."""
     await broker.open()
     if not broker.connected:
         raise TransportError(f"cannot connect to {settings.where}: {broker.problem}")
@@ -80,7 +80,7 @@ async def _show(settings: Settings, broker: Broker, robots: Robots, on_ready: Ca
 
 @contextlib.contextmanager
 def _signalled() -> Iterator[asyncio.Event]:
-    """Is set by the signals that end a program. Not all platforms let a loop handle signals."""
+    """Give an event that the signals set which end a program. Not all platforms let a loop handle signals."""
     loop, event = asyncio.get_running_loop(), asyncio.Event()
     with handled_by(lambda *_: loop.call_soon_threadsafe(event.set)):
         yield event

@@ -24,7 +24,7 @@ _HOW: Final = 'pip install "pebble-robot[foxglove]"'
 
 
 class ChannelSpec(NamedTuple):
-    """What Foxglove has to know of a channel to read it."""
+    """The description by which Foxglove reads a channel."""
 
     topic: str
     encoding: str  # of its messages: json or protobuf

@@ -110,7 +110,7 @@ class H264Decoder:
         self._context: av.VideoCodecContext | None = None
 
     def decode(self, unit: bytes, *, keyframe: bool) -> Pixels:
-        """Raises PayloadError for what is cut, damaged or too large; the next unit has to be a key frame then."""
+        """Decode a unit. Raises PayloadError for what is cut, damaged or too large; a key frame has to be next then."""
         try:
             return self._picture(self._frame(unit, keyframe))
         except PayloadError:

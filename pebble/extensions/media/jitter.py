@@ -142,7 +142,7 @@ class JitterBuffer:
         self._make_room()
 
     def _is_old(self, number: int, captured_ms: int) -> bool:
-        """Has this number been played or given up? If it was captured later, the sender has restarted instead."""
+        """True if this number was played or given up. If it was captured later, the sender has restarted instead."""
         if self._expected is None or ahead(number, self._expected) >= 0:
             self._behind = 0
             return False
@@ -234,7 +234,7 @@ class JitterBuffer:
         return Chunk(samples, received.rate, received.channels)
 
     def _decode(self, number: int) -> ReceivedSound | None:
-        """None if it is damaged."""
+        """Return the sound of a waiting packet; None if it is damaged."""
         sound = self._waiting.pop(number)
         self._expected = number % _NUMBERS + 1
         try:
@@ -270,7 +270,7 @@ class JitterBuffer:
         return Chunk(to_int16(estimate * gain[:, None]), last.rate, last.channels, concealed=True)
 
     def _estimated(self, last: ReceivedSound, size: int) -> Samples:
-        """By the codec, or the last packet backwards and forwards in turn, which makes no step at its ends."""
+        """Return the codec's estimate, else the last packet backwards and forwards in turn, which makes no step."""
         if self._spare is None or not len(self._spare):
             self._spare = self._decoder.conceal()
         if self._spare is not None:
@@ -289,7 +289,7 @@ def _faded_in(samples: Samples, rate: int) -> Samples:
 
 
 def _faded_over(old: ReceivedSound, new: ReceivedSound) -> ReceivedSound:
-    """``new``, beginning as ``old`` does."""
+    """Return ``new``, with its beginning faded over from ``old``."""
     size = min(len(old.samples), len(new.samples), round(_FADE_S * new.rate))
     if (old.rate, old.channels) != (new.rate, new.channels) or old is new:
         return new

@@ -21,7 +21,7 @@ Pixels: TypeAlias = NDArray[np.uint8]
 
 
 def decode_jpeg(jpeg: bytes) -> Pixels:
-    """BGR, shape (height, width, 3), the caller's own. Raises PayloadError unless it is a whole picture.
+    """Return a whole picture: BGR, shape (height, width, 3), the caller's own. Raises PayloadError for anything else.
 
     Bits flipped within the coefficients go undetected: JPEG has no checksum; TCP and zlib have.
     """

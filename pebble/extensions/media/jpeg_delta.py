@@ -10,12 +10,12 @@ GREY: Final = 128  # of a difference of nothing
 
 
 def subtract(picture: Pixels, reference: Pixels, out: Pixels | None = None) -> Pixels:
-    """``clip(picture - reference + 128)``; sums of bytes are exact in cv2's floats."""
+    """Return ``clip(picture - reference + 128)``; sums of bytes are exact in cv2's floats."""
     return cast(Pixels, cv2.addWeighted(picture, 1, reference, -1, GREY, out))
 
 
 def add(reference: Pixels, difference: Pixels, out: Pixels | None = None) -> Pixels:
-    """``clip(reference + difference - 128)``: what a receiver does. ``out`` may be ``reference``."""
+    """Return ``clip(reference + difference - 128)``, as a receiver does. ``out`` may be ``reference``."""
     return cast(Pixels, cv2.addWeighted(reference, 1, difference, 1, -GREY, out))
 
 
@@ -53,7 +53,7 @@ class JpegDelta:
         return jpeg
 
     def _is_reference(self) -> bool:
-        """Will anything build on this picture? Not if the next one is full."""
+        """True if the next picture builds on this one, because it is no full one."""
         self._chained = self._since_keyframe + 1 < self._interval
         return self._chained
 

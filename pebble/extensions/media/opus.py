@@ -32,7 +32,7 @@ def _layout(channels: int) -> str:
 
 
 def join(packets: list[bytes]) -> bytes:
-    """Opus packets as one PBAT body."""
+    """Return Opus packets as one PBAT body."""
     return b"".join(_LENGTH.pack(len(packet)) + packet for packet in packets)
 
 
@@ -116,7 +116,7 @@ class OpusDecoder:
         self._mode: bytes | None = None  # first byte of the last packet: what a concealed one is like
 
     def decode(self, packet: bytes) -> Samples:
-        """(samples, channels). Raises PayloadError for what is no Opus packet."""
+        """Return the samples of a packet, (samples, channels). Raises PayloadError for what is no Opus packet."""
         samples = self._decode(packet)
         self._mode = bytes([packet[0] & 0xFC])  # 0xFC: one frame, not several
         return samples

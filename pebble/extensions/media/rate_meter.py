@@ -35,17 +35,17 @@ class RateMeter:
         self._arrivals.clear()
 
     def rate(self, now: float) -> float:
-        """Messages per second; 0 before the second message."""
+        """Return the messages per second; 0 before the second message."""
         recent, seconds = self._recent(now)
         return (len(recent) - 1) / seconds if seconds > 0 else 0.0
 
     def bitrate(self, now: float) -> float:
-        """Bits of payload per second."""
+        """Return the bits of payload per second."""
         recent, seconds = self._recent(now)
         return 8 * sum(arrival.size for arrival in recent[1:]) / seconds if seconds > 0 else 0.0
 
     def age_s(self, now: float) -> float | None:
-        """Median age of the messages, if any of them has one."""
+        """Return the median age of the messages; None if none of them has one."""
         ages = [arrival.age_s for arrival in self._recent(now)[0] if arrival.age_s is not None]
         return statistics.median(ages) if ages else None
 

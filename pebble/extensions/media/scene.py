@@ -20,14 +20,10 @@ TAG_ID: Final = 7
 _TAG_BITS = ("001010", "111000", "011101", "001010", "011000", "001000")
 _TAG_CELLS = 10  # 6 of bits, 2 of black border, 2 of quiet zone
 
-_ROWS, _COLUMNS = 2, 20  # of the counter's cells: 24 bits of number, 16 of checksum
-_BAND = 10  # the counter takes the lowest tenth of the picture
+ROWS, COLUMNS = 2, 20  # of the counter's cells: 24 bits of number, 16 of checksum
+BAND = 10  # the counter takes the lowest tenth of the picture
 # The swing stays below 128: encoders that send differences clip them there, and the counter changes in every frame.
-_DARK, _LIGHT = 72, 184
-_MIDDLE = (_DARK + _LIGHT) / 2
-_MARGIN = 20  # a cell nearer than this to the middle is neither dark nor light: the picture is damaged
-_WITHIN = (0.3, 0.4, 0.5, 0.6, 0.7)  # where a reader samples, as shares of a cell
-_SMALLEST_BAND = 2 * _ROWS  # pixels; with less, or below 2 pixels per column, it cannot be read
+DARK, LIGHT = 72, 184
 
 _TURN = 320  # frames until the background has passed once
 _LAP = 450  # frames of one round of the tag
@@ -37,7 +33,7 @@ _BALL_BGR = np.array((60, 90, 220), np.uint8)
 
 
 def noise(seed: int, count: int) -> NDArray[np.float32]:
-    """``count`` pseudo-random numbers, 0 to 1, the same on every machine; ``seed``: 32 bits.
+    """Return ``count`` pseudo-random numbers, 0 to 1, the same on every machine; ``seed``: 32 bits.
 
     Splitmix64 (Steele, Lea, Flood 2014), which needs no import of numpy.random.
     """
@@ -52,11 +48,11 @@ class Scene:
 
     def __init__(self, width: int, height: int) -> None:
         self.width, self.height = width, height
-        self._floor = height - height // _BAND  # the counter begins here, everything else ends here
+        self._floor = height - height // BAND  # the counter begins here, everything else ends here
         self._background = _landscape(width, self._floor)
         self._tag = _tag(max(1, self._floor // (3 * _TAG_CELLS)))
         self._ball = _disc(max(1, self._floor // 12))
-        self._cell = np.arange(width).repeat(3) * _COLUMNS // width  # to which a byte of the counter's lines belongs
+        self._cell = np.arange(width).repeat(3) * COLUMNS // width  # to which a byte of the counter's lines belongs
 
     def render(self, number: int, out: Picture) -> None:
         """Draw frame ``number`` into ``out``, of shape (height, width, 3), BGR."""
@@ -64,11 +60,6 @@ class Scene:
         self._draw_ball(number, out)
         self._draw_tag(number, out)
         self._draw_counter(number % COUNTER_LIMIT, out)
-
-    def tag_centre(self, number: int) -> tuple[int, int]:
-        """Return where the middle of the tag is in frame ``number``: pixels from the left and from the top."""
-        left, top = self._tag_corner(number)
-        return left + self._tag.shape[1] // 2, top + self._tag.shape[0] // 2
 
     def _draw_background(self, number: int, out: Picture) -> None:
         shift = number % _TURN * self.width // _TURN
@@ -96,46 +87,20 @@ class Scene:
         return max(0, int(left)), max(0, int(top))
 
     def _draw_counter(self, value: int, out: Picture) -> None:
-        lines = np.where(_bits(value), np.uint8(_LIGHT), np.uint8(_DARK))[:, self._cell]
+        lines = np.where(_bits(value), np.uint8(LIGHT), np.uint8(DARK))[:, self._cell]
         for row, line in enumerate(lines):
-            top, bottom = (self._floor + (self.height - self._floor) * edge // _ROWS for edge in (row, row + 1))
+            top, bottom = (self._floor + (self.height - self._floor) * edge // ROWS for edge in (row, row + 1))
             out[top:bottom] = line.reshape(1, self.width, 3)
-
-
-def read_counter(picture: Picture) -> int | None:
-    """Return the number of the frame, out of a picture of any size, in colour (h, w, 3) or grey (h, w).
-
-    None where there is no counter, or a damaged one: one in 65,536 of those is read as a wrong number.
-    """
-    height, width = picture.shape[:2]
-    band = height // _BAND
-    if band < _SMALLEST_BAND or width < 2 * _COLUMNS:
-        return None
-    rows, columns = _samples(band, _ROWS) + height - band, _samples(width, _COLUMNS)
-    grid = picture[np.ix_(rows, columns)].astype(np.float32)
-    grey = grid if grid.ndim == 2 else grid.mean(axis=2)
-    cells = grey.reshape(_ROWS, len(_WITHIN), _COLUMNS, len(_WITHIN)).mean(axis=(1, 3)).ravel()
-    return None if np.any(np.abs(cells - _MIDDLE) < _MARGIN) else _value(cells > _MIDDLE)
 
 
 def _bits(value: int) -> NDArray[np.bool_]:
     raw = value.to_bytes(3)
     checked = raw + crc_hqx(raw, 0xFFFF).to_bytes(2)
-    return np.unpackbits(np.frombuffer(checked, np.uint8)).astype(bool).reshape(_ROWS, _COLUMNS)
-
-
-def _value(bits: NDArray[np.bool_]) -> int | None:
-    raw = np.packbits(bits).tobytes()
-    return int.from_bytes(raw[:3]) if crc_hqx(raw[:3], 0xFFFF) == int.from_bytes(raw[3:]) else None
-
-
-def _samples(length: int, cells: int) -> NDArray[np.intp]:
-    """Return where to sample ``cells`` cells on ``length`` pixels: some places within each, away from its edges."""
-    return (np.add.outer(np.arange(cells), _WITHIN) * length / cells).astype(np.intp).ravel()
+    return np.unpackbits(np.frombuffer(checked, np.uint8)).astype(bool).reshape(ROWS, COLUMNS)
 
 
 def _swing(number: int, period: int, room: int) -> int:
-    """To and fro between 0 and ``room``."""
+    """Return a position that goes to and fro between 0 and ``room``."""
     phase = number % period / period
     return int(max(0, room) * abs(2 * phase - 1))
 
@@ -155,7 +120,7 @@ def _landscape(width: int, height: int) -> Picture:
 
 
 def _grids(seed: int, *, octaves: int, contrast: float) -> list[NDArray[np.float32]]:
-    """Random points, from few and strong to many and weak."""
+    """Return grids of random points, from few and strong to many and weak."""
     shapes = [((3 << octave) + 1, 4 << octave) for octave in range(octaves)]
     return [
         (noise(seed + octave, rows * columns).reshape(rows, columns) - 0.5) * np.float32(contrast / 1.6**octave)
@@ -169,7 +134,7 @@ def _texture(grids: list[NDArray[np.float32]], rows: NDArray[np.float32], width:
 
 
 def _stretched(grid: NDArray[np.float32], rows: NDArray[np.float32], width: int) -> NDArray[np.float32]:
-    """Linear between the grid's points; it wraps around from right to left."""
+    """Return the grid's values over the picture, linear between its points; it wraps around from right to left."""
     x = np.arange(width, dtype=np.float32) * grid.shape[1] / width
     y = rows * (grid.shape[0] - 1)
     left, top = x.astype(np.intp), y.astype(np.intp)

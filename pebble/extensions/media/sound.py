@@ -25,7 +25,7 @@ _GAP_MS = 60  # a capture time further than this from where the last chunk ended
 
 
 def sequence_numbers() -> Iterator[int]:
-    """1, 2, 3 … 0xFFFFFFFF, 1 …: one for each packet of a process, whatever its encoding."""
+    """Yield 1, 2, 3 … 0xFFFFFFFF, 1 …: one for each packet of a process, whatever its encoding."""
     while True:
         yield from range(1, SEQUENCE_LIMIT)
 
@@ -41,14 +41,14 @@ class _Intake:
         self._next_ms: float | None = None  # when the first sample of the next chunk should have been captured
 
     def has_gap(self, captured_ms: int) -> bool:
-        """Is sound missing before ``captured_ms``? Then the samples left over are dropped."""
+        """Return True if sound is missing before ``captured_ms``; then the samples left over are dropped."""
         if self._next_ms is None or abs(captured_ms - self._next_ms) <= _GAP_MS:
             return False
         self._left = self._left[:0]
         return True
 
     def frames(self, pcm: bytes, captured_ms: int, size: int) -> Iterator[tuple[Samples, int]]:
-        """Frames of ``size`` samples, each with the epoch milliseconds of its first one."""
+        """Yield frames of ``size`` samples, each with the epoch milliseconds of its first one."""
         fed = to_samples(pcm, self._fed_channels)
         start_ms = captured_ms - 1000 * len(self._left) / self.rate
         held = np.concatenate((self._left, self._resampler.feed(remix(fed, self.channels))))
@@ -123,9 +123,9 @@ def make_sound_encoder(
         rate_out = rate_out if rate_out <= _HIGHEST_PCM_RATE else opus.RATES[-1]
         return SoundEncoder(_Intake(rate, channels, rate_out, channels_out), numbers, chunk_ms)
     if name == "opus":
-        rate_out = next((known for known in opus.RATES if known >= rate_out), opus.RATES[-1])
+        rate_out = next((rate for rate in opus.RATES if rate >= rate_out), opus.RATES[-1])
         intake = _Intake(rate, channels, rate_out, channels_out if channels_out <= 2 else 1)
-        frame_ms = next((known for known in opus.FRAMES_MS if known >= chunk_ms), opus.FRAMES_MS[-1])
+        frame_ms = next((ms for ms in opus.FRAMES_MS if ms >= chunk_ms), opus.FRAMES_MS[-1])
         codec = OpusEncoder(rate_out, intake.channels, frame_ms=frame_ms, bitrate=bitrate)
         return SoundEncoder(intake, numbers, frame_ms, codec, min(max(bundle, 1), opus.BUNDLE_LIMIT))
     raise PebbleError(f'there is no sound encoding "{name}": use {" or ".join(SOUND_ENCODINGS)}')

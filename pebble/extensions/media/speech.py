@@ -31,7 +31,7 @@ class Speech:
         self._mono = _period(rate)
 
     def samples(self, first: int, count: int) -> NDArray[np.int16]:
-        """``count`` samples from number ``first`` on, of shape (count, channels)."""
+        """Return ``count`` samples from number ``first`` on, of shape (count, channels)."""
         mono = self._mono.take(np.arange(first, first + count), mode="wrap")
         return np.repeat(mono[:, None], self.channels, axis=1)
 

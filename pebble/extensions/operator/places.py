@@ -25,7 +25,7 @@ class Places:
 
     @cached_property
     def unfinished(self) -> Path:
-        """A mark while setup runs: programs that read its files were not yet started anew. No backup has it."""
+        """A mark while setup runs: programs that read its files were not yet restarted. No backup has it."""
         return self.etc / "setup.new"
 
     @cached_property

@@ -134,7 +134,7 @@ async def _authority(request: Request) -> Response:
 
 
 async def _health(request: Request) -> Response:
-    """200 while there is a broker; says nothing else, because it needs no login."""
+    """Answer 200 while there is a broker, and say nothing else, because it needs no login."""
     connected = request.app.state.broker.connected
     return PlainTextResponse("ok" if connected else "no broker", 200 if connected else 503, headers=NO_STORE)
 
@@ -160,7 +160,6 @@ async def _estop(request: Request) -> Response:
         return answer(request, 400, str(error))
     address = "" if request.client is None else request.client.host
     server = _server_of(request)
-    await asyncio.sleep(server.stops.waits_s(session.user, time.monotonic()))
     server.stop(op.ref, op.stop, session, "", op.why, address)
     if answer is _plain:
         return _plain(request, 202, "sent")

@@ -38,7 +38,7 @@ _decoder = msgspec.json.Decoder(m.FromPage)
 
 
 class Leave(Exception):  # noqa: N818 - not an error
-    """The server ends this connection; the page may connect anew."""
+    """An end of this connection by the server; the page may connect again."""
 
 
 class Control:
@@ -57,10 +57,10 @@ class Control:
         self._why_not = ""  # why this page may not drive at all
         self._logs = LogReader()
         self._large_due = False  # whether the page has received the last large value
-        self._moved: set[str] = set()  # robots that this lease has moved, for the audit
+        self._moved: set[str] = set()  # robots moved since this page has control, for the audit
 
     async def serve(self) -> None:
-        """Until the page or the server ends it. What the page moved has been stopped then."""
+        """Serve until the page or the server ends it. What the page moved has been stopped then."""
         sender: asyncio.Task[None] | None = None
         try:
             self._begin(await asyncio.wait_for(self._receive(), HELLO_S))
@@ -137,14 +137,14 @@ class Control:
                 self._server.unwatch(self._interest.watched)
 
     async def _leave(self, reason: Leave) -> None:
-        self._end_leases()
+        self._end_control()
         try:
             await self._websocket.send_text(encode(m.Bye(why=str(reason), again=True)))
             await self._websocket.close(4000)
         except (WebSocketDisconnect, RuntimeError):
             pass  # it has gone already
 
-    def _end_leases(self) -> None:
+    def _end_control(self) -> None:
         self._server.drivers.closed(self._tab, for_good=True)
 
     def _is_secure(self) -> bool:
@@ -193,7 +193,7 @@ class Control:
                 if op.ref == self._interest.watched:
                     self._logs.begin(op.origin, op.after, on=op.on)
             case m.Lease():
-                self._lease(op)
+                self._control(op)
             case m.PictureFromOp():
                 if self._may("drive", op):
                     self._server.sources.choose(op.ref, op.source)
@@ -242,7 +242,7 @@ class Control:
             self._audit("drive", op.ref)
 
     def _end_stop(self, op: m.EstopEndOp) -> None:
-        """One's own, or with the right to reset: a viewer must not end the stop of another person."""
+        """End one's own stop, or any with the right to reset: a viewer must not end the stop of another person."""
         user = self._server.stops.user(op.stop)
         if user is not None and (user == self._session.user or self._may("reset", op)):
             self._server.stops.end(op.stop)
@@ -252,7 +252,7 @@ class Control:
         if not self._may("reset", op) or robot is None:
             return
         reset = Reset(robot.estop, self._session.user)
-        shown = {one.owner: (one.boot, one.count) for one in op.owners}
+        shown = {owner.owner: (owner.boot, owner.count) for owner in op.owners}
         reset.shown = {
             owner: msgspec.structs.replace(state, boot=shown[owner][0], count=shown[owner][1])
             for owner, state in reset.shown.items()
@@ -282,7 +282,7 @@ class Control:
         if before:
             self._server.unwatch(before)
 
-    def _lease(self, op: m.Lease) -> None:
+    def _control(self, op: m.Lease) -> None:
         server = self._server
         self._moved.discard(op.ref)
         if not op.take:
@@ -331,7 +331,7 @@ class Control:
         self._wake.set()
 
     async def _send_all(self) -> None:
-        """States at most every 50 ms, pings twice a second."""
+        """Send states at most every 50 ms, and pings twice a second."""
         ping_at, check_at = time.monotonic() + PING_S, time.monotonic() + CHECK_S
         people = self._server.people_version
         while self._websocket.application_state is WebSocketState.CONNECTED:
@@ -351,13 +351,13 @@ class Control:
     async def _flush(self, now: float) -> None:
         while self._waiting:
             await self._websocket.send_text(encode(self._waiting.popleft()))
-        drivers = {one for one in self._interest.dirty if one[1] == "web/driver"}
+        drivers = {key for key in self._interest.dirty if key[1] == "web/driver"}
         self._interest.dirty -= drivers
-        found, large = self._server.robots.take(self._interest, now, large=self._large_due)
+        taken, large = self._server.robots.take(self._interest, now, large=self._large_due)
         self._large_due = self._large_due and not large
         if self._interest.more:
             self._wake.set()
-        values = found + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)
+        values = taken + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)
         gone, self._interest.gone = tuple(self._interest.gone), set()
         if values or gone:
             await self._websocket.send_text(encode(m.State(now=1000 * time.time(), set=values, gone=gone)))
@@ -380,7 +380,7 @@ class Control:
     async def _check_session(self) -> None:
         session = await asyncio.to_thread(self._check)
         if session is None or session.role != self._session.role:
-            self._end_leases()
+            self._end_control()
             await self._websocket.send_text(encode(m.Bye(why="logged out", again=False)))
             await self._websocket.close(4001)
 

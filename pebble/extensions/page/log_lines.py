@@ -27,7 +27,7 @@ class Run(NamedTuple):
 
 
 class LogLines:
-    """``origin`` names this count of lines: another one begins when the component is opened anew."""
+    """Numbered log lines. ``origin`` changes when numbering restarts, as the component is opened again."""
 
     def __init__(self) -> None:
         self.origin = secrets.token_hex(4)
@@ -62,7 +62,7 @@ class LogLines:
 
 
 class LogReader:
-    """How far one page has read the lines of the component that it watches: one part at each echo."""
+    """The place up to which one page has read the lines of the component that it watches: one part at each echo."""
 
     def __init__(self) -> None:
         self._on = self._due = False  # due: the page has received the part before

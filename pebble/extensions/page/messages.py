@@ -1,4 +1,4 @@
-"""What a page and the server send each other on the control socket: JSON text, one struct per ``op``.
+"""Messages between a page and the server on the control socket: JSON text, one struct per ``op``.
 
 ``ref`` is a component's base topic, ``pebble/robots/goob``; "" is the server itself. Page clocks (``t``) are
 milliseconds of ``performance.now()``; server stamps (``now``) are epoch milliseconds. The page's
@@ -23,11 +23,11 @@ Level = Annotated[str, Meta(pattern=LEVEL, max_length=64)]  # one level of a top
 
 
 class _FromPage(Struct, frozen=True, kw_only=True, tag_field="op"):
-    """What a page sends."""
+    """A message of a page."""
 
 
 class Hello(_FromPage, frozen=True, kw_only=True, tag="hello"):
-    """The first message. ``token`` is the one of the page's last connection; it restores a lease within 5 s."""
+    """The first message. ``token`` is the one of the page's last connection; within 5 s it restores control."""
 
     version: Short  # of the page; another one than the server's may not drive
     device: Short = ""  # what others see beside the user's name: "phone"
@@ -81,7 +81,7 @@ class DriveOp(_FromPage, frozen=True, kw_only=True, tag="drive"):
 
 
 class StopOp(_FromPage, frozen=True, kw_only=True, tag="stop"):
-    """The space bar: a zero, from everybody, with or without a lease. It does not latch."""
+    """The space bar: a zero, from everybody, with or without control. It does not latch."""
 
     ref: Ref
 
@@ -123,7 +123,7 @@ class PictureFromOp(_FromPage, frozen=True, kw_only=True, tag="picture-from"):
 
 
 class _Asked(_FromPage, frozen=True, kw_only=True):
-    """What is asked of a robot; it is answered with Done or Refused."""
+    """A request to a robot; it is answered with Done or Refused."""
 
     n: Number = 0  # of the page, growing; the answer carries it
 
@@ -172,7 +172,7 @@ class McuOp(_Asked, frozen=True, kw_only=True, tag="mcu"):
 
 
 class ActionOp(_Asked, frozen=True, kw_only=True, tag="action"):
-    """What the robot does once, and does not acknowledge."""
+    """An action that the robot takes once, and does not acknowledge."""
 
     ref: Ref
     name: Literal["reboot", "service-restart", "git-pull"]
@@ -225,7 +225,7 @@ FromPage: TypeAlias = (
 
 
 class _ToPage(Struct, frozen=True, kw_only=True, tag_field="op"):
-    """What the server sends."""
+    """A message of the server."""
 
 
 class Welcome(_ToPage, frozen=True, kw_only=True, tag="welcome"):
@@ -296,7 +296,7 @@ class Done(_ToPage, frozen=True, kw_only=True, tag="done"):
 
 
 class Played(_ToPage, frozen=True, kw_only=True, tag="played"):
-    """Where a recording is, a few times a second and after each change. Times are epoch milliseconds."""
+    """The place in a recording, a few times a second and after each change. Times are epoch milliseconds."""
 
     at: float
     on: bool  # it is being played

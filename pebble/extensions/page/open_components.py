@@ -1,4 +1,4 @@
-"""What is received of the components that pages have open, besides what is received of all."""
+"""The components that pages have open, and the subscriptions for them besides those for all."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _FLAG_FIELDS = {flag: flag.metric.removeprefix("flags/").replace("-", "_") for f
 
 
 class OpenComponents:
-    """Subscribes while at least one page has a component open. Only the event loop calls it."""
+    """The subscriptions for components that at least one page has open. Only the event loop calls it."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class OpenComponents:
 
     @property
     def known(self) -> set[str]:
-        """The components of which anything is received or remembered here."""
+        """The components for which anything is received or remembered here."""
         return {*self._pages, *self._subscriptions, *self._wanted, *self._flags}
 
     def __contains__(self, ref: object) -> bool:
@@ -79,7 +79,7 @@ class OpenComponents:
         self._broker.loop.call_later(self._keep_s, self._closed, ref)
 
     def _closed(self, ref: str) -> None:
-        """Some time later: a page that is loaded anew finds everything."""
+        """Note, some time later, that a page was closed: one that is reloaded finds everything."""
         self._pages[ref] -= 1
         if not self._pages[ref]:
             del self._pages[ref]

@@ -1,4 +1,4 @@
-"""Bounds how old the messages of one page are, from pings that the page echoes. Pure: times are passed in.
+"""Bounds of the age of one page's messages, from pings that the page echoes. Pure: times are passed in.
 
 The page's clock has an unknown offset. An echo carries the page's time of some moment between sending the ping and
 receiving the echo, which bounds the offset on both sides: so a delay that is always there counts as well.
@@ -20,11 +20,11 @@ _JUDGED = 4  # answers by which people are told that a connection is slow
 
 
 class ClockJumpError(PebbleError):
-    """The page's clock, or the server's, has jumped: one of them was suspended. The connection has to be made anew."""
+    """A jump of the page's clock, or the server's: one of them was suspended. The page has to connect again."""
 
 
 class PageClock:
-    """One connection. Times are seconds of the server's clock; ``t_ms`` is the page's own."""
+    """The clock of one connection. Times are seconds of the server's clock; ``t_ms`` is the page's own."""
 
     def __init__(self) -> None:
         self.round_trip_s: float | None = None
@@ -82,5 +82,5 @@ class PageClock:
         return min(high for _, high, _ in self._bounds)
 
     def _check(self, low: float, high: float) -> None:
-        if self._bounds and (low > self._highest() + _JUMP_S or high < max(one[0] for one in self._bounds) - _JUMP_S):
+        if self._bounds and (low > self._highest() + _JUMP_S or high < max(self._bounds)[0] - _JUMP_S):
             raise ClockJumpError("a clock has jumped: one of the two machines was suspended")

@@ -1,4 +1,4 @@
-"""What a page asks of a robot, besides driving: which right it needs, and what is then published. Pure."""
+"""Requests of pages to robots, besides driving: the right that each needs, and what is then published. Pure."""
 
 from typing import Any, NamedTuple
 
@@ -59,8 +59,8 @@ def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
         offered = next(filter(None, (section_of(capabilities, section) for section in _sections(op))), {})
     if isinstance(op, m.OutletOp):
         outlets = section_of(capabilities, "outlets").get("outlets")
-        named = [one for one in outlets if isinstance(one, dict)] if isinstance(outlets, list) else []
-        offered = next((one for one in named if one.get("name") == op.outlet), {})
+        named = [outlet for outlet in outlets if isinstance(outlet, dict)] if isinstance(outlets, list) else []
+        offered = next((outlet for outlet in named if outlet.get("name") == op.outlet), {})
     refused = any(offered.get(name) is False for name in ("available", "controls", kind))
     name, metric = op.ref.rpartition("/")[2], command.channel.metric.format(**command.names)
     return f"{name} takes no {metric} commands" if refused else ""

@@ -78,7 +78,7 @@ def _ms(seconds: float | None) -> float | None:
 
 
 class Interest:
-    """What one page has not received yet, and which component it has open."""
+    """One page's view: what it has not received yet, and which component it has open."""
 
     def __init__(self, changed: Callable[[], None]) -> None:
         self.watched = ""
@@ -89,7 +89,7 @@ class Interest:
 
 
 class Robots:
-    """All components. Only the event loop calls it."""
+    """The table of all components. Only the event loop calls it."""
 
     def __init__(self) -> None:
         self.components: dict[str, Component] = {}
@@ -112,7 +112,7 @@ class Robots:
         return None if component is None else component.robot
 
     def capabilities(self, ref: str) -> dict[str, Any]:
-        """Empty until they are known."""
+        """Return the component's capabilities; empty until they are known."""
         component = self.components.get(ref)
         return {} if component is None else component.robot.capabilities
 
@@ -128,8 +128,8 @@ class Robots:
 
     def value(self, ref: str, metric: str) -> msgspec.Raw | None:
         """Return the newest value; that of a server's metric as well."""
-        found = self._find(ref, metric)
-        return None if found is None else found.raw
+        value = self._find(ref, metric)
+        return None if value is None else value.raw
 
     def take(
         self, interest: Interest, now: float, *, large: bool
@@ -141,15 +141,15 @@ class Robots:
         """
         dirty, interest.dirty = interest.dirty, set()
         taken, has_large, left = [], False, MAX_STATE_BYTES
-        for ref, metric in sorted(dirty, key=lambda one: one[0] != interest.watched):
-            one = self._find(ref, metric)
-            size = 0 if one is None else len(bytes(one.raw))
+        for ref, metric in sorted(dirty, key=lambda key: key[0] != interest.watched):
+            kept = self._find(ref, metric)
+            size = 0 if kept is None else len(bytes(kept.raw))
             if left <= 0 or (size > LARGE_BYTES and (has_large or not large)):
                 interest.dirty.add((ref, metric))
                 continue
             has_large = has_large or size > LARGE_BYTES
             left -= size
-            taken.append((ref, metric, None, 0.0) if one is None else (ref, metric, one.raw, 1000 * (now - one.at)))
+            taken.append((ref, metric, None, 0.0) if kept is None else (ref, metric, kept.raw, 1000 * (now - kept.at)))
         interest.more = left <= 0
         return tuple(taken), has_large
 
@@ -193,7 +193,7 @@ class Robots:
             self._mark(ref, metric, everybody=True)
 
     def remove_server_metric(self, ref: str, metric: str) -> None:
-        """Pages have its last value until they receive another one."""
+        """Remove one of the server's own metrics; pages have its last value until they receive another one."""
         self._server.pop((ref, metric), None)
 
     def receive(self, message: Message, now: float) -> None:
@@ -252,7 +252,7 @@ class Robots:
                     self._refresh(component, now)
                 elif age_s >= every_s:
                     older.append(component)
-        older.sort(key=lambda one: one.refreshed_at)
+        older.sort(key=lambda value: value.refreshed_at)
         for component in older[: 1 + min(len(self.components), _REFRESHES_PER_S) // 3]:
             self._refresh(component, now)
 
@@ -367,9 +367,9 @@ def _aliases(payload: bytes) -> tuple[str, ...]:
     manifest = codec.plain(c.MCU_DESCRIBE, payload)
     interfaces = manifest.get("interfaces") if isinstance(manifest, dict) else None
     outgoing = [
-        str(one.get("channel"))
-        for one in (interfaces if isinstance(interfaces, list) else ())
-        if isinstance(one, dict) and one.get("dir") == "out" and isinstance(one.get("channel"), str)
+        str(interface.get("channel"))
+        for interface in (interfaces if isinstance(interfaces, list) else ())
+        if isinstance(interface, dict) and interface.get("dir") == "out" and isinstance(interface.get("channel"), str)
     ]
     return tuple(filter(_may_be_alias, outgoing[:MAX_ALIASES]))
 

@@ -1,16 +1,9 @@
-"""The operator page as a process: ``python -m pebble.extensions.page.run CONFIG`` of a robot.
-
-Instead of CONFIG it takes fields of WebSettings as JSON, and prints ``{"url": …}`` once the page can be opened.
-"""
+"""The operator page as a process of a robot: ``python -m pebble.extensions.page.run CONFIG``."""
 
 import asyncio
 import logging
 import signal
 import sys
-from pathlib import Path
-from typing import Any
-
-import msgspec
 
 from pebble.config import Config, config_of_process
 from pebble.errors import ConfigError, PebbleError
@@ -24,22 +17,15 @@ from pebble.runtime.process import exit_at_the_latest
 log = logging.getLogger(__name__)
 
 
-class Ready(msgspec.Struct):
-    """The output of the process once the page of settings in JSON can be opened."""
-
-    url: str
-
-
 def main(arguments: list[str]) -> int:
     set_up_logging("INFO")
     if len(arguments) != 1:
         sys.stderr.write("usage: python -m pebble.extensions.page.run CONFIG\n")
         return 2
     try:
-        is_json = arguments[0].startswith("{")
-        settings = _decoded(arguments[0]) if is_json else _settings_of_process(arguments[0])
+        settings = _settings_of_process(arguments[0])
         require_packages()
-        return _Page(settings, prints_url=is_json).run()
+        return _Page(settings).run()
     except PebbleError as error:
         for line in str(error).splitlines():
             log.error("%s", line)
@@ -74,16 +60,6 @@ def _settings_of_process(path: str) -> WebSettings:
     return settings
 
 
-def _decoded(fields: str) -> WebSettings:
-    def path(kind: type[Any], value: Any) -> Any:
-        return Path(value) if issubclass(kind, Path) else value
-
-    try:
-        return msgspec.json.decode(fields, type=WebSettings, dec_hook=path)
-    except msgspec.MsgspecError as error:
-        raise PebbleError(f"fields of WebSettings: {error}") from None
-
-
 def _without_user(config: Config) -> list[str]:
     """Return the problem that a login is needed and there is no user; empty if all is well."""
     file = people_of(config)
@@ -98,9 +74,8 @@ def _without_user(config: Config) -> list[str]:
 class _Page:
     """Serves the page until SIGTERM, and notifies the launcher while its event loop is alive."""
 
-    def __init__(self, settings: WebSettings, *, prints_url: bool) -> None:
-        self._settings, self._prints_url = settings, prints_url
-        self._notify = Notifier()
+    def __init__(self, settings: WebSettings) -> None:
+        self._settings, self._notify = settings, Notifier()
         self._ended = self._served = False
         self._alive: asyncio.Task[None] | None = None
 
@@ -113,16 +88,13 @@ class _Page:
         return code if self._served else 1
 
     def _end(self, _signal: int, _frame: object) -> None:
-        """Called before the server has its own handlers, and by the server when it has ended."""
+        """End the server, by a signal before the server has its own handlers, or by the server when it has ended."""
         self._ended = True
         exit_at_the_latest()
 
     def _ready(self, url: str) -> None:
         self._served = True
         log.info("the operator page is at %s", url)
-        if self._prints_url:
-            sys.stdout.write(msgspec.json.encode(Ready(url)).decode() + "\n")
-            sys.stdout.flush()
         self._notify.ready()
         self._alive = asyncio.get_running_loop().create_task(self._report())
         if self._ended:

@@ -124,8 +124,8 @@ class Server:
         if channel_of(f"outgoing/{address.metric}") in (CAPABILITIES, CONTROL_STATE):
             self.drivers.updated(ref)
         if address.metric == CAPABILITIES.metric:
-            for one in (ref, *(page for page, source in self.robots.sources.items() if source == ref)):
-                self.open_components.update(one)
+            for page_ref in (ref, *(page for page, source in self.robots.sources.items() if source == ref)):
+                self.open_components.update(page_ref)
 
     def _ask_anew(self, _ref: str) -> None:
         """Ask again for what this robot has published, although it has been delivered."""
@@ -172,8 +172,8 @@ class Server:
         by = f"{session.user} on {device}" if device else session.user
         if ref and not _is_base(ref):
             return
-        known = [component.robot for component in self.robots.components.values()]
-        self._send(self.stops.press(ref, name, by=by, why=why, now=clock(), known=known, user=session.user))
+        robots = [component.robot for component in self.robots.components.values()]
+        self._send(self.stops.press(ref, name, by=by, why=why, now=clock(), known=robots, user=session.user))
         self.show_stops()
         self.audit.write("stop", ref=ref or "all", user=session.user, device=device, address=address, detail=why)
 

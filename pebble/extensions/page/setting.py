@@ -84,9 +84,9 @@ def people_of(config: Config) -> Path:
 
 
 def _listed(config: Config) -> dict[str, ListedRobot]:
-    own = config.identity
+    identity = config.identity
     return {
-        Identity(listed.system or own.system, listed.type or own.type, listed.id).base: listed
+        Identity(listed.system or identity.system, listed.type or identity.type, listed.id).base: listed
         for listed in config.section(WebInterface).robots
         if listed.id is not None
     }

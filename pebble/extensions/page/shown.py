@@ -1,4 +1,4 @@
-"""What the cards of a page may rely on in payloads of robots: it is checked here, and not again in the page. Pure."""
+"""The part of robots' payloads on which the cards of a page rely: checked here, and not again in the page. Pure."""
 
 from collections.abc import Callable
 from functools import partial
@@ -174,7 +174,7 @@ def _readable(kind: Any, entries: object) -> list[Any]:
 
 
 def _media(payload: Any) -> Any:
-    """Return the reports if all can be read. Each by itself: msgspec learns a dict's type anew with each call."""
+    """Return the reports if all can be read, each by itself: msgspec learns a dict's type again with each call."""
     reports = _inner(payload)
     return reports if isinstance(reports, dict) and all(_is(_Medium, report) for report in reports.values()) else {}
 

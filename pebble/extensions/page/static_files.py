@@ -57,7 +57,7 @@ class StaticFiles:
         self._policy = CONTENT_SECURITY_POLICY.replace("script-src", f"script-src {hashed}")
         index = self.files.pop("index.html").replace(_START, start)
         for name, screen in _SCREENS.items():
-            links = [_link(one) for one in (screen, *self._imported("main.js", screen))]
+            links = [_link(module_name) for module_name in (screen, *self._imported("main.js", screen))]
             if name in _SHEETS:
                 sheet = _SHEETS[name].encode()
                 links.insert(0, b'<link rel="preload" as="style" href="{root}static/{version}/%s">' % sheet)
@@ -70,14 +70,14 @@ class StaticFiles:
 
     def _imported(self, *names: str) -> list[str]:
         """Return what these modules import before they run, and what that imports."""
-        found = dict.fromkeys(names)
+        modules = dict.fromkeys(names)
         for name in (waiting := list(names)):
             for path in _IMPORT.findall(self.files.get(name, b"")):
                 other = posixpath.normpath(posixpath.join(posixpath.dirname(name), path.decode()))
-                if other not in found:
-                    found[other] = None
+                if other not in modules:
+                    modules[other] = None
                     waiting.append(other)
-        return [name for name in found if name not in names]
+        return [name for name in modules if name not in names]
 
     def page(self, request: Request) -> Response:
         """Return the operator page; which screen it shows is up to its address."""
@@ -100,14 +100,14 @@ class StaticFiles:
         if name not in self.files:
             return PlainTextResponse("not found", 404)
         if (query := request.scope.get("query_string", b"")).isdigit():
-            content = _IMPORT.sub(lambda found: self._renewed(name, found, query[:4]), self.files[name])
+            content = _IMPORT.sub(lambda match: self._renewed(name, match, query[:4]), self.files[name])
             return _response(request, name, content, _packed(name, content), headers)
         return _response(request, name, self.files[name], self._packed[name], headers)
 
-    def _renewed(self, name: str, found: re.Match[bytes], query: bytes) -> bytes:
-        path = found[1]
+    def _renewed(self, name: str, match: re.Match[bytes], query: bytes) -> bytes:
+        path = match[1]
         whole = posixpath.normpath(posixpath.join(posixpath.dirname(name), path.decode()))
-        return found[0] if whole in self._first else found[0].replace(path, path + b"?" + query)
+        return match[0] if whole in self._first else match[0].replace(path, path + b"?" + query)
 
 
 def root_of(request: Request) -> str:
@@ -142,7 +142,7 @@ def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
 
 
 def stripped(source: bytes, suffix: str) -> bytes:
-    """Without indentation, comments and empty lines: a sixth less to send."""
+    """Return a file without indentation, comments and empty lines: a sixth less to send."""
     text = source.decode()
     if suffix in ("css", "js", "mjs"):
         text = _COMMENTS.sub("", text)

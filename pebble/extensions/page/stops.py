@@ -12,7 +12,6 @@ from pebble.extensions.operator.client.estop import COLLECT_S, Progress, RobotSt
 from pebble.extensions.operator.client.robot_estop import RobotEstop
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.page import messages as m
-from pebble.extensions.page.pace import STOP_WAITS_S, Pace
 from pebble.transports import Message
 
 log = logging.getLogger(__name__)
@@ -35,7 +34,6 @@ class Stops:
         self._names: dict[str, str] = {}  # the stop of each robot, or of all
         self._crowded_at = float("-inf")  # when one was ended for lack of room
         self._shown: dict[str, tuple[str, str]] = {}  # by robot: progress and words, as pages see them
-        self._paces: dict[str, Pace] = {}  # by person
 
     def press(
         self,
@@ -65,10 +63,6 @@ class Stops:
         self.changed |= set(sender.robots)
         return self.tick(now)
 
-    def waits_s(self, user: str, now: float) -> float:
-        """Return how long a stop of this person waits that comes without a control socket, as it would on one."""
-        return min(self._paces.setdefault(user, Pace(now)).take(1, now), STOP_WAITS_S)
-
     def end(self, name: str) -> None:
         """Send this stop no more."""
         if name in self._senders:
@@ -95,13 +89,13 @@ class Stops:
         return any(ref in sender.robots for sender, _ in self._senders.values())
 
     def holds(self, ref: str) -> bool:
-        """True while a stop is repeated to a robot that cannot latch it: what drives it would end that."""
+        """True if a stop is being repeated to a robot that cannot latch it: what drives it would end that."""
         stop = self._newest(ref)[1]
         return stop is not None and stop.sending and not stop.estop.available
 
     @property
     def collecting(self) -> bool:
-        """True while a stop of all goes to further robots."""
+        """True if a stop of all still goes to further robots."""
         return "" in self._names and self._senders[self._names[""]][0].collecting
 
     def omitted(self, now: float) -> bool:
@@ -173,7 +167,7 @@ class Stops:
         return is_own
 
     def _worth(self, name: str) -> tuple[bool, bool, bool]:
-        """Of equal ones the oldest goes: what is over, what nothing was heard of, what is of one robot alone."""
+        """Return how much a stop is worth, smallest first: one that is over, unheard of, of one robot alone."""
         robots = self._senders[name][0].robots.values()
         heard = not self._refs[name] or any(robot.live or robot.estop.has_capabilities for robot in robots)
         return name not in self._over, heard, not self._refs[name]

@@ -187,18 +187,18 @@ class PahoClient:
         return sent.mid if qos else 0
 
     def subscribe(self, filters: Iterable[Filter]) -> int:
-        return self._request(self._paho.subscribe([self._topic(one) for one in filters]))
+        return self._request(self._paho.subscribe([self._topic(filter_) for filter_ in filters]))
 
     def unsubscribe(self, filters: Iterable[str]) -> int:
         return self._request(self._paho.unsubscribe(list(filters)))
 
-    def _topic(self, one: Filter) -> Any:
+    def _topic(self, filter_: Filter) -> Any:
         if not self._modern:
-            return one.text, one.qos
+            return filter_.text, filter_.qos
         handling = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
-        if not one.sends_retained:
+        if not filter_.sends_retained:
             handling = SubscribeOptions.RETAIN_DO_NOT_SEND
-        return one.text, SubscribeOptions(one.qos, one.no_local, one.as_published, handling)
+        return filter_.text, SubscribeOptions(filter_.qos, filter_.no_local, filter_.as_published, handling)
 
     def _request(self, sent: tuple[MQTTErrorCode, int | None]) -> int:
         self.write()

@@ -125,7 +125,7 @@ class Query:
 
 
 def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> None:
-    """Raises RecordingError if the recordings of ``places`` have no such robot or topic, which may be a mistake.
+    """Raise RecordingError if the recordings of ``places`` have no such robot or topic, which may be a mistake.
 
     Where a file cannot be read completely, names are not known: it is the file's problem that is to be said.
     """
@@ -142,17 +142,17 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
                     return
         except RecordingError:
             return
-    check_name("robot", query.robot, {robot for one in found if (robot := robot_of(one))}, places)
-    topics = {one.topic for one in found if query.robot in (None, robot_of(one))}
+    check_name("robot", query.robot, {robot for channel in found if (robot := robot_of(channel))}, places)
+    topics = {channel.topic for channel in found if query.robot in (None, robot_of(channel))}
     for filter_ in query.topics:
         if not any(_matches(filter_, topic) for topic in topics):
             check_name("topic", filter_, {topic for topic in topics if not topic.startswith("$")}, places)
 
 
 def check_name(kind: str, name: str | None, known: Collection[str], places: Iterable[Path]) -> None:
-    """Raises RecordingError, which says what there is, if ``name`` is none of the ``known`` ones."""
+    """Raise RecordingError, which says what there is, if ``name`` is none of the ``known`` ones."""
     if name is not None and name not in known:
-        listed = [shown(one) for one in sorted(known)[:_LISTED]] or ["none"]
+        listed = [shown(text) for text in sorted(known)[:_LISTED]] or ["none"]
         more = f" and {len(known) - _LISTED} more" if len(known) > _LISTED else ""
         where = ", ".join(map(str, places))
         raise RecordingError(f"no {kind} {shown(name)} in {where}; there are: {', '.join(listed)}{more}")

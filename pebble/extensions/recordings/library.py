@@ -100,7 +100,7 @@ def _begins_as_mcap(path: Path) -> bool:
 
 
 def robot_of(channel: Channel) -> str | None:
-    """``system/type/id`` of a channel's topic; None if it has none."""
+    """Return ``system/type/id`` of a channel's topic; None if it has none."""
     return robot_in(channel.topic)
 
 

@@ -131,7 +131,7 @@ def _clock(option: str, text: str) -> time:
 
 
 def _moment(option: str, text: str, now: datetime, days: int = 0) -> int:
-    """``days`` are added to a day."""
+    """Return the moment of a text; ``days`` are added to a day."""
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:
@@ -163,7 +163,7 @@ def _length_ns(age: re.Match[str]) -> int:
 
 
 def _ns(moment: datetime) -> int:
-    """Exact, unlike ``timestamp()``. A naive ``moment`` is in this machine's zone."""
+    """Return exact nanoseconds, unlike ``timestamp()``. A naive ``moment`` is in this machine's zone."""
     try:
         if moment.tzinfo is None:  # astimezone() is wrong where it does not exist
             return _clipped(int(moment.replace(microsecond=0).timestamp()) * 10**9 + moment.microsecond * 1000)

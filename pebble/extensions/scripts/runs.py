@@ -1,4 +1,4 @@
-"""Numbers the runs of scripts, so that a motor owner can tell an old run from a new one.
+"""Numbers of scripts' runs, by which a motor owner tells an old run from a new one.
 
 Which of two is newer, :func:`pebble.motion.arbiter.newer` decides: the numbers have no end.
 """
@@ -32,7 +32,7 @@ _EPOCH_S = 1_735_689_600  # 2025-01-01: counted from here, seconds fit into a ru
 
 
 class LocalScripts:
-    """Whether a script of the robot's own runs: each one holds a lock, or its manager does, from before its number.
+    """A lock that each script of the robot's own holds, or its manager for it, from before it gets its number.
 
     So a number that is taken while none runs is older than that of every script that starts later. The kernel frees
     the lock of a process that was killed.
@@ -43,7 +43,7 @@ class LocalScripts:
         self._held: int | None = None
 
     def hold(self) -> None:
-        """Note that one runs. Without the lock it starts all the same: neighbours then take no number, either."""
+        """Note that a script runs. Without the lock it starts all the same: neighbours then take no number, either."""
         if self._held is None:
             try:
                 self._held = self._open()
@@ -58,7 +58,7 @@ class LocalScripts:
 
     @contextmanager
     def none_runs(self) -> Iterator[bool]:
-        """False: one runs, or that is unknown. While it is True none begins."""
+        """Give True if no script runs; none begins in the block then. False: one runs, or that is unknown."""
         try:
             file = self._open()
         except OSError as error:
@@ -84,7 +84,7 @@ class LocalScripts:
 
 def newest(runs: Iterable[int]) -> int:
     """Return the newest of ``runs``, where 0 stands for none."""
-    return reduce(lambda one, run: run if newer(run, one) else one, runs, 0)
+    return reduce(lambda newest, run: run if newer(run, newest) else newest, runs, 0)
 
 
 def following(run: int) -> int:

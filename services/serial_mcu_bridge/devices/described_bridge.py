@@ -1,4 +1,4 @@
-"""Owns the serial line to a self-describing MCU (``pebble_serial_v1``), whose manifest defines its topics."""
+"""The owner of the serial line to a self-describing MCU (``pebble_serial_v1``), whose manifest defines its topics."""
 
 import logging
 import secrets
@@ -36,7 +36,6 @@ from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import (
     InterfaceKind,
     Manifest,
 )
-from pebble.services.serial_mcu_bridge.pebble_serial_v1.uid_claim import Move, UidClaim
 from pebble.services.serial_mcu_bridge.serial_service import SerialService
 from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine
 from pebble.transports import Message, Subscription
@@ -44,7 +43,8 @@ from pebble.transports import Message, Subscription
 CLAIM_S = 0.25  # between publishing claims and using them: another device has objected by then
 _WATCH_S = 0.5
 
-#: Published to request a uid or to check a retained manifest; the process that has the device publishes its manifest.
+#: Published to check a retained manifest: the process that has the device publishes it again. With a token it is from a
+#: process that has a device of this uid: another one that has warns.
 _UID_QUERY = Channel(
     metric=MCU_COMMAND.metric.replace("{name}", RESERVED),
     kind=Kind.COMMAND,
@@ -54,7 +54,7 @@ _UID_QUERY = Channel(
 
 
 class DescribedBridge(SerialService):
-    """Publishes the topics of one MCU while it is connected, and clears its retained messages when it has gone."""
+    """The service of one MCU: it publishes its topics while it is connected, and clears them when it has gone."""
 
     publishes = (MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, IMU_FAST, IMU)
     end = END
@@ -66,9 +66,8 @@ class DescribedBridge(SerialService):
         self._session = Session(self.config.base)
         self.watchdog = ImuWatchdog(self.options, self.instance)
         self._peers = PeerDevices()
-        self._uid = UidClaim(secrets.token_hex(8))
-        self._candidate: Manifest | None = None  # described, possibly under a uid that another device holds
-        self._conflict_logged = False
+        self._token = secrets.token_hex(8)
+        self._conflict_logged = False  # another device has the same uid
         self.device: Device | None = None
         self._published_states: dict[int, tuple[Reading, int]] = {}  # newest of each state interface, its epoch ms
         self._generic: list[Subscription] = []  # of the device that was described last, connected or not
@@ -117,13 +116,11 @@ class DescribedBridge(SerialService):
             self.clear(MCU_DESCRIBE, uid=uid)
             self.clear(MCU_LOCAL_ONLY, uid=uid)
             self.aliases.update()
-        self._perform(self._uid.tick(self.clock()))
         self._arm()
 
     def _arm(self) -> None:
         """Ensure that the timer is early enough; one that is too early has no effect."""
-        times = (self._session.due, self._peers.due, self._uid.due)
-        due = min((due for due in times if due is not None), default=None)
+        due = min((due for due in (self._session.due, self._peers.due) if due is not None), default=None)
         if due is None or (self._timer is not None and self._timer.due <= due):
             return
         if self._timer is not None:
@@ -140,8 +137,7 @@ class DescribedBridge(SerialService):
                 case Send(kind, data):
                     self.line.send(kind, data)
                 case Described(manifest):
-                    self._candidate = manifest
-                    self._perform(self._uid.request(manifest.uid, self.clock()))
+                    self._publish_device(manifest)
                 case Gone(why):
                     self._device_gone(why)
                 case Answer():
@@ -187,36 +183,17 @@ class DescribedBridge(SerialService):
 
     # -- the device appears and leaves
 
-    def _perform(self, move: Move) -> None:
-        candidate, device = self._candidate, self.device
-        match move:
-            case Move.ASK if candidate is not None:
-                self._ask(candidate.uid, self._uid.token)
-            case Move.INSIST if candidate is not None:
-                self._ask(candidate.uid, self._uid.token, has=True)
-            case Move.ANSWER if device is not None:
-                self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)
-            case Move.HOLD if candidate is not None:
-                self._publish_device(candidate)
-            case Move.YIELD if candidate is not None:
-                self._yield(candidate.uid)
-
-    def _yield(self, uid: str) -> None:
-        self._withdraw("released to another device")  # both held it if the local transport was disconnected
-        if not self._conflict_logged:
-            self._conflict_logged = True
-            text = "%s: another device has this uid already; this one is not used until that one leaves"
-            self.log.warning(text, uid)
-
-    def _ask(self, uid: str, token: str = "", *, has: bool = False) -> None:
-        """Ask which process holds this uid. No process yields to a question without a ``token``."""
-        self.publish(MCU_COMMAND, {"from": token, "has": has}, uid=uid, name=RESERVED)
-
     @on(_UID_QUERY)
     def on_question(self, question: dict[str, Any], uid: str) -> None:
-        token, has = str(question.get("from", "")), question.get("has") is True
-        self._perform(self._uid.on_question(uid, token, self.clock(), has=has))
-        self._arm()
+        if self.device is None or uid != self.device.uid:
+            return
+        token = question.get("from")
+        if not token:
+            self.publish(MCU_DESCRIBE, self.device.payload, uid=uid)
+        elif token != self._token and not self._conflict_logged:
+            self._conflict_logged = True
+            text = "%s: another device has this uid, too: both obey its commands; append the chip's own number"
+            self.log.warning(text, uid)
 
     def _publish_device(self, manifest: Manifest) -> None:
         port = str(self.options.serial.port)
@@ -238,20 +215,15 @@ class DescribedBridge(SerialService):
         self._listen_generic(device, private=False)  # a reader of the manifest may send commands at once
         self.publish(MCU_LOCAL_ONLY, device.local_only, uid=device.uid)
         self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)
+        self.publish(MCU_COMMAND, {"from": self._token}, uid=device.uid, name=RESERVED)
         self._listen_generic(device, private=True)
-        for reading, received_ms in self._published_states.values():  # received before we held the uid
-            self.publish(device.routes[reading.interface.id].generic, device.sample(reading, received_ms))
         self.aliases.announce(device)
         self.call_at(self.clock() + CLAIM_S, partial(self.aliases.permit, device))
 
     def _device_gone(self, why: str) -> None:
         """Remove the device's retained messages. Its commands are still received, counted and dropped."""
-        self._candidate, self._conflict_logged = None, False
+        self._conflict_logged = False
         self._published_states.clear()
-        self._uid.release()
-        self._withdraw(why)
-
-    def _withdraw(self, why: str) -> None:
         device, self.device = self.device, None
         if device is None:
             return
@@ -328,22 +300,16 @@ class DescribedBridge(SerialService):
         self.post_message(MCU_DESCRIBE, partial(self._receive_manifest, uid, manifest, message.retain))
 
     def _receive_manifest(self, uid: str, manifest: McuManifest | None, retained: bool) -> None:
-        now = self.clock()
         if self.device is not None and uid == self.device.uid:
             if manifest is None:
-                self.republish()  # another process removed it, for example one that has yielded the uid
-            else:
-                self._perform(self._uid.on_manifest(uid, now))
+                self.republish()  # another process removed it, for example that of a device with the same uid
             return
         if manifest is None:
             self._peers.forget(uid)
-            self._perform(self._uid.on_withdrawal(uid, now))
         else:
-            self._peers.add(uid, frozenset(claims(manifest).granted), now, retained=retained)
-            if retained:
-                self._ask(uid)  # unless its bridge publishes it again in time, _tick removes it
-            else:
-                self._perform(self._uid.on_manifest(uid, now))
+            self._peers.add(uid, frozenset(claims(manifest).granted), self.clock(), retained=retained)
+            if retained:  # unless its bridge publishes it again in time, _tick removes it
+                self.publish(MCU_COMMAND, {}, uid=uid, name=RESERVED)
         self.aliases.update()
         self._arm()
 

@@ -56,7 +56,7 @@ class Frame:
 
 
 def crc(body: bytes) -> int:
-    """CRC-16/CCITT-FALSE; of ``123456789`` it is 0x29B1."""
+    """Return the CRC-16/CCITT-FALSE; of ``123456789`` it is 0x29B1."""
     return binascii.crc_hqx(body, _CRC_START)
 
 
@@ -82,10 +82,10 @@ def decode(stuffed: bytes) -> Frame:
     if version != VERSION:
         raise FrameError("version", f"a frame of version {version}; {VERSION} is understood")
     try:
-        known = Type(kind)
+        type_ = Type(kind)
     except ValueError:
         raise FrameError("type", f"a frame of the unknown type 0x{kind:02x}") from None
-    return Frame(known, body[_HEAD.size :], interface, sequence, timestamp)
+    return Frame(type_, body[_HEAD.size :], interface, sequence, timestamp)
 
 
 def stuff(data: bytes) -> bytes:

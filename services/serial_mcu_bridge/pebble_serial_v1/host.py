@@ -131,7 +131,7 @@ class Session:
 
     @property
     def due(self) -> float | None:
-        """When :meth:`tick` has something to do; None for never."""
+        """The time at which :meth:`tick` has something to do; None for never."""
         times = [] if self._ask_at is None else [self._ask_at]
         if self._commands:
             times.append(next(iter(self._commands.values())).due)
@@ -225,10 +225,10 @@ class Session:
         if self.manifest is not None and self.manifest.hello == hello:
             return  # it has restarted, and its manifest is the same
         yield from self._forget("its HELLO differs")
-        known = self.known.get(hello)
-        if known is not None:
+        manifest = self.known.get(hello)
+        if manifest is not None:
             self.known.move_to_end(hello)
-            yield from self._begin(Described(known, remembered=True))
+            yield from self._begin(Described(manifest, remembered=True))
         else:  # a repeated HELLO does not delay the request
             self._ask_at = min(now + ASK_AFTER_HELLO_S, self._ask_at or float("inf"))
 
@@ -246,7 +246,7 @@ class Session:
     def _begin(self, described: Described) -> Iterator[Event]:
         self._ask_at = None
         self.manifest = described.manifest
-        self._by_id = {one.id: one for one in described.manifest.interfaces}
+        self._by_id = {interface.id: interface for interface in described.manifest.interfaces}
         self._slots.clear()
         yield described
 

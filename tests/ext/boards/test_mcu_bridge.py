@@ -142,14 +142,14 @@ def test_qos_and_retain_follow_the_interface(rig: SerialRig) -> None:
 
 
 def test_a_state_that_is_sent_only_once_is_not_lost(rig: SerialRig) -> None:
-    """A state right after the manifest arrives before the uid and the alias are known to be free."""
+    """A state right after the manifest arrives before the alias is known to be free."""
     mcu = rig.mcu(LAMP, plugged=False)
     mcu.after_describing = wire.frame(wire.STATE, b"\x0a", 2) + wire.frame(wire.STATE, b"\x0b", 2)
     rig.bridge()
     mcu.plug()
     assert rig.got("lights/lamp")
-    for metric in ("mcu/lamp-1/lamp", "lights/lamp"):
-        assert rig.values(metric) == [{"level": 5.5}]
+    assert rig.values("mcu/lamp-1/lamp") == [{"level": 5.0}, {"level": 5.5}]
+    assert rig.values("lights/lamp") == [{"level": 5.5}]
 
 
 # -- commands

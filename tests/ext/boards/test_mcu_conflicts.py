@@ -1,17 +1,13 @@
-"""Two devices with one channel: neither gets it. Two with one uid: the first gets it. On every transport."""
+"""Two devices with one channel: neither gets it. Two with one uid: a warning. On every transport."""
 
 from __future__ import annotations
 
 import logging
 import time
-from contextlib import closing
-from pathlib import Path
 
-import msgspec
 import pytest
 
-from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
-from pebble.transports import QoS, State
+from pebble.transports import QoS
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.boards.mcu_wire import IMU, LAMP, M, Received
 from tests.kit.board import SerialRig, motion
@@ -95,47 +91,19 @@ def test_a_contested_state_is_not_retained_and_a_contested_command_moves_nothing
     assert until(obeys, step=0.1)
 
 
-def test_the_first_of_two_devices_with_one_uid_gets_it(rig: SerialRig, caplog: pytest.LogCaptureFixture) -> None:
-    one, two = rig.mcu(IMU, "one"), rig.mcu(IMU, "two")
-    one.stream(50, motion(1000))
-    two.stream(50, motion(2000))
+def test_a_second_device_with_one_uid_is_warned_of_and_takes_nothing_along(
+    rig: SerialRig, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig.mcu(LAMP, "one")
+    other = rig.mcu(LAMP, "two")
     rig.bridge("one")
+    rig.described("lamp-1")
+    assert "another device" not in caplog.text
     rig.bridge("two")
-    assert rig.got("sensors/imu-fast")
-    time.sleep(0.6)
-    received = {body["value"]["accel_mps2"]["x"] for body in rig.world.payloads("sensors/imu-fast")}
-    generic = {body["value"]["ax"] for body in rig.world.payloads("mcu/goob-imu-nano/imu_fast")}
-    assert len(received) == len(generic) == 1
-    assert "goob-imu-nano: another device has this uid already" in caplog.text
-    (one if received == {1.0} else two).unplug()
-    other = {1.0, 2.0} - received
-    assert until(
-        lambda: other <= {body["value"]["accel_mps2"]["x"] for body in rig.world.payloads("sensors/imu-fast")}, 3
-    )
-
-
-def test_one_uid_twice_while_the_broker_is_down(tmp_path: Path) -> None:
-    """Without a broker both acquire the uid. Afterwards one releases it, and the other's messages are retained."""
-    with closing(SerialRig("mqtt", tmp_path)) as rig:
-        lines = {}
-        for name, level in (("one", b"\x0a"), ("two", b"\x14")):
-            rig.mcu(LAMP, name, plugged=False).after_describing = wire.frame(wire.STATE, level, 2)
-            lines[level[0] / 2] = rig.bridge(name).service
-
-        def holders() -> list[float]:
-            return [level for level, service in lines.items() if service.device is not None]  # type: ignore[attr-defined]
-
-        def retained(metric: str) -> list[float]:
-            return [msgspec.json.decode(raw)["value"]["level"] for raw in rig.world.newest_raw(metric)]
-
-        assert until(lambda: all(service.transport.state is State.CONNECTED for service in lines.values()))
-        with rig.network.outage():
-            for name in ("one", "two"):
-                rig.mcus[name].plug()
-            assert until(lambda: len(holders()) == 2)
-        assert until(lambda: len(holders()) == 1, 15)
-        assert until(lambda: rig.world.newest_raw("mcu/lamp-1/describe"), 10)
-        assert until(lambda: retained("mcu/lamp-1/lamp") == retained("lights/lamp") == holders(), 10)
+    assert until(lambda: "lamp-1: another device has this uid, too" in caplog.text)
+    other.unplug()
+    assert until(lambda: b"" in [message.payload for message in rig.world.on("mcu/lamp-1/describe")])
+    rig.listener("late").described("lamp-1")
 
 
 def test_a_manifest_cleared_by_another_is_published_again(rig: SerialRig) -> None:
@@ -146,22 +114,6 @@ def test_a_manifest_cleared_by_another_is_published_again(rig: SerialRig) -> Non
     other.publish(f"{rig.base}/outgoing/mcu/lamp-1/describe", b"", qos=QoS.DELIVERED, retain=True)
     assert until(lambda: len(rig.world.payloads("mcu/lamp-1/describe")) >= 2)
     rig.listener("late").described("lamp-1")
-
-
-def test_checking_a_retained_manifest_does_not_request_its_uid(memory_rig: SerialRig) -> None:
-    """A check must not delay a device with this uid that is being plugged in."""
-    asked: list[bytes] = []
-    questions = f"{memory_rig.base}/incoming/mcu/+/describe"
-    memory_rig.world.transport.subscribe(questions, lambda message: asked.append(message.payload))
-    ghost = parse_describe(LAMP.but(uid="ghost").describe()).payload()
-    body = msgspec.json.encode(ghost)
-    memory_rig.world.transport.publish(
-        f"{memory_rig.base}/outgoing/mcu/ghost/describe", body, qos=QoS.DELIVERED, retain=True
-    )
-    memory_rig.mcu(LAMP, plugged=False)
-    memory_rig.bridge()
-    assert until(lambda: asked)
-    assert [msgspec.json.decode(question)["from"] for question in asked] == [""]
 
 
 def test_a_line_that_renames_its_channels_leaves_them_to_the_other(memory_rig: SerialRig) -> None:

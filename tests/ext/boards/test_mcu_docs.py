@@ -7,7 +7,7 @@ from typing import Any
 
 from pebble.services.serial_mcu_bridge.devices import described_bridge, peers
 from pebble.services.serial_mcu_bridge.devices.aliases import claims
-from pebble.services.serial_mcu_bridge.pebble_serial_v1 import frame, host, manifest, uid_claim
+from pebble.services.serial_mcu_bridge.pebble_serial_v1 import frame, host, manifest
 from tests.support import ROOT
 
 DOCUMENT = (ROOT / "docs/ext/boards.md").read_text()
@@ -43,6 +43,4 @@ def test_the_numbers_agree_with_the_code() -> None:
         (manifest.MOST_INTERFACES, "fields of an interface; levels of a channel | {}; 64; 8"),
     ):
         assert sentence.format(number) in sentences, sentence
-    assert uid_claim.ASK_S + described_bridge.CLAIM_S + described_bridge.DescribedBridge.retry_s < 1, (
-        "the topics exist within two seconds"
-    )
+    assert described_bridge.CLAIM_S + described_bridge.DescribedBridge.retry_s < 1, "topics exist within two seconds"

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 
-from pebble.extensions.media.scene import read_counter
 from tests.ext.foxglove.live import Live, client, live
 from tests.ext.foxglove.watcher import Watcher
 from tests.ext.page.media.robots import (
@@ -26,6 +25,7 @@ from tests.ext.page.media.robots import (
     SoundRobot,
     capabilities,
 )
+from tests.kit.scene import read_counter
 from tests.support import Broker, some, until
 
 H264, JPEG, SAMPLES = f"{CAMERA}/video", f"{CAMERA}/image", f"{SOUND}/sound"

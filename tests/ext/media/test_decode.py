@@ -17,9 +17,9 @@ from pebble.extensions.media.decode import MAX_PAYLOAD, VideoDecoder
 from pebble.extensions.media.jpeg import decode_jpeg, jpeg_size
 from pebble.extensions.media.json_video import inflate
 from pebble.extensions.media.packets import Picture, PictureKind
-from pebble.extensions.media.scene import read_counter
 from pebble.extensions.media.video import make_encoder
 from tests.ext.recordings.demo_robots import FRED, MEDIA, recorded
+from tests.kit.scene import read_counter
 
 T0 = 1_710_969_600_000
 FORMS = ("json", "pbvd", "h264")

@@ -101,13 +101,8 @@ def lamp(one_lamp: Lamp) -> Lamp:
 def drive(lamp: Lamp) -> Iterator[Drive]:
     consoles: list[Terminal] = []
 
-    def start(*options: str, shell: bool = False, shows: str = "ready") -> Terminal:
-        command = [sys.executable, "-m", "pebble", "drive", "minilamp", "--url", lamp.url, *options]
-        if shell:
-            consoles.append(Terminal("bash", "--norc", "-i"))
-            consoles[-1].type(" ".join(command).encode() + b"\n")
-        else:
-            consoles.append(Terminal(*command))
+    def start(*options: str, shows: str = "ready") -> Terminal:
+        consoles.append(Terminal(sys.executable, "-m", "pebble", "drive", "minilamp", "--url", lamp.url, *options))
         assert consoles[-1].sees(shows), consoles[-1].shown
         return consoles[-1]
 
@@ -164,6 +159,7 @@ ENDS = {
     "SIGTERM": (signalled(signal.SIGTERM), 1),
     "SIGHUP": (signalled(signal.SIGHUP), 1),
     "Ctrl-D": (typed(b"\x04"), 0),
+    "Ctrl-Z": (typed(b"w\x1a"), 0),
     "SIGQUIT": (signalled(signal.SIGQUIT), 1),
     "space": (typed(b" "), None),
     "SIGINT": (signalled(signal.SIGINT), 0),
@@ -199,29 +195,6 @@ def test_after_a_stall_a_key_that_is_still_held_moves_nothing(drive: Drive, lamp
     console.hold(b"")
     assert console.sees("ready")
     driving(console, lamp)
-
-
-def test_ctrl_z_stops_the_robot_and_what_follows_needs_a_new_key(drive: Drive, lamp: Lamp) -> None:
-    console = drive(shell=True)
-    driving(console, lamp)
-    console.hold(b"")
-    console.type(b"w\x1a")
-    pressed = time.monotonic()
-    assert lamp.halted_after(pressed) < BUSY_S
-    assert console.sees("Stopped")
-    assert [command for _, command in lamp.commands[-3:]] == [FINAL] * 3
-    console.forget()
-    resumed = time.monotonic()
-    console.type(b"fg\n")
-    assert console.sees("ready"), console.shown
-    assert not lamp.moved_since(resumed)
-    driving(console, lamp)
-    console.hold(b"")
-    console.forget()
-    console.type(b"\x03")
-    assert console.sees("$ ")
-    console.type(b"stty -a\n")
-    assert console.sees(" icanon"), "the shell has its own mode again"
 
 
 @pytest.mark.parametrize("keys", some([b"\x1b\x1b", b"!"], 2))

@@ -3,7 +3,8 @@
 import msgspec
 
 from pebble.extensions.operator.client import drive_reasons
-from pebble.extensions.page import messages, messages_docs
+from pebble.extensions.page import messages
+from tools import messages_docs
 
 decoder = msgspec.json.Decoder(messages.FromPage)
 

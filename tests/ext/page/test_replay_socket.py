@@ -14,7 +14,6 @@ from websockets.sync.client import connect
 
 from pebble.contract import CAPABILITIES
 from pebble.extensions.media.decode import VideoDecoder
-from pebble.extensions.media.scene import read_counter
 from pebble.extensions.page import messages as m
 from pebble.extensions.page.recordings import viewers
 from pebble.extensions.page.recordings.playing import FOR_DECODER, MEDIUM, PICTURE, SOUND
@@ -22,6 +21,7 @@ from tests.ext.page.served import Served
 from tests.ext.recordings.playing import GOOB, Line, js, ms, write
 from tests.ext.recordings.recorder.test_record import Reference
 from tests.ext.recordings.seek.filming import FPS, SCENES, film
+from tests.kit.scene import read_counter
 from tests.support import Broker, gone, until
 
 SECONDS = 20

@@ -36,7 +36,7 @@ class Printer:
         self._config, self._as_json = shlex.quote(config), as_json
 
     def take(self, result: CheckResult, why: str = "") -> None:
-        """Texts come from the robot, so they are shown without secrets and control characters."""
+        """Show a result. Texts come from the robot, so they are shown without secrets and control characters."""
         text, fix = (
             shown(without_secrets(words)) for words in (result.text, result.fix.replace("CONFIG", self._config))
         )

@@ -103,7 +103,7 @@ _WITH = {"--may-move": ("--running",), "--root": ("--running", "--report")}
 
 
 def _check_modes(modes: dict[str, bool], options: dict[str, bool]) -> None:
-    """Raises BadParameter for options that do not go together."""
+    """Raise BadParameter for options that do not go together."""
     chosen = [mode for mode, is_given in modes.items() if is_given]
     if len(chosen) > 1:
         raise typer.BadParameter(f"give {chosen[0]} or {chosen[1]}, not both")

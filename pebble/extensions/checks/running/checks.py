@@ -81,7 +81,7 @@ def _states(robot: RobotUnderTest) -> dict[str, str]:
 
 
 def _unready(robot: RobotUnderTest) -> list[str]:
-    """``held`` ones wait while people drive over a thin link, and ``stopped`` ones until they are requested."""
+    """Return the unready programs; ``held`` ones wait while people drive, and those on demand for a request."""
     if not robot.own_side.status:
         return ["its status has not arrived: is it starting?"]
     states = {name: state for name, state in _states(robot).items() if state not in ("ready", "held")}

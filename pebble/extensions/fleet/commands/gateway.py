@@ -53,12 +53,12 @@ def gateway(file: FileArgument) -> int:
     places = [*settings.hub.connect]
     if (boards := settings.boards) is not None:
         places.append(f"{boards.host}:{boards.port}")
-        programs += [of_board(base, one, boards, run_dir) for base, one in settings.neighbours.items()]
+        programs += [of_board(base, robot, boards, run_dir) for base, robot in settings.neighbours.items()]
     if (mqtt := settings.operators) is not None:
         transports = gateway_transports(settings, mqtt, run_dir, will(name))
         programs.append(Gateway(name, settings.robots, *transports))
     others = [f"{mqtt.host}:{mqtt.port}"] if mqtt is not None else []
-    others += [endpoint for one in settings.neighbours.values() for endpoint in one.lan.connect]
+    others += [endpoint for robot in settings.neighbours.values() for endpoint in robot.lan.connect]
     typer.echo(
         f"gateway {name} between {', '.join(places)} and {', '.join(dict.fromkeys(others))}; Ctrl-C ends it", err=True
     )
@@ -79,13 +79,13 @@ class _Together:
 
     def run(self, ready: Callable[[], None]) -> int:
         ends = EndSignal()
-        threads = [threading.Thread(target=self._run, args=(one, ends)) for one in self._programs]
+        threads = [threading.Thread(target=self._run, args=(program, ends)) for program in self._programs]
         for thread in threads:
             thread.start()
         ready()
         ends.wait()
-        for one in self._programs:
-            one.quit()
+        for program in self._programs:
+            program.quit()
         for thread in threads:
             thread.join()
         return int(self._failed)

@@ -85,7 +85,7 @@ def init(
         return _init_again(place, host, level, plain)
     if host is None:
         raise PebbleError("--host is missing: the name or address by which robots and people reach the broker")
-    first, *others = (host_of("--host", one) for one in split_names(host))
+    first, *others = (host_of("--host", text) for text in split_names(host))
     server = Server(host=first, port=port, unencrypted=unencrypted)
     fleet = Fleet(level=_LEVELS[level or "login"], brokers=(server,), plain=bool(plain))
     with as_owner(place, *LATE, make=True):
@@ -348,8 +348,8 @@ def _place(folder_: Path | None) -> Path:
     """Return the folder that is named, else the only fleet in this one. Raises PebbleError."""
     if folder_ is not None:
         return folder_.absolute()
-    found = [Path(), *sorted(path for path in Path().iterdir() if path.is_dir() and not path.name.startswith("."))]
-    fleets = [path.absolute() for path in found if (path / folder.FLEET).is_file()]
+    folders = [Path(), *sorted(path for path in Path().iterdir() if path.is_dir() and not path.name.startswith("."))]
+    fleets = [path.absolute() for path in folders if (path / folder.FLEET).is_file()]
     if len(fleets) != 1:
         names = ", ".join(map(_shown, fleets))
         why = f"there are several fleets here, {names}" if fleets else "there is no fleet here"

@@ -121,14 +121,14 @@ def up(folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the fl
 def _commands(place: Path) -> dict[str, list[str]]:
     """Return what runs here, by its name; nothing for what this LAN does not have. Raises PebbleError."""
     pebble = [sys.executable, "-Pm", "pebble"]  # nothing of the folder that we are in
-    found = {"hub": [*pebble, "fleet", "hub", str(place / HUB_FILE)]}
+    hub = {"hub": [*pebble, "fleet", "hub", str(place / HUB_FILE)]}
     if not (place / GATEWAY_FILE).exists():
-        return found
+        return hub
     mosquitto = mosquitto_path()
     if mosquitto is None:
         raise PebbleError("mosquitto is not installed: sudo apt install mosquitto")
     broker = [] if applying.pid_of(place) else [mosquitto, "-c", str(place / CONF)]
-    return {"broker": broker, **found, "gateway": [*pebble, "fleet", "gateway", str(place / GATEWAY_FILE)]}
+    return {"broker": broker, **hub, "gateway": [*pebble, "fleet", "gateway", str(place / GATEWAY_FILE)]}
 
 
 @contextmanager

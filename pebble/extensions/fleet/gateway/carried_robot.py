@@ -1,4 +1,4 @@
-"""A robot that the gateway carries: a forwarder and the subscriptions of one time, made anew when it begins again.
+"""A robot that the gateway carries: a forwarder and its subscriptions, which are new whenever it begins again.
 
 So what hub and broker retain then counts, as at the start of a bridge.
 """
@@ -22,7 +22,6 @@ from pebble.contract import (
 )
 from pebble.contract.names import BY, stop_topic, without_name
 from pebble.errors import PayloadError
-from pebble.extensions.fleet.gateway.pace import LARGEST, MOST_EACH, MOST_TOGETHER, Pace
 from pebble.forwarding.cycles import PROBE_PERIOD_S
 from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
@@ -32,6 +31,7 @@ from pebble.transports import Handler, Message, Subscription, Transport, clock
 
 #: What the robot sends of each medium, by what allows and what requests it.
 _MEDIA = ((CAMERA, MQTT_VIDEO, VIDEO_CONTROL), (AUDIO, MQTT_AUDIO, AUDIO_CONTROL))
+LARGEST = 1024 * 1024  # bytes of a message; the brokers of `pebble fleet` take no more
 
 
 class NamedSubjects(Subjects):
@@ -109,8 +109,8 @@ def _subscribe(robots: Sequence["CarriedRobot"], side: Side, transport: Transpor
 class CarriedRobot:
     """A robot of the hub.
 
-    ``stops_pass`` is asked for each stop: whether another way carries it. ``flooded`` is called with the topic of each
-    message that is too much at this moment.
+    ``stops_pass`` is asked for each stop: whether another way carries it. ``too_large`` is called with the topic of a
+    message that no broker takes.
     """
 
     def __init__(
@@ -119,13 +119,12 @@ class CarriedRobot:
         hub: Transport,
         broker: Transport,
         stops_pass: Callable[[], bool],
-        flooded: Callable[[str], None],
+        too_large: Callable[[str], None],
         clock: Callable[[], float],
         beginning: Beginning,
     ) -> None:
         self.base = base
-        self._stops_pass, self._flooded, self._clock, self._beginning = stops_pass, flooded, clock, beginning
-        self._paces = {side: Pace(clock, MOST_EACH, MOST_TOGETHER) for side in Side}
+        self._stops_pass, self._too_large, self._clock, self._beginning = stops_pass, too_large, clock, beginning
         self._subscriptions: list[Subscription] = []
         #: By the channel of each medium: what allows it, and whether it was requested at the broker; None: not known.
         self._allowed: dict[Channel, bool] = {}
@@ -158,10 +157,7 @@ class CarriedRobot:
             subscription.close()
 
     def tick(self, now: float) -> None:
-        """Do what is due: what was too much in the second before; what both sides retain; a look for cycles."""
-        for side, pace in self._paces.items():
-            for message in pace.due():
-                self._pass(side, message)
+        """Do what is due: forward what both sides retain, and look for cycles."""
         if now >= self._synchronize_at:
             self._synchronize_at = float("inf")
             for side in Side:
@@ -173,15 +169,11 @@ class CarriedRobot:
     # -- the transports' threads
 
     def receive(self, side: Side, message: Message) -> None:
-        is_old = self.forwarder.sides[side].window.may_be_old(message)  # all that is retained comes at once
-        if len(message.payload) <= LARGEST and (is_old or self._paces[side].takes(message, message.topic)):
-            self._pass(side, message)
-        else:
-            self._flooded(message.topic)
-
-    def _pass(self, side: Side, message: Message) -> None:
         subject = self.subjects[message.topic]
         if subject is None:
+            return
+        if len(message.payload) > LARGEST:
+            self._too_large(message.topic)
             return
         if side is Side.LOCAL:
             if self._is_wanted(subject.channel):

@@ -2,7 +2,7 @@
 
 Where boards are, the broker of a LAN takes the place of the hub. There is one gateway for a LAN; a second one does not
 start. A live emergency stop has a connection of its own, which is subscribed to nothing else, and passes for every
-robot, heard or not. Only while that connection is away, or flooded, the robot's forwarder passes it as well.
+robot, heard or not. Only while that connection is away, the robot's forwarder passes it as well.
 """
 
 import logging
@@ -20,7 +20,6 @@ from pebble.contract.payloads import GatewayHeartbeat
 from pebble.errors import PebbleError
 from pebble.extensions.fleet.gateway.carried_robot import Beginning, CarriedRobot, begin
 from pebble.extensions.fleet.gateway.others import FRESH_S, HEARTBEAT_S, OtherGateways
-from pebble.extensions.fleet.gateway.pace import MOST_STOPS, Pace, Senders
 from pebble.forwarding.cycles import Cycles, Finding
 from pebble.forwarding.routing import Side
 from pebble.forwarding.subjects import Subject
@@ -31,7 +30,6 @@ from pebble.transports.counters import Counters
 log = logging.getLogger(__name__)
 
 TICK_S = 0.1
-FLOOD_S = 2.0  # so long after a flood of stops others may wait behind it
 MAX_ROBOTS = 1000  # that one gateway carries; further ones with a warning
 SILENT_S = 30.0  # without a heartbeat a robot is carried so long: three of the slowest pace
 #: Robots that begin in one turn: they wait together for hub and broker. What moves is taken for old while a turn lasts
@@ -48,7 +46,7 @@ class SecondGatewayError(PebbleError):
 
 
 def will(name: str) -> Message:
-    """Return what tells the others that this gateway has gone."""
+    """Return the message that tells other gateways that this one has gone."""
     return Message(ONLINE.topic(Identity("pebble", GATEWAYS, name).base), b"", QoS.DELIVERED, True)
 
 
@@ -85,9 +83,7 @@ class Gateway:
         self._carried: dict[str, CarriedRobot] = {}
         self._has_begun = False
         self._beginning = Beginning()
-        self._stop_pace, self._stop_cycles = Pace(clock, MOST_STOPS), Cycles(clock)
-        self._stop_senders = Senders(self._heard, clock)
-        self._flooded_at = float("-inf")  # the connection of stops
+        self._stop_cycles = Cycles(clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._lost, self._wake = threading.Event(), threading.Event()
         self._running = True
@@ -139,8 +135,6 @@ class Gateway:
 
     def tick(self) -> None:
         """Take a turn: end what is over, begin what is heard, and tell other gateways."""
-        for stop in self._stop_pace.due():
-            self._pass_stop(stop)
         if self._lost.is_set():
             self._lost.clear()
             self._end(self.carries)
@@ -165,7 +159,7 @@ class Gateway:
     @property
     def _is_connected(self) -> bool:
         """True if robots can be carried, as far as this depends on connections."""
-        return all(one.state is State.CONNECTED for one in (self._hub, self._broker, self._presence))
+        return all(transport.state is State.CONNECTED for transport in (self._hub, self._broker, self._presence))
 
     def _leave_to_others(self, now: float) -> None:
         for base in list(self._heard):
@@ -190,7 +184,7 @@ class Gateway:
             return
         hub, broker = self._hub, self._broker
         robots = [
-            CarriedRobot(base, hub, broker, self._stops_pass, self._report_flood, self._clock, self._beginning)
+            CarriedRobot(base, hub, broker, self._stops_pass, self._report_large, self._clock, self._beginning)
             for base in waiting[:TOGETHER]
         ]
         for transport in (hub, broker):
@@ -252,28 +246,18 @@ class Gateway:
                 return
             self._others.heard(name, heartbeat.run, heartbeat.robots[:MAX_ROBOTS], self._clock())
 
-    def _on_stop(self, message: Message) -> None:
-        if message.retain:
-            return
-        if self._stop_pace.takes(message, self._stop_senders.key(message)):
-            self._pass_stop(message)
-        else:
-            self._flooded_at = self._clock()
-            self._report_flood(message.topic)
-
-    def _pass_stop(self, stop: Message) -> None:
-        if self._stop_cycles.examine(Side.REMOTE, _STOP, stop) is Finding.PASS:
+    def _on_stop(self, stop: Message) -> None:
+        if not stop.retain and self._stop_cycles.examine(Side.REMOTE, _STOP, stop) is Finding.PASS:
             self.counters.add("stops")
             self._hub.publish(stop.topic, stop.payload, qos=QoS.DELIVERED, urgent=True)
 
-    def _report_flood(self, topic: str) -> None:
-        self.counters.add("too_often")
-        self._quiet_log.warning("flood", "more comes on %s than a gateway passes in a second", topic[:200])
+    def _report_large(self, topic: str) -> None:
+        self.counters.add("too_large")
+        self._quiet_log.warning("large", "a message on %s is larger than a gateway passes", topic[:200])
 
     def _stops_pass(self) -> bool:
-        """True if stops come, and soon, by their own connection."""
-        is_flooded = self._clock() - self._flooded_at < FLOOD_S
-        return self._stops.state is State.CONNECTED and not self._stops.not_received and not is_flooded
+        """True if stops come by their own connection."""
+        return self._stops.state is State.CONNECTED and not self._stops.not_received
 
     def _of(self, topic: str) -> CarriedRobot | None:
         address = parse_topic(topic)

@@ -70,7 +70,7 @@ def load_gateway(path: Path, env: Mapping[str, str] = os.environ) -> tuple[Gatew
     _check_sides(reader.notes, gateway, operators)
     _check_neighbours(reader.notes, gateway)
     if reader.notes.problems:
-        raise ConfigError(list(dict.fromkeys(f"{path.name}: {one}" for one in reader.notes.problems)))
+        raise ConfigError(list(dict.fromkeys(f"{path.name}: {problem}" for problem in reader.notes.problems)))
     return gateway, name, default_run_folder(f"gateway {path}", env)
 
 
@@ -91,13 +91,13 @@ def _check_neighbours(notes: Notes, gateway: GatewayFile) -> None:
         notes.problem(("neighbours",), "must be left out without boards: a robot at a hub has its own")
     if len(gateway.neighbours) > MOST_BOARDS:
         notes.problem(("neighbours",), f"has {len(gateway.neighbours)} robots: {MOST_BOARDS} are the most")
-    for base, one in gateway.neighbours.items():
+    for base, robot in gateway.neighbours.items():
         path = ("neighbours", base)
         if "+" in base or not _is_base(base):
             notes.problem(path, f"{base!r} is no base: write SYSTEM/TYPE/ID, such as pebble/robots/minilamp")
-        if not one.lan.connect:
+        if not robot.lan.connect:
             notes.problem((*path, "lan", "connect"), 'is missing: write where the hub listens: ["tls/hub.lab:7447"]')
-        if one.listens:
+        if robot.listens:
             notes.problem((*path, "listens"), "must be left out: no script of this robot runs here")
 
 

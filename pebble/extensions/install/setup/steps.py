@@ -135,7 +135,7 @@ class Job:
                 yield self._new_password("password of the page at the robot's broker", page)
 
     def _new_password(self, what: str, file: Path, *, known: bool = True) -> Step:
-        """``known``: what is in the file is of this broker."""
+        """Make a new password. ``known``: what is in the file is of this broker."""
         write = partial(self.system.write, file)
         return Step(what, lambda: known and file.exists(), lambda: write(f"{new_password()}\n".encode()))
 

@@ -79,9 +79,9 @@ def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cel
                 for variant in in_turn(list(driven), number + pass_):
                     progress(f"{variant}, {load}")
                     turns.append((variant, driven[variant].drive(settings.seconds / passes)))
-            for variant, own in grouped(turns, lambda turn: turn[0]).items():
-                arrived = driven[variant].arrived([turn for _, turn in own])
-                for _, turn in own:
+            for variant, of_variant in grouped(turns, lambda turn: turn[0]).items():
+                arrived = driven[variant].arrived([turn for _, turn in of_variant])
+                for _, turn in of_variant:
                     yield from cells_of(variant, load, turn, arrived)
 
 
@@ -91,15 +91,15 @@ def cells_of(variant: str, load: str, turn: Turn, arrived: Arrived) -> Iterator[
     down = [(arrived.commands[wheels] - ns) / 1e6 for wheels, ns in turn.sent.items() if wheels in arrived.commands]
     yield round_cell(variant, DOWN, "ms", down, params, sent=len(turn.sent), **figures)
     if load != COMMANDS:
-        own = [(sent, ns) for sent, ns in arrived.reports if turn.began <= sent <= turn.ended]
+        reports = [(sent, ns) for sent, ns in arrived.reports if turn.began <= sent <= turn.ended]
         yield round_cell(
-            variant, UP, "ms", [(ns - sent) / 1e6 for sent, ns in own if ns is not None], params, sent=len(own)
+            variant, UP, "ms", [(ns - sent) / 1e6 for sent, ns in reports if ns is not None], params, sent=len(reports)
         )
     forwarded = len(down) + sum(turn.began <= ns <= turn.ended for ns, _ in arrived.received)
     for process, cpu_s in turn.cpu_s.items():
         if process != ALL:
-            each = [1e6 * cpu_s / forwarded] if forwarded else []
-            yield round_cell(variant, CPU, "us", each, {**params, "process": process})
+            cost = [1e6 * cpu_s / forwarded] if forwarded else []
+            yield round_cell(variant, CPU, "us", cost, {**params, "process": process})
 
 
 def latency_table(results: Results, cells: Sequence[Cell]) -> Table:

@@ -19,8 +19,8 @@ from pebble.extensions.lab.bench.results import STAND_IN
 from pebble.extensions.lab.bench.usage import cpu_s
 from pebble.extensions.lab.rig.processes import python
 from pebble.extensions.lab.rig.robot import BASE, Robot, one_robot
+from pebble.extensions.lab.rig.scripted_operator import paced
 from pebble.extensions.lab.simulation.trace import Entry
-from pebble.extensions.operator.client.scripted_operator import paced
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch, parse
 
 ALL = "all"  # processes of a robot; and those that forward, by the names of their services
@@ -55,12 +55,12 @@ def wheels(number: int) -> Wheels:
 
 
 def arrivals(entries: Sequence[Entry]) -> dict[Wheels, int]:
-    """Maps each command to the time at which it first reached the MCU."""
+    """Return when each command first reached the MCU."""
     return {line.drive: line.ns for line in reversed(entries) if line.drive is not None}
 
 
 def matched(entries: Sequence[Entry], received: Sequence[tuple[int, Touch]]) -> list[tuple[int, int | None]]:
-    """Pairs the time each report was sent with the time it was received; None if it was not.
+    """Pair the time each report was sent with the time it was received; None if it was not.
 
     A report is identified by its values: while the wheels turn, the sensors never report the same values for long.
     Values that were sent more than once do not count.
@@ -92,7 +92,7 @@ class DrivenRobot(StockClient):
         self.open(robot.remote_port)
 
     def wait_until_ready(self) -> None:
-        """Raises PebbleError if it does not become so."""
+        """Wait until the robot is ready. Raises PebbleError if it does not become so."""
         robot = self.robot
         with closing(RobotSubscriber(robot.remote_port, BASE)) as seen:
             robot.expect(lambda: None not in (seen.ready_ns, seen.first_heartbeat_ns), "it is not ready", _UP_S)
@@ -118,7 +118,7 @@ class DrivenRobot(StockClient):
         return Turn(began, ended, sent, used)
 
     def arrived(self, turns: Sequence[Turn]) -> Arrived:
-        """Waits until the last commands and reports have arrived or count as lost."""
+        """Wait until the last commands and reports have arrived or count as lost."""
         time.sleep(max(0.0, turns[-1].ended / 1e9 + _ARRIVE_S - time.monotonic()))
         since = turns[0].began
         entries = self.robot.lines(since)
@@ -131,7 +131,7 @@ class DrivenRobot(StockClient):
         self._acknowledge()
 
     def _acknowledge(self, *_: object) -> None:
-        """Sets TCP_QUICKACK. The kernel resets it whenever we send, so this is called after every message."""
+        """Set TCP_QUICKACK. The kernel resets it whenever we send, so this is called after every message."""
         sock: Any = self.paho.socket()
         if sock is not None:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
@@ -153,7 +153,7 @@ class StandIn(Robot):
 
 @contextmanager
 def driven_robot(kind: str, *, reports: bool = True) -> Iterator[DrivenRobot]:
-    """Launches a robot and connects its operator; with ``reports`` it forwards those of its MCU. Raises PebbleError."""
+    """Launch a robot and connect its operator; with ``reports`` it forwards those of its MCU. Raises PebbleError."""
     with one_robot(kind, StandIn if kind == STAND_IN else Robot, reports=reports) as robot:
         robot.launch()
         with closing(DrivenRobot(robot)) as driven:

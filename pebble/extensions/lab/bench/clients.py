@@ -18,9 +18,9 @@ from pebble import contract
 from pebble.contract.payloads import Drive
 from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.lab.rig.robot import BASE, MEDIA, Robot, one_robot
+from pebble.extensions.lab.rig.scripted_operator import ScriptedOperator
 from pebble.extensions.media.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.operator.client.robot_view import RobotView
-from pebble.extensions.operator.client.scripted_operator import ScriptedOperator
 from pebble.transports import Message
 
 _AHEAD: Final = 0.5

@@ -97,8 +97,8 @@ def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cel
                     progress(f"{variant}, {', '.join(map(str, case.params().values()))}")
                     done, pictures_hz = participants.run(variant, case, settings.seconds)
                     figures = {"sent": done.sent, "late": done.late, "pictures_hz": pictures_hz}
-                    one_way = [(each.echoed_ns - each.sent_ns) / 1000 for each in done.exchanges]
-                    round_trip = [(each.received_ns - each.sent_ns) / 1000 for each in done.exchanges]
+                    one_way = [(exchange.echoed_ns - exchange.sent_ns) / 1000 for exchange in done.exchanges]
+                    round_trip = [(exchange.received_ns - exchange.sent_ns) / 1000 for exchange in done.exchanges]
                     yield round_cell(variant, ONE_WAY, "us", one_way, case.params(), **figures)
                     yield round_cell(variant, ROUND_TRIP, "us", round_trip, case.params(), **figures)
 

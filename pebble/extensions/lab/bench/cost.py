@@ -120,7 +120,7 @@ def table(results: Results) -> Table:
                 for variant in KINDS
                 for measure_ in (MEMORY, CPU, THREADS)
             }
-            own = [compared(used["zenoh", measure_], used["mqtt", measure_]) for measure_ in (MEMORY, CPU)]
+            comparisons = [compared(used["zenoh", measure_], used["mqtt", measure_]) for measure_ in (MEMORY, CPU)]
             place, style = "" if number else str(phase), "bold" if process == ALL else None
-            grid.add_row(place, process, *map(middle, used.values()), *own, style=style)
+            grid.add_row(place, process, *map(middle, used.values()), *comparisons, style=style)
     return grid

@@ -46,7 +46,7 @@ def write(writer: Writer, size: int) -> None:
     stamps: list[int] = []  # of the frames, also of those that could not be sent
 
     def fill(frame: np.ndarray) -> None:
-        """Pixels are written first, then the time, as a camera does."""
+        """Write pixels first, then the time, as a camera does."""
         np.copyto(frame, picture)
         for place in (8, len(frame) - 8):
             struct.pack_into("<q", frame.data, place, len(stamps))
@@ -122,7 +122,7 @@ class ZenohReader:
 
 
 def _refuse(problem: str) -> None:
-    """Raises TransportError: results of frames that took another way would be labelled wrongly."""
+    """Raise TransportError: results of frames that took another way would be labelled wrongly."""
     if problem:
         raise TransportError(problem)
 
@@ -208,7 +208,7 @@ class GstWriter:
         return True
 
     def close(self) -> None:
-        """shmsink removes its socket and its segment."""
+        """Close: shmsink removes its socket and its segment."""
         self._pipeline.set_state(Gst.State.NULL)
 
 
@@ -254,7 +254,7 @@ Reader = ZenohReader | MqttReader | GstReader
 
 
 def writer(variant: str, where: str, size: int, caps: str = "") -> Writer:
-    """``size`` in bytes; ``caps``: the format of frames, for GStreamer."""
+    """Return a writer. ``size`` in bytes; ``caps``: the format of frames, for GStreamer."""
     if variant == "gstreamer-shm":
         return GstWriter(f"{where}/gst.sock", caps, size)
     return MqttWriter(int(where), size) if variant == "mqtt" else ZenohWriter(Path(where), size)

@@ -96,7 +96,7 @@ def run(names: Sequence[str], folder: Path, *, quick: bool, console: Console) ->
     Without names all that this user may run. Raises PebbleError if the folder cannot be written.
     """
     path, sections, failed = _checked(folder), _chosen(names), 0
-    console.print(f"{len(sections)} comparisons: about {_span(sum(one.expected_s(quick) for one in sections))}")
+    console.print(f"{len(sections)} comparisons: about {_span(sum(section.expected_s(quick) for section in sections))}")
     try:
         with interrupted_by_signals():
             for section in sections:
@@ -126,7 +126,9 @@ def _checked(folder: Path) -> Path:
 
 def _chosen(names: Sequence[str]) -> list[Section]:
     """Return the sections of these names; without names all that this user may run."""
-    return [one for one in SECTIONS if one.name in names or (not names and not (one.needs_root and os.geteuid()))]
+    if names:
+        return [section for section in SECTIONS if section.name in names]
+    return [section for section in SECTIONS if not (section.needs_root and os.geteuid())]
 
 
 def run_one(section: Section, folder: Path, quick: bool) -> str:

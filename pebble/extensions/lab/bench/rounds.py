@@ -124,7 +124,7 @@ def paired(ours: Samples, theirs: Samples, percent: float = 50) -> Interval:
         return Interval()
     import numpy as np  # importing it earlier than it is needed would change the memory of measured processes
 
-    logs = [math.log(one) if one else -math.inf for one in ratios]
+    logs = [math.log(ratio) if ratio else -math.inf for ratio in ratios]
     middle = float(np.median(logs))
     random = np.random.default_rng(1)  # the same samples give the same interval
     drawn = np.median(random.choice(logs, (RESAMPLES, len(logs))), axis=1)

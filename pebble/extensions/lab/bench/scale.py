@@ -73,8 +73,8 @@ def run(settings: Settings, console: Console) -> Shown:
             yield from measure(boards, settings.seconds)
 
     measure_rounds(results, 1, measure_all, console)
-    own = [cell for cell in results.cells if cell.params.get("process") in (None, PAGE)]
-    return Shown(results, [table(results)], plots.lines("scale", "What boards cost", own, over="boards"))
+    cells = [cell for cell in results.cells if cell.params.get("process") in (None, PAGE)]
+    return Shown(results, [table(results)], plots.lines("scale", "What boards cost", cells, over="boards"))
 
 
 def table(results: Results) -> Table:
@@ -152,7 +152,7 @@ class Viewer:
         return len(self._online)
 
     def wait_until(self, condition: Callable[[], bool], what: str) -> None:
-        """Raises PebbleError if the page never shows it."""
+        """Wait until the page shows it. Raises PebbleError if it never does."""
         end = time.monotonic() + _UP_S
         while not condition():
             if time.monotonic() > end:

@@ -30,7 +30,7 @@ _TOUCH = ("a0", "a1", "a2")
 
 
 def bridge(remote_port: int, local_port: int, base: str) -> None:
-    """Forwards commands to the local broker, everything else to the remote one; publishes heartbeats."""
+    """Forward commands to the local broker, everything else to the remote one; publish heartbeats."""
 
     def to_local(message: MQTTMessage) -> None:
         local.paho.publish(message.topic, message.payload, message.qos, message.retain)
@@ -50,7 +50,7 @@ def bridge(remote_port: int, local_port: int, base: str) -> None:
 
 
 def serial_bridge(local_port: int, base: str, device: str, *, reports: bool) -> None:
-    """Writes a line for each drive command, and with ``reports`` publishes each one of the touch sensors."""
+    """Write a line for each drive command, and with ``reports`` publish each one of the touch sensors."""
     port = serial.Serial(device, _BAUD, timeout=_READ_S)
 
     def drive(message: MQTTMessage) -> None:

@@ -135,7 +135,7 @@ def _use(testbed: Testbed, seconds: float) -> None:
             receiver.request("video", "json")
             receiver.request("audio", "pcm")
         end = time.monotonic() + _READY_S
-        while silent := [one.robot.name for one in receivers if len(one.encoding) < 2]:
+        while silent := [receiver.robot.name for receiver in receivers if len(receiver.encoding) < 2]:
             poll()
             if time.monotonic() > end:
                 raise PebbleError(f"no pictures or no sound came from {', '.join(silent)}")
@@ -151,9 +151,9 @@ def cells_of(robots: Analysed) -> Iterator[Cell]:
         yield round_cell(name, "outage", "ms", [outage.length_ms for outage in robot.outages])
         if robot.latency is not None:
             yield round_cell(name, "heartbeat latency", "ms", [robot.latency.median_ms], p95_ms=robot.latency.p95_ms)
-        for one in robot.bandwidth:
-            about = {"messages": one.family, "time": one.time}
-            yield round_cell(name, "bandwidth", "kbit/s", [one.median_kbps], about, p95_kbps=one.p95_kbps)
+        for bandwidth in robot.bandwidth:
+            about = {"messages": bandwidth.family, "time": bandwidth.time}
+            yield round_cell(name, "bandwidth", "kbit/s", [bandwidth.median_kbps], about, p95_kbps=bandwidth.p95_kbps)
 
 
 def media_table(robots: Analysed) -> Table:
@@ -162,7 +162,7 @@ def media_table(robots: Analysed) -> Table:
     table = plain_table("Table 4.1: media, kbit/s of active seconds", ["robot", "", *heads], left=2)
     for name, paper in TABLE_4_1.items():
         here = [robots[name].of(family) if name in robots else None for family in (VIDEO, AUDIO)]
-        shown = [("–", "–") if one is None else (f"{one.median_kbps:.2f}", f"{one.p95_kbps:.2f}") for one in here]
+        shown = [("–", "–") if row is None else (f"{row.median_kbps:.2f}", f"{row.p95_kbps:.2f}") for row in here]
         table.add_row(name, "paper", *(f"{value:.2f}" for value in paper))
         table.add_row("", "here", *chain(*shown))
     return table
@@ -183,7 +183,7 @@ def _draw(robots: Analysed) -> Figure:
     for axes, (number, name, what) in zip(places, shown, strict=True):
         robot = robots[name]
         if what == _BANDWIDTH:
-            draw_bandwidth(axes, [one for one in robot.bandwidth if one.time in (SESSION, IDLE)])
+            draw_bandwidth(axes, [bandwidth for bandwidth in robot.bandwidth if bandwidth.time in (SESSION, IDLE)])
         elif what == _OUTAGES:
             draw_outages(axes, robot)
         elif robot.latency is not None:

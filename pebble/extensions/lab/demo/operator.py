@@ -21,10 +21,10 @@ from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, Lights
 from pebble.errors import PayloadError
 from pebble.extensions.lab.demo.outcome import Driven, Wheels
 from pebble.extensions.lab.demo.visitors import Visitors
+from pebble.extensions.lab.rig.scripted_operator import ScriptedOperator, paced
 from pebble.extensions.lab.rig.testbed import CLIP, TAG_ID
 from pebble.extensions.operator.client.discovery import ALL_OUTGOING, Discovery
 from pebble.extensions.operator.client.robot_view import RobotView
-from pebble.extensions.operator.client.scripted_operator import ScriptedOperator, paced
 from pebble.motion.arbiter import HOLD_MS
 from pebble.transports import Message, MqttSettings, QoS, create
 
@@ -116,9 +116,11 @@ class Operator:
     def connect(self) -> None:
         """Connect and subscribe; returns at once."""
         self._transport.open(timeout=0.0)
-        self._transport.subscribe(ALL_OUTGOING, lambda one: self.discovery.receive(one, time.monotonic(), time.time()))
+        self._transport.subscribe(
+            ALL_OUTGOING, lambda message: self.discovery.receive(message, time.monotonic(), time.time())
+        )
         drives = c.DRIVE.filter("+/+/+")
-        self._transport.subscribe(drives, lambda one: self.visitors.receive_drive(one, time.monotonic()))
+        self._transport.subscribe(drives, lambda message: self.visitors.receive_drive(message, time.monotonic()))
         self._transport.subscribe(c.AUTONOMY_FILES.filter("+/+/+"), self._receive_scripts)
 
     def not_ready(self, names: Iterable[str]) -> list[str]:
@@ -153,7 +155,7 @@ class Operator:
         address = parse_topic(message.topic)
         with suppress(PayloadError):
             files = codec.decode(c.AUTONOMY_FILES, message.payload).files if message.payload else []
-            if address is not None and any(one.get("file") == TRAIL for one in files):
+            if address is not None and any(script.get("file") == TRAIL for script in files):
                 self._drawing.add(address.identity.base)
 
     def _mine(self, robot: RobotView) -> bool:

@@ -70,7 +70,9 @@ class Outcomes:
 
     def add(self, outcome: Outcome) -> None:
         key = outcome.robot, outcome.step
-        self._worst[key] = max(outcome, self._worst.get(key, outcome), key=lambda one: (bool(one.wrong), one.off_s))
+        self._worst[key] = max(
+            outcome, self._worst.get(key, outcome), key=lambda judged: (bool(judged.wrong), judged.off_s)
+        )
 
     def of(self, robot: str, step: str) -> Outcome | None:
         return self._worst.get((robot, step))
@@ -80,4 +82,6 @@ class Outcomes:
 
     def problems(self, robot: str) -> list[str]:
         """Return what went wrong with a robot, step by step."""
-        return [f"{one.step}: {one.wrong}" for one in self._worst.values() if one.robot == robot and one.wrong]
+        return [
+            f"{worst.step}: {worst.wrong}" for worst in self._worst.values() if worst.robot == robot and worst.wrong
+        ]

@@ -25,7 +25,7 @@ _BLOCKS: Final = {(False, False): " ", (True, False): "▀", (False, True): "▄
 
 
 def require_terminal() -> None:
-    """Raises PebbleError where what is printed may end in a file."""
+    """Raise PebbleError where what is printed may end in a file."""
     if not sys.stdout.isatty():
         raise PebbleError("--phone prints a password, to a terminal only: start the demo in one, without a pipe")
 

@@ -76,7 +76,7 @@ class Program:
         return self.log.read_text(errors="replace").strip()[-_TAIL:]
 
     def freeze(self) -> None:
-        """SIGSTOP: its connections stay, and it answers nothing. A process that has ended stays so."""
+        """Send SIGSTOP: its connections stay, and it answers nothing. A process that has ended stays so."""
         self._process.send_signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
@@ -130,7 +130,7 @@ class Worker(Program):
         raise PebbleError(f"{self.name} {why}\n{self.tail()}".rstrip())
 
     def send(self, line: str) -> None:
-        """Writes a line to standard input. Ignored if the process has ended: :meth:`answer` reports that."""
+        """Write a line to standard input. Ignored if the process has ended: :meth:`answer` reports that."""
         if self._process.stdin is not None:
             with suppress(BrokenPipeError):
                 self._process.stdin.write(line.encode() + b"\n")
@@ -230,11 +230,11 @@ class Processes:
         return self
 
     def start(self) -> None:
-        """Starts what a subclass consists of, as the ``with`` block begins."""
+        """Start what a subclass consists of, as the ``with`` block begins."""
 
     def __exit__(self, *_: object) -> None:
         for kind, within_s in enumerate(self.ends_s):
-            end_all([program for program, one in self._kinds.items() if one == kind], within_s)
+            end_all([program for program, its_kind in self._kinds.items() if its_kind == kind], within_s)
         if not self.keep:
             shutil.rmtree(self.folder, ignore_errors=True)
 

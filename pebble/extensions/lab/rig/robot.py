@@ -113,7 +113,7 @@ class Robot(SimulatedRobot):
         self._own: Config = {"robot": {"id": name}, "transport": {"kind": kind}}
 
     def prepare(self, ending: threading.Event | None = None) -> None:
-        """Starts what the robot needs and writes its config, or waits no longer once ``ending`` is set.
+        """Start what the robot needs and write its config, or wait no longer once ``ending`` is set.
 
         Raises PebbleError if a process does not start.
         """
@@ -180,7 +180,7 @@ class Robot(SimulatedRobot):
         return {program.name for program in programs(load(self.config))}
 
     def expect(self, condition: Callable[[], bool], what: str, timeout: float) -> None:
-        """Waits for the condition. Raises PebbleError with the robot's log after ``timeout`` seconds, or if it ends."""
+        """Wait for the condition. Raises PebbleError with the robot's log after ``timeout`` seconds, or if it ends."""
         try:
             self.launcher.wait_until(condition, timeout)
         except PebbleError as error:

@@ -15,13 +15,13 @@ import msgspec
 
 from pebble.config.raw import deep_merge
 from pebble.errors import PebbleError
+from pebble.extensions.lab.rig.page import Ready
 from pebble.extensions.lab.rig.processes import HOST, OPERATORS, Processes, Program, python
 from pebble.extensions.lab.rig.robot import MEDIA, START_S, Config, Robot, SimulatedRobot
 from pebble.extensions.lab.simulation.world.program import port_path, trace_path
 from pebble.extensions.media.sound_file import write_wav
 from pebble.extensions.operator.client.discovery import ALL_OUTGOING, Discovery
 from pebble.extensions.operator.client.page_packages import require_packages
-from pebble.extensions.page.run import Ready
 from pebble.transports import MqttSettings, create
 
 ROBOTS = ("goob", "fred", "minilamp", "benjr")
@@ -139,7 +139,7 @@ class PageServer(Program):
         require_packages()
         self.url = ""  # with a slash at the end; empty until it can be opened
         fields = {"broker": {"host": HOST, "port": broker_port}, "host": HOST, "server": "demo", **settings}
-        command = python("pebble.extensions.page.run", msgspec.json.encode(fields, enc_hook=str).decode())
+        command = python("pebble.extensions.lab.rig.page", msgspec.json.encode(fields, enc_hook=str).decode())
         super().__init__("the operator page", command, folder / "page.log", self._take)
 
     def wait(self, ending: threading.Event | None = None) -> None:

@@ -74,7 +74,7 @@ class Body:
         board.pins.before_change = self.before_output_change
 
     def before_output_change(self) -> None:
-        """Called just before an output of the board changes; several may change in one turn."""
+        """Advance to now, just before an output of the board changes; several may change in one turn."""
         now = self.board.clock.now()
         if self._stale and now == self._changed_at:
             return
@@ -127,7 +127,7 @@ class Body:
         )
 
     def outputs(self) -> Pair:
-        """Inputs of the left and right motor driver, −1..1; + is the driver's own forward."""
+        """Return the inputs of the left and right motor driver, −1..1; + is the driver's own forward."""
         return 0.0, 0.0
 
     def forward(self, left: float, right: float) -> Pair:

@@ -125,7 +125,7 @@ class ConnectionReporter:
 
 
 def members(count: int) -> Iterator[tuple[str, Identity]]:
-    """Kind and identity of each robot of a fleet, alternating the kinds: minilamp-001, benjr-001, minilamp-002, …"""
+    """Yield kind and identity of each robot of a fleet, alternating the kinds: minilamp-001, benjr-001, …"""
     if not 1 <= count <= MOST:
         raise ConfigError(f"a fleet has 1 to {MOST} robots, not {count}")
     for number in range(count):

@@ -66,7 +66,7 @@ class Mpu6050:
     # -- the sensors
 
     def _sample(self) -> bytes:
-        """Acceleration, temperature and angular rate, as in the 14 data registers."""
+        """Return acceleration, temperature and angular rate, as in the 14 data registers."""
         accel, gyro = self._true_values()
         per_g = _ACCEL_LSB_PER_G / (1 << (self._registers[_ACCEL_CONFIG] >> 3 & 3))
         per_dps = _GYRO_LSB_PER_DPS / (1 << (self._registers[_GYRO_CONFIG] >> 3 & 3))
@@ -78,7 +78,7 @@ class Mpu6050:
         )
 
     def _true_values(self) -> tuple[Vector, Vector]:
-        """Specific force in g (at rest: 1 g upwards), and angular rate in degrees per second."""
+        """Return specific force in g (at rest: 1 g upwards), and angular rate in degrees per second."""
         roll, pitch = (math.radians(angle) for angle in self.tilt_deg)
         ahead, aside, turn_dps = self._motion_values()
         accel = (
@@ -90,7 +90,7 @@ class Mpu6050:
         return accel, (bias_x, bias_y, bias_z + turn_dps)
 
     def _motion_values(self) -> tuple[float, float, float]:
-        """Contribution of the motion: acceleration ahead and to the left in g, and angular rate to the left."""
+        """Return what the motion adds: acceleration ahead and to the left in g, and angular rate to the left."""
         if self._motion is None:
             return 0.0, 0.0, 0.0
         now = self._now()

@@ -83,7 +83,7 @@ _SAG_V = 0.075  # under full load
 
 
 def hall(motion: RobotMotion) -> tuple[float, float, float]:
-    """Hall sensors: left wheel, right wheel, and left wheel a quarter wave later, as parts 0..1 of the ADC's range."""
+    """Return the Hall sensors, 0..1 of the ADC's range: left wheel, right wheel, left wheel a quarter wave later."""
     waves_per_mm = _MAGNETS / 2 / (math.pi * WHEEL_DIAMETER_MM)
     left, right = (math.tau * waves_per_mm * way for way in (motion.left_mm, motion.right_mm))
     return _part(math.sin(left)), _part(math.sin(right)), _part(math.sin(left - math.pi / 2))

@@ -41,7 +41,7 @@ class _Recorder:
             self._add(ns, "line", self._received.feed(data))
 
     def sent(self, ns: int, data: bytes, *, whole: bool) -> None:
-        """``whole``: nothing was lost after it."""
+        """Note what was sent. ``whole``: nothing was lost after it."""
         if self._sent is not None:
             self._add(ns, "said", self._sent.feed(data))
             if not whole:

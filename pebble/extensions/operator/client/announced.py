@@ -1,4 +1,4 @@
-"""What a robot without capabilities offers, by the subscriptions that its heartbeat or status lists. Pure."""
+"""The offer of a robot without capabilities, by the subscriptions that its heartbeat or status lists. Pure."""
 
 from typing import Any
 
@@ -30,11 +30,11 @@ def announced(base: str, payload: bytes) -> dict[str, Any]:
     if len(payload) > _LARGEST or b'"subscribes"' not in payload:
         return {}
     try:
-        found = _decode(payload)
+        decoded = _decode(payload)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
         return {}
     listed: Any = None
-    for level in (found, found.get("value") if isinstance(found, dict) else None):
+    for level in (decoded, decoded.get("value") if isinstance(decoded, dict) else None):
         listed = level.get("subscribes") if isinstance(level, dict) and listed is None else listed
     if not isinstance(listed, list):
         return {}

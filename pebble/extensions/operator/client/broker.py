@@ -95,12 +95,12 @@ class Broker:
 
     @property
     def problem(self) -> str:
-        """Why nothing should be sent to it now, in one line; empty if all is well."""
+        """The reason why nothing should be sent now, in one line; empty if all is well."""
         return problem_of(self.transport)
 
     @property
     def not_received(self) -> str:
-        """Return what is not heard although there is a connection, and why, in one line."""
+        """The line that says what is not heard although there is a connection, and why."""
         return self.transport.not_received if self.connected else ""
 
     async def open(self) -> None:
@@ -155,8 +155,8 @@ class Broker:
         """Hand over what has arrived, in its order; the rest after whatever else is due, if that takes long."""
         self._woken = False
         end = time.monotonic() + _DELIVER_S
-        while (one := self._arrived.get()) is not None:
-            handler, message, at = one
+        while (arrived := self._arrived.get()) is not None:
+            handler, message, at = arrived
             try:
                 handler(message, at)
             except Exception:  # one message must not hold back the others

@@ -34,7 +34,7 @@ _NAME, _DEVICE = 40, 20  # characters, as robots cut them
 
 
 class RobotControl:
-    """Who has control of one robot, by the states of its motor owners; ``estop`` knows which of them it lists."""
+    """The control of one robot, by the states of its motor owners; ``estop`` knows which of them it lists."""
 
     def __init__(self, estop: RobotEstop) -> None:
         self.base = estop.base
@@ -44,18 +44,18 @@ class RobotControl:
 
     @property
     def states(self) -> list[ControlState]:
-        """They are in the order of the owners' names; with capabilities only those that these list."""
+        """The states in the order of the owners' names; with capabilities only those that these list."""
         names = self._estop.owners if self._estop.has_capabilities else self._states
         return [self._states[name] for name in sorted(names) if name in self._states]
 
     @property
     def state(self) -> ControlState | None:
-        """The one that decides; None: nothing is known."""
+        """The state that decides; None: nothing is known."""
         return next(iter(self.states), None)
 
     @property
     def who(self) -> str:
-        """Who has control, for people; "" nobody has."""
+        """The name of the one who has control, for people; "" if nobody has."""
         state = self.state
         return "" if state is None or not state.id else state.by or "somebody"
 
@@ -80,7 +80,7 @@ class RobotControl:
 
 
 class ControlClient:
-    """What one tab, or one process, wants of one robot. Call :meth:`update` after each state, and :meth:`tick` often.
+    """One tab, or process, that asks for control of a robot. Call :meth:`update` after each state, :meth:`tick` often.
 
     ``held``: the robot has answered that it has control. ``failed``: why it no longer asks for it, for people.
     """
@@ -117,7 +117,7 @@ class ControlClient:
         self.decided = ""
 
     def keep(self) -> None:
-        """Do not let drive who asks now."""
+        """Refuse the one who asks now."""
         state = self.robot.state
         self.passed_over = state.asks_id if state is not None else ""
 
@@ -128,18 +128,18 @@ class ControlClient:
         state = self.robot.state
         if not self.wanted or state is None:
             return
-        mine = state.id == self.id
-        if self.held and not mine and state.id:  # it was taken over, or ended while this client was not heard
+        is_ours = state.id == self.id
+        if self.held and not is_ours and state.id:  # it was taken over, or ended while this client was not heard
             self._give_up(f"{self.robot.who} has control now")
             return
-        if self.held and not mine:  # free: it has ended, or the motor owner was started again
+        if self.held and not is_ours:  # free: it has ended, or the motor owner was started again
             self._asked_at = self._answered_at = self._due_at = now
-        self.held, self.decided = mine, state.key if mine else ""
-        if mine:
+        self.held, self.decided = is_ours, state.key if is_ours else ""
+        if is_ours:
             self._take = False
         elif state.asks_id:  # of this client, or of another: then it waits for its turn
             self._answered_at = now
-        if not mine and state.id and self._has_any():
+        if not is_ours and state.id and self._has_any():
             self._out = [self._message(CONTROL, want="release")]
             self._due_at = max(self._due_at, now + APART * self._pace_of().control_s)
 
@@ -164,13 +164,13 @@ class ControlClient:
 
     @property
     def key(self) -> str:
-        """What a drive command needs: the keys of all motor owners that this client has control of."""
-        keys = [one.key for one in self.robot.states if one.id == self.id]
+        """The keys for a drive command: of all motor owners that this client has control of."""
+        keys = [state.key for state in self.robot.states if state.id == self.id]
         return " ".join(keys[:_KEYS]) if self.held else ""
 
     @property
     def asked_by(self) -> str:
-        """Who asks for it, and was not refused; "" nobody does, or it is not held."""
+        """The name of the one who asks for it and was not refused; "" if nobody does, or it is not held."""
         state = self.robot.state
         if not self.held or state is None or state.asks_id in ("", self.id, self.passed_over):
             return ""
@@ -181,7 +181,7 @@ class ControlClient:
         self.failed = why
 
     def _has_any(self) -> bool:
-        return any(one.id == self.id for one in self.robot.states)
+        return any(state.id == self.id for state in self.robot.states)
 
     def _hopeless(self, now: float) -> str:
         """Return why it is given up; empty: it is not."""

@@ -22,8 +22,8 @@ class Discovery:
 
     def awaits_heartbeat(self, waited_s: float) -> bool:
         """True if one of them, or the first of all, may be there although nothing was heard of it for so long."""
-        robots = [one.liveness for one in self.all_robots()]
-        awaited = [silent_after(link=one.link) for one in robots if one.received_at is None]
+        robots = [robot.liveness for robot in self.all_robots()]
+        awaited = [silent_after(link=liveness.link) for liveness in robots if liveness.received_at is None]
         return waited_s < max(awaited, default=0.0 if robots else silent_after())
 
     def receive(self, message: Message, now: float, wall: float) -> None:

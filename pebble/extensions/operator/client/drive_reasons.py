@@ -1,4 +1,4 @@
-"""Why a robot is not driven: the reasons, their order and their words, and the limits they have in common. Pure.
+"""The reasons why a robot is not driven: their order, their words, and the limits they have in common. Pure.
 
 When the page's own reasons apply is in ``web/static/core/reasons.js``; ``tests/vectors/drive_reasons.json`` is run by
 both. `make docs` writes the table of words.
@@ -35,7 +35,7 @@ class Code(StrEnum):
 
 
 class Situation(NamedTuple):
-    """What is known of one robot and of the way to it, at one moment."""
+    """The facts about one robot and the way to it, at one moment."""
 
     problem: str = ""  # why there is no connection
     online: bool | None = None  # None: it is not known

@@ -1,4 +1,4 @@
-"""What a robot's status reports: whether it can be driven, and stopped, and what waits while it is driven. Pure."""
+"""The facts in a robot's status: can it be driven, and stopped, and what waits while it is driven. Pure."""
 
 from typing import Any, NamedTuple
 
@@ -29,19 +29,19 @@ def driveable_of(status: bytes) -> Driveable | None:
 
     None: it is not there, as for an older robot, or one without motors.
     """
-    found = _value(status).get("driveable")
-    if not isinstance(found, dict) or found.get("state") not in ("yes", "no", "unknown"):
+    section = _value(status).get("driveable")
+    if not isinstance(section, dict) or section.get("state") not in ("yes", "no", "unknown"):
         return None
-    why = found.get("why")
-    return Driveable(found["state"], why[:_WHY] if isinstance(why, str) else "")
+    why = section.get("why")
+    return Driveable(section["state"], why[:_WHY] if isinstance(why, str) else "")
 
 
 def is_held(status: bytes, program: str) -> bool:
     """True if that program is requested, and waits while people drive over a thin link."""
-    found: Any = _value(status)
+    section: Any = _value(status)
     for level in ("services", program, "state"):
-        found = found.get(level) if isinstance(found, dict) else None
-    return bool(found == "held")
+        section = section.get(level) if isinstance(section, dict) else None
+    return bool(section == "held")
 
 
 def _value(status: bytes) -> dict[str, Any]:

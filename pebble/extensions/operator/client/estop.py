@@ -48,7 +48,7 @@ class Progress(Enum):
 
 
 class Order(NamedTuple):
-    """What is the same for every robot that one stop is sent to."""
+    """The part of a stop that is the same for every robot that it is sent to."""
 
     name: str
     payload: bytes
@@ -79,7 +79,7 @@ class RobotStop:
 
     @property
     def progress(self) -> Progress:
-        """How far its stop is."""
+        """The progress of its stop."""
         if self.confirmed_s is not None:
             return Progress.CONFIRMED
         if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._order.named):
@@ -103,12 +103,12 @@ class RobotStop:
 
     @property
     def unconfirmed(self) -> dict[str, str]:
-        """Why, by owner; owners that are confirmed are not in it."""
+        """The reasons by owner; owners that are confirmed are not among them."""
         return {owner: why for owner in self.estop.owners if (why := self._lacks(owner))}
 
     @property
     def why(self) -> str:
-        """Why it is not confirmed, in words; empty if it is. Names of owners in it come from the robot."""
+        """The reason why it is not confirmed, in words; empty if it is. Names of owners in it come from the robot."""
         if self.progress in (Progress.CONFIRMED, Progress.SPARED):
             return ""
         if self.estop.old:
@@ -177,7 +177,9 @@ class RobotStop:
             messages.append(_message(AUTONOMY_COMMAND, self.estop.script_topic, _END_SCRIPT))
         topics = dict.fromkeys((self.estop.drive_topic, *self.estop.zeros))
         messages += [_message(DRIVE, topic, _ZERO) for topic in topics]
-        return [one for one in messages if not self._order.own_only or _is_incoming(one.topic, self.estop.base)]
+        return [
+            message for message in messages if not self._order.own_only or _is_incoming(message.topic, self.estop.base)
+        ]
 
     def give_up(self) -> None:
         """Send no more."""
@@ -257,12 +259,12 @@ class StopSender:
     @property
     def confirmed(self) -> bool:
         """True if at least one robot is stopped, and every other one, except components that do not drive."""
-        found = {robot.progress for robot in self.robots.values()}
-        return Progress.CONFIRMED in found and found <= {Progress.CONFIRMED, Progress.SPARED} and not self.omitted
+        progress = {robot.progress for robot in self.robots.values()}
+        return Progress.CONFIRMED in progress and progress <= {Progress.CONFIRMED, Progress.SPARED} and not self.omitted
 
     @property
     def due(self) -> float | None:
-        """When to call ``tick`` next; None: not before a message."""
+        """The time to call ``tick`` next; None: not before a message."""
         if self.finished:
             return None
         times = [robot.next for robot in self.robots.values() if robot.sending]
@@ -309,7 +311,7 @@ class StopSender:
 
     @property
     def _collect_s(self) -> float:
-        """A robot that is not in ``robots`` gets the stop again only when anything arrives from it: for a minute."""
+        """The seconds for which further robots are stopped: a minute if some get it only when anything arrives."""
         return GIVE_UP_S if self.omitted else COLLECT_S
 
     def _receive_first(self, base: str, message: Message, now: float) -> None:
@@ -335,7 +337,7 @@ def send(publish: Callable[..., bool], messages: Iterable[Message]) -> None:
 
 
 def _is_incoming(topic: str, base: str) -> bool:
-    """Also one that the contract calls otherwise: a stop does no harm there, and it may be what drives this robot."""
+    """True for any incoming topic of the robot: a stop does no harm there, and it may be what drives this robot."""
     return topic.startswith(f"{base}/{Direction.INCOMING}/") and not topic.endswith("/")
 
 

@@ -25,7 +25,7 @@ class Reset:
 
     @property
     def waiting(self) -> list[str]:
-        """The owners whose answer is missing."""
+        """The owners whose answers are missing."""
         return [owner for owner in self.shown if self._free(owner) is None]
 
     @property
@@ -38,7 +38,7 @@ class Reset:
         return {owner: self._refusal(owner) for owner in self.shown if not self._free(owner)}
 
     def _free(self, owner: str) -> bool | None:
-        """None until the owner's state shows an effect. ``reset_refused`` does not decide: others reset as well."""
+        """True if the owner is free; None until its state shows it. ``reset_refused`` may be of another reset."""
         before, now = self.shown[owner], self.robot.states.get(owner)
         if now is None or (now.latched and (now.boot, now.count) == (before.boot, before.count)):
             return None

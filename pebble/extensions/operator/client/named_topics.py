@@ -62,16 +62,16 @@ class NamedTopics:
             raise NoNameError(command.identity.id, self.account)
 
     def signed(self, topic: str, payload: bytes, person: str) -> bytes:
-        """Return the payload with the person for whom this client acts, where the robot puts the account before."""
+        """Return the payload with the person for whom this client acts, if the robot puts the account before it."""
         command = _command(topic) if person else None
         if command is None or not self._is_named(command.identity.base):
             return payload
-        found = _object(payload)
-        body = found.get("value") if found is not None and isinstance(found.get("value"), dict) else found
-        if found is None or body is None or "by" in body:
+        plain = _object(payload)
+        body = plain.get("value") if plain is not None and isinstance(plain.get("value"), dict) else plain
+        if plain is None or body is None or "by" in body:
             return payload
         body["by"] = person
-        return msgspec.json.encode(found)
+        return msgspec.json.encode(plain)
 
 
 def _command(topic: str) -> ParsedTopic | None:
@@ -92,15 +92,15 @@ def _without_claim(payload: bytes, account: str) -> bytes:
     """Return the payload without its own name: the account alone tells who it is."""
     if f'"{account}'.encode() not in payload:
         return payload
-    found = _object(payload)
-    if found is None or str(found.get("by")).partition("@")[0] != account:
+    command = _object(payload)
+    if command is None or str(command.get("by")).partition("@")[0] != account:
         return payload
-    return msgspec.json.encode({key: one for key, one in found.items() if key != "by"})
+    return msgspec.json.encode({key: value for key, value in command.items() if key != "by"})
 
 
 def _object(payload: bytes) -> dict[str, Any] | None:
     try:
-        found = _decoder.decode(payload)
+        plain = _decoder.decode(payload)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
         return None
-    return found if isinstance(found, dict) else None
+    return plain if isinstance(plain, dict) else None

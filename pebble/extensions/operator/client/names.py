@@ -30,7 +30,7 @@ class Names:
         channel = self._find(name, (OUTGOING, INCOMING))
         if channel is None:
             return [name]
-        return [self._place(one, name) for one in _with_synonyms(channel)]
+        return [self._place(synonym, name) for synonym in _with_synonyms(channel)]
 
     def topic(self, name: str) -> str:
         """Return the topic to publish to for ``name``. Raises PebbleError if it is not exactly one."""
@@ -44,23 +44,24 @@ class Names:
 
     def channel(self, topic: str) -> Channel | None:
         """Return the channel of ``topic``, of any robot."""
-        known = None if self._addresses is None else self._addresses.channel(topic)
-        if known is not None:
-            return known
+        announced = None if self._addresses is None else self._addresses.channel(topic)
+        if announced is not None:
+            return announced
         address = parse_topic(topic)
         return None if address is None else channel_of(f"{address.direction}/{address.metric}")
 
     def _find(self, name: str, directions: tuple[str, str]) -> Channel | None:
         """Return the channel of a short name; None for a whole topic. The first direction that has the name wins."""
         if name.startswith((f"{INCOMING}/", f"{OUTGOING}/")):
-            found = channel_of(name)
+            channel = channel_of(name)
         elif parse_topic(name) is not None or is_pattern(name):
             return None
         else:
-            found = next((one for way in directions if (one := channel_of(f"{way}/{name}")) is not None), None)
-        if found is None:
+            channels = (channel_of(f"{direction}/{name}") for direction in directions)
+            channel = next((channel for channel in channels if channel is not None), None)
+        if channel is None:
             _refuse_misspelt(name)
-        return found
+        return channel
 
     def _place(self, channel: Channel, name: str) -> str:
         if channel.is_pattern:
@@ -98,8 +99,8 @@ def _with_synonyms(channel: Channel) -> Iterator[Channel]:
 
 def _refuse_misspelt(name: str) -> None:
     """Raise NamingError for a single word or a near match: other topics may exist on a broker outside the contract."""
-    known = {spelling for channel in CHANNELS for spelling in (channel.metric, channel.suffix)}
-    near = difflib.get_close_matches(name, sorted(known), n=1)
+    spellings = {spelling for channel in CHANNELS for spelling in (channel.metric, channel.suffix)}
+    near = difflib.get_close_matches(name, sorted(spellings), n=1)
     if near:
         raise NamingError(f'there is no topic "{name}": did you mean "{near[0]}"?')
     if "/" not in name:

@@ -1,4 +1,4 @@
-"""How often, and how, a robot is sent commands over the link that it reports as ``outgoing/link``. Pure.
+"""The pace of commands to a robot, over the link that it reports as ``outgoing/link``. Pure.
 
 What brings something to rest has no pace: it is sent at once, with QoS 1, at every level.
 """
@@ -33,9 +33,7 @@ class Pace(NamedTuple):
     answer_s: float = LEVELS["wide"].answer_s  # a robot that has not answered by then will not
 
     def dated(self, drive: Drive, now: float, key: str) -> Drive:
-        """Return a command that moves something, as it is sent now.
-
-        Valid for as long as commands on this link are, and dated.
+        """Return a command that moves something, dated, and valid for as long as commands on this link are.
 
         ``key``: where the robot has given none.
         """
@@ -73,5 +71,5 @@ def way_s(link: LinkState) -> float:
 
 
 def ms(now: float) -> int:
-    """``t`` of a command: milliseconds of the sender's clock. It goes on while the machine is suspended."""
+    """Return ``t`` of a command: milliseconds of the sender's clock, which goes on while the machine is suspended."""
     return round(1000 * now)

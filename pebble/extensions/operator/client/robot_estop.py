@@ -49,7 +49,7 @@ class RobotEstop:
 
     @property
     def states(self) -> dict[str, EstopState]:
-        """By owner; without capabilities of every owner, else of the listed ones: others are no longer there."""
+        """The states by owner; with capabilities only of the owners that these list: others are no longer there."""
         if not self.has_capabilities:
             return dict(self._states)
         return {owner: self._states[owner] for owner in self.owners if owner in self._states}
@@ -76,7 +76,7 @@ class RobotEstop:
 
     @property
     def missing_control(self) -> list[str]:
-        """Who has control of these owners, if the robot keeps it itself."""
+        """The topics of control of these owners, if the robot keeps it itself."""
         owners = [owner for owner in self.owners if owner not in self._states] if self.keeps_control else []
         return [CONTROL_STATE.topic(self.base, owner=owner) for owner in owners]
 

@@ -1,4 +1,4 @@
-"""Which topics of robots an operator's program subscribes to, and which of them capabilities may name. Pure."""
+"""The topics of robots that an operator's program subscribes to, and those that capabilities may name. Pure."""
 
 from typing import Any
 
@@ -74,10 +74,10 @@ def topic_of(ref: str, capabilities: dict[str, Any], channel: c.Channel) -> str:
 
 def section_of(capabilities: dict[str, Any], name: str) -> dict[str, Any]:
     """Return a section of capabilities, or one of a section: ``system.reboot``. Empty if there is none."""
-    found: Any = capabilities
+    section: Any = capabilities
     for level in name.split("."):
-        found = found.get(level) if isinstance(found, dict) else None
-    return found if isinstance(found, dict) else {}
+        section = section.get(level) if isinstance(section, dict) else None
+    return section if isinstance(section, dict) else {}
 
 
 def own_topic(ref: str, topic: object, direction: str) -> bool:

@@ -27,7 +27,7 @@ _STAMPS = 5  # heartbeats by which a clock of whole seconds is recognised
 
 
 class Liveness:
-    """Is a component online? As on the paper's operator page, the timeout follows the heartbeat's own interval."""
+    """The heartbeats of a component. As on the paper's operator page, its timeout follows their own interval."""
 
     def __init__(self) -> None:
         self.received_at: float | None = None  # monotonic
@@ -54,12 +54,12 @@ class Liveness:
 
     @property
     def average_latency_s(self) -> float | None:
-        """It is the mean of the last ten heartbeats that tell it; correct only if both clocks are synchronised."""
+        """The mean latency of the last ten heartbeats that tell it; correct only if both clocks are synchronised."""
         return _mean(self._latencies)
 
     @property
     def interval_s(self) -> float | None:
-        """It is the mean time between the last ten heartbeats."""
+        """The mean time between the last ten heartbeats."""
         return _mean(self._intervals)
 
     @property
@@ -71,7 +71,7 @@ class Liveness:
         return None if self.received_at is None else now - self.received_at
 
     def online(self, now: float, at_least_s: float = 0.0) -> bool | None:
-        """None while there are too few heartbeats to decide; a silence of less than ``at_least_s`` is none."""
+        """True if it is there; None while there are too few heartbeats. A silence below ``at_least_s`` is none."""
         if self.reported_offline:
             return False
         interval = self.interval_s
@@ -81,7 +81,7 @@ class Liveness:
         return age <= silent_after(interval, self.link, self.average_latency_s or 0.0) or age < at_least_s
 
     def online_to_people(self, now: float) -> bool | None:
-        """As :meth:`online`, but not silent after less than 1.5 s: longer while its heartbeats come and go."""
+        """True if people see it as there: not silent before 1.5 s, or longer while its heartbeats come and go."""
         returns = sum(now - at < _COMES_AND_GOES_S for at in self._returns)
         return self.online(now, SILENT_S * (1 + returns))
 
@@ -157,8 +157,8 @@ class RobotView:
     def _announce(self, payload: bytes) -> None:
         """Take what a heartbeat or status lists, unless it publishes capabilities."""
         if not self.capabilities or "announced" in self.capabilities:
-            found = announced(self.base, payload)
-            self.capabilities = self.capabilities if found == self.capabilities else found or self.capabilities
+            value = announced(self.base, payload)
+            self.capabilities = self.capabilities if value == self.capabilities else value or self.capabilities
 
     def _receive_stop(self, channel: c.Channel, message: Message, now: float) -> None:
         """Take capabilities, or the state of a motor owner. Empty capabilities take nothing away."""
@@ -180,10 +180,10 @@ class RobotView:
 
     def _remember(self, message: Message) -> None:
         """Keep it for an emergency stop that begins later; invented owners keep no capabilities out."""
-        known = (*self.remembered, c.CAPABILITIES.topic(self.base))
+        topics = (*self.remembered, c.CAPABILITIES.topic(self.base))
         if not message.payload:
             self.remembered.pop(message.topic, None)
-        elif len(self.remembered) < MAX_REMEMBERED or message.topic in known:
+        elif len(self.remembered) < MAX_REMEMBERED or message.topic in topics:
             self.remembered[message.topic] = message
 
     # -- what is assumed
@@ -249,7 +249,7 @@ class RobotView:
 
     @property
     def driveable(self) -> Driveable | None:
-        """It is what its status says of its motors."""
+        """The answer of its status to whether its motors obey."""
         return driveable_of(self._status)
 
     def holds(self, program: str) -> bool:
@@ -263,13 +263,13 @@ class RobotView:
 
     @property
     def slow_s(self) -> float | None:
-        """How long commands take over its thin link; None: it has reported none, or is gone."""
+        """The seconds that commands take over its thin link; None: it has reported none, or is gone."""
         link = self.link
         return None if link is None or link.level == "wide" or self.liveness.reported_offline else way_s(link)
 
     @property
     def pace(self) -> Pace:
-        """At what rate, and how, commands go to it; also while it is gone, for when it is back over the same link."""
+        """The pace of commands to it; also while it is gone, for when it is back over the same link."""
         return pace_of(self.link)
 
     def topic(self, channel: c.Channel) -> str | None:

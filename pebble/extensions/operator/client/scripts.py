@@ -20,7 +20,7 @@ Entry = dict[str, Any]
 
 
 class RobotScripts:
-    """Which scripts one robot offers, and what runs. Other threads may read while it receives."""
+    """The scripts that one robot offers, and the one that runs. Other threads may read while it receives."""
 
     def __init__(self, names: Names) -> None:
         self.robot = RobotView(names.base)
@@ -31,12 +31,12 @@ class RobotScripts:
 
     @property
     def status(self) -> AutonomyStatus | None:
-        """It is what runs; None: the robot has not published it."""
+        """The newest status; None: the robot has not published any."""
         return self.robot.autonomy
 
     @property
     def answer_s(self) -> float:
-        """A robot whose status has not changed so long after a command does not follow it."""
+        """The seconds after which a robot whose status has not changed does not follow a command."""
         return max(_STARTS_S, self.robot.pace.answer_s)
 
     def subscribe(self, transport: Transport) -> None:
@@ -105,10 +105,7 @@ def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
 
 
 def options_of(setting: forms.Setting) -> list[tuple[str, bool | None]]:
-    """Return the options of a setting: first the script's own, then those made of its key.
-
-    For flags with their value.
-    """
+    """Return a setting's options, a flag's with their values: first the script's own, then those made of its key."""
     key = setting.key.replace("_", "-")
     on = _distinct(setting.arg, f"--{key}")
     if setting.type != "bool":

@@ -102,7 +102,7 @@ def estop(
 
 
 def _parse(words: list[str]) -> tuple[str, str | None]:
-    """``("reset", "goob.json")``; the verb is empty for a stop. A robot called reset is given as system/type/id."""
+    """Return such as ``("reset", "goob.json")``; the verb is empty for a stop."""
     verb = words[0] if words and words[0] in _VERBS else ""
     robots = words[1:] if verb else words
     near = difflib.get_close_matches(words[0], _VERBS, n=1) if len(words) > 1 and not verb else []
@@ -160,7 +160,7 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
 
 @contextmanager
 def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
-    """Of all robots, whom a stop of all goes to; within a robot there are none."""
+    """Listen to the heartbeats of all robots, for a stop of all; within a robot there are none."""
     _, settings, _, _ = resolve(target)
     if not every or not isinstance(settings, MqttSettings) or settings.client_id is not None:
         yield None
@@ -213,7 +213,7 @@ class _Outbox:
         send(self._accepts, self._sender.tick(time.monotonic()))  # waits for no acknowledgement
 
     def has_sent(self, base: str) -> bool:
-        """True once a stop of this robot has arrived at the other end of the connection."""
+        """True if a stop of this robot has arrived at the other end of the connection."""
         if self._transport.state is State.CONNECTED and not self._transport.outgoing.waiting:
             self._left |= self._waiting
             self._waiting.clear()
@@ -312,7 +312,7 @@ def _reset(target: Target) -> int:
         robot = view.estop
         put_names(transport, names, lambda base: base == robot.base and robot.named)
         robot.subscribe(second)
-        second.subscribe(LINK.topic(robot.base), lambda one: view.receive(LINK, one, 0.0, 0.0), direct=True)
+        second.subscribe(LINK.topic(robot.base), lambda message: view.receive(LINK, message, 0.0, 0.0), direct=True)
         wait_for(lambda: robot.has_capabilities, _ANSWER_S)
         second.ask(robot.missing)  # the capabilities may have come after the subscription
         wait_for(lambda: not robot.missing, _ANSWER_S)
@@ -353,7 +353,7 @@ def _status(target: Target, *, every: bool) -> int:
         if is_remote:
             found, began = discovery.all_robots, time.monotonic()
             wait_for(lambda: not discovery.awaits_heartbeat(time.monotonic() - began), float("inf"))
-            wait_for(lambda: not any(one.liveness.received_at and one.estop.lacks for one in found()), _ANSWER_S)
+            wait_for(lambda: not any(robot.liveness.received_at and robot.estop.lacks for robot in found()), _ANSWER_S)
         robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
     for robot in robots:
         _print_states(robot.estop, robot.driveable, silent=is_remote and robot.liveness.received_at is None)

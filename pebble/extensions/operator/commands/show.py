@@ -1,4 +1,4 @@
-"""What ``pebble topic`` prints: messages, rates and lists of topics, without characters that control the terminal."""
+"""The output of ``pebble topic``: messages, rates and lists, without characters that control the terminal."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def print_table(
 
 
 def body(payload: bytes, width: int) -> str:
-    """JSON on one line where it fits and indented where not; text as it is; the rest as a hex dump."""
+    """Return JSON on one line where it fits and indented where not; text as it is; the rest as a hex dump."""
     if not payload:
         return "(empty: removes the retained message)"
     plain = parsed(payload)
@@ -64,10 +64,10 @@ def body(payload: bytes, width: int) -> str:
         with suppress(RecursionError):
             line = json.dumps(plain, ensure_ascii=False)
             return shown(line if len(line) <= width else json.dumps(plain, ensure_ascii=False, indent=2))
-    known = recognised(payload)
-    if known is None and _is_text(payload):
+    value = recognised(payload)
+    if value is None and _is_text(payload):
         return shown(payload.decode())
-    return f"{known or 'binary'}, {len(payload)} bytes\n{hex_dump(payload[:_DUMPED], width)}"
+    return f"{value or 'binary'}, {len(payload)} bytes\n{hex_dump(payload[:_DUMPED], width)}"
 
 
 def parsed(payload: bytes) -> Any:
@@ -84,7 +84,7 @@ def recognised(payload: bytes) -> str | None:
 
 
 def hex_dump(raw: bytes, width: int) -> str:
-    """Offset, bytes and their ASCII, as many per line as fit."""
+    """Return lines of offset, bytes and their ASCII, with as many bytes as fit."""
     per_line = 16 if width >= 76 else 8
     lines = []
     for start in range(0, len(raw), per_line):
@@ -95,7 +95,7 @@ def hex_dump(raw: bytes, width: int) -> str:
 
 
 def headline(message: Message, now: float) -> str:
-    """Topic, size, QoS, whether it is retained, and its age by the payload's stamp. ``now``: epoch seconds."""
+    """Return topic, size, QoS, "retained", and the age by the payload's stamp. ``now``: epoch seconds."""
     parts = [shown(message.topic), f"{len(message.payload)} B", f"qos {int(message.qos)}"]
     if message.retain:
         parts.append("retained")
@@ -108,7 +108,7 @@ def headline(message: Message, now: float) -> str:
 
 
 def age(seconds: float) -> str:
-    """``12 ms ago``, ``3.2 s ago``, ``2 h ago``; clocks that differ show as ``… ahead``."""
+    """Return such as ``12 ms ago``, ``3.2 s ago``, ``2 h ago``; clocks that differ show as ``… ahead``."""
     return f"{duration(abs(seconds))} {'ago' if seconds >= 0 else 'ahead'}"
 
 
@@ -218,7 +218,7 @@ def remarks(listing: Listing, wall: float) -> list[str]:
 
 
 def stopped_line(robot: RobotEstop, wall: float) -> str:
-    """``goob is stopped by ann@desk, 3 min ago: a dog``; empty if it is not stopped."""
+    """Return such as ``goob is stopped by ann@desk, 3 min ago: a dog``; empty if it is not stopped."""
     state = robot.stopped_by
     return "" if state is None else f"{shown(id_of(robot.base))} is {stopped(state, wall)}"
 
@@ -239,7 +239,7 @@ def _cells(record: TopicRecord, now: float, wall: float) -> tuple[str, str, str,
 
 
 def _age(record: TopicRecord, last: Message, now: float, wall: float) -> str:
-    """Since arrival for a live message; by the payload's stamp for a retained one."""
+    """Return the age of a live message since its arrival, of a retained one by the payload's stamp."""
     if not last.retain:
         return duration(now - record.arrived)
     stamp = stamp_of(parsed(last.payload))

@@ -46,15 +46,15 @@ def with_target(*, program: str = "tool", robot: bool = False) -> Callable[[Call
                 Target,  # not all commands that use this module connect
             )
 
-            target = {one.name: given.pop(one.name) for one in (*options, *_CREDENTIALS)}
+            target = {option.name: given.pop(option.name) for option in (*options, *_CREDENTIALS)}
             return command(**given, target=Target(**target, program=program))
 
         signature = inspect.signature(command, eval_str=True)
-        own = list(signature.parameters.values())
+        declared = list(signature.parameters.values())
         at = list(signature.parameters).index("target")
-        parameters = [*own[:at], *options, *own[at + 1 :], *_CREDENTIALS]
+        parameters = [*declared[:at], *options, *declared[at + 1 :], *_CREDENTIALS]
         run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {one.name: one.annotation for one in parameters}
+        run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
         return run
 
     return decorate

@@ -162,7 +162,7 @@ def pub(
         robot = cache(lambda: _estop(transport, names, message.topic))
         estop = robot() if not force and _moves(names, message) else None
         if not force:
-            put_names(transport, names, lambda _base: (one := robot()) is not None and one.named)
+            put_names(transport, names, lambda _base: (view := robot()) is not None and view.named)
         for number in range(1 if rate is None else count or sys.maxsize):
             if number:
                 time.sleep(1 / (rate or 1))

@@ -22,16 +22,16 @@ _LEVELS: Final = {
 
 def document() -> str:
     """Return the whole of asyncapi.yaml. Needs PyYAML."""
-    found = schemas()
+    all_schemas = schemas()
     described: dict[str, Any] = {
         "asyncapi": "3.0.0",
         "info": {"title": "Pebble", "version": "1.0.0", "description": _DESCRIPTION, "license": {"name": "MIT"}},
         "defaultContentType": "application/json",
-        "channels": {_name(channel): _channel(channel, found["topics"]) for channel in CHANNELS},
+        "channels": {_name(channel): _channel(channel, all_schemas["topics"]) for channel in CHANNELS},
         "operations": {_name(channel): _operation(channel) for channel in CHANNELS},
         "components": {
             "parameters": {name: {"description": text} for name, text in _LEVELS.items()},
-            "schemas": found["$defs"],
+            "schemas": all_schemas["$defs"],
         },
     }
     whole = json.loads(json.dumps(described).replace('"#/$defs/', '"#/components/schemas/'))
@@ -39,7 +39,7 @@ def document() -> str:
 
 
 def _name(channel: Channel) -> str:
-    """``incoming.drive-values``; the names of a family are its parameters."""
+    """Return such as ``incoming.drive-values``; the names of a family are its parameters."""
     return channel.suffix.replace("/", ".").translate({ord("{"): None, ord("}"): None})
 
 

@@ -85,14 +85,14 @@ def _travel_row(channel: Channel) -> tuple[str, ...]:
 
 
 def rate(channel: Channel) -> str:
-    """Nominal rate in words."""
+    """Return the nominal rate in words."""
     if channel.rate_hz:
         return f"{channel.rate_hz:g} Hz"
     return {Kind.STATE: "on change", Kind.STREAM: "varies", Kind.FEED: "varies"}.get(channel.kind, "on demand")
 
 
 def payload_name(channel: Channel) -> str:
-    """``boolean``, ``binary``, or the name of the struct."""
+    """Return ``boolean``, ``binary``, or the name of the struct."""
     return {bool: "boolean", bytes: "binary"}.get(channel.payload) or str(channel.payload.__name__)
 
 
@@ -103,19 +103,19 @@ def _payload_name(channel: Channel) -> str:
 
 def _structs() -> list[type[Payload]]:
     """Return the payload structs in the order of their channels, each followed by the structs inside it."""
-    found: dict[type[Payload], None] = {}
+    structs: dict[type[Payload], None] = {}
     for channel in CHANNELS:
-        _collect(channel.payload, found)
-    return list(found)
+        _collect(channel.payload, structs)
+    return list(structs)
 
 
-def _collect(kind: Any, found: dict[type[Payload], None]) -> None:
-    if isinstance(kind, type) and issubclass(kind, Payload) and kind not in found:
-        found[kind] = None
+def _collect(kind: Any, structs: dict[type[Payload], None]) -> None:
+    if isinstance(kind, type) and issubclass(kind, Payload) and kind not in structs:
+        structs[kind] = None
         for member in [*get_type_hints(kind).values(), *([CapabilitiesValue] if kind is Capabilities else ())]:
-            _collect(member, found)
+            _collect(member, structs)
     for inner in get_args(kind):
-        _collect(inner, found)
+        _collect(inner, structs)
 
 
 def _payload(struct: type[Payload]) -> str:
@@ -131,7 +131,7 @@ def _payload(struct: type[Payload]) -> str:
 
 def _type_name(kind: Any) -> str:
     """Return a field's type as a reader of JSON calls it; a field that may be absent shows it in its default."""
-    origin, inner = get_origin(kind), [one for one in get_args(kind) if one is not UnsetType]
+    origin, inner = get_origin(kind), [argument for argument in get_args(kind) if argument is not UnsetType]
     if origin in (Union, UnionType):
         return " or ".join(map(_type_name, inner))
     if origin is Literal:
@@ -161,8 +161,8 @@ def _remarks(struct: type[Payload]) -> dict[str, str]:
     """Return the comments behind the fields of the structs: units and meanings."""
     sources = [_source(base) for base in reversed(struct.__mro__) if issubclass(base, Payload)]
     lines = [line for source in sources for line in source.splitlines()]
-    found = (re.match(r"    (\w+): [^#]*#\s*(.+)$", line) for line in lines)
-    return {match[1]: match[2] for match in found if match is not None}
+    matches = (re.match(r"    (\w+): [^#]*#\s*(.+)$", line) for line in lines)
+    return {match[1]: match[2] for match in matches if match is not None}
 
 
 def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:

@@ -1,1 +1,1 @@
-"""Who gets to the server: which requests are looked at, how many connections there are, and who has logged in."""
+"""Access to the server: which requests are looked at, and who has logged in."""

@@ -1,4 +1,4 @@
-"""The first to see each request: which host it names, where it comes from, and how large it is."""
+"""A check of each request: which host it names, where it comes from, and how large it is."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Guard:
                 await _refuse(scope, receive, send, 503, "the server ends")
 
     def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str] | None:
-        """Status and text, if this request must not go on."""
+        """Return status and text if this request must not go on."""
         if not self._is_known(headers):
             return 421, "this server has another name; start `pebble web` with --name for each name that it may have"
         if scope["method"] not in _METHODS:
@@ -122,8 +122,8 @@ def host_names(settings: WebSettings) -> frozenset[str]:
     names |= {parts[1] for name in settings.names if (parts := _split(name)) is not None}  # behind a forwarded port
     if not is_loopback(settings.host):
         names.add(settings.host)
-        own = socket.gethostname()
-        of_machine = (own, f"{own.partition('.')[0]}.local")
+        hostname = socket.gethostname()
+        of_machine = (hostname, f"{hostname.partition('.')[0]}.local")
         names |= {*(of_machine if settings.certificate is None else certificates.show(settings.certificate).names)}
     return frozenset(map(canonical, names))
 
@@ -147,7 +147,7 @@ def canonical(name: str) -> str:
 
 
 def _is_own_origin(scope: Scope, headers: Headers) -> bool:
-    """Origin is exactly the scheme and host of this request; a browser sends it with each WebSocket and each POST."""
+    """True if Origin, which browsers send with each WebSocket and POST, is this request's scheme and host."""
     scheme = {"ws": "http", "wss": "https"}.get(scope["scheme"], scope["scheme"])
     return headers.getlist("origin") == [f"{scheme}://{headers.get('host', '')}".lower()]
 

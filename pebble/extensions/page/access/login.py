@@ -44,7 +44,7 @@ class _Hashing:
         self._waiting = 0
 
     async def check(self, request: Request, login: Login) -> User | None:
-        """Raises TooManyTriesError, also while too many logins wait."""
+        """Check name and password. Raises TooManyTriesError, also while too many logins wait."""
         if self._waiting >= _WAITING:
             raise TooManyTriesError(5)
         self._waiting += 1
@@ -83,7 +83,7 @@ def session_of(connection: HTTPConnection) -> Session | None:
 
 
 def named(session: Session, name: str) -> Session:
-    """Takes the name that a person goes by; "" changes nothing. Used only where there is no login."""
+    """Take the name that a person goes by; "" changes nothing. Used only where there is no login."""
     user = printable(name).strip()
     return dataclasses.replace(session, user=user) if user else session
 

@@ -37,7 +37,7 @@ def drive(
     *,
     target: Target,
 ) -> int:
-    """Drive a robot with the keys of this terminal, which it prints. What interrupts a drive ends it: press anew.
+    """Drive a robot with the keys of this terminal, which it prints. What interrupts a drive ends it: press again.
 
     \b
         pebble drive goob.json
@@ -76,13 +76,6 @@ def _drive(transport: Transport, driver: TerminalDriver, terminal: Terminal) -> 
         for message in driver.tick(clock(), problem_of(transport)):
             transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
 
-    def end(*, leave: bool) -> None:
-        began = clock()
-        driver.end(began, leave=leave)
-        while clock() < began + (_STOP_S if leave and driver.unconfirmed else _ZEROS_S):
-            tick()
-            time.sleep(PERIOD_S)
-
     for filter_ in driver.filters:
         transport.subscribe(filter_, receive, qos=QoS.DELIVERED, direct=True)
     try:
@@ -91,6 +84,9 @@ def _drive(transport: Transport, driver: TerminalDriver, terminal: Terminal) -> 
             driver.press(keys, clock())
             tick()
             terminal.show(driver.status, at_once=bool(keys))
-            terminal.suspend(lambda: end(leave=False))
     finally:
-        end(leave=True)
+        began = clock()
+        driver.end(began, leave=True)
+        while clock() < began + (_STOP_S if driver.unconfirmed else _ZEROS_S):
+            tick()
+            time.sleep(PERIOD_S)

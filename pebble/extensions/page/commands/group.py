@@ -85,7 +85,7 @@ def serve(
     options = {
         "host": None if host is None else host_of("--host", host),
         "port": port,
-        "names": tuple(host_of("--name", one, name_of_page) for one in name or ()),
+        "names": tuple(host_of("--name", text, name_of_page) for text in name or ()),
         "people": people,
         "recordings": recordings,
     }

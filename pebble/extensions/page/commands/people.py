@@ -172,7 +172,7 @@ def opened(file: Path | None) -> Iterator[People]:
 
 
 def _read_password() -> str:
-    """Never from the command line, which every user of the machine can read. Raises PebbleError."""
+    """Read a password, never from the command line, which every user of the machine can read. Raises PebbleError."""
     if sys.stdin.isatty():
         return str(typer.prompt("Password", hide_input=True, confirmation_prompt=True, err=True))
     line = sys.stdin.readline().rstrip("\r\n")

@@ -88,8 +88,8 @@ class TerminalDriver:
         self._assume(now)
         self._tab.clock.echo(self._tab.clock.ping(now), 1000 * now, now)  # no network is between keys and driver
         view = self._driven.shown(self._tab, now)
-        known = self._driven.published is not None if view.keeps else self.robot.situation(now).published
-        if self._willing and known and not view.by and not view.asking:
+        is_published = self._driven.published is not None if view.keeps else self.robot.situation(now).published
+        if self._willing and is_published and not view.by and not view.asking:
             self._take(now, over=False)
         self._out += self._driven.update(now)
         self._reason = f"no connection: {problem}" if problem else self._why_not(now)
@@ -109,7 +109,7 @@ class TerminalDriver:
 
     @property
     def unconfirmed(self) -> str:
-        """It is why an emergency stop from here is not confirmed; empty if none is pending."""
+        """The reason why an emergency stop from here is not confirmed; empty if none is pending."""
         return "" if self.stop is None or self.stop.confirmed else self.stop.robots[self.robot.base].why
 
     def status(self) -> str:

@@ -1,1 +1,1 @@
-"""Who drives which robot from one server: leases of pages, wishes at robots that decide themselves, other servers."""
+"""Driving from one server: the pages that have control, those that ask for it, and why it is refused."""

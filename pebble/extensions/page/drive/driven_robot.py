@@ -1,4 +1,4 @@
-"""Which page of this server drives one robot, and which commands of pages reach it. Pure: times are passed in.
+"""One robot as pages of this server drive it: who has control, and which commands reach it. Pure.
 
 Motion belongs to a numbered gesture: from the moment the inputs leave neutral until they are released. What interrupts
 a gesture ends it for good, so a key that is held down never moves anything again before it was released.
@@ -32,7 +32,7 @@ ZERO, FINAL_ZERO = Drive(), Drive(valid_ms=0)
 
 
 class State(Enum):
-    """What one robot is to this server."""
+    """The state of one robot at this server."""
 
     FREE = "no page of this server has control"
     HELD = "a page has control, and its inputs rest"
@@ -40,7 +40,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """What happens to one robot."""
+    """An event of one robot."""
 
     GIVEN = "a page gets control: from the robot, or from this server if the robot keeps none"
     ENDED = "its page gives control back, has gone, or has rested for a minute"
@@ -51,7 +51,7 @@ class Event(Enum):
 
 
 class Step(NamedTuple):
-    """What follows from an event."""
+    """The consequence of an event."""
 
     state: State
     halts: bool = False  # by a final zero, which is repeated
@@ -101,7 +101,7 @@ class Tab:
 
 @dataclass(slots=True, eq=False)
 class Wish:
-    """What one page wants of a robot that keeps control. ``granted`` or ``failed`` is called when that has answered."""
+    """A request of one page for control of a robot that keeps it; its answer calls ``granted`` or ``failed``."""
 
     client: ControlClient
     granted: Callable[[], None]
@@ -110,7 +110,7 @@ class Wish:
 
 
 class DrivenRobot:
-    """One robot. ``changed`` collects those of which pages see something else than before."""
+    """One robot. ``changed`` collects robots that pages have to be shown again."""
 
     def __init__(self, ref: str, view: Callable[[], RobotView | None], changed: set[str]) -> None:
         self.ref = ref
@@ -139,19 +139,19 @@ class DrivenRobot:
 
     @property
     def published(self) -> ControlState | None:
-        """It is what the robot says of control; None if it keeps none."""
+        """The robot's own state of control; None if it keeps none."""
         robot = self._view()
         return robot.control.state if robot is not None and robot.controlled else None
 
     @property
     def pace(self) -> Pace:
-        """It is how often the robot is sent commands."""
+        """The pace of commands to the robot."""
         robot = self._view()
         return WIDE if robot is None else robot.pace
 
     @property
     def moved_by(self) -> str:
-        """It is who moves the robot now: while a gesture lasts, or as the robot says. Empty: no page does."""
+        """The user who moves the robot now: while a gesture lasts, or as the robot says. Empty: no page does."""
         if other := self._elsewhere():
             return other.by
         return self.tab.user if self.tab is not None and self.state is State.MOVING else ""
@@ -161,7 +161,7 @@ class DrivenRobot:
         return self.tab is tab or tab in self._wishes
 
     def awaits(self, token: str, now: float) -> bool:
-        """True, once, if a page with this token has just had control, and still nobody else has it."""
+        """Return True, once, if a page with this token has just had control, and still nobody else has it."""
         awaited, until = self._awaited
         if awaited != token:
             return False
@@ -330,7 +330,7 @@ class DrivenRobot:
         return commands
 
     def _is_over(self, wish: Wish, now: float) -> bool:
-        """Not before the robot has taken note: until then it is this server that has control, and no other."""
+        """True if the robot has taken note of the end: until then it is this server that has control, and no other."""
         if not wish.client.done:
             wish.ended_at = float("inf")
             return False
@@ -346,7 +346,7 @@ class DrivenRobot:
         return replace(state, by=state.by or "somebody")
 
     def _active(self, now: float) -> str:
-        """Return who drives it now and has to be asked; empty: it can be taken."""
+        """Return the user who drives it now and has to be asked; empty: it can be taken."""
         if other := self._elsewhere():
             return other.by
         if self.tab is None or (self.state is State.HELD and now - self._idle_from >= TAKEN_FROM_IDLE_S):
@@ -366,7 +366,7 @@ class DrivenRobot:
         return words(Code.LATE) if tab.clock.late(op.t, now) else ""
 
     def _zero(self, tab: Tab, op: DriveOp, now: float) -> list[Command]:
-        """Forward it always. At the end of a gesture it is the release."""
+        """Forward a zero, always. At the end of a gesture it is the release."""
         tab.over = max(tab.over, op.g)
         if tab.moves is self and op.g >= tab.gesture:
             self._on(Event.LETS_GO, now)

@@ -1,4 +1,4 @@
-"""What pages and robots want of driving, and what is published for it."""
+"""The driven robots of one server: requests of pages, answers of robots, and what is published for them."""
 
 from collections.abc import Callable
 from functools import partial
@@ -17,7 +17,7 @@ MOST_WISHES = 16  # of one tab: robots of which it has control, or asks for it
 
 
 class Drivers:
-    """It belongs to one server. What a method decides is published at once."""
+    """The driven robots of one server. What a method decides is published at once."""
 
     def __init__(self, broker: Broker, robots: Robots) -> None:
         self._broker, self._robots = broker, robots
@@ -26,7 +26,7 @@ class Drivers:
         self.refusals = Refusals(broker, lambda ref: self.robot(ref).moved_by, robots.view)
 
     def robot(self, ref: str) -> DrivenRobot:
-        """Return who drives that robot; of one that rests nothing is remembered."""
+        """Return that robot; nothing is remembered of one that rests."""
         robot = self._driven.get(ref)
         if robot is None:
             robot = self._driven[ref] = DrivenRobot(ref, partial(self._robots.view, ref), self._changed)
@@ -39,7 +39,7 @@ class Drivers:
     ) -> None:
         """Take control for a page; ``granted``, or ``failed`` with the reason, is called as soon as that is known."""
         now, robot = clock(), self.robot(view.base)
-        wanted = sum(one.wanted_by(tab) for one in self._driven.values())
+        wanted = sum(robot.wanted_by(tab) for robot in self._driven.values())
         if why := self.refusals.nameless(view):
             failed(why)
         elif wanted >= MOST_WISHES and not robot.wanted_by(tab):
@@ -67,9 +67,9 @@ class Drivers:
         """
         now = clock()
         old = {robot.tab for robot in self._driven.values() if robot.tab is not None and robot.tab.token == token}
-        for stalled in [one for one in old if one.clock.problem(now)]:
+        for stalled in [robot for robot in old if robot.clock.problem(now)]:
             self.closed(stalled)
-        for robot in [one for one in self._driven.values() if one.awaits(token, now)]:
+        for robot in [robot for robot in self._driven.values() if robot.awaits(token, now)]:
             if (view := self._robots.view(robot.ref)) is not None:
                 self.take(tab, view, lambda: None, lambda _why: None, over=False)
 

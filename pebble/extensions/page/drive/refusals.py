@@ -1,4 +1,4 @@
-"""Why a page may not ask a robot for something now, in words for people. Each returns "" where it may."""
+"""The reasons why a page may not ask something of a robot now, in words for people. Each is "" where it may."""
 
 import time
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from pebble.extensions.page import robot_commands
 
 
 class Refusals:
-    """It belongs to one server; ``moved_by`` tells who moves a component, ``robot_of`` finds it."""
+    """The refusals of one server; ``moved_by`` tells who moves a component, ``robot_of`` finds it."""
 
     def __init__(
         self, broker: Broker, moved_by: Callable[[str], str], robot_of: Callable[[str], RobotView | None]

@@ -1,4 +1,4 @@
-"""Where the picture on a robot's page comes from, if a person has chosen that: for everybody, and remembered."""
+"""The sources of pictures on robots' pages that people have chosen: for everybody, and remembered."""
 
 import logging
 from collections.abc import Callable
@@ -14,7 +14,7 @@ _PICTURE = "picture-from "  # what a setting of the server begins with; then the
 
 
 class ChosenSources:
-    """Another component's picture; ``on_change`` is called with the component."""
+    """The chosen sources; ``on_change`` is called with the component whose page shows another one's picture."""
 
     def __init__(self, people: People, robots: Robots, on_change: Callable[[str], None]) -> None:
         self._people, self._robots, self._on_change = people, robots, on_change

@@ -136,9 +136,9 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
 
     def _can(self) -> list[frozenset[str]]:
         """Return what each viewer decodes. For one that decodes nothing, what this server converts counts."""
-        known = frozenset(BEST_FIRST["video"])
-        converted = frozenset(name for name in known if not rescue.unavailable(name))
-        return [viewer.queue.can & known or converted for viewer in self.viewers]
+        encodings = frozenset(BEST_FIRST["video"])
+        converted = frozenset(name for name in encodings if not rescue.unavailable(name))
+        return [viewer.queue.can & encodings or converted for viewer in self.viewers]
 
     async def _help_viewers(self) -> None:
         """Request a key frame, or begin the rescue stream, if viewers need it."""

@@ -157,7 +157,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         return ""
 
     def _release(self, now: float) -> None:
-        """End a talk of which nothing comes any more."""
+        """End a talk from which nothing comes any more."""
         if self._talk is not None and self._talk.is_over(now):
             self._interrupt(f"No sound came in time for {SILENT_S:g} s")
 

@@ -32,7 +32,7 @@ ViewT = TypeVar("ViewT")
 
 
 class Arrivals:
-    """What arrives of one medium: in which encoding, how much, and whether it still does. Pure: times are passed in."""
+    """The arrivals of one medium: their encoding, their rate, and whether they go on. Pure: times are passed in."""
 
     def __init__(self) -> None:
         self.encoding = ""  # of the newest payload
@@ -89,7 +89,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
 
     @property
     def robot(self) -> RobotView:
-        """It is the robot, as far as it is known."""
+        """The robot, as far as it is known."""
         return self._robots.view(self.ref) or RobotView(self.ref)
 
     # -- of each medium

@@ -102,7 +102,7 @@ class Link:
 
 
 class RobotSource:
-    """What an archive holds of one robot; ``begins`` is called with a time, and the picture that was seen then.
+    """One robot in an archive; ``begins`` is called with a time, and the picture that was seen then.
 
     What was received at a time belongs to the state at that time.
     """
@@ -192,7 +192,7 @@ class PlayedRobot:
     # -- what the page is sent
 
     def _begin(self, at_ns: int, picture: Recorded | None) -> None:
-        """Begin anew: a seek has arrived."""
+        """Start again at another time: a seek has arrived."""
         self._picture, self._newest_ns = picture, at_ns
         self._values: dict[str, tuple[Any, float]] = {}
         self._lines: list[msgspec.Raw] = []

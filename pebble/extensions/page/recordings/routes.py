@@ -48,7 +48,7 @@ _export_decoder = msgspec.json.Decoder(ExportRequest)
 
 @dataclass(slots=True)
 class _Timeline:
-    """One that is being made, or was made; ``made``: JSON, while a newer one is made that of before."""
+    """A timeline that is being made, or was made; ``made``: JSON, that of before while a newer one is made."""
 
     paths: list[str]
     active: bool
@@ -66,7 +66,7 @@ class _Timeline:
 
 @dataclass(slots=True)
 class _Export:
-    """The one export that there is."""
+    """The export that runs or is ready; there is one at most."""
 
     id: str
     name: str
@@ -79,7 +79,7 @@ class BadQuestionError(PebbleError):
 
 
 class Recordings:
-    """What one server offers of a folder of recordings. Everything runs on the event loop."""
+    """A folder of recordings at one server. Everything runs on the event loop."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -91,34 +91,34 @@ class Recordings:
 
     @property
     def scratch(self) -> Path:
-        """Where jobs write."""
+        """The folder in which jobs write."""
         return Path(self._scratch.name)
 
     async def close(self) -> None:
         self.process.close()
-        for one in self._timelines.values():
-            await one.job.end()
+        for timeline in self._timelines.values():
+            await timeline.job.end()
         if self._export is not None:
             await self._export.job.end()
         self._scratch.cleanup()
 
     async def timeline(self, day: str, robot: str, *, again: bool = False) -> bytes | float:
-        """JSON, or the share of the work that is done. Raises PebbleError.
+        """Return JSON, or the share of the work that is done. Raises PebbleError.
 
         What has failed is done anew only ``again``, or for other recordings.
         """
         key, period = (day, robot), _period_of(day)
         paths, active = await self.process.ask(questions.files, robot, *period)
-        known = self._timelines.pop(key, None)
-        if known is None or self._is_old(known, paths, active=active, again=again):
-            before = None if known is None else known.take()
-            known = self._begin(robot, period, paths, active=active, before=before)
-        self._timelines[key] = known  # the last one used is the last one forgotten
+        timeline = self._timelines.pop(key, None)
+        if timeline is None or self._is_old(timeline, paths, active=active, again=again):
+            before = None if timeline is None else timeline.take()
+            timeline = self._begin(robot, period, paths, active=active, before=before)
+        self._timelines[key] = timeline  # the last one used is the last one forgotten
         await self._forget()
-        if known.job.why:
-            raise PebbleError(known.job.why)
-        made = known.take()
-        return known.job.done if made is None else made
+        if timeline.job.why:
+            raise PebbleError(timeline.job.why)
+        made = timeline.take()
+        return timeline.job.done if made is None else made
 
     async def export(self, wanted: ExportRequest) -> str:
         """Begin an export; returns its id. Raises PebbleError, BusyError while one runs."""
@@ -143,10 +143,10 @@ class Recordings:
         return self._export if self._export is not None and self._export.id == number else None
 
     async def end_export(self) -> None:
-        one, self._export = self._export, None
-        if one is not None:
-            await one.job.end()
-            one.target.unlink(missing_ok=True)
+        export, self._export = self._export, None
+        if export is not None:
+            await export.job.end()
+            export.target.unlink(missing_ok=True)
 
     def _begin(
         self, robot: str, period: tuple[int, int], paths: list[str], *, active: bool, before: bytes | None
@@ -163,13 +163,13 @@ class Recordings:
             raise PebbleError(questions.reason(error)) from None
         return self.scratch / name
 
-    def _is_old(self, known: _Timeline, paths: list[str], *, active: bool, again: bool) -> bool:
-        if known.job.running:
+    def _is_old(self, timeline: _Timeline, paths: list[str], *, active: bool, again: bool) -> bool:
+        if timeline.job.running:
             return False
-        if known.job.why:
-            return again or paths != known.paths
-        changed = paths != known.paths or known.active or active
-        return changed and clock() - known.began_at > _ACTIVE_S
+        if timeline.job.why:
+            return again or paths != timeline.paths
+        changed = paths != timeline.paths or timeline.active or active
+        return changed and clock() - timeline.began_at > _ACTIVE_S
 
     async def _forget(self) -> None:
         while len(self._timelines) > _TIMELINES:
@@ -248,20 +248,20 @@ async def _begin_export(request: Request, recordings: Recordings) -> Response:
 
 
 async def _export(request: Request, recordings: Recordings) -> Response:
-    one = recordings.export_of(request.path_params["id"])
-    if one is None:
+    export = recordings.export_of(request.path_params["id"])
+    if export is None:
         return PlainTextResponse("there is no such export", 404)
-    state = "running" if one.job.running else "ready" if one.job.ready else "failed"
-    size = one.target.stat().st_size if state == "ready" else 0
-    why = one.job.why or one.job.unread
-    return JSONResponse({"state": state, "done": one.job.done, "why": why, "name": one.name, "bytes": size})
+    state = "running" if export.job.running else "ready" if export.job.ready else "failed"
+    size = export.target.stat().st_size if state == "ready" else 0
+    why = export.job.why or export.job.unread
+    return JSONResponse({"state": state, "done": export.job.done, "why": why, "name": export.name, "bytes": size})
 
 
 async def _file(request: Request, recordings: Recordings) -> Response:
-    one = recordings.export_of(request.path_params["id"])
-    if one is None or one.job.running or not one.job.ready:
+    export = recordings.export_of(request.path_params["id"])
+    if export is None or export.job.running or not export.job.ready:
         return PlainTextResponse("there is no such export, or it is not ready", 404)
-    return FileResponse(one.target, filename=one.name, media_type="application/octet-stream")
+    return FileResponse(export.target, filename=export.name, media_type="application/octet-stream")
 
 
 async def _end_export(request: Request, recordings: Recordings) -> Response:

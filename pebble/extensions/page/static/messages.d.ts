@@ -1,4 +1,4 @@
-// Generated from pebble/extensions/page/messages.py by python -m pebble.extensions.page.messages_docs.
+// Generated from pebble/extensions/page/messages.py by python tools/messages_docs.py.
 
 export interface Hello {
   op: "hello";

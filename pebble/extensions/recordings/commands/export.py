@@ -130,15 +130,15 @@ def _export(
 
 def _import(found: Iterable[Recorded | BadLine], copy: Copy) -> Counter[str]:
     counted = Counter[str]()
-    for one in found:
-        if isinstance(one, BadLine):
+    for item in found:
+        if isinstance(item, BadLine):
             counted["bad"] += 1
             if counted["bad"] <= 3:
-                typer.echo(f"pebble: line {one.number}: {shown(one.problem)}", err=True)
+                typer.echo(f"pebble: line {item.number}: {shown(item.problem)}", err=True)
             continue
-        copy.add(one)
+        copy.add(item)
         counted["messages"] += 1
-        counted["truncated"] += TRUNCATED in one.channel.metadata
+        counted["truncated"] += TRUNCATED in item.channel.metadata
     return counted
 
 

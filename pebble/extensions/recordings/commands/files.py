@@ -121,7 +121,7 @@ def _reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:
 
 
 def _delete_whole(path: Path, *, yes: bool) -> int:
-    """Raises PebbleError for what is no file of a recorder, or is being written."""
+    """Delete whole files. Raises PebbleError for what is no file of a recorder, or is being written."""
     if path.is_symlink():
         raise PebbleError(f"{path} is a link: name the file itself")
     if not path.is_file() or not path.name.endswith((SUFFIX, ACTIVE, DAMAGED)):

@@ -28,11 +28,11 @@ def list_(places: RecordingsArgument, since: Since = None, until: Until = None, 
     """List the files, their times, sizes and state."""
     rows, total = list[tuple[str, ...]](), Counter[str]()
     looked, unread = _looked_at(places, since, until, check=check)
-    for one in looked:
-        lasts = show.duration((one.last_ns - one.first_ns) / 1e9) if one.messages else ""
-        begins = local_time(one.first_ns) if one.messages else ""
-        rows.append((begins, lasts, _lane(one.path), f"{one.messages:,}", show.size(one.size), _state(one)))
-        total.update(files=1, messages=one.messages, size=one.size)
+    for info in looked:
+        lasts = show.duration((info.last_ns - info.first_ns) / 1e9) if info.messages else ""
+        begins = local_time(info.first_ns) if info.messages else ""
+        rows.append((begins, lasts, _lane(info.path), f"{info.messages:,}", show.size(info.size), _state(info)))
+        total.update(files=1, messages=info.messages, size=info.size)
     columns = ("begins", "lasts", "what", "messages", "size", "state")
     show.print_table(columns, rows, whole=("begins", "lasts"), right=("messages", "size"))
     typer.echo(f"{total['files']} files, {total['messages']:,} messages, {show.size(total['size'])}")
@@ -42,29 +42,29 @@ def list_(places: RecordingsArgument, since: Since = None, until: Until = None, 
 def info(places: RecordingsArgument, since: Since = None, until: Until = None, check: Check = False) -> int:
     """Show robots, topics, and what happened to the recording."""
     looked, unread = _looked_at(places, since, until, check=check, inside=True)
-    topics, sizes = Counter[str](), sum(one.size for one in looked)
-    for one in looked:
-        topics.update(one.topics)
-    messages = sum(one.messages for one in looked)
-    times = [one for one in looked if one.messages]
+    topics, sizes = Counter[str](), sum(info.size for info in looked)
+    for info in looked:
+        topics.update(info.topics)
+    messages = sum(info.messages for info in looked)
+    times = [info for info in looked if info.messages]
     if times:
-        begin, end = min(one.first_ns for one in times), max(one.last_ns for one in times)
+        begin, end = min(info.first_ns for info in times), max(info.last_ns for info in times)
         typer.echo(f"{local_time(begin)} to {local_time(end)} ({show.duration((end - begin) / 1e9)})")
     typer.echo(f"{messages:,} messages, {show.size(sizes)} in {len(looked)} files")
-    missing = sum(one.missing for one in looked)
+    missing = sum(info.missing for info in looked)
     if missing:
         typer.echo(f"{missing:,} messages are missing: files were damaged")
-    for robot in sorted(set().union(*(one.robots for one in looked))):
+    for robot in sorted(set().union(*(info.robots for info in looked))):
         counts = Counter({topic[len(robot) + 1 :]: n for topic, n in topics.items() if robot_in(topic) == robot})
         typer.echo(f"\n{one_line(shown(robot))}: {counts.total():,} messages")
         _print_topics(counts)
-    encodings = {topic: name for one in looked for topic, name in one.encodings.items() if robot_in(topic) is None}
+    encodings = {topic: name for info in looked for topic, name in info.encodings.items() if robot_in(topic) is None}
     named = ((topic, name) for topic, name in encodings.items() if not topic.startswith("$recorder/"))
     others = Counter({f"{topic} {name}": topics[topic] for topic, name in named})
     if others:
         typer.echo(f"\nTopics that are of no robot: {others.total():,} messages")
     _print_topics(others)
-    _print_events(one.path for one in looked if one.readable)
+    _print_events(info.path for info in looked if info.readable)
     return report_unread(unread)
 
 
@@ -119,38 +119,38 @@ def _looked_at(
     with progress("reading", len(paths)) as advance:
         for number, path in enumerate(paths, 1):
             try:
-                one = catalogue.look_at(path, whole=check or size <= _CHECKED, **counted_ns)
+                info = catalogue.look_at(path, whole=check or size <= _CHECKED, **counted_ns)
             except RecordingError as error:
                 if not path.exists():  # finished, renamed or deleted meanwhile
                     continue
-                one = FileInfo(path, path.stat().st_size, readable=False)
+                info = FileInfo(path, path.stat().st_size, readable=False)
                 unread.append(str(error))
-            if one.problem:
-                unread.append(f"{path}: {one.problem}")
-            if one.first_ns < until_ns and (one.last_ns >= since_ns or not one.messages):
-                looked.append(one)
+            if info.problem:
+                unread.append(f"{path}: {info.problem}")
+            if info.first_ns < until_ns and (info.last_ns >= since_ns or not info.messages):
+                looked.append(info)
             advance(number)
     if size > _CHECKED and not check:
         typer.echo(f"pebble: {show.size(size)} were not read but for their summaries: add --check", err=True)
-    return sorted(looked, key=lambda one: (one.first_ns, one.path.name)), unread
+    return sorted(looked, key=lambda info: (info.first_ns, info.path.name)), unread
 
 
 def _lane(path: Path) -> str:
-    """``state`` or ``media of goob``, from the name of a recorder's file; else that name."""
+    """Return ``state`` or ``media of goob``, from the name of a recorder's file; else that name."""
     parts = path.name.removesuffix(".active").removesuffix(".mcap").split(".", 1)
     if len(parts) == 1:
         return shown(path.name)
     return shown(f"media of {parts[1].rpartition('.')[2]}" if parts[1].startswith("media.") else parts[1])
 
 
-def _state(one: FileInfo) -> str:
-    if one.is_active:
+def _state(info: FileInfo) -> str:
+    if info.is_active:
         return "being written"
-    if one.missing:
-        return f"{one.missing:,} missing"
-    if not one.readable:
+    if info.missing:
+        return f"{info.missing:,} missing"
+    if not info.readable:
         return "cannot be read"
-    return "damaged" if one.damaged or one.problem else "" if one.finished else "unfinished"
+    return "damaged" if info.damaged or info.problem else "" if info.finished else "unfinished"
 
 
 def _print_events(paths: Iterable[Path]) -> None:

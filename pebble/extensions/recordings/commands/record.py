@@ -163,7 +163,7 @@ def _print_end(recorder: Recorder, into: Path) -> None:
 
 
 def seconds(text: str) -> float:
-    """Raises PebbleError."""
+    """Return the seconds. Raises PebbleError."""
     return _value(text, _SECONDS, "a duration: 30s, 10min, 1h or 7d")
 
 

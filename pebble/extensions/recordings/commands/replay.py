@@ -176,7 +176,6 @@ class _Console:
         else:
             for key in self._terminal.keys(seconds):
                 self._press(key, player)
-            self._terminal.suspend(player.pause)
             self.ended = self.ended or self._terminal.ended
             self._terminal.show(lambda: status(player, robots.problem), at_once=False)
         if self.ended and not player.ended:
@@ -189,7 +188,7 @@ class _Console:
             typer.echo(f"pebble: {shown(problem) or 'it goes on'}", err=True)
 
     def on_signal(self, number: int, _frame: object) -> None:
-        """Signals end the replay; until all is cleaned up no further one ends this process."""
+        """End the replay; until all is cleaned up no further signal ends this process."""
         self.ended = self.ended or signal.Signals(number).name
 
     def _press(self, key: str, player: Player) -> None:

@@ -92,13 +92,13 @@ class Media:
         self._sounds: dict[str, SoundDecoder] = {}
 
     def convert(self, topic: str, payload: bytes) -> Converted | None:
-        """None for bytes that are no media of a known kind, and for pictures without those that they build on."""
+        """Return None for bytes that are no media of a known kind, and for pictures that build on others not given."""
         if payload.startswith(PBAT):
             return self.sound(topic, payload)
         return self.video(topic, payload) if is_h264(payload) else self.image(topic, payload)
 
     def video(self, topic: str, payload: bytes) -> Converted | None:
-        """H.264 as it was sent: one picture in Annex B, parameter sets in key frames, no B-frames, as Foxglove asks.
+        """Return H.264 as it was sent: Annex B, parameter sets in key frames, no B-frames, as Foxglove asks.
 
         None for another encoding, and for what is damaged.
         """
@@ -125,7 +125,7 @@ class Media:
         return Converted(self._make(schema, frame_id=_id(topic), data=jpeg, format="jpeg"), ending)
 
     def sound(self, topic: str, payload: bytes) -> Converted | None:
-        """Samples: Foxglove knows no Opus. None for what is no sound, and for Opus without PyAV."""
+        """Return samples: Foxglove knows no Opus. None for what is no sound, and for Opus without PyAV."""
         from pebble.extensions.media.sound import SoundDecoder
 
         decoder = self._sounds.get(topic) or self._sounds.setdefault(topic, SoundDecoder())
@@ -163,7 +163,7 @@ class Telemetry:
         }
 
     def convert(self, topic: str, payload: bytes) -> Converted | None:
-        """None for a payload that is to stay as it is, also if it is not what its channel has."""
+        """Return None for a payload that is to stay as it is, also if it is not what its channel has."""
         levels = topic.split("/", 3)
         channel = channel_of(levels[3]) if len(levels) == 4 and levels[3].startswith((c.INCOMING, c.OUTGOING)) else None
         convert = None if channel is None else self._converters.get(channel)
@@ -180,7 +180,7 @@ class Telemetry:
         return Converted(self._make("Log", level=level, message=record.message, name=record.service), "log")
 
     def _odometry(self, topic: str, payload: bytes) -> Converted | None:
-        """Some robots have metres, and other names (paper A.8.12)."""
+        """Convert odometry; some robots have metres, and other names (paper A.8.12)."""
         odometry = codec.decode(c.WHEEL_ODOMETRY, payload)
         value, per_metre = odometry.value, 1.0 if odometry.unit == "m" else _MILLIMETRES
         x, y = (_number(value, f"{axis}_mm", axis) for axis in "xy")
@@ -304,4 +304,6 @@ def _id(topic: str) -> str:
 def _number(value: dict[str, Any], *names: str) -> float | None:
     """Return the first of the named fields that is a number; None if none is."""
     found = (value.get(name) for name in names)
-    return next((float(one) for one in found if isinstance(one, int | float) and not isinstance(one, bool)), None)
+    return next(
+        (float(number) for number in found if isinstance(number, int | float) and not isinstance(number, bool)), None
+    )

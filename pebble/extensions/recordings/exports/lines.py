@@ -156,7 +156,7 @@ def _stamp_ns(stamp: bytes) -> int:
 
 
 def _epoch_ns(stamp: Decimal) -> int:
-    """Nanoseconds since 1970 of a stamp in seconds or milliseconds. Raises ValueError."""
+    """Return the nanoseconds since 1970 of a stamp in seconds or milliseconds. Raises ValueError."""
     if not 0 <= stamp < _LATEST_NS // 1_000_000:  # false for NaN, too
         raise ValueError("the stamp is no time")
     return int(stamp * (10**6 if stamp >= _MILLISECONDS_FROM else 10**9))

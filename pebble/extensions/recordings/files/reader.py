@@ -153,7 +153,7 @@ class RecordingFile:
         What is wrong is noted in :attr:`damage`. Chunks outside the period are left out; messages outside it may come.
         """
         chunks = [chunk for chunk in self.chunks if chunk.end_ns >= since_ns and chunk.start_ns < until_ns]
-        if any(one.end_ns > two.start_ns for one, two in pairwise(chunks)):  # other programs write in any order
+        if any(chunk.end_ns > next_.start_ns for chunk, next_ in pairwise(chunks)):  # other programs write in any order
             opened = [0]
             yield from in_time_order(
                 (chunk.start_ns, partial(self._opened, chunk, chooses, opened)) for chunk in chunks
@@ -215,7 +215,7 @@ class RecordingFile:
             self._look_through()
 
     def _summary(self) -> Summary | None:
-        """None: it is not finished, its end is damaged, or it has none."""
+        """Return the summary; None: it is not finished, its end is damaged, or it has none."""
         tail = FOOTER.size + len(MAGIC)
         file_size = self.size
         footer = self._read(max(0, file_size - tail), tail)

@@ -87,8 +87,8 @@ def with_own_topic(channel: Channel, payload: bytes) -> tuple[Channel, bytes]:
 
     with _damage():
         stream = ReadDataStream(BytesIO(payload))
-        own = Metadata.read(stream)
-    return Channel(channel.id, own.name, channel.encoding, own.metadata), payload[stream.count :]
+        metadata = Metadata.read(stream)
+    return Channel(channel.id, metadata.name, channel.encoding, metadata.metadata), payload[stream.count :]
 
 
 def record_of(data: bytes) -> McapRecord:

@@ -134,7 +134,7 @@ def write_copy(
 
 
 def _copy(source: Path, part: Path, keeps: Keeps, *, complete: bool) -> Rewritten:
-    """Raises RecordingError if it is not ``complete`` as it has to be, and OSError."""
+    """Write the copy. Raises RecordingError if it is not ``complete`` as it has to be, and OSError."""
     if shutil.disk_usage(part.parent).free < source.stat().st_size:
         raise OSError(errno.ENOSPC, f"there is no room for a copy of {source.name}", str(part.parent))
     left_out = 0

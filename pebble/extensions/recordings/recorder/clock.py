@@ -19,7 +19,7 @@ class RecordingClock:
         self.offset_ns = wall_ns() - self._checked_at
 
     def at(self, boot_ns: int) -> int:
-        """Wall time, in nanoseconds since 1970, of a moment on the other clock."""
+        """Return the wall time, in nanoseconds since 1970, of a moment on the other clock."""
         return boot_ns + self.offset_ns
 
     def now(self) -> int:

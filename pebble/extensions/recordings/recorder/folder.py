@@ -141,7 +141,7 @@ class Folder:
 
 @contextmanager
 def _locked(path: Path, used: str) -> Iterator[bool]:
-    """False where the file system has no locks. Raises RecordingError(used) if another process holds it."""
+    """Yield False where the file system has no locks. Raises RecordingError(used) if another process holds it."""
     try:
         import fcntl
     except ImportError:  # Windows
@@ -169,7 +169,7 @@ def finished_path(path: Path) -> Path:
 
 
 def rename(path: Path, target: Path) -> None:
-    """Durably; never over another file. Raises OSError."""
+    """Rename a file durably; never over another file. Raises OSError."""
     if target.exists():
         raise FileExistsError(errno.EEXIST, "there is another file of this name", str(target))
     path.rename(target)

@@ -80,7 +80,7 @@ class Intake:
             self._counters["dropped"] += messages
 
     def add_order(self, topic: str, source: str) -> None:
-        """Something for the writer to do between the messages before and after: ``topic`` says what."""
+        """Add something for the writer to do between the messages before and after: ``topic`` says what."""
         self._events.append(Item(self._boot_ns(), topic, b"", None, None, "", source))
 
     def take(self) -> list[Item]:

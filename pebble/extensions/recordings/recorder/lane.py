@@ -56,7 +56,7 @@ class OpenFile:
         return self.writer.channels >= _MOST_CHANNELS or self.writer.indexed >= _MOST_INDEXED
 
     def add(self, item: Item, at_ns: int) -> None:
-        """Raises OSError. Times never go back within a file."""
+        """Add a message. Times never go back within a file. Raises OSError."""
         if item.retained != CARRIED:
             self.pending.append(item)
         self.last_ns = log_ns = max(self.last_ns, at_ns)
@@ -81,7 +81,7 @@ class OpenFile:
         return self._taken - since
 
     def take_lacking(self) -> list[Item]:
-        """After an error: the messages that the file has not taken. They are not pending any more."""
+        """Return, after an error, the messages that the file has not taken. They are not pending any more."""
         lacking = self.writer.messages - self.writer.flushed
         items, self.pending = self.pending, []
         return items[max(0, len(items) - lacking) :] if lacking else []

@@ -31,7 +31,7 @@ class Source:
     def __init__(self, recorder: Recorder, kind: str, settings: Any, filters: Iterable[str], name: str = "") -> None:
         self._recorder, self._kind, self._name = recorder, kind, name
         self._filters = list(dict.fromkeys(filters))
-        self._ignored = () if any(one.startswith(REPLAYED) for one in self._filters) else (REPLAYED,)
+        self._ignored = () if any(filter_.startswith(REPLAYED) for filter_ in self._filters) else (REPLAYED,)
         self._settings, self._is_modern = settings, True
         self._lost_at = 0  # nanoseconds since 1970; 0: connected, or never was
         self._losses: dict[str, int] = {}

@@ -210,7 +210,7 @@ class Writing:
         log.warning("recording again")
 
     def give_up(self) -> None:
-        """At the end: count what no file has taken."""
+        """Count, at the end, what no file has taken."""
         self._intake.drop(len(self._lacking))
         self._lacking = []
         self._finisher.retry()

@@ -100,7 +100,7 @@ class Rules:
         return Outgoing(Message(address.topic, shifted(payload, by_ns), address.qos), moves)
 
     def _listed(self, channel: Channel) -> _Address | None:
-        """None for robots that the files did not name at the start: they may be live."""
+        """Return None for robots that the files did not name at the start: they may be live."""
         address = self._address(channel)
         return address if address is not None and address.base in self.robots else None
 
@@ -109,7 +109,7 @@ class Rules:
         return self._found(channel.topic, metadata.get("qos", "0"), metadata.get("retained") == "1")
 
     def _find(self, topic: str, qos: str, retained: bool) -> _Address | None:
-        """``retained``: the recorder received it as an old message."""
+        """Return the address. ``retained``: the recorder received it as an old message."""
         parsed = None if topic.startswith("$") else parse_topic(topic)
         if parsed is None or parsed.identity.is_server or not self._wanted(topic):
             return None
@@ -137,7 +137,7 @@ class Rules:
         return self._options.incoming and declared in _MILD
 
     def _moves(self, payload: bytes) -> bool | None:
-        """None for a command that is not to be sent: one that cannot be read, or a script's."""
+        """Return None for a command that is not to be sent: one that cannot be read, or a script's."""
         try:
             command: Drive = codec.decode(c.DRIVE, payload)
         except PayloadError:
@@ -189,7 +189,7 @@ def _is_probe(payload: bytes) -> bool:
 
 
 def _rebased(plain: Any, old: str, new: str) -> Any:
-    """``plain`` with all topics below ``old`` moved below ``new``; names of topics elsewhere are left out."""
+    """Return ``plain`` with all topics below ``old`` moved below ``new``; names of topics elsewhere are left out."""
     if isinstance(plain, dict):
         return {key: _rebased(value, old, new) for key, value in plain.items() if not _is_elsewhere(key, value, old)}
     if isinstance(plain, list):
@@ -205,7 +205,7 @@ def _is_elsewhere(key: str, value: Any, old: str) -> bool:
 
 
 def _without_controls(section: Any, *, drives: bool) -> Any:
-    """No part of a recording obeys a command."""
+    """Return the section without controls: no part of a recording obeys a command."""
     if isinstance(section, list):
         return [_without_controls(value, drives=drives) for value in section]
     if not isinstance(section, dict):

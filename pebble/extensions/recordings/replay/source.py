@@ -37,7 +37,7 @@ class ReplaySource:
         return [channel for channels in self._files.values() for channel in channels]
 
     def messages(self, since_ns: int = 0, until_ns: int = FOREVER_NS) -> Iterator[Recorded]:
-        """By the time at which they were received; ``until_ns`` is not included."""
+        """Yield messages by the time at which they were received; ``until_ns`` is not included."""
         return merged(self._files, since_ns=since_ns, until_ns=until_ns, damages=self.damages)
 
     def state_before(self, at_ns: int, publishes: Chooses = lambda _channel: True) -> list[Recorded]:
@@ -69,11 +69,11 @@ class ReplaySource:
                 found[message.channel.topic] = [message]
             elif message.channel.topic in found and is_picture(message.payload):
                 found[message.channel.topic].append(message)
-        pictures = [message for each in found.values() if len(each) <= _PICTURES for message in each]
+        pictures = [message for messages in found.values() if len(messages) <= _PICTURES for message in messages]
         return sorted(pictures, key=lambda message: message.log_ns)
 
     def _having(self, chooses: Callable[[Channel], bool], since_ns: int, until_ns: int) -> list[Path]:
-        """Files of that time with such channels: media must not be unpacked for a state."""
+        """Return the files of that time with such channels: media must not be unpacked for a state."""
         having = [path for path, channels in self._files.items() if any(map(chooses, channels))]
         return [path for path in having if reaches_into(path, since_ns, until_ns)]
 

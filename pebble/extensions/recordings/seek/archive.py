@@ -56,11 +56,13 @@ class Archive:
         for file in self.files(robot, since_ns, until_ns):
             for chunk in _within(file, file.channels_of(robot), since_ns, until_ns):
                 found += (
-                    one
-                    for one in file.messages_of(chunk)
-                    if since_ns <= one.log_ns < until_ns and _is_of(one.channel, robot) and not is_carried(one.channel)
+                    message
+                    for message in file.messages_of(chunk)
+                    if since_ns <= message.log_ns < until_ns
+                    and _is_of(message.channel, robot)
+                    and not is_carried(message.channel)
                 )
-        found.sort(key=lambda one: one.log_ns)
+        found.sort(key=lambda message: message.log_ns)
         return found
 
     def state(self, robot: str, at_ns: int) -> list[Recorded]:
@@ -69,8 +71,8 @@ class Archive:
         files = [file for file in files if file.first_ns < at_ns]
         if not files:
             return []
-        file = max(files, key=lambda one: one.first_ns)
-        wanted = {one.topic for one in file.channels.values() if _is_of(one, robot)}
+        file = max(files, key=lambda file_: file_.first_ns)
+        wanted = {channel.topic for channel in file.channels.values() if _is_of(channel, robot)}
         found: dict[str, Recorded] = {}
         for chunk in reversed(_within(file, file.channels_of(robot), 0, at_ns)):
             missing = wanted - found.keys()
@@ -80,35 +82,41 @@ class Archive:
                 file.channels[number].topic in missing for number in chunk.channels if number in file.channels
             ):
                 continue
-            for one in reversed(file.messages_of(chunk)):
-                topic = one.channel.topic
-                if one.log_ns < at_ns and topic not in found and _is_of(one.channel, robot):
-                    found[topic] = one
-        return sorted((one for one in found.values() if not is_media(one.payload)), key=lambda one: one.log_ns)
+            for message in reversed(file.messages_of(chunk)):
+                topic = message.channel.topic
+                if message.log_ns < at_ns and topic not in found and _is_of(message.channel, robot):
+                    found[topic] = message
+        return sorted(
+            (message for message in found.values() if not is_media(message.payload)), key=lambda message: message.log_ns
+        )
 
     def log_lines(self, robot: str, at_ns: int) -> list[Recorded]:
         """Return the last lines of its log before ``at_ns``, the oldest first."""
         topic = LOGS.topic(robot)
         found: list[Recorded] = []
         for file in reversed(self.files(robot, at_ns - _LOG_NS, at_ns, media=False)):
-            numbers = frozenset(number for number, one in file.channels.items() if one.topic == topic)
+            numbers = frozenset(number for number, channel in file.channels.items() if channel.topic == topic)
             for chunk in reversed(_within(file, numbers, at_ns - _LOG_NS, at_ns)):
-                lines = [one for one in file.messages_of(chunk) if one.channel.topic == topic and one.log_ns < at_ns]
+                lines = [
+                    message
+                    for message in file.messages_of(chunk)
+                    if message.channel.topic == topic and message.log_ns < at_ns
+                ]
                 found += reversed(lines)
                 if len(found) >= LOG_LINES:
                     break
-        return sorted(found[:LOG_LINES], key=lambda one: one.log_ns)
+        return sorted(found[:LOG_LINES], key=lambda message: message.log_ns)
 
     def pictures(self, robot: str, at_ns: int) -> list[Recorded]:
         """Return the last picture before ``at_ns``, and before it all from its key frame on; empty if there is none."""
         chain: list[Recorded] = []
         size = 0
-        for one in self._pictures_before(robot, at_ns):
-            if chain and one.channel.topic != chain[-1].channel.topic:
+        for message in self._pictures_before(robot, at_ns):
+            if chain and message.channel.topic != chain[-1].channel.topic:
                 continue
-            chain.append(one)
-            size += len(one.payload)
-            if is_keyframe(one.payload):
+            chain.append(message)
+            size += len(message.payload)
+            if is_keyframe(message.payload):
                 chain.reverse()
                 return chain
             if size > _CHAIN_BYTES:
@@ -118,12 +126,12 @@ class Archive:
     def next_ns(self, robot: str, at_ns: int) -> int | None:
         """Return the time of the robot's next message from ``at_ns`` on; None if there is none."""
         found: int | None = None
-        for file in sorted(self.files(robot, at_ns, 1 << 63), key=lambda one: one.first_ns):
+        for file in sorted(self.files(robot, at_ns, 1 << 63), key=lambda file_: file_.first_ns):
             if found is not None and file.first_ns >= found:
                 break
-            one = _first(file, robot, at_ns)
-            if one is not None:
-                found = one if found is None else min(found, one)
+            first_ns = _first(file, robot, at_ns)
+            if first_ns is not None:
+                found = first_ns if found is None else min(found, first_ns)
         return found
 
     def files(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[SeekableFile]:
@@ -139,7 +147,7 @@ class Archive:
             if file is None or not file.chunks or file.first_ns >= until_ns or file.last_ns < since_ns:
                 continue
             found.append(file)
-        return sorted(found, key=lambda one: one.first_ns)
+        return sorted(found, key=lambda file_: file_.first_ns)
 
     def all_files(self) -> Iterator[SeekableFile]:
         """Yield all, opened one after the other."""
@@ -164,7 +172,7 @@ class Archive:
         return self._named
 
     def _opened(self, path: Path) -> SeekableFile | None:
-        """None for one that has gone meanwhile, or is no recording."""
+        """Return None for one that has gone meanwhile, or is no recording."""
         file = self._open.pop(path, None)
         try:
             if file is not None and file.is_replaced():
@@ -187,10 +195,10 @@ class Archive:
         since_ns = at_ns - _CHAIN_NS
         for file in reversed(self.files(robot, since_ns, at_ns)):
             for chunk in reversed(_within(file, file.channels_of(robot), since_ns, at_ns)):
-                for one in reversed(file.messages_of(chunk)):
-                    outgoing = one.channel.topic.startswith(f"{robot}/outgoing/")
-                    if one.log_ns < at_ns and outgoing and is_picture(one.payload):
-                        yield one
+                for message in reversed(file.messages_of(chunk)):
+                    outgoing = message.channel.topic.startswith(f"{robot}/outgoing/")
+                    if message.log_ns < at_ns and outgoing and is_picture(message.payload):
+                        yield message
 
 
 def metric_of(topic: str) -> tuple[str, bool]:
@@ -203,9 +211,9 @@ def metric_of(topic: str) -> tuple[str, bool]:
 
 def _first(file: SeekableFile, robot: str, at_ns: int) -> int | None:
     for chunk in _within(file, file.channels_of(robot), at_ns, 1 << 63):
-        for one in file.messages_of(chunk):
-            if one.log_ns >= at_ns and _is_of(one.channel, robot) and not is_carried(one.channel):
-                return one.log_ns
+        for message in file.messages_of(chunk):
+            if message.log_ns >= at_ns and _is_of(message.channel, robot) and not is_carried(message.channel):
+                return message.log_ns
     return None
 
 

@@ -122,7 +122,9 @@ def _gaps(file: SeekableFile) -> list[int]:
     for chunk in file.chunks if numbers else []:
         if not chunk.channels.isdisjoint(numbers):
             found += [
-                one.log_ns for one in file.messages_of(chunk) if one.channel.id in numbers and _is_gap(one.payload)
+                message.log_ns
+                for message in file.messages_of(chunk)
+                if message.channel.id in numbers and _is_gap(message.payload)
             ]
     return found
 

@@ -28,7 +28,9 @@ class SeekableFile(RecordingFile):
     def channels_of(self, robot: str) -> frozenset[int]:
         """Return those of a robot, and of topics that have no channel of their own in a file of the last version."""
         return frozenset(
-            number for number, one in self.channels.items() if robot_of(one) == robot or one.topic == OLD_OTHER
+            number
+            for number, channel in self.channels.items()
+            if robot_of(channel) == robot or channel.topic == OLD_OTHER
         )
 
     def is_replaced(self) -> bool:

@@ -57,7 +57,7 @@ def begin(folder: Path) -> None:
 
 
 def days() -> bytes:
-    """JSON."""
+    """Return JSON."""
     return msgspec.json.encode(_days.all())
 
 

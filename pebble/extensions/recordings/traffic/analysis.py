@@ -34,7 +34,7 @@ class RecorderEvents(Struct):
     dropped: int = 0
 
     def breaks(self) -> list[tuple[int, int]]:
-        """Times that no heartbeat interval can be measured across."""
+        """Return times that no heartbeat interval can be measured across."""
         return [*((gap.since_ns, gap.until_ns) for gap in self.gaps), *((ns, ns) for ns in self.starts)]
 
 
@@ -94,6 +94,6 @@ def recorder_events(connection: Any, indexes: Sequence[Path], since_ns: int, unt
         elif event == "dropped" and since_ns <= ns < until_ns:
             found.dropped += messages
     connection.execute("CREATE TEMP TABLE breaks (since_ns BIGINT, until_ns BIGINT)")
-    for one in found.breaks():
-        connection.execute("INSERT INTO breaks VALUES (?, ?)", one)
+    for pause in found.breaks():
+        connection.execute("INSERT INTO breaks VALUES (?, ?)", pause)
     return found

@@ -19,7 +19,7 @@ _GLOB: Final = re.compile(r"([*?\[])")
 
 
 def require_packages(*names: str) -> None:
-    """Raises PebbleError that names those of the extra "archive" that are not installed."""
+    """Raise PebbleError that names those of the extra "archive" that are not installed."""
     missing = [name for name in names if find_spec(name) is None]
     if missing:
         raise PebbleError(f'{" and ".join(missing)} missing: pip install "pebble-robot[archive]"')

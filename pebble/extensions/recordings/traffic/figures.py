@@ -106,7 +106,7 @@ def draw_latency(axes: Axes, latency: Latency) -> None:
 
 
 def _bandwidth(robot: RobotTraffic) -> Figure | None:
-    shown = [one for one in robot.bandwidth if one.time in (SESSION, IDLE)]
+    shown = [bandwidth for bandwidth in robot.bandwidth if bandwidth.time in (SESSION, IDLE)]
     if not shown:
         return None
     caption = (
@@ -118,21 +118,21 @@ def _bandwidth(robot: RobotTraffic) -> Figure | None:
 
 
 def draw_bandwidth(axes: Axes, shown: Sequence[Bandwidth]) -> None:
-    """Median and 95th percentile of each family, in sessions and while idle."""
-    names = [family for family in reversed(FAMILIES) if any(one.family == family for one in shown)]
+    """Draw the median and the 95th percentile of each family, in sessions and while idle."""
+    names = [family for family in reversed(FAMILIES) if any(bandwidth.family == family for bandwidth in shown)]
     for time, label, colour, offset, marker in _TIMES:
-        mine = [one for one in shown if one.time == time]
-        places = [names.index(one.family) - offset for one in mine]
-        medians = [max(one.median_kbps, 0.01) for one in mine]
-        axes.hlines(places, medians, [max(one.p95_kbps, 0.01) for one in mine], color=colour, linewidth=2)
+        mine = [bandwidth for bandwidth in shown if bandwidth.time == time]
+        places = [names.index(bandwidth.family) - offset for bandwidth in mine]
+        medians = [max(bandwidth.median_kbps, 0.01) for bandwidth in mine]
+        axes.hlines(places, medians, [max(bandwidth.p95_kbps, 0.01) for bandwidth in mine], color=colour, linewidth=2)
         axes.plot(medians, places, marker, color=colour, markersize=6, label=label)
-        for one, place in zip(mine, places, strict=True):
-            right = max(one.p95_kbps, 0.01)
+        for bandwidth, place in zip(mine, places, strict=True):
+            right = max(bandwidth.p95_kbps, 0.01)
             axes.annotate(
-                _short(one.median_kbps), (right, place), xytext=(6, 0), textcoords="offset points", va="center",
+                _short(bandwidth.median_kbps), (right, place), xytext=(6, 0), textcoords="offset points", va="center",
                 fontsize=7, color="#333",
             )  # fmt: skip
-    values = [max(value, 0.01) for one in shown for value in (one.median_kbps, one.p95_kbps)]
+    values = [max(value, 0.01) for bandwidth in shown for value in (bandwidth.median_kbps, bandwidth.p95_kbps)]
     axes.set_xscale("log")
     axes.set_xlim(10 ** math.floor(math.log10(min(values) * 0.7)), max(values) * 4)
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -144,7 +144,7 @@ def draw_bandwidth(axes: Axes, shown: Sequence[Bandwidth]) -> None:
 
 
 def _legend(axes: Axes) -> None:
-    """Above the drawing, where it hides nothing."""
+    """Draw the legend above the drawing, where it hides nothing."""
     axes.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.2)
 
 
@@ -163,7 +163,7 @@ def _short(value: float) -> str:
 
 
 def _svg(draw: Any, robot: RobotTraffic, name: str) -> str:
-    """Without ids that two figures of a page could share, and without names of other hosts."""
+    """Return SVG without ids that two figures of a page could share, and without names of other hosts."""
     import matplotlib as mpl
     from matplotlib.figure import Figure as Drawing
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
 _BINS, _FINEST_MS = 60, 0.5  # of histograms
-_LINUX_ONLY: Final = tuple(one.metric for one in (c.LOGS, c.MEDIA_STATUS, c.SOUNDBOARD_FILES, c.AUTONOMY_FILES))
+_LINUX_ONLY: Final = tuple(channel.metric for channel in (c.LOGS, c.MEDIA_STATUS, c.SOUNDBOARD_FILES, c.AUTONOMY_FILES))
 
 
 def _names(texts: Sequence[str]) -> str:
@@ -165,15 +165,15 @@ class RobotQueries:
         self._connection.execute(_SESSIONS)
 
     def totals(self) -> tuple[int, int, int, int]:
-        """Messages, bytes, times of the first and of the last one."""
+        """Return the numbers of messages and bytes, and the times of the first and the last message."""
         messages, size, first, last = self._row(_TOTALS)
         return messages, size, first, last
 
     def bandwidth(self) -> list[traffic.Bandwidth]:
         found = [traffic.Bandwidth(*row) for row in self._rows(_BANDWIDTH)]
         order = {name: number for number, name in enumerate((*traffic.FAMILIES, *traffic.TIMES))}
-        known = [one for one in found if one.time in order]
-        return sorted(known, key=lambda one: (order[one.family], order[one.time]))
+        known = [bandwidth for bandwidth in found if bandwidth.time in order]
+        return sorted(known, key=lambda bandwidth: (order[bandwidth.family], order[bandwidth.time]))
 
     def sessions(self) -> list[traffic.Session]:
         return [traffic.Session(since, until) for since, until in self._rows("FROM sessions")]

@@ -95,7 +95,7 @@ def _page(traffic: Traffic, advance: Callable[[str, float], None]) -> str:
 
 
 def _head(traffic: Traffic) -> Iterable[str]:
-    messages, size = sum(one.messages for one in traffic.robots), sum(one.bytes for one in traffic.robots)
+    messages, size = sum(robot.messages for robot in traffic.robots), sum(robot.bytes for robot in traffic.robots)
     yield "<h1>Robot traffic</h1>"
     yield (
         f"<p>{moment(traffic.since_ns // 10**9)} to {moment(traffic.until_ns // 10**9)}: {len(traffic.robots)} robots "
@@ -107,7 +107,7 @@ def _head(traffic: Traffic) -> Iterable[str]:
     yield f'<nav>{" ".join(links)} <a href="#words">words</a></nav>'
     found = remarks(traffic)
     if found:
-        items = "".join(f"<li>{_text(one)}</li>" for one in found)
+        items = "".join(f"<li>{_text(remark)}</li>" for remark in found)
         yield f'<h2>What stands out</h2><ul class="remarks">{items}</ul>'
     table = media_bandwidth(traffic)
     if table.rows:

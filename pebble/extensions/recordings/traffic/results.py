@@ -84,7 +84,7 @@ class RobotTraffic(Struct, kw_only=True):
     latency: Latency | None
 
     def of(self, family: str, time: str = ALL) -> Bandwidth | None:
-        return next((one for one in self.bandwidth if one.family == family and one.time == time), None)
+        return next((row for row in self.bandwidth if row.family == family and row.time == time), None)
 
 
 class Gap(Struct, frozen=True):

@@ -87,8 +87,8 @@ def _of_deleted(place: Path) -> Iterator[Path]:
             yield index
 
 
-def _report(progress: Progress, name: str, before: float, own: float, share: float) -> None:
-    progress(f"index {name}", before + share * own)
+def _report(progress: Progress, name: str, before: float, part: float, share: float) -> None:
+    progress(f"index {name}", before + share * part)
 
 
 def _index(path: Path, spare: Path, connection: DuckDBPyConnection, advance: Callable[[float], None]) -> Path | None:

@@ -26,7 +26,7 @@ def tables(traffic: Traffic) -> list[Table]:
 
 
 def media_bandwidth(traffic: Traffic) -> Table:
-    """Table 4.1 of the paper."""
+    """Return table 4.1 of the paper."""
     columns = [
         ("robot", "robot"), ("video_median_kbps", "video, median kbit/s"), ("video_p95_kbps", "video, p95"),
         ("audio_median_kbps", "audio, median kbit/s"), ("audio_p95_kbps", "audio, p95"),
@@ -35,7 +35,7 @@ def media_bandwidth(traffic: Traffic) -> Table:
     for robot in traffic.robots:
         both = robot.of(VIDEO), robot.of(AUDIO)
         if any(both):
-            cells = [(None, None) if one is None else (one.median_kbps, one.p95_kbps) for one in both]
+            cells = [(None, None) if row is None else (row.median_kbps, row.p95_kbps) for row in both]
             rows.append([robot.robot, *cells[0], *cells[1]])
     return Table("table-4-1-media-bandwidth", "Table 4.1: bandwidth of media, of active seconds", columns, rows)
 
@@ -48,11 +48,11 @@ def _bandwidth(traffic: Traffic) -> Table:
     ]  # fmt: skip
     rows = [
         [
-            robot.robot, robot.machine, one.family, one.time, one.seconds, one.median_kbps, one.p95_kbps, one.messages,
-            one.bytes,
+            robot.robot, robot.machine, row.family, row.time, row.seconds, row.median_kbps, row.p95_kbps, row.messages,
+            row.bytes,
         ]
         for robot in traffic.robots
-        for one in robot.bandwidth
+        for row in robot.bandwidth
     ]  # fmt: skip
     return Table("bandwidth", "Figure 4.3: bandwidth in sessions and while idle", columns, rows)
 
@@ -62,9 +62,9 @@ def _latency(traffic: Traffic) -> Table:
         ("robot", "robot"), ("heartbeats", "heartbeats"), ("median_ms", "median ms"), ("p95_ms", "p95 ms"),
     ]  # fmt: skip
     rows = [
-        [robot.robot, one.count, one.median_ms, one.p95_ms]
+        [robot.robot, latency.count, latency.median_ms, latency.p95_ms]
         for robot in traffic.robots
-        if (one := robot.latency) is not None
+        if (latency := robot.latency) is not None
     ]
     return Table("latency", "Figures 4.2, 4.5 and 4.6: latency of heartbeats", columns, rows)
 
@@ -72,19 +72,19 @@ def _latency(traffic: Traffic) -> Table:
 def _outages(traffic: Traffic) -> Table:
     columns = [("robot", "robot"), ("since", "from"), ("length_ms", "length ms")]
     rows = [
-        [robot.robot, moment(one.since_ns / 1e9), one.length_ms] for robot in traffic.robots for one in robot.outages
+        [robot.robot, moment(gap.since_ns / 1e9), gap.length_ms] for robot in traffic.robots for gap in robot.outages
     ]
     return Table("outages", "Figures 4.1 and 4.4: outages of heartbeats", columns, rows)
 
 
 def moment(seconds: float) -> str:
-    """``2026-11-20T10:00:00Z``; with milliseconds if it is no whole second."""
+    """Return ``2026-11-20T10:00:00Z``; with milliseconds if it is no whole second."""
     spec = "seconds" if seconds == int(seconds) else "milliseconds"
     return datetime.fromtimestamp(seconds, UTC).replace(tzinfo=None).isoformat(timespec=spec) + "Z"
 
 
 def write_csv(table: Table, folder: Path) -> Path:
-    """Raises OSError."""
+    """Write a table as CSV. Raises OSError."""
     path = folder / f"{table.name}.csv"
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -94,5 +94,5 @@ def write_csv(table: Table, folder: Path) -> Path:
 
 
 def _cell(value: Any) -> Any:
-    """Spreadsheets take text for a formula that begins like one; anyone may choose the names in topics."""
+    """Return a cell that no spreadsheet takes for a formula; anyone may choose the names in topics."""
     return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value

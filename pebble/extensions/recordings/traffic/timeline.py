@@ -83,10 +83,10 @@ def timeline(
         queries.load(found.indexes, since_ns, until_ns)
         made = _stepped(connection)
         made.gaps = gaps
-        made.sessions = [Stretch(1000 * one.since_s, 1000 * one.until_s) for one in queries.sessions()]
+        made.sessions = [Stretch(1000 * session.since_s, 1000 * session.until_s) for session in queries.sessions()]
         interval_ms = queries.interval_ms()
-        for one in () if interval_ms is None else queries.outages(interval_ms):
-            made.outages.append(Stretch(_ms(one.since_ns), _ms(one.since_ns) + one.length_ms))
+        for outage in () if interval_ms is None else queries.outages(interval_ms):
+            made.outages.append(Stretch(_ms(outage.since_ns), _ms(outage.since_ns) + outage.length_ms))
     return made
 
 

@@ -170,7 +170,7 @@ def _print_status(status: AutonomyStatus) -> None:
 
 
 def _option(setting: forms.Setting) -> str:
-    """``--tag-id INT  Tag ID (default: 13)``."""
+    """Return such as ``--tag-id INT  Tag ID (default: 13)``."""
     first = {value: option for option, value in reversed(options_of(setting))}
     flag = setting.type == "bool"
     shown = f"[{first[True]} | {first[False]}]" if flag else f"{first[None]} {setting.type.upper()}"

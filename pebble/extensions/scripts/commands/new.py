@@ -39,7 +39,7 @@ def _alike(target: Path) -> Path | None:
     """Return what exists with this name, whatever its case: many file systems make no difference."""
     if not target.parent.is_dir():
         return None
-    return next((one for one in target.parent.iterdir() if one.name.lower() == target.name.lower()), None)
+    return next((path for path in target.parent.iterdir() if path.name.lower() == target.name.lower()), None)
 
 
 def _text(file: str) -> str:
@@ -51,6 +51,6 @@ def _room() -> str:
 
 
 def _robot(target: Path) -> str:
-    """Return the config names absolute paths, so that `pebble up` finds them from everywhere."""
+    """Return the robot's config; it names absolute paths, so that `pebble up` finds them from everywhere."""
     world = Path(tempfile.gettempdir(), "pebble-world-room")
     return _text("goob.json").replace("{folder}", str(target.absolute())).replace("{world}", str(world))

@@ -30,7 +30,7 @@ class CameraModel:
 
     @classmethod
     def of_hfov(cls, hfov_deg: float = HFOV_DEG, size: tuple[int, int] = (640, 480)) -> CameraModel:
-        """Square pixels, the axis in the middle, no distortion."""
+        """Return a camera with square pixels, the axis in the middle, and no distortion."""
         width, height = size
         focal = width / 2 / math.tan(math.radians(hfov_deg) / 2)
         matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
@@ -38,7 +38,7 @@ class CameraModel:
 
     @classmethod
     def read(cls, path: Path) -> CameraModel:
-        """Raises ConfigError if the file is none that OpenCV wrote with a calibration in it."""
+        """Return the camera of a calibration file that OpenCV wrote. Raises ConfigError for any other."""
         import cv2  # late: many programs that import this need no OpenCV
 
         try:

@@ -1,4 +1,4 @@
-"""Drives towards a tag and holds a distance from it, by what the camera shows alone.
+"""A controller that drives towards a tag and holds a distance from it, by the camera alone.
 
 A tag outside of a cone ahead is turned to in pulses with pauses between them, because a turning camera sees a blurred
 picture, and a late one. Inside the cone the robot drives and steers. A lost tag is waited for, then searched in the
@@ -78,7 +78,7 @@ class Command(NamedTuple):
 
 
 class Pulses:
-    """Turns for a moment, then pauses."""
+    """A rhythm of short turns and pauses."""
 
     def __init__(self) -> None:
         self._x = 0.0
@@ -94,7 +94,7 @@ class Pulses:
 
 
 class Follower:
-    """Call ``step`` at a steady rate of about 10 Hz, with where the tag is, or None if it is not in the picture."""
+    """A follower of a tag. Call ``step`` at about 10 Hz, with where the tag is, or None if it is not in the picture."""
 
     def __init__(self, settings: FollowSettings) -> None:
         self.settings = settings
@@ -130,7 +130,7 @@ class Follower:
         return Command(x, 0.0, "turn")
 
     def _approach(self, error: float, angle: float) -> Command:
-        """``error`` > 0: too far away."""
+        """Return the command for a tag within the cone. ``error`` > 0: it is too far away."""
         settings = self.settings
         x = max(-settings.turn_power, min(settings.turn_power, _STEER_PER_RAD * angle))
         if error < 0.0:

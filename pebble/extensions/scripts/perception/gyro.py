@@ -14,7 +14,7 @@ _LEAST_RATIO, _MOST_RATIO = 0.5, 2.0  # sensor to wheels; else it is mounted oth
 
 
 class GyroHeading:
-    """Collects turns of an inertial sensor that lies flat; + is counter-clockwise."""
+    """The turns of an inertial sensor that lies flat; + is counter-clockwise."""
 
     def __init__(self) -> None:
         self._turn_rad = 0.0  # since it was taken

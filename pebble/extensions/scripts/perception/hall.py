@@ -61,7 +61,7 @@ class SensorRange:
             self._end_of_half_wave(value)
 
     def level(self, value: float) -> float:
-        """−1..1."""
+        """Return a value as a part of the range, −1..1."""
         middle, swing = (self.low + self.high) / 2, (self.high - self.low) / 2
         return max(-1.0, min(1.0, (value - middle) / swing))
 
@@ -113,7 +113,7 @@ class PhaseTracker:
         return self._move_to(self.phase, nearest, power)
 
     def update_pair(self, phase: float, power: float) -> float:
-        """Does what ``update`` does, from the phase itself, which is known but for whole waves."""
+        """Do what ``update`` does, from the phase itself, which is known but for whole waves."""
         if self.phase is None:
             self.phase = self._farthest = phase
             return 0.0
@@ -240,7 +240,7 @@ class HallWheel:
         counts.rad_in_any_direction += abs(added)
 
     def _second_sensor(self, samples: list[HallSample]) -> int:
-        """1 or −1 if the second sensor shows the commanded directions, as it is mounted; 0 if it shows nothing."""
+        """Return 1 or −1 if the second sensor shows the commanded directions, as mounted; 0 if it shows nothing."""
         if not self._second.swings or self._second.extrema < 1:
             return 0
         agreed = total = run = 0.0  # run: the motion since the direction changed

@@ -1,4 +1,4 @@
-"""Follows a tag, and drives on without seeing it: to where it was, by the wheels' odometry, for a bounded time."""
+"""A controller that follows a tag, and drives on to where it was by odometry while it is out of sight, for a while."""
 
 import math
 from typing import Any, NamedTuple
@@ -41,13 +41,13 @@ def pose_of(odometry: WheelOdometry | None) -> Pose | None:
 
 
 def _number(value: dict[str, Any], *names: str) -> float | None:
-    found = next((value[name] for name in names if value.get(name) is not None), None)
-    usable = isinstance(found, int | float) and math.isfinite(found)
-    return float(found) if usable else None  # type: ignore[arg-type]
+    number = next((value[name] for name in names if value.get(name) is not None), None)
+    usable = isinstance(number, int | float) and math.isfinite(number)
+    return float(number) if usable else None  # type: ignore[arg-type]
 
 
 class OdomFollower:
-    """Call ``see`` for every picture, and ``step`` at a steady rate of about 10 Hz."""
+    """A follower of a tag in and out of sight. Call ``see`` for every picture, and ``step`` at about 10 Hz."""
 
     def __init__(self, settings: FollowSettings) -> None:
         self.settings = settings
@@ -74,7 +74,7 @@ class OdomFollower:
         return Command(reason="goal reached") if now - self._reached_at < self.settings.goal_hold_s else vision
 
     def _plan(self, place: Place, pose: Pose) -> tuple[float, float] | None:
-        """Return the point at the wanted distance from the tag, on the way to it; None: it is near."""
+        """Return the point at the wanted distance from the tag, on the way to it; None if it is near."""
         settings = self.settings
         advance = place.distance_m - settings.target_distance_m
         if advance <= max(settings.distance_threshold_m, settings.min_goal_advance_m):
@@ -83,7 +83,7 @@ class OdomFollower:
         return pose.x_m + advance * math.cos(bearing), pose.y_m + advance * math.sin(bearing)
 
     def _to_goal(self, now: float, goal: tuple[float, float], pose: Pose) -> Command | None:
-        """None: it has been reached, or the time is over."""
+        """Return the command that leads to the goal; None if it has been reached, or the time is over."""
         settings = self.settings
         dx, dy = goal[0] - pose.x_m, goal[1] - pose.y_m
         distance = math.hypot(dx, dy)

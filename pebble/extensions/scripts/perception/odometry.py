@@ -1,4 +1,4 @@
-"""Where a robot is, by its wheels' hall sensors and the power of its motors: dead reckoning from the pose (0, 0, 0).
+"""The pose of a robot by its wheels' hall sensors and the power of its motors: dead reckoning from (0, 0, 0).
 
 Commands and samples are processed in the order of their arrival, because samples carry no time. Distances are good to
 millimetres as long as no wheel slips; heading is good to the difference of both wheels' calibration, and better with
@@ -114,7 +114,7 @@ class Directions:
         self._power = (power.left, power.right)
 
     def at(self, now: float) -> tuple[tuple[float, int], tuple[float, int]]:
-        """Power and possible direction of the left and the right wheel; a direction remains while wheels coast."""
+        """Return power and possible direction of the left and the right wheel; directions remain in coasting."""
         self._note_signs(now)
         left, right = (s if now <= until else 0 for s, until in zip(self._signs, self._signs_until, strict=True))
         return (self._power[0], left), (self._power[1], right)
@@ -127,7 +127,7 @@ class Directions:
 
 
 class Odometry:
-    """Feed it every power that the wheels are commanded, and every sample."""
+    """The odometry of one robot: feed it every power that the wheels are commanded, and every sample."""
 
     def __init__(self, settings: OdometrySettings, now: float) -> None:
         self.pose = self._base = WheelPose()

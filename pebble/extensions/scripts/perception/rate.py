@@ -2,7 +2,7 @@
 
 
 class Rate:
-    """Call ``due`` at every event. What is late is not repeated."""
+    """A steady rate. Call ``due`` at every event; what is late is not repeated."""
 
     def __init__(self, hz: float) -> None:
         self.hz = hz

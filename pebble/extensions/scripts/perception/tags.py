@@ -15,7 +15,7 @@ _HINTS = {(4,): ": leave out the last with picture[:, :, :3]", (1,): ": use pict
 
 
 class Place(NamedTuple):
-    """Where the middle of a tag is, seen from the camera; ``angle_rad`` is positive to the right."""
+    """The place of a tag's middle, seen from the camera; ``angle_rad`` is positive to the right."""
 
     distance_m: float
     angle_rad: float
@@ -56,16 +56,19 @@ class TagGeometry:
         self._camera = camera or CameraModel.of_hfov()
 
     def place(self, corners: Floats, width: int, height: int) -> Place | None:
-        """``corners`` as in :class:`Tag`, in a picture of this size. None: they are no square in front of a camera."""
+        """Return the place of a tag by its ``corners``; None if they are no square in front of a camera.
+
+        ``corners`` are those of :class:`Tag`, in a picture of this size.
+        """
         import cv2
 
         matrix, distortion = self._camera.matrix(width, height), self._camera.distortion
         points = np.asarray(corners, float).reshape(4, 1, 2)
         try:
-            found, _, middle = cv2.solvePnP(self._square, points, matrix, distortion, flags=cv2.SOLVEPNP_IPPE_SQUARE)
+            solved, _, middle = cv2.solvePnP(self._square, points, matrix, distortion, flags=cv2.SOLVEPNP_IPPE_SQUARE)
         except cv2.error:
             return None
-        if not found or middle is None:
+        if not solved or middle is None:
             return None
         right, down, ahead = (float(part) for part in np.ravel(middle))
         distance = math.sqrt(right * right + down * down + ahead * ahead)
@@ -101,8 +104,8 @@ class TagFinder:
         grey = picture if picture.ndim == 2 else self._cv2.cvtColor(picture, self._cv2.COLOR_BGR2GRAY)
         corners, ids, _ = self._detector.detectMarkers(grey)
         tags = []
-        for found, number in zip(corners, [] if ids is None else np.ravel(ids), strict=False):
-            four = np.asarray(found, float).reshape(4, 2)
+        for corner, number in zip(corners, [] if ids is None else np.ravel(ids), strict=False):
+            four = np.asarray(corner, float).reshape(4, 2)
             if (place := self._geometry.place(four, width, height)) is not None:
                 tags.append(Tag(int(number), four, place))
         return sorted(tags, key=lambda tag: (tag.id, -tag.area))
@@ -127,6 +130,6 @@ def _dictionary(aruco: Any, family: str) -> Any:
     names = {name.upper(): name for name in dir(aruco) if name.startswith("DICT_")}
     name = names.get("DICT_" + family.strip().upper().removeprefix("DICT_"))
     if name is None:
-        known = ", ".join(sorted(name.removeprefix("DICT_") for name in names if "APRILTAG" in name))
-        raise PebbleError(f"unknown tag family {family!r}; known: {known}")
+        families = ", ".join(sorted(name.removeprefix("DICT_") for name in names if "APRILTAG" in name))
+        raise PebbleError(f"unknown tag family {family!r}; known: {families}")
     return aruco.getPredefinedDictionary(getattr(aruco, name))

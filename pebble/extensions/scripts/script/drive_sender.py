@@ -1,4 +1,4 @@
-"""Decides which drive commands of a script are published, and when. Pure: the caller receives, waits and has a clock.
+"""The drive commands of a script that are published, and when. Pure: the caller receives, waits and has a clock.
 
 The wheels belong to the motor owner, whose arbiter decides. This only knows what the owners and other senders have
 published, so that a script learns that its commands have no effect, and that others are not disturbed.
@@ -68,7 +68,7 @@ class DriveSender:
         return obeyed
 
     def drive_another(self, now: float) -> str:
-        """Return a command for another robot: what ends this run ends that, too. Returns :meth:`refusal`."""
+        """Note a command for another robot, and return :meth:`refusal`: what ends this run ends that, too."""
         self._tried = True
         return self.refusal(now)
 
@@ -139,7 +139,7 @@ class DriveSender:
 
     @property
     def due(self) -> float | None:
-        """When to call :meth:`tick`, and to look at :meth:`ended`; None: not before something happens."""
+        """The time to call :meth:`tick`, and to look at :meth:`ended`; None: not before something happens."""
         times = [] if self._pending is None else [self._turn]
         if self._barred_at is not None and not self._end:
             times.append(self._barred_at + _GRACE_S)

@@ -1,4 +1,4 @@
-"""Ends a script on a signal, whatever its main thread does: asleep, busy, or blocked in C code."""
+"""The end of a script on a signal, whatever its main thread does: asleep, busy, or blocked in C code."""
 
 import os
 import select
@@ -13,7 +13,7 @@ _NUMBERS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 class Guard:
-    """Calls ``end(number)`` on its own thread when a signal arrives, and ends the process 2 s later.
+    """A thread that calls ``end(number)`` when a signal arrives, and ends the process 2 s later.
 
     The kernel's handler only writes a byte into a pipe, and the thread waits for nothing else: a handler in Python
     would run on the main thread, perhaps much later, or while that holds a lock. Code that holds Python's global lock

@@ -22,7 +22,7 @@ class NotGrantedError(PebbleError):
 
 
 class Way(NamedTuple):
-    """What a neighbour needs of its robot. ``check`` raises once the script is to end."""
+    """The parts of its robot that a neighbour needs. ``check`` raises once the script is to end."""
 
     transport: Transport
     wheels: Wheels
@@ -87,7 +87,7 @@ class Neighbour:
 
     @property
     def why_refused(self) -> str:
-        """Why :meth:`drive` would have no effect now, in words; empty: it would, as far as is known."""
+        """The reason why :meth:`drive` would have no effect now; empty: it would have one, as far as is known."""
         state = self._state
         if state is None:
             return f"{self.name} is not heard"

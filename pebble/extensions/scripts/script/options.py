@@ -93,10 +93,7 @@ def _setting(field: inspect.Field, hint: Any) -> Setting:
 
 
 def _plain(kind: inspect.Type, name: str) -> tuple[Any, dict[str, Any], bool]:
-    """Return the type inside of Meta and ``| None``.
-
-    Title, description and extras of the Meta; whether None is allowed.
-    """
+    """Return the type inside of Meta and ``| None``, what the Meta says beside it, and whether None is allowed."""
     meta: dict[str, Any] = {}
     optional = False
     while True:
@@ -104,7 +101,7 @@ def _plain(kind: inspect.Type, name: str) -> tuple[Any, dict[str, Any], bool]:
             meta = {**(kind.extra_json_schema or {}), **(kind.extra or {}), **meta}
             kind = kind.type
         elif isinstance(kind, inspect.UnionType):
-            types = [one for one in kind.types if not isinstance(one, inspect.NoneType)]
+            types = [member for member in kind.types if not isinstance(member, inspect.NoneType)]
             if len(types) != 1:
                 raise TypeError(
                     f"option {name}: a form has no place for a choice of types: use one type, or `X | None`"
@@ -118,20 +115,20 @@ def _choices(hint: Any) -> list[str]:
     """Return the strings of a Literal in the order of their declaration, which msgspec does not preserve."""
     if typing.get_origin(hint) is Literal:
         return list(typing.get_args(hint))
-    return next((found for one in typing.get_args(hint) if (found := _choices(one))), [])
+    return next((choices for argument in typing.get_args(hint) if (choices := _choices(argument))), [])
 
 
 def _kind(kind: Any, name: str) -> Any:
-    found = _KINDS.get(type(kind))
-    if found is None:
+    form = _KINDS.get(type(kind))
+    if form is None:
         what = type(kind).__name__.removesuffix("Type").lower()
         raise TypeError(f"option {name}: {what} cannot become a form: use bool, int, float, str or Literal of strings")
-    if found == "enum" and not all(isinstance(value, str) for value in kind.values):
+    if form == "enum" and not all(isinstance(value, str) for value in kind.values):
         raise TypeError(f"option {name}: a Literal must list strings only: write Literal['1', '2'] instead of numbers")
     for bound, instead in (("gt", "ge"), ("lt", "le")):
         if getattr(kind, bound, None) is not None:
             raise TypeError(f"option {name}: the bounds of a form belong to it: write {instead} instead of {bound}")
-    return found
+    return form
 
 
 def _default(field: inspect.Field, setting: Setting) -> Value:
@@ -189,7 +186,7 @@ def _converter(setting: Setting) -> Callable[[str], object]:
 
 
 def _joined(arguments: list[str], settings: list[Setting]) -> list[str]:
-    """``--x -1e-05`` as ``--x=-1e-05``: argparse takes some numbers for options."""
+    """Return words with ``--x=-1e-05`` for ``--x -1e-05``: argparse takes some numbers for options."""
     valued = {setting.arg for setting in settings if setting.type != "bool"}
     joined: list[str] = []
     words = iter(arguments)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Pictures:
-    """Opens the camera when it is first used, and imports what that needs. One thread reads; any may close."""
+    """The robot's camera, opened when it is first used, as are its imports. One thread reads; any may close."""
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir

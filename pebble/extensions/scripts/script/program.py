@@ -1,4 +1,4 @@
-"""Makes a program of a function that gets a robot and its options: ``run(main)``."""
+"""The program of a function that gets a robot and its options: ``run(main)``."""
 
 import inspect
 import logging
@@ -71,10 +71,10 @@ def _options_of(main: Callable[..., None]) -> type[msgspec.Struct] | None:
         raise TypeError(f"{main.__name__}: write main(robot) or main(robot, options)")
     if len(parameters) == 1:
         return None
-    found = parameters[1].annotation
-    if not (isinstance(found, type) and issubclass(found, msgspec.Struct)):
+    struct = parameters[1].annotation
+    if not (isinstance(struct, type) and issubclass(struct, msgspec.Struct)):
         raise TypeError(f"{main.__name__}: annotate {parameters[1].name} with a msgspec Struct of yours")
-    return found
+    return struct
 
 
 def _name() -> str:
@@ -175,10 +175,7 @@ class _Program:
 
 
 def _connected(config: Config, path: Path) -> Transport:
-    """Return the open local transport.
-
-    Without a manager, who is at a shell learns what is missing. Raises PebbleError.
-    """
+    """Return the open local transport. Raises PebbleError with what is missing, for a script started at a shell."""
     transport = local_transport(config, f"script-{os.getpid()}")
     transport.open(_CONNECT_S)
     if transport.state is not State.CONNECTED and RUN not in os.environ:
@@ -191,7 +188,7 @@ def _connected(config: Config, path: Path) -> Transport:
 
 
 def _numbered(config: Config) -> Callable[[int], int]:
-    """Gives the run's number: that of the manager, else a new one above the given one. Raises ConfigError."""
+    """Return what gives the run's number: the manager's, else a new one above the given. Raises ConfigError."""
     text = os.environ.get(RUN)
     if text is None:
         return lambda above: next_run(config, above)

@@ -69,7 +69,7 @@ class _Latest:
         self._arrived: dict[Channel, _Arrived | None] = {}
 
     def of(self, channel: Channel, max_age: float) -> Any:
-        """Return the first call subscribes."""
+        """Return the newest payload that is not older than ``max_age`` seconds; the first call subscribes."""
         if channel not in self._arrived:
             self._arrived[channel] = None
             self._subscribe(channel, lambda value, **_: self._receive(channel, value))
@@ -174,7 +174,7 @@ class Robot:
 
     @property
     def why_refused(self) -> str:
-        """Why :meth:`drive` would have no effect now, in words; empty: it would, as far as is known."""
+        """The reason why :meth:`drive` would have no effect now; empty: it would have one, as far as is known."""
         return self._wheels.refusal()
 
     def publish(self, channel: Channel, value: Any, **names: str) -> bool:
@@ -190,17 +190,17 @@ class Robot:
         self._last_values[channel] = value
 
     def neighbour(self, name: str) -> Neighbour:
-        """Another robot of the LAN, which ``services.neighbours.listens`` names. Raises PebbleError for others."""
+        """Return another robot of the LAN, named in ``services.neighbours.listens``. Raises PebbleError for others."""
         self._check()
-        found = self._neighbours.get(name)
-        if found is None:
+        neighbour = self._neighbours.get(name)
+        if neighbour is None:
             section = getattr(self.config.services, "neighbours", None)  # with its extension
             if section is None or not section.enabled or name not in section.listens:
                 raise PebbleError(f'robot.neighbour: {name!r} is not in services.neighbours.listens: add "{name}": []')
             latest = _Latest(partial(self._subscribe_to, name), self._clock)
             way = Way(self._transport, self._wheels, latest.of, self._check, self._check_drives, self._clock)
-            found = self._neighbours[name] = Neighbour(name, self.config.identity, way)
-        return found
+            neighbour = self._neighbours[name] = Neighbour(name, self.config.identity, way)
+        return neighbour
 
     def sleep(self, seconds: float) -> None:
         """Wait; the wheels stop after 0.75 s without a command."""
@@ -218,8 +218,8 @@ class Robot:
             self._exit_code = exit_code
         self._stopped.set()
         self._wheels.end(why)
-        for one in list(self._neighbours.values()):
-            one.end()
+        for neighbour in list(self._neighbours.values()):
+            neighbour.end()
         locked = self._publishing.acquire(timeout=_STUCK_S)
         try:
             values, self._last_values = self._last_values, {}
@@ -277,7 +277,7 @@ class Robot:
 
 
 def _axis(name: str, value: Any) -> float:
-    """Raises ValueError or TypeError that names the axis."""
+    """Return a number as a float. Raises ValueError or TypeError that names the axis."""
     try:
         return float(value)
     except (TypeError, ValueError) as error:

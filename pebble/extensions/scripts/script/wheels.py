@@ -1,4 +1,4 @@
-"""Publishes a script's drive commands on the robot's local transport, and knows whether they have an effect."""
+"""A script's drive commands on the robot's local transport, and whether they have an effect."""
 
 import logging
 import threading
@@ -53,7 +53,7 @@ class Wheels:
         return self._sender.run
 
     def drive(self, wanted: Drive) -> bool:
-        """Publish; False: it has no effect, as far as is known."""
+        """Publish a drive command. False: it has no effect, as far as is known."""
         with self._lock:
             now = self._clock()
             self._sender.owners(self.estop.states, now)
@@ -66,7 +66,7 @@ class Wheels:
         return obeyed
 
     def drive_another(self) -> str:
-        """To be called before each command for another robot: why there is none now; empty: it may be sent."""
+        """Return why no command for another robot may be sent now; empty: it may. To be called before each."""
         with self._lock:
             now = self._clock()
             self._sender.owners(self.estop.states, now)

@@ -16,11 +16,11 @@ import pytest
 from pebble.contract import MEDIA_REPORT
 from pebble.contract.payloads import MediaReport
 from pebble.extensions.media.frames import FrameReader
-from pebble.extensions.media.scene import read_counter
 from pebble.transports import QoS
 from tests.ext.av.av_daemon.av_rig import is_speech
 from tests.fakes.installed import Installed
 from tests.kit.robot import ProgramRobot
+from tests.kit.scene import read_counter
 from tests.support import Broker, until
 
 SYNTHETIC = {"video": {"backend": "synthetic", "fps": 30}, "audio": {"source": "synthetic"}}

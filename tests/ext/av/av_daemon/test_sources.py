@@ -16,7 +16,7 @@ import pytest
 from pebble.errors import DeviceError
 from pebble.extensions.media.frames import FrameInfo
 from pebble.extensions.media.frames.frame import picture
-from pebble.extensions.media.scene import Scene, read_counter
+from pebble.extensions.media.scene import Scene
 from pebble.extensions.media.speech import Speech
 from pebble.services.av_daemon import alsa, capture_program, sources
 from pebble.services.av_daemon.alsa import AlsaMicrophone
@@ -29,6 +29,7 @@ from pebble.services.av_daemon.synthetic import Pacer, SyntheticCamera, Syntheti
 from pebble.services.av_daemon.v4l2 import V4l2Camera
 from tests.ext.av.av_daemon.av_rig import grabbed, is_speech, options
 from tests.fakes.installed import Installed
+from tests.kit.scene import read_counter
 from tests.support import until
 
 SMALL = {"width": 320, "height": 240, "fps": 30}

@@ -12,13 +12,13 @@ from pebble.contract.payloads import MediaReport
 from pebble.errors import DeviceError
 from pebble.extensions.media.frames import FrameInfo
 from pebble.extensions.media.frames.frame import picture
-from pebble.extensions.media.scene import read_counter
 from pebble.services.av_daemon import health, sources
 from pebble.services.av_daemon.health import NOTHING, Asked, Health
 from pebble.services.av_daemon.service import Reports
 from pebble.services.av_daemon.source import Capture, Source
 from pebble.services.av_daemon.stream import Stream
 from tests.ext.av.av_daemon.av_rig import Remembering, options
+from tests.kit.scene import read_counter
 from tests.support import until
 
 SMALL = {"width": 320, "height": 240, "fps": 30}

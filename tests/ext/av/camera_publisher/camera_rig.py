@@ -11,9 +11,10 @@ import numpy as np
 
 from pebble.extensions.media.decode import VideoDecoder
 from pebble.extensions.media.frames import FrameInfo
-from pebble.extensions.media.scene import Scene, read_counter
+from pebble.extensions.media.scene import Scene
 from pebble.transports import Message
 from tests.ext.av.media_rig import Device, MediaProgram, Operator
+from tests.kit.scene import read_counter
 
 
 class Camera(Device):

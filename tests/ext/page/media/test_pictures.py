@@ -11,7 +11,6 @@ import pytest
 
 from pebble.extensions.media.decode import VideoDecoder
 from pebble.extensions.media.picture_header import read_header
-from pebble.extensions.media.scene import read_counter
 from pebble.extensions.operator.client.media_request.queue import NO_FRAME
 from pebble.extensions.page.media import rescue
 from pebble.transports import QoS
@@ -25,6 +24,7 @@ from tests.ext.page.media.robots import (
     serving,
     until,
 )
+from tests.kit.scene import read_counter
 
 pytestmark = pytest.mark.anyio
 PLAIN = EVERYTHING - {"h264"}

@@ -20,9 +20,10 @@ from playwright.sync_api import Browser, Route
 from pebble.extensions.media.decode import VideoDecoder
 from pebble.extensions.media.packets import Picture, PictureKind
 from pebble.extensions.media.picture_header import read_header
-from pebble.extensions.media.scene import Scene, noise, read_counter
+from pebble.extensions.media.scene import Scene, noise
 from pebble.extensions.media.video import make_encoder
 from tests.ext.page.browser import tab
+from tests.kit.scene import read_counter
 from tests.support import ROOT, cases
 
 STATIC = ROOT / "pebble/extensions/page/static"

@@ -15,12 +15,13 @@ import pytest
 from pebble.extensions.media.h264 import seal
 from pebble.extensions.media.packets import Picture
 from pebble.extensions.media.pcm import to_bytes
-from pebble.extensions.media.scene import Scene, read_counter
+from pebble.extensions.media.scene import Scene
 from pebble.extensions.media.sound import make_sound_encoder
 from pebble.extensions.media.video import make_encoder
 from pebble.extensions.recordings.exports.film import write_film, write_wav
 from pebble.extensions.recordings.exports.film_sound import RATE
 from pebble.extensions.recordings.files.recorded import Channel, Recorded, RecordingError
+from tests.kit.scene import read_counter
 from tests.support import further
 
 ROBOT = "pebble/robots/goob"

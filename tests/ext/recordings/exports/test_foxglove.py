@@ -31,11 +31,11 @@ from pebble.contract.payloads import (
 from pebble.errors import PebbleError
 from pebble.extensions.media.h264 import unseal
 from pebble.extensions.media.pcm import to_bytes
-from pebble.extensions.media.scene import read_counter
 from pebble.extensions.media.sound import make_sound_encoder
 from pebble.extensions.recordings.exports.foxglove import write_foxglove
 from pebble.extensions.recordings.files.recorded import Channel, Recorded
 from tests.ext.recordings.exports.test_film import DELAY_MS, ROBOT, T0_MS, pictures
+from tests.kit.scene import read_counter
 
 T0_NS = T0_MS * 10**6
 DELAY_NS = DELAY_MS * 10**6

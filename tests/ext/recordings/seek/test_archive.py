@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from pebble.extensions.media.decode import VideoDecoder
-from pebble.extensions.media.scene import read_counter
 from pebble.extensions.recordings.files.recorded import Recorded
 from pebble.extensions.recordings.library import files, merged
 from pebble.extensions.recordings.recorder.folder import Folder, finished_path
@@ -18,6 +17,7 @@ from pebble.extensions.recordings.seek.archive import Archive
 from pebble.extensions.recordings.seek.days import Days
 from tests.ext.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, write
 from tests.ext.recordings.seek.filming import CAMERA, FPS, SCENES, film
+from tests.kit.scene import read_counter
 
 SECONDS = 30
 ENCODINGS = ("json", "pbvd", "h264")

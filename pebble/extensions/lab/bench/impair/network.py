@@ -79,7 +79,7 @@ class NamespaceNetwork(Worker):
         self._remote.run("nft", "-f", "-", stdin=f"flush chain ip impair arriving\n{add}")
 
     def close(self) -> None:
-        """May be called repeatedly."""
+        """Remove the namespaces. May be called repeatedly."""
         end_all([self])
 
 
@@ -105,7 +105,7 @@ class _Side:
         self.run("nft", "-f", "-", stdin=_TABLE)
 
     def batch(self, program: str, *lines: str) -> None:
-        """Runs lines of ``ip`` or ``tc``."""
+        """Run lines of ``ip`` or ``tc``."""
         self.run(program, "-batch", "-", stdin="".join(f"{line}\n" for line in lines))
 
     def run(self, program: str, *arguments: str, stdin: str = "") -> None:
@@ -140,7 +140,7 @@ def why_no_namespaces() -> str | None:
 
 
 def require_namespaces() -> None:
-    """Raises PebbleError if there are none."""
+    """Raise PebbleError if there are none."""
     if why := why_no_namespaces():
         raise PebbleError(f"no network namespaces: {why}")
 

@@ -25,13 +25,13 @@ from pebble.extensions.lab.bench.bridge_operator import wheels
 from pebble.extensions.lab.bench.clients import all_ready, drive_of
 from pebble.extensions.lab.bench.impair.metrics import Arrival, Command, Plan, Report, Window, heard, seen
 from pebble.extensions.lab.bench.usage import wall_clock_ahead_ns
+from pebble.extensions.lab.rig.scripted_operator import ScriptedOperator, paced
 from pebble.extensions.lab.rig.worker_end import answer, serve_on_thread
 from pebble.extensions.media.decode import Decoded
 from pebble.extensions.media.sound import ReceivedSound
 from pebble.extensions.operator.client.media_receiver import MediaReceiver
 from pebble.extensions.operator.client.media_request.offer import Medium
 from pebble.extensions.operator.client.robot_view import RobotView
-from pebble.extensions.operator.client.scripted_operator import ScriptedOperator, paced
 from pebble.transports import Message, MqttSettings, State, Transport, create
 
 _RATE_HZ = 10.0  # of drive commands
@@ -74,7 +74,7 @@ class TrialOperator:
         self._over_at = time.monotonic()
 
     def open(self) -> Report:
-        """Connects and waits until the robot is ready. Raises PebbleError without a broker or a robot."""
+        """Connect and wait until the robot is ready. Raises PebbleError without a broker or a robot."""
         for connection in (self._controls, self._media):
             connection.open(_CONNECT_S)
             if connection.state is not State.CONNECTED:
@@ -86,7 +86,7 @@ class TrialOperator:
         return Report()
 
     def recover(self) -> Report:
-        """Waits until the network delivers no old messages. Raises PebbleError if the robot does not recover."""
+        """Wait until the network delivers no old messages. Raises PebbleError if the robot does not recover."""
         _pause(self._over_at + self._plan.quiet_s - time.monotonic())
         if not _wait(self._is_fresh, _STARTUP_S):
             raise PebbleError(f"no fresh heartbeat {_STARTUP_S:.0f} s after the network was restored")
@@ -114,7 +114,7 @@ class TrialOperator:
     # -- phases
 
     def _watch(self, medium: Medium, encoding: str | None) -> closing[MediaSubscriber]:
-        """Requests a medium, and waits for its first message."""
+        """Request a medium, and wait for its first message."""
         subscriber = MediaSubscriber(self._media, self._base)
         subscriber.wait_for_capabilities(_KNOWN_S)
         subscriber.request(medium, encoding)
@@ -159,7 +159,7 @@ class TrialOperator:
 
 
 def _wait(condition: Callable[[], bool], seconds: float, meanwhile: Callable[[], None] = lambda: None) -> bool:
-    """Waits for ``condition``, at most so long; whether it was met. Calls ``meanwhile`` now and then."""
+    """Wait for ``condition``, at most so long; return whether it was met. Calls ``meanwhile`` now and then."""
     end = time.monotonic() + seconds
     while not (met := condition()) and (left := end - time.monotonic()) > 0:
         time.sleep(min(left, _POLL_S))
@@ -175,7 +175,7 @@ def _pause(seconds: float, meanwhile: Callable[[], None] = lambda: None) -> Wind
 
 
 def monotonic_ns(epoch_ms: int) -> int:
-    """Converts a wall-clock time of the robot, which runs on this machine, to the monotonic clock."""
+    """Convert a wall-clock time of the robot, which runs on this machine, to the monotonic clock."""
     return epoch_ms * 1_000_000 - wall_clock_ahead_ns()
 
 

@@ -190,7 +190,7 @@ def _trials(settings: Settings, every: Sequence[ImpairedRobot], progress: Progre
     with ThreadPoolExecutor(len(every), thread_name_prefix="subject") as pool:
         try:
             list(pool.map(ImpairedRobot.report, every))
-            for number, condition in enumerate(each for each in CONDITIONS if each.name in settings.trials):
+            for number, condition in enumerate(trial for trial in CONDITIONS if trial.name in settings.trials):
                 for robots_ in in_turn(list(together.values()), number):
                     progress(f"{condition.name}: {', '.join(robot.subject for robot in robots_)}")
                     cells += chain(*pool.map(ImpairedRobot.trial, robots_, [condition] * len(robots_)))

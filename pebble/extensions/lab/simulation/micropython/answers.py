@@ -25,7 +25,9 @@ def name_answer(query: bytes, addresses_of: Callable[[str], str | Sequence[str] 
     if addresses is None:
         return query[:2] + struct.pack("!HHHHH", _ANSWER | NO_SUCH_NAME, 1, 0, 0, 0) + question
     head = struct.pack("!HHHIH", 0xC00C, _A, _IN, _TTL_S, 4)
-    records = [head + socket.inet_aton(one) for one in ([addresses] if isinstance(addresses, str) else addresses)]
+    records = [
+        head + socket.inet_aton(address) for address in ([addresses] if isinstance(addresses, str) else addresses)
+    ]
     return query[:2] + struct.pack("!HHHHH", _ANSWER, 1, len(records), 0, 0) + question + b"".join(records)
 
 

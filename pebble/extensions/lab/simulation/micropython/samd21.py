@@ -62,7 +62,7 @@ class PwmTimers:
         possible = _TIMERS.get(pin, ())
         if not possible:
             raise ValueError(f"not a PWM Pin: {pin}")
-        timer, output = next((one for one in possible if one[0] not in self._started), possible[0])
+        timer, output = next((pair for pair in possible if pair[0] not in self._started), possible[0])
         channel = timer, output % _CHANNELS[timer]
         if channel in self._shown:
             raise SharedPwm(f"{pin} and {self._shown[channel]} are both on channel {channel[1]} of TCC{timer}")

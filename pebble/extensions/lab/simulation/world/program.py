@@ -102,7 +102,7 @@ def _mcus(world: World, motions: Mapping[str, RobotMotion], folder: Path, trace:
 
 
 def _imus(world: World, motions: Mapping[str, RobotMotion], folder: Path) -> Mcus:
-    """They only read the motion, which the thread of the motor MCU advances."""
+    """Return the IMUs: they only read the motion, which the thread of the motor MCU advances."""
     return {
         name: PtyMcu("goob_imu", imu_port_path(folder, name), motion=motions[name])
         for name, place in world.robots.items()

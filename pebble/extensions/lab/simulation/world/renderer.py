@@ -126,7 +126,7 @@ class Renderer:
         return np.asarray(self._middle[0] + self._focal * plan[..., 1] / plan[..., 0])
 
     def _rows(self, surface: Surface, plan: _Floats) -> _Floats:
-        """Top and bottom at both edges."""
+        """Return top and bottom at both edges."""
         heights = self._lens.height_m - np.array((surface.top, surface.bottom))
         return np.asarray(self._middle[1] + self._focal * heights[None] / plan[:, :1])
 
@@ -210,7 +210,7 @@ def _back_to_front(plan: _Floats, layers: Sequence[int], columns: _Floats) -> li
 
 
 def _covers(plan: _Floats, layers: NDArray[np.int_], columns: _Floats) -> NDArray[np.bool_]:
-    """``[i, j]``: surface i hides a part of j. The camera is at 0, 0."""
+    """Return at ``[i, j]`` whether surface i hides a part of j. The camera is at 0, 0."""
     start, along = plan[:, 0], plan[:, 1] - plan[:, 0]
     normal = np.stack((along[:, 1], -along[:, 0]), axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
     normal *= np.where((start * normal).sum(axis=1, keepdims=True) > 0, -1.0, 1.0)  # towards the camera
@@ -248,7 +248,7 @@ def _floor(world: World) -> tuple[Image, _Floats]:
 
 
 def _noise(width: int, height: int, sigma: float) -> Image:
-    """Gaussian noise, what it adds and what it takes away; larger than a picture, each gets another part of it."""
+    """Return Gaussian noise, what it adds and what it takes away; pictures get different parts of it."""
     shape = (height + _NOISES, width + _NOISES, 3)
     grain = np.round(np.random.default_rng(2).standard_normal(shape, np.float32) * np.float32(sigma))
     return np.stack((grain.clip(0, 255), (-grain).clip(0, 255))).astype(np.uint8)

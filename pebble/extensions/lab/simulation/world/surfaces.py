@@ -93,8 +93,8 @@ def _left_side(wall: Wall, index: int) -> Surface:
 
 
 def _both_sides(wall: Wall, index: int) -> tuple[Surface, Surface]:
-    one = _left_side(wall, index)
-    return one, one._replace(left=one.right, right=one.left)
+    left_side = _left_side(wall, index)
+    return left_side, left_side._replace(left=left_side.right, right=left_side.left)
 
 
 def _modules(world: World) -> int:

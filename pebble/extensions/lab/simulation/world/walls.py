@@ -60,10 +60,10 @@ class Floor:
 
     def _clearance_mm(self, name: str, x_mm: float, y_mm: float) -> float:
         """Return the way from the robot's body to the nearest obstacle; negative: they overlap."""
-        own = self._radius_mm[name]
-        walls = (wall.distance(x_mm / 1000, y_mm / 1000) * 1000 - own for wall in self._walls)
+        radius_mm = self._radius_mm[name]
+        walls = (wall.distance(x_mm / 1000, y_mm / 1000) * 1000 - radius_mm for wall in self._walls)
         others = (
-            math.hypot(x_mm - pose.x_mm, y_mm - pose.y_mm) - own - self._radius_mm[other]
+            math.hypot(x_mm - pose.x_mm, y_mm - pose.y_mm) - radius_mm - self._radius_mm[other]
             for other, pose in self._poses.items()
             if other != name
         )

@@ -1,4 +1,4 @@
-"""What of a robot's pictures and sound may be requested, by its capabilities. Pure."""
+"""The pictures and sound that may be requested of a robot, by its capabilities. Pure."""
 
 from collections.abc import Collection, Sequence
 from typing import Any, Final, Literal, NamedTuple
@@ -19,7 +19,7 @@ BEST_FIRST: Final[dict[Medium, tuple[str, ...]]] = {"video": ("h264", "pbvd", "j
 
 
 class Words(NamedTuple):
-    """How people are told of a medium."""
+    """The words for a medium."""
 
     lacking: str
     fixed: str
@@ -60,5 +60,5 @@ def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
 
 def best(medium: Medium, encodings: Collection[str], viewers: Sequence[frozenset[str]]) -> str | None:
     """Return the best of what most viewers can show or play; None: whatever the robot sends, as it lists none."""
-    known = [encoding for encoding in BEST_FIRST[medium] if encoding in encodings]
-    return max(known, key=lambda encoding: sum(encoding in can for can in viewers), default=None)
+    readable = [encoding for encoding in BEST_FIRST[medium] if encoding in encodings]
+    return max(readable, key=lambda encoding: sum(encoding in can for can in viewers), default=None)

@@ -1,4 +1,4 @@
-"""What one page receives next of a robot's pictures, and who gets the rescue stream. Pure: times are passed in.
+"""The queue of a robot's pictures for one page, and the choice of its rescue stream. Pure: times are passed in.
 
 A page acknowledges each frame when it has drawn it, and few frames are under way at a time: without that, a slow
 connection shows what happened seconds ago. A difference is of no use without all before it since the last key frame,
@@ -102,7 +102,7 @@ class ViewerQueue:
             self._late_at = now
 
     def forget_lateness(self, now: float) -> None:
-        """Frames that are under way say nothing of those that follow."""
+        """Forget that frames were late: those under way say nothing of those that follow."""
         self.late_acks, self._late_at = 0, now
 
     def wait_for_keyframe(self) -> None:

@@ -14,12 +14,12 @@ _KEY = re.compile(
     re.DOTALL,
 )
 _ARROWS = {b"A": UP, b"B": DOWN, b"C": RIGHT, b"D": LEFT}
-_NAMED = {b"\x1b": ESCAPE, b" ": SPACE, b"\x04": END}  # Ctrl-D
+_NAMED = {b"\x1b": ESCAPE, b" ": SPACE, b"\x04": END, b"\x1a": END}  # Ctrl-D, Ctrl-Z
 _NAMED |= {begin + end: arrow for begin in (b"\x1b[", b"\x1bO") for end, arrow in _ARROWS.items()}
 
 
 class KeyDecoder:
-    """Feed it what was read; arrow keys, function keys and the Escape key all begin with the same byte."""
+    """A decoder of what was read: arrow keys, function keys and the Escape key all begin with the same byte."""
 
     def __init__(self) -> None:
         self._waiting = b""  # the beginning of a sequence
@@ -27,7 +27,7 @@ class KeyDecoder:
 
     @property
     def due(self) -> float | None:
-        """When to call :meth:`feed` although nothing was read; None: not before something is."""
+        """The time to call :meth:`feed` although nothing was read; None: not before something is."""
         return self._since + ALONE_S if self._waiting else None
 
     def feed(self, data: bytes, now: float) -> list[str]:

@@ -5,7 +5,6 @@ import select
 import shutil
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -28,38 +27,35 @@ class Terminal:
         import termios
 
         self.ended = ""  # why it is over: a signal, Ctrl-D, or a terminal that is gone
-        self._suspended = self._continued = False  # by Ctrl-Z, and after it
         self._termios, self._fd = termios, sys.stdin.fileno()
         self._before: list[Any] = termios.tcgetattr(self._fd)
         self._decoder = KeyDecoder()
         self._line, self._shown_at = "", float("-inf")
 
     def start(self) -> None:
-        """Turn off echo and lines; Ctrl-C and Ctrl-Z stay signals, and Ctrl-S holds nothing back."""
+        """Turn off echo and lines; Ctrl-C stays a signal, Ctrl-Z is a key, and Ctrl-S holds nothing back."""
         import tty
 
         tty.setcbreak(self._fd, self._termios.TCSAFLUSH)
         mode = self._termios.tcgetattr(self._fd)
         mode[0] &= ~self._termios.IXON
+        mode[6][self._termios.VSUSP] = b"\0"
         self._termios.tcsetattr(self._fd, self._termios.TCSANOW, mode)
         _write(_HIDE_CURSOR)
 
     def restore(self) -> None:
-        """Restores the terminal; keys that were not read are forgotten, so that no shell gets them."""
+        """Restore the terminal; keys that were not read are forgotten, so that no shell gets them."""
         _write("\r\n" + _SHOW_CURSOR)
         with suppress(self._termios.error, OSError):
             self._termios.tcsetattr(self._fd, self._termios.TCSAFLUSH, self._before)
 
     def keys(self, seconds: float) -> list[str]:
         """Wait up to ``seconds`` for keys."""
-        if self._continued:  # a shell may have changed the mode of the terminal meanwhile
-            self._continued = False
-            self.start()
         data, is_gone, due = b"", False, self._decoder.due
         wait_s = seconds if due is None else min(seconds, due - time.monotonic())
         try:
             is_ready = bool(select.select([self._fd], [], [], max(0.0, wait_s))[0])
-            if is_ready and not (self.ended or self._suspended):
+            if is_ready and not self.ended:
                 data = os.read(self._fd, _READ)
                 is_gone = not data
         except OSError:  # EIO: its other end was closed, or this process is in the background for good
@@ -79,26 +75,9 @@ class Terminal:
                 self._line = line
                 _write(f"\r{line[: max(10, shutil.get_terminal_size().columns) - 1]}{_ERASE_REST}")
 
-    def suspend(self, prepare: Callable[[], object]) -> None:
-        """Stand still after Ctrl-Z, once that is prepared, until this process goes on. Main thread only."""
-        if not self._suspended:
-            return
-        prepare()
-        self.restore()
-        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
-        signal.pthread_kill(threading.get_ident(), signal.SIGTSTP)  # to this thread: it acts before the next line
-        signal.signal(signal.SIGTSTP, self.on_signal)
-        self._suspended, self._continued = False, True
-        self._line = ""  # a shell has written over it
-
     def on_signal(self, number: int, _frame: FrameType | None) -> None:
-        """Note a signal."""
-        if number == signal.SIGTSTP:
-            self._suspended = True
-        elif number == signal.SIGCONT:
-            self._continued = True
-        else:
-            self.ended = self.ended or signal.Signals(number).name
+        """Note a signal that ends it."""
+        self.ended = self.ended or signal.Signals(number).name
 
 
 def _write(text: str) -> None:
@@ -119,7 +98,7 @@ def has_terminal() -> bool:
 def opened() -> Iterator[Terminal]:
     """Give the terminal of this process, restored at the end."""
     terminal = Terminal()
-    with handled_by(terminal.on_signal, signal.SIGQUIT, signal.SIGTSTP, signal.SIGCONT):
+    with handled_by(terminal.on_signal, signal.SIGQUIT):
         try:
             terminal.start()
             yield terminal

@@ -30,7 +30,7 @@ def main(robot: Robot, options: OdometrySettings) -> None:
     log = RateLimitedLog(robot.log)
 
     def take(method: Callable[..., None]) -> Callable[..., None]:
-        """Commands and samples wait in one queue: a sample gets its direction from the commands before it."""
+        """Return a handler that queues: a sample gets its direction from the commands that came before it."""
 
         def receive(value: Any, **_: str) -> None:
             try:
@@ -66,13 +66,13 @@ def main(robot: Robot, options: OdometrySettings) -> None:
 
 
 def tuned(robot: Robot, options: OdometrySettings) -> OdometrySettings:
-    """With use_tune_state, the track width of the original's tuning program wins over the geometry."""
+    """Return the settings; with use_tune_state the track width of the original's tuning program wins."""
     width = tune_state(robot).get("track_width_mm") if options.use_tune_state else None
     return replace(options, track_width_mm=options.track_width_mm if width is None else width)
 
 
 def tune_state(robot: Robot) -> dict[str, float]:
-    """Return its numbers but for the lengths of a step: its counter counts steps twice, and no factor repairs that."""
+    """Return the tuning program's numbers but for the lengths of a step: it counts steps twice, beyond repair."""
     try:
         values = convert(
             json.loads((robot.config.folder / TUNE_STATE).read_text(encoding="utf-8"))["current_values"], dict[str, Any]

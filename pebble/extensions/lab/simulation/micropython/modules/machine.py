@@ -119,9 +119,9 @@ class Machine(SimpleNamespace):
     def __getattr__(self, name: str) -> type:
         if name not in _KINDS:
             raise AttributeError(f"module 'machine' has no attribute '{name}'")
-        own = type(name, (_KINDS[name],), {"_board": self._board})
-        setattr(self, name, own)
-        return own
+        kind = type(name, (_KINDS[name],), {"_board": self._board})
+        setattr(self, name, kind)
+        return kind
 
 
 def _reset() -> None:

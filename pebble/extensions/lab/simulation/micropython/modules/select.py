@@ -32,7 +32,7 @@ class Poll:
         return list(self.ipoll(timeout))
 
     def ipoll(self, timeout: int = -1) -> Iterable[tuple[Pollable, int]]:
-        """``poll`` that allocates no list on a real board."""
+        """Poll; on a real board this allocates no list."""
         if timeout != 0:
             raise WouldHang("the firmware polls with a timeout, meanwhile its motors have no deadline")
         for thing, mask in self._watched.values():

@@ -47,7 +47,7 @@ def micropython_module(board: Board) -> SimpleNamespace:
 
 
 def random_module(board: Board) -> SimpleNamespace:
-    """CPython's generator, one per board, so that runs are repeatable."""
+    """Return CPython's generator, one per board, so that runs are repeatable."""
     return SimpleNamespace(getrandbits=board.random.getrandbits)
 
 

@@ -45,7 +45,7 @@ class BoardTime:
 
 
 def gmtime(seconds: int) -> tuple[int, ...]:
-    """Year, month, day, hour, minute, second, weekday, day of the year; counted from 2000 as the ESP32 does."""
+    """Return year, month, day, hour, minute, second, weekday, day of the year; counted from 2000 as the ESP32 does."""
     return tuple(time.gmtime(seconds + _YEAR_2000_S))[:8]
 
 
@@ -56,5 +56,5 @@ def ticks_add(ticks: int, delta: int) -> int:
 
 
 def ticks_diff(end: int, start: int) -> int:
-    """Ticks from ``start`` to ``end``, -2**29..2**29-1."""
+    """Return the ticks from ``start`` to ``end``, -2**29..2**29-1."""
     return ((end - start + _HALF) & _MASK) - _HALF

@@ -90,7 +90,7 @@ class Wlan:
         return ADDRESS if self._radio.connected else ("0.0.0.0", "0.0.0.0", "0.0.0.0", "0.0.0.0")  # noqa: S104
 
     def config(self, **values: Any) -> None:
-        """Ignored: power saving has no visible effect."""
+        """Ignore it: power saving has no visible effect."""
 
 
 def network_module(radio: Radio) -> SimpleNamespace:

@@ -12,8 +12,8 @@ import pytest
 
 from pebble.contract import channel_of
 from pebble.contract.payloads import Drive
+from pebble.extensions.lab.rig.scripted_operator import RATE_HZ, VALID_MS, ScriptedOperator, paced
 from pebble.extensions.operator.client.robot_view import RobotView
-from pebble.extensions.operator.client.scripted_operator import RATE_HZ, VALID_MS, ScriptedOperator, paced
 from pebble.transports import Message, QoS
 from tests.ext.operator.client.control_robot import KeepingRobot
 from tests.ext.operator.client.estop_robot import Robot, capabilities

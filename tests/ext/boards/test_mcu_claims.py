@@ -1,10 +1,6 @@
-"""Two devices with one uid, and their claims of channels: without a serial line and without a clock."""
+"""Claims of channels by self-describing devices, and peers: without a serial line and without a clock."""
 
 from __future__ import annotations
-
-import itertools
-from dataclasses import dataclass, field
-from typing import Any
 
 import msgspec
 import pytest
@@ -14,114 +10,16 @@ from hypothesis import strategies as st
 from pebble.config import SerialBridge
 from pebble.contract import DRIVE, MCU_DESCRIBE, codec
 from pebble.contract.payloads import McuManifest
+from pebble.extension import ours
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.serial_mcu_bridge.devices.aliases import claims
 from pebble.services.serial_mcu_bridge.devices.peers import CONFIRM_S, PeerDevices
 from pebble.services.serial_mcu_bridge.imu import ImuWatchdog
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
-from pebble.services.serial_mcu_bridge.pebble_serial_v1.uid_claim import AGAIN_S, ASK_S, Move, UidClaim
 from pebble.transports import Message
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.boards.mcu_wire import IMU, STATION, F, I, M
 from tests.support import cases
-
-# -- uids
-
-
-#: What a claim with this token is told and asked, one after the other, and what it does.
-CLAIMS: dict[str, tuple[str, list[tuple[Move, str, Any]]]] = {
-    "a uid without an objection is acquired": ("a", [
-        *((Move.ASK, "request", ("u", 0.0)), (Move.NOTHING, "tick", (ASK_S - 0.01,)), (Move.HOLD, "tick", (ASK_S,))),
-        *((Move.ANSWER, "on_question", ("u", "b", 1.0)), (Move.NOTHING, "on_question", ("other", "b", 1.0))),
-        (Move.NOTHING, "on_question", ("u", "a", 1.0)),  # its own question, echoed
-        (Move.INSIST, "on_manifest", ("u", 1.0)),  # its own manifest, echoed, or that of another holder
-    ]),
-    "a requester that is answered waits and asks again": ("z", [
-        *((Move.ASK, "request", ("u", 0.0)), (Move.NOTHING, "on_manifest", ("other", 0.1))),
-        *((Move.YIELD, "on_manifest", ("u", 0.1)), (Move.NOTHING, "on_question", ("u", "b", 1.0))),
-        *((Move.NOTHING, "tick", (0.09 + AGAIN_S,)), (Move.ASK, "tick", (0.1 + AGAIN_S,))),
-        *((Move.YIELD, "on_manifest", ("u", 6.0)), (Move.ASK, "on_withdrawal", ("u", 7.0))),
-        (Move.HOLD, "tick", (7.0 + ASK_S,)),
-    ]),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("token", "history"), CLAIMS.values(), ids=CLAIMS)
-def test_how_a_uid_is_claimed(token: str, history: list[tuple[Move, str, Any]]) -> None:
-    claim = UidClaim(token)
-    for move, event, arguments in history:
-        assert getattr(claim, event)(*arguments) is move, (event, arguments)
-
-
-def holder(token: str) -> UidClaim:
-    claim = UidClaim(token)
-    claim.request("u", 0.0)
-    assert claim.tick(ASK_S) is Move.HOLD
-    assert claim.due is None
-    return claim
-
-
-def test_of_two_holders_the_one_with_the_smaller_token_yields_and_a_requester_always() -> None:
-    weak, strong, requester = holder("a"), holder("b"), UidClaim("z")
-    assert strong.on_question("u", "a", 1.0, has=True) is Move.INSIST
-    assert weak.on_question("u", "b", 1.0, has=True) is Move.YIELD
-    assert weak.due == 1.0 + AGAIN_S
-    requester.request("u", 0.0)
-    assert requester.on_question("u", "a", 0.1, has=True) is Move.YIELD
-
-
-def test_a_released_uid_is_not_answered_for() -> None:
-    claim = holder("a")
-    claim.release()
-    assert (claim.tick(10.0), claim.on_question("u", "b", 10.0)) == (Move.NOTHING, Move.NOTHING)
-
-
-@dataclass
-class LocalNetwork:
-    """Claims that receive each other's messages, and their own, after ``delay`` s."""
-
-    delay: float
-    claims: dict[str, UidClaim] = field(default_factory=dict)
-    on_its_way: list[tuple[float, str, str]] = field(default_factory=list)
-    holders: set[str] = field(default_factory=set)
-
-    def act(self, token: str, move: Move, now: float) -> None:
-        if move in (Move.ASK, Move.ANSWER):
-            self.on_its_way.append((now + self.delay, move.name, token))
-        elif move is Move.HOLD:
-            self.holders.add(token)
-            self.on_its_way.append((now + self.delay, "ANSWER", token))
-
-    def run(self, begin: dict[str, float], until: float) -> None:
-        for step in range(int(until * 1000)):
-            now = step / 1000
-            due = [one for one in self.on_its_way if one[0] <= now]
-            self.on_its_way = [one for one in self.on_its_way if one[0] > now]
-            for token, at in begin.items():
-                if step == round(at * 1000):
-                    self.claims[token] = UidClaim(token)
-                    self.act(token, self.claims[token].request("u", now), now)
-            for _, what, sender in due:
-                for token, claim in self.claims.items():
-                    answer = claim.on_question("u", sender, now) if what == "ASK" else claim.on_manifest("u", now)
-                    self.act(token, answer, now)
-            for token, claim in self.claims.items():
-                self.act(token, claim.tick(now), now)
-
-
-@pytest.mark.parametrize("tokens", ["ab", "ba"])
-def test_of_two_exactly_one_has_it(tokens: str) -> None:
-    for delay, later in itertools.product((0.001, 0.02, 0.09), (0.0, 0.001, 0.05, 0.15, 0.3, 3.0)):
-        network = LocalNetwork(delay)
-        network.run({tokens[0]: 0.0, tokens[1]: later}, 12.0)
-        assert len(network.holders) == 1, (delay, later)
-
-
-def test_of_five_at_once_exactly_one_has_it() -> None:
-    network = LocalNetwork(0.01)
-    network.run(dict.fromkeys("cadbe", 0.0), 12.0)
-    assert network.holders == {"e"}
-
 
 # -- claims
 
@@ -275,6 +173,7 @@ def test_the_number_of_peer_devices_is_bounded() -> None:
     ],
 )
 def test_which_lines_have_a_timeout(section: dict[str, object], instance: str, expected: float) -> None:
+    ours()  # which protocols there are
     watchdog = ImuWatchdog(SerialBridge(**section), instance)  # type: ignore[arg-type]
     assert watchdog.timeout_s == expected
     watchdog.begin(100.0)

@@ -1,8 +1,10 @@
-"""Generates messages.d.ts from messages.py, and the table of the words for people.
+"""Writes messages.d.ts, the types of what pages and server send each other, and the table of the words for people.
 
-Program: ``python -m pebble.extensions.page.messages_docs`` writes messages.d.ts; a test checks that it is current.
-With a folder it writes the table there.
+Program: ``python tools/messages_docs.py`` writes messages.d.ts; a test checks that it is current. With a folder it
+writes the table there.
 """
+
+from __future__ import annotations
 
 import json
 import sys
@@ -16,7 +18,7 @@ from pebble.contract.capabilities import RobotIdentity
 from pebble.extensions.operator.client import drive_reasons
 from pebble.extensions.page import messages
 
-DECLARATIONS = Path(__file__).parent / "static" / "messages.d.ts"
+DECLARATIONS = Path(messages.__file__).parent / "static" / "messages.d.ts"
 
 
 def words() -> str:
@@ -26,10 +28,8 @@ def words() -> str:
 
 
 def declarations() -> str:
-    """messages.d.ts: one interface for each struct, and for what a robot reports of itself."""
-    parts = [
-        "// Generated from pebble/extensions/page/messages.py by python -m pebble.extensions.page.messages_docs.\n"
-    ]
+    """Return messages.d.ts: one interface for each struct, and for what a robot reports of itself."""
+    parts = ["// Generated from pebble/extensions/page/messages.py by python tools/messages_docs.py.\n"]
     for struct in (
         *get_args(messages.FromPage),
         *get_args(messages.ToPage),
@@ -42,12 +42,12 @@ def declarations() -> str:
     ):
         info: Any = types.type_info(struct)
         tag = [f'  op: "{info.tag}";'] if info.tag is not None else []
-        fields = [f"  {one.name}{'' if one.required else '?'}: {_script(one.type)};" for one in info.fields]
+        fields = [f"  {member.name}{'' if member.required else '?'}: {_script(member.type)};" for member in info.fields]
         parts.append("\n".join([f"export interface {struct.__name__} {{", *tag, *fields, "}\n"]))
     metrics = [f'  "{name}": {view.__name__};' for name, view in messages.SERVER_METRICS.items()]
     parts.append("\n".join(["export interface Metrics {", *metrics, "}\n"]))
     for name in ("FromPage", "ToPage"):
-        members = " | ".join(one.__name__ for one in get_args(getattr(messages, name)))
+        members = " | ".join(struct.__name__ for struct in get_args(getattr(messages, name)))
         parts.append(f"export type {name} = {members};\n")
     return "\n".join(parts)
 
