@@ -44,6 +44,7 @@ _SECTION_KEY = re.compile(r"(services\.)?[A-Za-z]\w*", re.ASCII)
 OURS: Final[Mapping[str, tuple[str, ...]]] = {
     "pebble.extensions.media": (),
     "pebble.extensions.paho": (),
+    "pebble.extensions.thin": (),
     "pebble.extensions.operator": (),
     "pebble.extensions.scripts": (),
     "pebble.extensions.recordings": (),
@@ -132,6 +133,7 @@ class Extension(Struct, frozen=True, kw_only=True, eq=False):
     programs: str = ""  # a function of the config: its other Programs
     observer: str = ""  # of config and clock: pebble.forwarding.observer.Observer, which sees what the bridge passes
     step: str = ""  # a function of the config: pebble.forwarding.observer.Step, which may refuse it
+    uplink: str = ""  # pebble.services.mqtt_bridge.uplink.Uplink, where the link may be thin
     offers: str = ""  # a function of config and CapabilitiesValue, which it returns completed
     facts: str = ""  # a function of the config: Facts
     checks: str = ""  # a function of the config, for `pebble doctor`: CheckResults

@@ -16,25 +16,8 @@ from pebble.transports.ages import Patience, SenderClocks
 MOST = 16  # senders of drive commands, and of requests for control, whose clocks are remembered
 STAMP = b'"t"'  # without it a command does not tell its age
 STAMP_LETTER = ord("t")  # most commands have none, which is known six times as fast
-_RUN_S = 1.0  # late commands that are further apart are no run
 _LONGEST = 80  # characters of the keys of several motor owners
 _PATIENCE = Patience(believed_s=60.0, set_back_s=2.0, silent_s=60.0)
-
-
-class LateRun:
-    """Commands of senders that do not follow the link: those that were late, soon one after the other."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._since = self._newest_at = 0.0
-
-    def add(self, now: float) -> None:
-        if not self.count or now - self._newest_at > _RUN_S:
-            self.count, self._since = 0, now
-        self.count, self._newest_at = self.count + 1, now
-
-    def seconds(self, now: float) -> float:
-        return now - self._since if self.count else 0.0
 
 
 class CommandAges:
@@ -46,7 +29,6 @@ class CommandAges:
 
     def __init__(self) -> None:
         self.keys: frozenset[bytes] | None = None
-        self.late = LateRun()
         self._drivers = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
         self._asking = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
 

@@ -28,7 +28,6 @@ from pebble.forwarding.publisher import Publisher
 from pebble.forwarding.retained_topics import RetainedTopics
 from pebble.forwarding.routing import Drop, Forward, Rules, Side, route
 from pebble.forwarding.side import Gate, Sides, SideState
-from pebble.forwarding.sifter import Sifter
 from pebble.forwarding.signatures import unsigned
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.runtime.rate_limit import RateLimitedLog
@@ -42,6 +41,9 @@ _STOP = f"/{ESTOP.metric}".encode()
 _NAMES = (Drop.UNNAMED, Drop.MISNAMED, Drop.UNREADABLE)
 _BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCULATES, Drop.SIGNED, *_NAMES)
 _WARNED = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN)
+
+
+Pass = Callable[[SideState, Subject, Message, Forward], Forward | Drop]
 
 
 class Routed(msgspec.Struct, frozen=True):
@@ -122,7 +124,10 @@ class Forwarder:
         self.retained = RetainedTopics(self.sides, subjects, self.publisher, winner, both_ways, on_value)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self.mirroring = Mirroring(self.sides)
-        self.sifter = Sifter(self.sides, self._pass)
+        #: Publishes a message that is admitted, at once; an extension may put in its place what lets some wait.
+        self.pass_on: Pass = self.pass_now
+        #: Is told of each command whose age matters, and that does not tell its own, whether it was late.
+        self.note_age: Callable[[bool], None] = lambda _late: None
         for transport in transports.values():
             transport.policy.is_stop = self._is_stop
 
@@ -190,7 +195,7 @@ class Forwarder:
             subject = self._subjects[message.topic]
             outcome = self._admit(here, subject, message, message.topic, True)
             if subject is not None and isinstance(outcome, Forward):
-                outcome = self.sifter.forward(here, subject, message, outcome)
+                outcome = self.pass_on(here, subject, message, outcome)
             routed = Routed(subject, outcome)
         if isinstance(routed.outcome, Drop):
             self.counters.add(f"{side.value}: {routed.outcome.value}")
@@ -210,7 +215,7 @@ class Forwarder:
                 case Signed(message, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:
                     outcome = self.retained.change(subject, message)
                 case Signed(message, by):
-                    outcome = self._pass(here, subject, message, outcome, sender.account)
+                    outcome = self.pass_now(here, subject, message, outcome, sender.account)
                 case Drop.UNNAMED if outcome.retain:  # the broker may retain what the robot itself has published
                     outcome = self.retained.receive(here, subject, message, outcome, old=True)
                 case drop:
@@ -285,7 +290,7 @@ class Forwarder:
     #: sent or looked at for cycles, an echo is no cycle, and extensions are asked last.
     _ADMISSION = (_beyond_bound, _echo, _cycle, _refused_by_step)
 
-    def _pass(
+    def pass_now(
         self, here: SideState, subject: Subject, message: Message, forward: Forward, account: str = ""
     ) -> Forward | Drop:
         """Publish it on the other side, or say why not. Hot.
@@ -308,13 +313,10 @@ class Forwarder:
         waited_s = message.waited_s
         if forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload:
             waited_s = self.ages.waited_s(subject, message, account)
-        if waited_s > subject.waits_s and not ends_something(subject, message):
-            if forward.stamped and STAMP not in message.payload:  # else its sender keeps to the pace of the link
-                self.ages.late.add(self._clock())
-            return True
-        if forward.stamped:
-            self.ages.late.count = 0
-        return False
+        late = waited_s > subject.waits_s and not ends_something(subject, message)
+        if forward.stamped and not (late and STAMP in message.payload):  # who tells it keeps to the pace of the link
+            self.note_age(late)
+        return late
 
     def _without_script(self, here: SideState, message: Message) -> Message | None:
         """Return a drive command that is no script's, or what of a script's ends motion; None: nothing of it passes."""

@@ -1,7 +1,4 @@
-"""Which media programs are to run: a flag of the operators allows them, a request starts and stops them. Pure.
-
-On a thin link those that send pictures or sound wait while a person drives: both share what the modem carries.
-"""
+"""Which media programs are to run: a flag of the operators allows them, a request starts and stops them. Pure."""
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -27,8 +24,6 @@ MEDIA: Final = (
     Row(MQTT_VIDEO, VIDEO_CONTROL, ALL_VIDEO, ("camera_publisher", "video_stream")),
     Row(MQTT_AUDIO, AUDIO_CONTROL, ALL_SOUND, ("audio_publisher", "audio_receiver")),
 )
-HELD: Final = ("camera_publisher", "video_stream", "audio_publisher")
-HOLD_S: Final = 5.0  # after the newest command that moves something: each beginning costs 2 KB of states and logs
 _ROWS: Final = {channel.suffix: row for row in MEDIA for channel in (row.flag, row.request)}
 _NO: Final = ProgramRequest(on=False)
 
@@ -78,27 +73,6 @@ class Media:
         for program, request in self.requests().items():
             if self._sent.get(program) != request and self._send_one(program, request):
                 self._sent[program] = request
-
-
-class Hold:
-    """Tells the launcher which of ``programs`` wait; ``send_one`` returns False if it is busy."""
-
-    def __init__(self, programs: Collection[str], send_one: Callable[[str, bool], bool]) -> None:
-        self._sent = dict.fromkeys((name for name in HELD if name in programs), False)
-        self._send_one = send_one
-        self._driven_at = float("-inf")
-
-    def drive(self, now: float) -> None:
-        """Note that a command that moves something has come over a thin link."""
-        self._driven_at = now
-        self.send(now)
-
-    def send(self, now: float) -> None:
-        """Send what has changed with time, and again what the launcher did not accept."""
-        on = now - self._driven_at < HOLD_S
-        for program, sent in self._sent.items():
-            if sent is not on and self._send_one(program, on):
-                self._sent[program] = on
 
 
 def _first(row: Row, running: Mapping[str, ProgramRequest]) -> ProgramRequest:

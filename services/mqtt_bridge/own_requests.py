@@ -1,20 +1,16 @@
 """What messages request of the bridge itself: system actions, pictures and sound."""
 
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from typing import Any
 
 from pebble.contract import DRIVE, REMOTE_MIRROR, Channel, codec
-from pebble.contract.levels import LEVELS
-from pebble.contract.payloads import SCRIPT, Drive
 from pebble.errors import PayloadError
 from pebble.forwarding.forwarder import Mirroring
 from pebble.runtime.parent import Notifier, earlier_requests
 from pebble.runtime.service import Service
 from pebble.services.mqtt_bridge.actions import ACTIONS, system_actions
-from pebble.services.mqtt_bridge.media import MEDIA, Hold, Media
-from pebble.services.mqtt_bridge.uplink import Uplink
+from pebble.services.mqtt_bridge.media import MEDIA, Media
 
 
 class OwnRequests:
@@ -25,20 +21,17 @@ class OwnRequests:
         service: Service,
         mirroring: Mirroring,
         notifier: Notifier,
-        uplink: Uplink | None,
+        note_drive: Callable[[bytes], None],
     ) -> None:
         config, section = service.config, service.config.services.mqtt_bridge
-        self._service, self._post, self._clock = service, service.post_message, service.clock
-        self._mirroring, self._uplink = mirroring, uplink
+        self._service, self._post, self._mirroring = service, service.post_message, mirroring
         self.actions = system_actions(section, config.state_dir(), service.clock)
         self._media = Media(config.on_demand_programs(), earlier_requests(), notifier.request)
-        self._hold = Hold(config.on_demand_programs(), notifier.hold)
         self._messages: dict[str, Callable[[bytes], None]] = {
             **{row.request.suffix: partial(self._on_media_request, row.request) for row in MEDIA},
             **{row.channel.suffix: partial(self._on_action, row.channel) for row in ACTIONS},
+            DRIVE.suffix: note_drive,
         }
-        if section.link.profile != "wide":
-            self._messages[DRIVE.suffix] = self._on_drive
         self._flags: dict[str, Callable[[bytes], None]] = {
             **{row.flag.suffix: partial(self._on_media_flag, row.flag) for row in MEDIA},
             REMOTE_MIRROR.suffix: self._on_remote_mirror,
@@ -57,9 +50,8 @@ class OwnRequests:
             reaction(payload)
 
     def send(self) -> None:
-        """Tell the launcher which media programs are to run, and which wait."""
+        """Tell the launcher which media programs are to run."""
         self._media.send()
-        self._hold.send(self._clock())
 
     def _on_remote_mirror(self, payload: bytes) -> None:
         self._mirroring.switch(on=self._boolean(REMOTE_MIRROR, payload))
@@ -70,14 +62,6 @@ class OwnRequests:
     def _on_media_request(self, channel: Channel, payload: bytes) -> None:
         if (request := self._decoded(channel, payload)) is not None:
             self._post(channel, partial(self._media.request, channel, request), newest_of=channel.metric)
-
-    def _on_drive(self, payload: bytes) -> None:
-        """Let media wait on a thin link while a person drives; who the robot obeys is decided elsewhere."""
-        with suppress(PayloadError):
-            command: Drive = codec.decode(DRIVE, payload)
-            thin = self._uplink is not None and self._uplink.level is LEVELS["thin"]
-            if thin and command.moves and command.source != SCRIPT:
-                self._post(DRIVE, lambda: self._hold.drive(self._clock()), newest_of="hold")
 
     def _on_action(self, channel: Channel, payload: bytes) -> None:
         if self._boolean(channel, payload):

@@ -14,7 +14,6 @@ from pebble.contract import (
     DRIVE,
     ESTOP,
     ESTOP_STATE,
-    LINK,
     ONLINE,
     REMOTE_MIRROR,
     Channel,
@@ -46,7 +45,7 @@ from pebble.services.mqtt_bridge.own_requests import OwnRequests
 from pebble.services.mqtt_bridge.passed_stops import REPEAT_S, PassedStops, named
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.same_broker import SameBrokerProbe, now_ms
-from pebble.services.mqtt_bridge.uplink import POLL_S, Uplink
+from pebble.services.mqtt_bridge.uplink import POLL_S, uplink_of
 from pebble.services.mqtt_bridge.vouching import PERIOD_S, Vouching
 from pebble.transports import Message, QoS, State, Transport
 
@@ -93,12 +92,12 @@ class MqttBridge(ForwardingService):
         decides = min(self.config.motor_owners, default="")
         self._control_topic = CONTROL_STATE.topic(self.config.base, owner=decides) if decides else ""
         self._private = PrivateTopics(self.config.base)
-        self._uplink: Uplink | None = None
-        if section.link.profile != "wide":
-            self._uplink = Uplink(section, self.addresses[LINK], self.remote, self.forwarder, self.clock)
-        self._requests = OwnRequests(self, self.forwarder.mirroring, notifier, self._uplink)
-        own, sparing = ((), False) if self._uplink is None else ((LINK,), True)
-        self._leftovers = Leftovers(self.config.base, self.subjects, self.remote, *own, sparing=sparing)
+        self._is_thin = section.link.profile != "wide"  # or may become so
+        self._uplink = uplink_of(self.config, self.addresses, self.remote, self.forwarder, self.clock)
+        self._requests = OwnRequests(self, self.forwarder.mirroring, notifier, self._uplink.note_drive)
+        self._leftovers = Leftovers(
+            self.config.base, self.subjects, self.remote, *self._uplink.channels, sparing=self._is_thin
+        )
         self._leftover_timer: Timer | None = None
         self._earlier_names = EarlierNames(
             self.config, [self.remote, self.transport], lambda seconds, job: self.call_at(self.clock() + seconds, job)
@@ -145,14 +144,12 @@ class MqttBridge(ForwardingService):
             return None
         from pebble.services.mqtt_bridge.stop_connection import StopConnection  # only who needs it pays for it
 
-        notices_s = self._silence_s + _NOTICED_S
         make = partial(StopConnection, transport, self._stop_filters, self._pass_stop, self._forwards, self.clock)
-        uplink = self._uplink
-        if uplink is None:
-            return make(notices_s=notices_s)
+        if not self._is_thin:
+            return make(notices_s=self._silence_s + _NOTICED_S)
         transport.suit_link(thin=True)
-        notices_s = max(notices_s, LEVELS["thin"].silent_s + _NOTICED_S)
-        return make(notices_s=notices_s, grace_s=_THIN_GRACE_S, wanted=lambda: uplink.is_flooded)
+        notices_s = max(self._silence_s, LEVELS["thin"].silent_s) + _NOTICED_S
+        return make(notices_s=notices_s, grace_s=_THIN_GRACE_S, wanted=lambda: self._uplink.is_flooded)
 
     def start(self) -> None:
         super().start()
@@ -164,7 +161,7 @@ class MqttBridge(ForwardingService):
         if self._heartbeat is not None:
             interval = self.config.services.mqtt_bridge.heartbeat.interval_seconds
             self.timers.add(self.clock(), self._publish_heartbeat, period=interval)
-        if self._uplink is not None:
+        if self._is_thin:
             self.timers.add(self.clock(), self._follow_link, period=POLL_S)
         if self._same_broker.announces:
             self.timers.add(self.clock(), self._same_broker.report_arrival, period=_ARRIVAL_S)
@@ -173,11 +170,11 @@ class MqttBridge(ForwardingService):
     # -- the service's thread
 
     def _publish_heartbeat(self, *, at_once: bool = False) -> None:
-        if self._heartbeat is None or not (at_once or self._uplink is None or self._uplink.heartbeat_due()):
+        if self._heartbeat is None or not (at_once or self._uplink.heartbeat_due()):
             return
         if not at_once and self._subscribes_soon:
             return
-        self._heartbeat.publish(self.remote, now_ms(), None if self._uplink is None else self._uplink.heartbeat_qos)
+        self._heartbeat.publish(self.remote, now_ms(), self._uplink.heartbeat_qos)
 
     @property
     def _subscribes_soon(self) -> bool:
@@ -187,7 +184,7 @@ class MqttBridge(ForwardingService):
 
     def _follow_link(self) -> None:
         """Learn what the link carries, and send what has waited for room."""
-        if self._uplink is not None and self._uplink.poll():
+        if self._uplink.poll():
             self._publish_heartbeat()
 
     def _look_later(self) -> None:
@@ -204,7 +201,7 @@ class MqttBridge(ForwardingService):
             self._look_later()
             return
         asked = self._leftovers.ask_next()
-        pause = ASK_S if self._uplink is None else self._uplink.pause(ASK_S)
+        pause = self._uplink.pause(ASK_S)
         wait, then = (pause, self._look_for_leftovers) if asked else (INITIAL_SYNC_S, self._remove_leftovers)
         self._leftover_timer = self.call_at(self.clock() + wait, then)
 

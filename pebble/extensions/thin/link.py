@@ -8,7 +8,7 @@ from collections import deque
 from msgspec import Struct
 
 from pebble.contract.payloads import LinkLevel
-from pebble.forwarding.sieve import Rank
+from pebble.extensions.thin.sieve import Rank
 from pebble.runtime.rate import InFlight
 from pebble.transports import Answer
 
@@ -27,6 +27,7 @@ _MOST = 256  # messages that are remembered
 _SLACK_BYTES = 64  # of pings and headers
 _CARRIED = 0.75  # of what a link carries; the rest are headers of small packets
 _POLL_S = 0.1  # so late an acknowledgement is noticed
+_RUN_S = 1.0  # late commands that are further apart are no run
 
 
 class _Rule(Struct, frozen=True):
@@ -199,3 +200,24 @@ class Room:
             self._in_flight.sent(size, now)
             self._waiting += size
         return fits
+
+
+class LateRun:
+    """Commands of senders that do not follow the link: late ones, one soon after the other, since a prompt one."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._since = self._newest_at = 0.0
+
+    def note(self, late: bool, now: float) -> None:
+        """Note a command that does not tell its age."""
+        if not late:
+            self.count = 0
+            return
+        if not self.count or now - self._newest_at > _RUN_S:
+            self.count, self._since = 0, now
+        self.count, self._newest_at = self.count + 1, now
+
+    def seconds(self, now: float) -> float:
+        """Return how long all of them were late."""
+        return now - self._since if self.count else 0.0
