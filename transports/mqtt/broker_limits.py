@@ -9,7 +9,6 @@ from typing import Final
 from pebble.transports.base import Message, QoS
 from pebble.transports.mqtt.bridge_mode import Result
 
-_LOSSES: Final = 6  # of connections, then less is tried, and something else with each further one
 _VALID_S: Final = 600.0  # after which the next connection is made with everything again
 
 
@@ -50,7 +49,6 @@ class Limits:
 EVERYTHING: Final = Limits()
 #: What a CONNECT is tried with on which the broker hangs up, in this order.
 _STEPS: Final = (EVERYTHING, Limits(qos=0), Limits(retain=False), Limits(retain=False, qos=0), Limits(will=False))
-_LESS: Final = _STEPS[:-1]  # for messages
 
 
 class Asking(Enum):
@@ -65,16 +63,14 @@ class BrokerLimits:
     """What the broker at one address is used with next, by how its CONNECTs ended.
 
     On 3.1.1 a broker hangs up on a will that is retained or has QoS 1, as mosquitto does, and so does a proxy whose
-    broker is away: a hang-up counts only after the same broker has accepted a CONNECT without a will. A client that has
-    no will learns it from connections that are closed one after the other, while nothing was ever confirmed.
+    broker is away: a hang-up counts only after the same broker has accepted a CONNECT without a will. A client without
+    a will does not learn it; the errors that name its topics do.
     """
 
     def __init__(self) -> None:
         self.limits = EVERYTHING  # of the next connection
         self._asking = Asking.NOTHING
         self._since = float("-inf")  # when the limits were last reduced
-        self._losses = 0  # in a row
-        self._is_decided = False  # such messages were confirmed, or less did not help: losses have another reason
 
     @property
     def wants_probe(self) -> bool:
@@ -117,23 +113,6 @@ class BrokerLimits:
             self._reduce(_STEPS[_STEPS.index(self.limits) + 1], now)
         elif again and result is not Result.ACCEPTED:
             self.limits = EVERYTHING
-
-    def note_loss(self, *, unconfirmed: bool, confirmed: bool, held: bool, now: float) -> bool:
-        """Note that the broker has closed a connection; return True if that may be for what it lacks.
-
-        ``unconfirmed``, ``confirmed``: there were retained messages or such of QoS 1. ``held``: for a while.
-        """
-        self._is_decided |= confirmed
-        tries_less = self._losses >= _LOSSES  # then none is on its way that could be the reason, and less did not help
-        if self._is_decided or held or not (unconfirmed or tries_less):
-            self._losses = 0
-            return False
-        self._losses += 1
-        step = self._losses - _LOSSES + 1
-        if step > 0:
-            self.limits, self._since = _LESS[step % len(_LESS)], now
-            self._is_decided = step == len(_LESS)
-        return True
 
     def _reduce(self, limits: Limits, now: float) -> None:
         self.limits, self._since, self._asking = limits, now, Asking.AGAIN

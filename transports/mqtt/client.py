@@ -9,8 +9,8 @@ import socket
 import ssl
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterable
+from contextlib import closing, suppress
 from typing import NamedTuple
 
 from pebble.transports.base import Message
@@ -24,8 +24,7 @@ SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its d
 _PIECE = 64 * 1024  # bytes that are read at once
 _ENDING_S = 0.2  # after DISCONNECT
 _MOST_IDS = 65_535  # MQTT's packet identifiers have 16 bits
-_NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", None)  # not on Windows
-_CORK = getattr(socket, "TCP_CORK", None)  # Linux only
+_NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", None)
 _NOT_NOW = (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
 
 
@@ -110,21 +109,6 @@ def keep_unsent(sock: socket.socket, size: int) -> None:
     if _NOTSENT_LOWAT is not None:
         with suppress(OSError):  # it may be closed already
             sock.setsockopt(socket.IPPROTO_TCP, _NOTSENT_LOWAT, size)
-
-
-@contextmanager
-def one_packet(sock: socket.socket | None) -> Iterator[None]:
-    """Have the kernel send what is written meanwhile in one packet, where it can."""
-    if _CORK is None or sock is None:
-        yield
-        return
-    with suppress(OSError):  # it may be closed already
-        sock.setsockopt(socket.IPPROTO_TCP, _CORK, 1)
-    try:
-        yield
-    finally:
-        with suppress(OSError):
-            sock.setsockopt(socket.IPPROTO_TCP, _CORK, 0)
 
 
 def _mark(sock: socket.socket, dscp: int) -> None:

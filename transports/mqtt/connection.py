@@ -18,7 +18,7 @@ from pebble.transports.base import Answer, Message, Outgoing, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, Limits
-from pebble.transports.mqtt.client import Client, Opening, TlsLateError, keep_unsent, one_packet
+from pebble.transports.mqtt.client import Client, Opening, TlsLateError, keep_unsent
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
 from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Sink
 from pebble.transports.mqtt.outgoing import (
@@ -277,12 +277,7 @@ class Connection:
             else:
                 if self._backlog.waiting:
                     self._counters.add("dropped", self._backlog.supersede(message))
-                if self.pings.joins(clock.since_boot()):
-                    with one_packet(client.socket):
-                        self._write_publish(message, expires_s)
-                        self.pings.send(client)
-                else:
-                    self._write_publish(message, expires_s)
+                self._write_publish(message, expires_s)
             blocked = client.socket is None or client.waiting
         if blocked:
             self.wake()
@@ -390,11 +385,6 @@ class Connection:
     def lost_bytes(self) -> int:
         """The bytes of the largest message for which the broker was silent to the end of the connection."""
         return self._in_flight.lost_bytes
-
-    @property
-    def has_confirmed(self) -> bool:
-        """True if the broker has confirmed a retained message or one of QoS 1."""
-        return self._in_flight.has_confirmed
 
     def written_before_loss(self) -> dict[str, int] | None:
         """Return what the other side may have closed the connection for; None: it has not, or for another reason."""

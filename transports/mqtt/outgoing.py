@@ -3,10 +3,12 @@
 Neither class is locked: their connection is.
 """
 
+import fcntl
 import itertools
 import socket
 import struct
 import sys
+import termios
 import threading
 from collections import deque
 from collections.abc import Sequence
@@ -14,14 +16,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from pebble.transports.base import Message, QoS
-
-try:
-    import fcntl
-    import termios
-except ImportError:  # Windows has neither
-    _can_measure = False
-else:
-    _can_measure = True
 
 BACKLOG_MESSAGES = 64  # that are not retained
 BACKLOG_BYTES = 256 * 1024  # of their payloads; one message may always wait, whatever its size
@@ -131,7 +125,6 @@ class InFlightTable:
         self._round_trips: deque[float] = deque(maxlen=ROUND_TRIPS)  # the latest, seconds
         self._unacked: dict[int, tuple[str, float]] = {}  # by message id: the topic, and when sent
         self._acked_at = float("-inf")  # the newest acknowledgement
-        self.has_confirmed = False  # the broker, a DELIVERED or a retained message
         self._unconfirmed: dict[str, _Unconfirmed] = {}  # newest retained message of each topic, oldest first
         self._requests: dict[int, tuple[PendingAck, Sequence[str]]] = {}  # unanswered, with the filters of a SUBSCRIBE
         self.answered: list[PendingAck] = []  # and not completed yet
@@ -184,7 +177,7 @@ class InFlightTable:
         """Process a PUBACK: when its message was sent; None if it belongs to no known message."""
         if mid not in self._unacked:
             return None
-        self._acked_at, self.has_confirmed = now, True
+        self._acked_at = now
         topic, sent_at = self._unacked.pop(mid)
         if topic in self._unconfirmed and self._unconfirmed[topic].mid == mid:
             del self._unconfirmed[topic]
@@ -246,7 +239,6 @@ class InFlightTable:
             _note(self._accepted, topic, at, max(size, SMALL))
         for topic in [t for t, entry in self._unconfirmed.items() if entry.ping and entry.ping <= self._pong_number]:
             del self._unconfirmed[topic]
-            self.has_confirmed = True
         if ack is not None:
             self.answered.append(ack)
 
@@ -282,24 +274,19 @@ def _note(table: dict[str, tuple[float, int]], topic: str, at: float, size: int)
 
 
 def unconfirmed_bytes(sock: socket.socket) -> int:
-    """Return bytes the kernel has accepted and the other side's TCP has not acknowledged, sent or not (SIOCOUTQ).
-
-    0 where the system does not say.
-    """
-    return _kernel_bytes(sock, "TIOCOUTQ")
+    """Return bytes the kernel has accepted and the other side's TCP has not acknowledged, sent or not (SIOCOUTQ)."""
+    return _kernel_bytes(sock, termios.TIOCOUTQ)
 
 
 def readable_bytes(sock: socket.socket | None) -> int:
-    """Return bytes that the kernel has received and we have not read (FIONREAD); 0 where the system does not say."""
-    return 0 if sock is None else _kernel_bytes(sock, "FIONREAD")
+    """Return bytes that the kernel has received and we have not read (FIONREAD)."""
+    return 0 if sock is None else _kernel_bytes(sock, termios.FIONREAD)
 
 
-def _kernel_bytes(sock: socket.socket, request: str) -> int:
+def _kernel_bytes(sock: socket.socket, request: int) -> int:
     size = bytearray(4)
-    if not _can_measure:
-        return 0
     with suppress(OSError, ValueError):  # closed, or no TCP
-        fcntl.ioctl(sock.fileno(), getattr(termios, request), size)
+        fcntl.ioctl(sock.fileno(), request, size)
     return int.from_bytes(size, sys.byteorder)
 
 

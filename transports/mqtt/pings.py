@@ -12,7 +12,6 @@ from pebble.transports.settings import MqttSettings
 _CLEAR = 8 * 1024  # bytes ahead of a ping that do not delay it much
 _LEAST_S = 0.05  # between two pings, however short the allowed silence
 _THIN_S, _THIN_TRIPS, _THIN_INTERVAL_S = 5.0, 8, 1.5  # over a thin link: the limit, and between two pings
-_EARLY_S = 0.6  # over a thin link a ping goes along with a message: half of its packets are saved
 _LEAST_SHARE = 0.75  # of the interval between pings: answers to regular ones could not be told apart
 
 
@@ -29,10 +28,6 @@ class Pings:
         self._stalled_since = (
             age.waiting.checked_at
         )  # when the last time without reading began, for which a ping was sent
-
-    def joins(self, now: float) -> bool:
-        """True if a ping goes along with the message that is sent at ``now``."""
-        return self.is_thin and now >= self.due_at - _EARLY_S
 
     def begin(self, now: float) -> None:
         """Note that the broker has accepted us."""

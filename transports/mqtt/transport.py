@@ -19,7 +19,7 @@ from pebble.transports.mqtt.dialler import Dialler
 from pebble.transports.mqtt.ending import Lost, Silent
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import PendingAck
-from pebble.transports.mqtt.refused_topics import LARGE, RefusedTopics
+from pebble.transports.mqtt.refused_topics import RefusedTopics
 from pebble.transports.settings import MqttSettings
 
 log = logging.getLogger(__name__)
@@ -262,26 +262,14 @@ class MqttTransport(Transport):
                 if self._refused.withheld:
                     self._try_withheld(connection)
         except Lost as lost:
-            self._note_loss(connection, lost, held=time.monotonic() > tried_at)
+            self._note_loss(connection, lost)
             raise
 
-    def _note_loss(self, connection: Connection, lost: Lost, *, held: bool) -> None:
-        """Note what the broker may have closed the connection for: what it lacks, or a message on a topic.
-
-        First what it lacks that all such messages need: else each of their topics would seem to be at fault. ``held``:
-        it has lasted for a while.
-        """
-        now = time.monotonic()
+    def _note_loss(self, connection: Connection, lost: Lost) -> None:
+        """Note which messages the broker may have closed the connection for."""
         written = None if isinstance(lost, Silent) else connection.written_before_loss()
-        lacks = written is not None and self._dialler.limits.note_loss(
-            unconfirmed=connection.unacked > 0 or bool(connection.unconfirmed_retained()),
-            confirmed=connection.has_confirmed,
-            held=held,
-            now=now,
-        )
-        if not lacks or max((written or {}).values(), default=0) >= LARGE:
-            with self._publishing:
-                self._refused.note_loss(connection.where, written, now)
+        with self._publishing:
+            self._refused.note_loss(connection.where, written, time.monotonic())
 
     def _try_withheld(self, connection: Connection) -> None:
         """Send what is retained on a topic that is tried again."""
