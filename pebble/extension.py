@@ -59,6 +59,7 @@ OURS: Final[Mapping[str, tuple[str, ...]]] = {
     "pebble.services.neighbours": ("services.neighbours",),
     "pebble.extensions.fleet": (),
     "pebble.extensions.page": ("services.web_handler", "web_interface"),
+    "pebble.services.serial_mcu_bridge.imu": (),
     "pebble.services.serial_mcu_bridge.pebble_serial_v1": (),
     "pebble.services.serial_mcu_bridge.devices": (),
     "pebble.extensions.foxglove": (),

@@ -38,6 +38,7 @@ TESTS = {
     "autonomy_manager": "scripts",
     "recorder": "recordings",
     "paho": "../transports",
+    "imu": "boards",
     "pebble_serial_v1": "boards",
     "devices": "boards",
 }
@@ -334,7 +335,7 @@ PROTOCOL = """
 from pebble.contract.serial_protocols import SerialProtocol
 from pebble.extension import Extension
 
-ROW = SerialProtocol("pebble.services.serial_mcu_bridge.text.imu_bridge:ImuBridge", is_imu=True)
+ROW = SerialProtocol("pebble.services.serial_mcu_bridge.imu.bridge:ImuBridge", is_imu=True)
 EXTENSION = Extension(name="gyro", package="gyro.py", protocols={"gyro_v1": ROW})
 """
 

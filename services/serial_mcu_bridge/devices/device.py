@@ -7,8 +7,8 @@ from typing import Any
 from pebble import contract as c
 from pebble.contract.payloads import McuLocalOnly, McuManifest, McuSample, Payload
 from pebble.runtime.addresses import Addresses
-from pebble.services.serial_mcu_bridge import imu
 from pebble.services.serial_mcu_bridge.devices.aliases import Claims, claims
+from pebble.services.serial_mcu_bridge.imu import reports as imu
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import Reading
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import Direction, Interface, InterfaceKind, Manifest
 

@@ -17,7 +17,7 @@ from pebble.contract.payloads import McuManifest
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.serial_mcu_bridge.devices.aliases import claims
 from pebble.services.serial_mcu_bridge.devices.peers import CONFIRM_S, PeerDevices
-from pebble.services.serial_mcu_bridge.imu import ImuWatchdog
+from pebble.services.serial_mcu_bridge.imu.reports import ImuWatchdog
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.uid_claim import AGAIN_S, ASK_S, Move, UidClaim
 from pebble.transports import Message
