@@ -21,7 +21,6 @@ from pebble.transports.peers import FileLock, PeerRegistry, new_name, prepare_ru
 from pebble.transports.renewed import Renewed
 from pebble.transports.settings import TlsSettings, ZenohSettings
 from pebble.transports.socket_holders import why_not
-from pebble.transports.zenoh.access import Access, read_access
 from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.hub.worker import HubWorker
@@ -37,7 +36,7 @@ log = logging.getLogger(__name__)
 class ZenohHub:
     """A hub with its Zenoh session and its worker thread."""
 
-    def __init__(self, settings: ZenohSettings) -> None:
+    def __init__(self, settings: ZenohSettings, admission: Admission | None = None) -> None:
         self.name = new_name()
         self.counters = Counters()
         self._settings = settings
@@ -45,9 +44,8 @@ class ZenohHub:
         self._session: zenoh.Session | None = None
         self._worker: HubWorker | None = None
         self._store: HubStore | None = None
-        self._admission = Admission(settings.wills, settings.unretained)
+        self._admission = admission or Admission(settings.wills, settings.unretained)
         self._certificates = None if settings.tls is None else _renewed(settings.tls)
-        self._access = None if (file := settings.access) is None else Renewed([file], lambda: read_access(file))
         self._used = self._newest
 
     @property
@@ -89,24 +87,19 @@ class ZenohHub:
             return
         if not self._lock.in_place:
             raise TransportError(f"{self._lock.path} was removed: this hub ends, as what starts now does not reach it")
-        if not self._is_renewed():
+        newest = self._newest
+        if all(new is old for new, old in zip(newest, self._used, strict=True)):
             return
-        self._used = self._newest
+        self._used = newest
         if self._session is not None:
             close_session(self._session)
         self._listen(self._worker)
         log.info("the hub uses renewed certificates or rules")
 
     @property
-    def _newest(self) -> tuple[object, Access | None]:
+    def _newest(self) -> tuple[object, object]:
         """The certificates and rules, as their files are now."""
-        return (
-            None if self._certificates is None else self._certificates.get(),
-            None if self._access is None else self._access.get(),
-        )
-
-    def _is_renewed(self) -> bool:
-        return any(new is not old for new, old in zip(self._newest, self._used, strict=True))
+        return None if self._certificates is None else self._certificates.get(), self._admission.newest()
 
     def close(self) -> None:
         if self._session is not None:
@@ -139,9 +132,8 @@ class ZenohHub:
         siblings = PeerRegistry(self._settings.run_dir).sockets()  # they would connect within 0.5 s; we connect at once
         try:
             settings = replace(self._settings, listen=tuple(filter(self._is_free, self._settings.listen)))
-            _, access = self._used
-            self._admission.accounts = {} if access is None else access.accounts
-            config = session_config(settings, "router", listen=[self._socket], connect=siblings, access=access)
+            rules = self._admission.rules()
+            config = session_config(settings, "router", listen=[self._socket], connect=siblings, rules=rules)
             self._session = open_session(config)
         except zenoh.ZError as error:
             raise TransportError(f"the hub cannot open {self._socket}: {error}") from None
