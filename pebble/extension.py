@@ -135,6 +135,7 @@ class Extension(Struct, frozen=True, kw_only=True, eq=False):
     observer: str = ""  # of config and clock: pebble.forwarding.observer.Observer, which sees what the bridge passes
     step: str = ""  # a function of the config: pebble.forwarding.observer.Step, which may refuse it
     uplink: str = ""  # pebble.services.mqtt_bridge.uplink.Uplink, where the link may be thin
+    names: str = ""  # pebble.forwarding.names.Names, where a robot's operators are known by name
     accounts: str = ""  # pebble.transports.zenoh.hub.admission.Admission, where a hub has a file of access
     offers: str = ""  # a function of config and CapabilitiesValue, which it returns completed
     facts: str = ""  # a function of the config: Facts

@@ -95,18 +95,6 @@ TABLE_A1: Final = Rules(
 #: Between a robot's own transport and a broker on the robot: everything, both ways, except media.
 MIRROR: Final = Rules(passes={side: frozenset(Kind) for side in Side}, leaves_robot=False)
 
-#: Between a hub and a broker, for a robot of the hub whose bridge forwards by the first one.
-GATEWAY: Final = Rules(
-    passes={
-        Side.LOCAL: frozenset({Kind.STATE, Kind.EVENT, Kind.STREAM, Kind.FLAG}),
-        Side.REMOTE: frozenset({Kind.COMMAND, Kind.FLAG, Kind.ACTION, Kind.FEED}),
-    },
-    leaves_robot=True,
-    media=True,
-    stored=False,
-)
-
-
 def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *, mirroring: bool) -> Forward | Drop:
     """Return how to forward ``message``, received on ``side``, or why not. Pure."""
     if subject is None:

@@ -22,7 +22,8 @@ from pebble.contract import (
 from pebble.contract.levels import LEVELS
 from pebble.contract.names import with_name
 from pebble.contract.payloads import ControlState
-from pebble.errors import PayloadError
+from pebble.errors import ConfigError, PayloadError
+from pebble.extension import part
 from pebble.forwarding.forwarder import Routed, barrier
 from pebble.forwarding.names import Names
 from pebble.forwarding.observer import ROBOT, Observers, Step, steps_of
@@ -128,7 +129,13 @@ class MqttBridge(ForwardingService):
 
     def make_names(self) -> Names | None:
         security = self.config.security
-        return Names(self.config.base, self.subjects, security.unnamed) if security.named else None
+        if not security.named:
+            return None
+        for extension in self.config.installed:
+            if extension.names:
+                names: Names = part(extension.names)(self.config.base, self.subjects, security.unnamed)
+                return names
+        raise ConfigError("security.level: named is of the extension fleet, which is not installed")
 
     def make_remote(self) -> Transport:
         enabled = self.config.services.mqtt_bridge.heartbeat.enabled

@@ -6,6 +6,7 @@ EXTENSION = Extension(
     name="fleet",
     needs=("operator", "neighbours"),
     observer="pebble.extensions.fleet.robot_audit:Audit",
+    names="pebble.extensions.fleet.names:CheckedNames",
     accounts="pebble.extensions.fleet.hub_access:AccountAdmission",
     commands={
         "fleet": Command(
