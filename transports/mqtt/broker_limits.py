@@ -1,4 +1,4 @@
-"""What a broker lacks: retained messages, QoS 1 or wills, as it says on MQTT 5 or shows at CONNECT. Pure."""
+"""Limits of a broker without retained messages, QoS 1 or wills, as MQTT 5 says or a CONNECT shows. Pure."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _VALID_S: Final = 600.0  # after which the next connection is made with everythi
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a broker is used with."""
+    """Limits within which a broker is used."""
 
     retain: bool = True
     qos: int = 1
     will: bool = True
 
     def fit(self, message: Message) -> Message:
-        """``message`` as this broker takes it."""
+        """Return ``message`` as this broker takes it."""
         return Message(message.topic, message.payload, QoS(min(message.qos, self.qos)), message.retain and self.retain)
 
     def fit_will(self, will: Message | None) -> Message | None:
@@ -32,7 +32,7 @@ class Limits:
 
     @property
     def losses(self) -> str:
-        """What does not work with this broker, in words."""
+        """The functions that this broker lacks, in words; empty: none."""
         lost = []
         if not self.retain:
             lost.append(
@@ -52,19 +52,19 @@ _STEPS: Final = (EVERYTHING, Limits(qos=0), Limits(retain=False), Limits(retain=
 
 
 class Asking(Enum):
-    """What the broker is asked at once, in another way than before."""
+    """Another CONNECT that is tried at once, before the next one has its usual turn."""
 
-    NOTHING = "the next CONNECT has its usual turn"
+    NOTHING = "none"
     WITHOUT_WILL = "a CONNECT without a will"
     AGAIN = "a CONNECT with a will, as the limits have it: it takes one without, or has said what it lacks"
 
 
 class BrokerLimits:
-    """What the broker at one address is used with next, by how its CONNECTs ended.
+    """The limits of the broker at one address, learned from how its CONNECTs end.
 
     On 3.1.1 a broker hangs up on a will that is retained or has QoS 1, as mosquitto does, and so does a proxy whose
     broker is away: a hang-up counts only after the same broker has accepted a CONNECT without a will. A client without
-    a will does not learn it; the errors that name its topics do.
+    a will does not learn it: it withholds the topics on which the broker hangs up.
     """
 
     def __init__(self) -> None:

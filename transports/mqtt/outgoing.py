@@ -1,4 +1,4 @@
-"""What one MQTT connection has accepted and not finished sending: the backlog before its socket, and what is in flight.
+"""Messages that one MQTT connection has accepted: the backlog before its socket, and those in flight.
 
 Neither class is locked: their connection is.
 """
@@ -74,7 +74,7 @@ class Backlog:
         return self._remove(next(iter(self.waiting)))
 
     def supersede(self, newer: Message) -> int:
-        """Drop what waits on the topic of a DELIVERED message that is sent ahead: it is stale (T8). Return how many."""
+        """Drop messages that wait on the topic of a DELIVERED one that is sent ahead (T8); return how many."""
         stale = [
             key
             for key, message in self.waiting.items()
@@ -93,7 +93,7 @@ class Backlog:
 
 
 class PendingAck:
-    """The answer to a request, to wait for. The loss of the connection completes it, too."""
+    """An answer to wait for. The loss of the connection completes it, too."""
 
     def __init__(self) -> None:
         self._answered = threading.Event()
@@ -141,16 +141,16 @@ class InFlightTable:
 
     @property
     def unacked(self) -> int:
-        """How many DELIVERED messages the broker has not acknowledged."""
+        """The number of DELIVERED messages that the broker has not acknowledged."""
         return len(self._unacked)
 
     @property
     def waiting_since(self) -> float | None:
-        """Since when DELIVERED messages wait and none was acknowledged; None if none waits."""
+        """The time since when DELIVERED messages wait and none was acknowledged; None if none waits."""
         return max(next(iter(self._unacked.values()))[1], self._acked_at) if self._unacked else None
 
     def unconfirmed_retained(self) -> list[Message]:
-        """Retained messages the broker may not have, oldest first."""
+        """Return the retained messages that the broker may not have, oldest first."""
         return [entry.message for entry in self._unconfirmed.values()]
 
     def accept(self, message: Message) -> None:
@@ -174,7 +174,7 @@ class InFlightTable:
                 entry.ping = self._ping_number + 1
 
     def acknowledge(self, mid: int, now: float) -> float | None:
-        """Process a PUBACK: when its message was sent; None if it belongs to no known message."""
+        """Process a PUBACK; return when its message was sent, None if it belongs to no known message."""
         if mid not in self._unacked:
             return None
         self._acked_at = now
@@ -188,13 +188,16 @@ class InFlightTable:
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
-        """Return the bytes by topic of what was written lately, and was its first message or largest, not yet read."""
-        found: dict[str, int] = {}
+        """Return the bytes by topic of lately written messages that no answer to a ping has confirmed.
+
+        They are the first messages of their topics on this connection, or larger than those before.
+        """
+        sizes: dict[str, int] = {}
         for written in (*(written for _, _, written in self._pings), self._written):
             for topic, (at, size) in written.items():
                 if at >= now - WINDOW_S - self.round_trip_s:
-                    found[topic] = max(size, found.get(topic, 0))
-        return found
+                    sizes[topic] = max(size, sizes.get(topic, 0))
+        return sizes
 
     # -- requests and pings
 
@@ -203,7 +206,7 @@ class InFlightTable:
         self._requests[mid] = ack, filters
 
     def answer(self, mid: int) -> Sequence[str]:
-        """Process a SUBACK or UNSUBACK: returns which filters are subscribed to, or refused."""
+        """Process a SUBACK or UNSUBACK; return the filters that it answers."""
         if mid not in self._requests:
             return ()
         ack, filters = self._requests.pop(mid)
@@ -212,7 +215,7 @@ class InFlightTable:
 
     @property
     def asked(self) -> list[str]:
-        """The filters of each SUBSCRIBE that is not answered."""
+        """The filters of all SUBSCRIBEs that are not answered."""
         return [filter_ for _, filters in self._requests.values() for filter_ in filters]
 
     def complete(self) -> None:
@@ -247,18 +250,18 @@ class InFlightTable:
 
     @property
     def round_trip_s(self) -> float:
-        """The shortest recent one: an answer that a stalled connection delayed gives the next stall no extra time."""
+        """The shortest recent round trip: a delayed answer gives the next stall no extra time."""
         return min(self._round_trips, default=0.0)
 
     def newest_answer(self, now: float) -> tuple[int, float]:
-        """Return how many pings were answered, and how long the newest answer took, or the next one if longer."""
+        """Return the number of answered pings, and how long the newest answer took, or the next one if longer."""
         waits = now - self._pings[0][0] if self._pings else 0.0
         return self._pong_number, max(self._newest_s, waits)
 
     def end(self) -> None:
         """Complete everything: no answer can come any more."""
-        first = self._pings[0][2] if self._pings else self._written
-        self.lost_bytes = max((size for _, size in first.values()), default=0)
+        unanswered = self._pings[0][2] if self._pings else self._written
+        self.lost_bytes = max((size for _, size in unanswered.values()), default=0)
         self.complete()
         for ack in [*(ack for ack, _ in self._requests.values()), *(ack for _, ack, _ in self._pings if ack)]:
             ack.complete()

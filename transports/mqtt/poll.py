@@ -1,4 +1,4 @@
-"""Waiting for a socket, from which other threads can wake the one that waits."""
+"""A poll of a socket, from which other threads can wake the one that waits."""
 
 import select
 import socket
@@ -10,7 +10,7 @@ NOTHING = (False, False, False)  # is readable, writable, or was woken
 
 
 class SocketPoll:
-    """Waits until a socket is readable or has an error, or (with ``write``) writable, or `wake` was called."""
+    """A wait until a socket is readable or has an error, or (with ``write``) writable, or `wake` was called."""
 
     def __init__(self) -> None:
         self._wakeup = WakeupPipe()
@@ -39,7 +39,7 @@ class SocketPoll:
         return readable, writable, woken
 
     def wake(self) -> None:
-        """Make `wait` return; for other threads."""
+        """Make `wait` return; other threads call it."""
         self._wakeup.set()
 
     def close(self) -> None:

@@ -68,7 +68,7 @@ def _numbered(endpoint: str) -> str:
 def session_config(
     settings: ZenohSettings, mode: str, *, listen: list[Path], connect: list[Path], rules: Mapping[str, Any] = {}
 ) -> str:
-    """Return the configuration of a ``mode`` (router, peer or client) on unix sockets plus the settings' own endpoints.
+    """Return the configuration of a ``mode`` (router, peer or client), on unix sockets and the settings' endpoints.
 
     ``rules``: of a hub, what certificates allow, instead of the settings' ``allowed_names``. Raises TransportError for
     endpoints or certificates that can never work.
@@ -196,7 +196,7 @@ def _refuse_fork() -> None:
 
 
 def check_process(opened_by: int | None) -> None:
-    """Raise TransportError if the session was opened by another process, of which this one is a fork."""
+    """Raise TransportError if the session was opened by another process, from which this one was forked."""
     if opened_by is not None and opened_by != os.getpid():
         raise TransportError("Zenoh does not survive a fork: start child processes with spawn or subprocess")
 

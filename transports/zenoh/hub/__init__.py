@@ -54,8 +54,10 @@ class ZenohHub:
 
     @property
     def retained(self) -> dict[str, bytes]:
-        """What it retains, by topic."""
-        return {} if self._store is None else {one.key: one.payload for one in self._store.retained()}
+        """The payloads that it retains, by topic."""
+        if self._store is None:
+            return {}
+        return {retained.key: retained.payload for retained in self._store.retained()}
 
     @property
     def refused_wills(self) -> int:
@@ -63,7 +65,7 @@ class ZenohHub:
 
     @property
     def refused(self) -> int:
-        """Retained messages and wills there was no room for."""
+        """The number of retained messages and wills for which there was no room."""
         return 0 if self._store is None else self._store.refused
 
     def open(self) -> ZenohHub:
@@ -81,7 +83,7 @@ class ZenohHub:
         """Listen again, with all that is stored, if a certificate or rule changed; call often.
 
         Zenoh reads certificates and rules when a session begins. Raises TransportError if it cannot listen there again,
-        or if its files were removed: who started this hub starts another one.
+        or if its files were removed: this hub then ends, and its launcher starts another one.
         """
         if self._lock is None or self._worker is None:
             return
@@ -141,7 +143,10 @@ class ZenohHub:
         worker.serve(self._session)
 
     def _is_free(self, endpoint: str) -> bool:
-        """Say who has taken an endpoint. A robot's hub runs without it, as any user can take a port; others end."""
+        """Return True unless a process has taken the endpoint, which is named in the log or in a TransportError.
+
+        A robot's hub runs without such an endpoint, as any user can take a port; other hubs end.
+        """
         kind = socket.SOCK_DGRAM if endpoint.startswith("quic/") else socket.SOCK_STREAM
         host, _, port = endpoint.partition("/")[2].partition("#")[0].partition("?")[0].rpartition(":")
         try:

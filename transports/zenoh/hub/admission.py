@@ -1,4 +1,4 @@
-"""What a hub takes from its clients: which wills, and what is retained.
+"""Rules of a hub for wills and retained messages of its clients.
 
 A command that was left as a will would be published as a fresh one, any time later.
 """
@@ -32,7 +32,7 @@ class Admission:
         self._logged: set[str] = set()
 
     def newest(self) -> object:
-        """Return what the rules for other machines are made from: another object once that has changed."""
+        """Return the source of the rules for other machines: another object once it has changed."""
         return None
 
     def rules(self) -> Mapping[str, Any]:
@@ -40,7 +40,7 @@ class Admission:
         return {}
 
     def hello(self, account: str, hello: Hello) -> Hello | None:
-        """Return what is taken of a hello; None: it is not answered."""
+        """Return a hello as it is taken; None: it is not answered."""
         return None if account else hello
 
     def owns(self, account: str, session: str) -> bool:
@@ -48,7 +48,7 @@ class Admission:
         return not account and bool(session)
 
     def admitted(self, record: Record) -> Record | None:
-        """Return what may be stored of ``record``: of a will that is refused, that there is none; None: nothing."""
+        """Return ``record`` as it may be stored, with no will in place of a refused one; None: it may not."""
         if isinstance(record, Retained):
             refused = bool(self._unretained) and _matches_any(self._unretained, key_to_topic(record.key))
             return None if refused else record
