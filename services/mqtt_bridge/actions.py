@@ -42,7 +42,7 @@ ACTIONS: Final = (
 
 
 class Action:
-    """Runs one command at a time, no more often than its cooldown allows. Not thread-safe.
+    """A command that runs once at a time, and no more often than its cooldown allows. Not thread-safe.
 
     Operators read the log, and a command's words or output may hold a token: they stay in a file in ``folder``.
     """
@@ -63,7 +63,7 @@ class Action:
         return self._process is not None and self._process.poll() is None
 
     def request(self) -> bool:
-        """Run the command; False, with a log line, if that is refused."""
+        """Run the command; return False, with a log line, if that is refused."""
         if not self.control.command:
             if not self._warned:
                 self._warned = True
@@ -131,5 +131,5 @@ def shorten(file: int) -> None:
 
 
 def system_actions(section: MqttBridge, folder: Path, clock: Callable[[], float]) -> dict[Channel, Action]:
-    """Return the whole table, for one robot's config."""
+    """Return all actions of a robot."""
     return {row.channel: Action(row, getattr(section, row.section), folder=folder, clock=clock) for row in ACTIONS}

@@ -1,4 +1,4 @@
-"""Which media programs are to run: a flag of the operators allows them, a request starts and stops them. Pure."""
+"""Requests for media programs: a flag of the operators allows them, a request starts and stops them. Pure."""
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ _NO: Final = ProgramRequest(on=False)
 
 
 class Media:
-    """The newest flag and request of each medium of a robot that has ``programs``; the launcher is sent each change.
+    """The newest flag and request of each medium of a robot that has ``programs``; each change goes to the launcher.
 
     ``running`` are the programs that an earlier bridge process had requested. They count as requested, because a
     request is never retained and the operator does not know that the bridge was restarted. Until the flag of a medium
@@ -60,7 +60,7 @@ class Media:
         self.send()
 
     def requests(self) -> dict[str, ProgramRequest]:
-        """By program; without those whose flag has to be known first."""
+        """Return the requests by program, without those whose flag has to be known first."""
         requests: dict[str, ProgramRequest] = {}
         for row, request in self._requested.items():
             if not request.on or row in self._allowed:
@@ -69,7 +69,7 @@ class Media:
         return {name: request for name, request in requests.items() if name in self._programs}
 
     def send(self) -> None:
-        """Send what has changed, and again what the launcher did not accept."""
+        """Send the requests that have changed, and again those that the launcher did not accept."""
         for program, request in self.requests().items():
             if self._sent.get(program) != request and self._send_one(program, request):
                 self._sent[program] = request

@@ -1,4 +1,4 @@
-"""What messages request of the bridge itself: system actions, pictures and sound."""
+"""Requests to the bridge itself: system actions, pictures and sound."""
 
 from collections.abc import Callable
 from functools import partial
@@ -14,7 +14,7 @@ from pebble.services.mqtt_bridge.media import MEDIA, Media
 
 
 class OwnRequests:
-    """Reads them on the transports' threads; what takes longer is done on that of ``service``."""
+    """Requests, read on the transports' threads; those that take longer are done on the thread of ``service``."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class OwnRequests:
             self._post(channel, partial(self._run_action, channel), newest_of=channel.metric)
 
     def _boolean(self, channel: Channel, payload: bytes) -> bool:
-        """True if a boolean control is; an empty payload (a removed flag) and a malformed one are false."""
+        """True if the payload is; an empty one (a removed flag) and a malformed one are false."""
         return bool(payload) and bool(self._decoded(channel, payload))
 
     def _decoded(self, channel: Channel, payload: bytes) -> Any:

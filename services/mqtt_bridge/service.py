@@ -67,7 +67,7 @@ ASK_S = 0.2  # between two questions about what is left at the remote broker
 
 
 class MqttBridge(ForwardingService):
-    """Forwards by Table A.1, once its two sides are known not to be one broker."""
+    """The bridge: it forwards by Table A.1, once its two sides are known not to be one broker."""
 
     name = "mqtt_bridge"
     publishes = (ONLINE, BRIDGE_PROBE, CONTROL_VOUCHED)
@@ -111,7 +111,7 @@ class MqttBridge(ForwardingService):
 
     @property
     def winner(self) -> Side:
-        """Where names are checked, nothing on the remote side but the robot itself can have left a flag there."""
+        """The side whose retained messages count. Where names are checked, the robot alone leaves flags remotely."""
         return Side.LOCAL if self.config.security.named else Side.REMOTE
 
     @property
@@ -120,7 +120,7 @@ class MqttBridge(ForwardingService):
 
     @property
     def _silence_s(self) -> float:
-        """After so long a silent remote side is lost."""
+        """Seconds of silence after which the remote side is lost."""
         section = self.config.services.mqtt_bridge
         return section.remote_mqtt.silence_seconds if section.remote is None else section.remote.lease_ms / 1000
 
@@ -183,17 +183,17 @@ class MqttBridge(ForwardingService):
 
     @property
     def _subscribes_soon(self) -> bool:
-        """True if the heartbeat waits: who sees it sends commands, which would be lost before the subscription."""
+        """True if the heartbeat waits: operators that see it send commands, which would be lost before we subscribe."""
         subscribed = self.subscriptions[Side.REMOTE] or self.forwarder.gate is Gate.SHUT
         return not subscribed and self._same_broker.both_connected
 
     def _follow_link(self) -> None:
-        """Learn what the link carries, and send what has waited for room."""
+        """Measure the link, and send messages that have waited for room."""
         if self._uplink.poll():
             self._publish_heartbeat()
 
     def _look_later(self) -> None:
-        """Wait (again) until all that the robot retains is known, and look for what only the remote side retains."""
+        """Look for messages that only the remote side retains, once all of the robot are known; wait for that again."""
         if self._leftovers.done:
             return
         if self._leftover_timer is not None:
@@ -380,7 +380,7 @@ class MqttBridge(ForwardingService):
         self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
 
     def _receive_stop(self, message: Message) -> None:
-        """Name it before anything else, so that whatever waits for an answer knows it by the same name."""
+        """Give a stop a name before anything else, so that all who wait for its confirmation know the same name."""
         message = msgspec.structs.replace(message, payload=named(message.payload))
         self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
 
@@ -401,9 +401,9 @@ class MqttBridge(ForwardingService):
             self._receive_stop(message)
 
     def _react(self, side: Side, message: Message, routed: Routed) -> None:
-        """Do what the message requests of the bridge itself, whether or not a remote side is connected.
+        """Do as the message requests of the bridge itself, whether or not a remote side is connected.
 
-        What is forwarded to the local side is never received there by the bridge, so this is the only occasion.
+        The bridge does not receive messages that it forwards to the local side, so this is the only occasion.
         """
         channel = routed.subject.channel if routed.subject is not None else None
         local = side is Side.LOCAL
@@ -417,8 +417,8 @@ class MqttBridge(ForwardingService):
         if channel is None or codec.is_blank(message.payload):
             return
         if not message.retain and routed.outcome is not Drop.KNOWN:
-            own = local and self.forwarder.gate is Gate.OPEN
-            self._observers.passed(channel, ROBOT if own else routed.by, message.payload)
+            by_robot = local and self.forwarder.gate is Gate.OPEN
+            self._observers.passed(channel, ROBOT if by_robot else routed.by, message.payload)
         self._requests.message(channel, message.payload)
 
     def on_value(self, subject: Subject, payload: bytes) -> None:

@@ -131,7 +131,7 @@ class FrameReader:
 
     @property
     def shared(self) -> bool:
-        """True if frames come through shared memory; else `problem` explains why, unless that is the reader's choice."""
+        """True if frames come through shared memory; else `problem` explains why, unless it is the reader's choice."""
         return self._sharing and not self.problem
 
     @property

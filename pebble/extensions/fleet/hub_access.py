@@ -1,4 +1,4 @@
-"""What connections from other machines may do at a hub, by the name in their certificate: Zenoh's access_control.
+"""Rights of connections from other machines at a hub, by the name in their certificate: Zenoh's access_control.
 
 The hub itself refuses what Zenoh cannot: wills, and what is retained, of accounts that it is not for.
 """
@@ -127,7 +127,7 @@ def _named(names: Sequence[str]) -> dict[str, Any]:
 
 
 class AccountAdmission(Admission):
-    """What a hub takes from its clients, and from accounts of other machines what is theirs by the access file."""
+    """The admission of clients at a hub, also of accounts of other machines, by the access file."""
 
     def __init__(self, file: Path, wills: Sequence[tuple[str, bool]], unretained: Sequence[str] = ()) -> None:
         super().__init__(wills, unretained)

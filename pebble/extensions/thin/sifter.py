@@ -1,4 +1,4 @@
-"""Passes on what leaves a robot through a sieve, while the link to its remote side is thin."""
+"""Passes messages that leave a robot through a sieve, while the link to its remote side is thin."""
 
 import threading
 from collections.abc import Iterable
@@ -12,7 +12,7 @@ from pebble.transports import Message
 
 
 class Sifter:
-    """Has a forwarder pass what leaves the robot through a sieve, or at once; thread-safe."""
+    """The sieve in a forwarder, for messages that leave the robot; thread-safe."""
 
     def __init__(self, forwarder: Forwarder) -> None:
         self._forwarder, self._sides = forwarder, forwarder.sides
@@ -20,7 +20,7 @@ class Sifter:
         self._lock = threading.RLock()  # so that a message which has waited is not sent after a newer one
 
     def use(self, sieve: Sieve | None) -> None:
-        """Pass what leaves the robot through ``sieve``, whose owner calls :meth:`send_waiting`; None: no more."""
+        """Pass messages through ``sieve``, whose owner calls :meth:`send_waiting`; None: pass them at once."""
         with self._lock:
             before, self._sieve = self._sieve, sieve
             self._forwarder.pass_on = self._forwarder.pass_now if sieve is None else self._sift
@@ -31,7 +31,7 @@ class Sifter:
                 events.resume()
 
     def send_waiting(self) -> None:
-        """Send what waits in the sieve, as far as there is room."""
+        """Send the messages that wait in the sieve, as far as there is room."""
         with self._lock:
             if self._sieve is not None:
                 self._send(self._sieve.due(Rank.STATE))

@@ -1,4 +1,4 @@
-"""Suits what the bridge sends to a link to the remote broker that may be thin, and publishes what it carries."""
+"""Adapts the bridge to a link to the remote broker that may be thin, and publishes the link's level."""
 
 import logging
 import threading
@@ -37,11 +37,11 @@ RENEW_S = 30.0  # between two connections that are renewed for it, at least: who
 
 
 class LinkReport:
-    """The retained state by which others know what the link carries: a change of level at once, of its queue soon."""
+    """The retained state that tells others the level of the link: a change at once, one of its queue soon."""
 
     def __init__(self, meter: LinkMeter, address: Address, remote: Transport) -> None:
         self._meter, self._address, self._remote = meter, address, remote
-        self._level, self._crowded, self._queue_s = "", False, 0.0  # that the others know; none yet
+        self._level, self._crowded, self._queue_s = "", False, 0.0  # as published last
         self._at = -inf
 
     @property
@@ -58,13 +58,13 @@ class LinkReport:
 
     def publish(self, now: float) -> None:
         """Publish a retained message: without a connection it is sent at the next one."""
-        meter, before = self._meter, self._level
+        meter, earlier = self._meter, self._level
         self._level, self._crowded, self._queue_s, self._at = meter.level, meter.crowded, meter.queue_s, now
         trip_ms, queue_ms = round(1000 * meter.round_trip_s), round(1000 * meter.queue_s)
-        if before not in ("", meter.level):
+        if earlier not in ("", meter.level):
             log.info(
                 "the link to the remote broker is %s now (it was %s): a round trip of %d ms, and %d ms of queue",
-                meter.level, before, trip_ms, queue_ms
+                meter.level, earlier, trip_ms, queue_ms
             )  # fmt: skip
         drive_hz = round(LEVELS[meter.level].drive_hz * (_CROWDED_DRIVE if meter.crowded else 1), 2)
         state = LinkState(level=meter.level, drive_hz=drive_hz, rtt_ms=trip_ms, queue_ms=queue_ms, t=now_ms())
@@ -164,7 +164,7 @@ class ThinUplink(Uplink):
             self._remote.renew_connection("only late commands come over a thin link: those that wait there are dropped")
 
     def _suit(self, now: float) -> None:
-        """Suit the link: its level is another one, or a queue begins or ends to stand."""
+        """Adapt to another level, or to a queue that begins or ends to stand."""
         self._suit_transport()
         stream_hz = (self.level.stream_hz or 0.0) * (_CROWDED_STREAMS if self._meter.crowded else 1)
         self._sieve.stream_s = 1 / stream_hz if stream_hz else 0.0

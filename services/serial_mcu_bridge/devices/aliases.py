@@ -24,7 +24,7 @@ Lookup = Callable[[str], c.Channel | None]
 
 @dataclass(frozen=True, slots=True)
 class Claims:
-    """What one manifest asks for: interface names by claim, and the reasons of refusals by interface name.
+    """The claims of one manifest: interface names by claim, and the reasons of refusals by interface name.
 
     A claim is a channel with its direction, ``outgoing/outlets/o1/status``.
     """

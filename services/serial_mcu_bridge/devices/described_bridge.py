@@ -54,7 +54,7 @@ _UID_QUERY = Channel(
 
 
 class DescribedBridge(SerialService):
-    """Publishes the topics of one MCU while it is connected, and clears its retained messages when it has gone."""
+    """The service of one MCU: it publishes its topics while it is connected, and clears them when it has gone."""
 
     publishes = (MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, IMU_FAST, IMU)
     end = END

@@ -46,7 +46,7 @@ class FrameError(PayloadError):
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """``interface`` 0 is the protocol itself; ``timestamp`` is milliseconds of the sender's clock, modulo 2**32."""
+    """A frame. ``interface`` 0 is the protocol itself; ``timestamp`` is in ms of the sender's clock, of 32 bits."""
 
     type: Type
     payload: bytes = b""
@@ -56,7 +56,7 @@ class Frame:
 
 
 def crc(body: bytes) -> int:
-    """CRC-16/CCITT-FALSE; of ``123456789`` it is 0x29B1."""
+    """Return the CRC-16/CCITT-FALSE; of ``123456789`` it is 0x29B1."""
     return binascii.crc_hqx(body, _CRC_START)
 
 

@@ -114,7 +114,7 @@ class Session:
     """
 
     def __init__(self, base: str = "") -> None:
-        """``base`` is what the robot's topics begin with."""
+        """Begin without a device; ``base`` is the beginning of the robot's topics."""
         self.manifest: Manifest | None = None
         self.frames = 0  # valid ones from a device
         self.mcu_ms: int | None = None  # what its clock showed when it sent something of its own accord
@@ -246,7 +246,7 @@ class Session:
     def _begin(self, described: Described) -> Iterator[Event]:
         self._ask_at = None
         self.manifest = described.manifest
-        self._by_id = {one.id: one for one in described.manifest.interfaces}
+        self._by_id = {interface.id: interface for interface in described.manifest.interfaces}
         self._slots.clear()
         yield described
 

@@ -12,7 +12,7 @@ AGAIN_S = 5.0
 
 
 class Move(Enum):
-    """What the caller has to do."""
+    """The next move of the caller."""
 
     NOTHING = "nothing"
     ASK = "publish the question"

@@ -105,8 +105,6 @@ class HubStore:
 def _size(message: Retained | Will | None) -> int:
     if message is None:
         return 0
-    if isinstance(message, Retained):
-        texts = message.key, message.stamp.origin
-    else:
-        texts = message.topic, message.client
-    return OVERHEAD + sum(map(len, texts)) + len(message.payload)
+    retained = isinstance(message, Retained)
+    names = (message.key, message.stamp.origin) if retained else (message.topic, message.client)
+    return OVERHEAD + sum(map(len, names)) + len(message.payload)
