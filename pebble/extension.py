@@ -45,6 +45,7 @@ OURS: Final[Mapping[str, tuple[str, ...]]] = {
     "pebble.extensions.media": (),
     "pebble.extensions.paho": (),
     "pebble.extensions.thin": (),
+    "pebble.services.mqtt_bridge.requests": (),
     "pebble.extensions.operator": (),
     "pebble.extensions.scripts": (),
     "pebble.extensions.recordings": (),
@@ -134,6 +135,7 @@ class Extension(Struct, frozen=True, kw_only=True, eq=False):
     programs: str = ""  # a function of the config: its other Programs
     observer: str = ""  # of config and clock: pebble.forwarding.observer.Observer, which sees what the bridge passes
     step: str = ""  # a function of the config: pebble.forwarding.observer.Step, which may refuse it
+    requests: tuple[str, ...] = ()  # pebble.services.mqtt_bridge.own_requests.Requests, which the bridge fulfils
     uplink: str = ""  # pebble.services.mqtt_bridge.uplink.Uplink, where the link may be thin
     names: str = ""  # pebble.forwarding.names.Names, where a robot's operators are known by name
     accounts: str = ""  # pebble.transports.zenoh.hub.admission.Admission, where a hub has a file of access

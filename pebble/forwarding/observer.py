@@ -57,7 +57,7 @@ class Observers(Observer):
         self._observers: list[Observer] = []
         for extension in config.installed:
             if extension.observer:
-                with _logged(extension.name):
+                with logged(extension.name):
                     self._observers.append(part(extension.observer)(config, clock))
 
     def start(self) -> None:
@@ -80,7 +80,7 @@ class Observers(Observer):
 
     def _tell(self, method: str, *values: object) -> None:
         for observer in self._observers:
-            with _logged(type(observer).__name__):
+            with logged(type(observer).__name__):
                 getattr(observer, method)(*values)
 
 
@@ -89,13 +89,14 @@ def steps_of(config: Config) -> dict[str, Step]:
     steps: dict[str, Step] = {}
     for extension in config.installed:
         if extension.step:
-            with _logged(extension.name):
+            with logged(extension.name):
                 steps[extension.name] = part(extension.step)(config)
     return steps
 
 
 @contextmanager
-def _logged(name: str) -> Iterator[None]:
+def logged(name: str) -> Iterator[None]:
+    """Log an error of the extension called ``name``, and go on."""
     try:
         yield
     except Exception as error:  # noqa: BLE001 - whatever a stranger's code raises: it must not end the bridge

@@ -23,7 +23,7 @@ from pebble.contract.levels import LEVELS
 from pebble.contract.names import with_name
 from pebble.contract.payloads import ControlState
 from pebble.errors import ConfigError, PayloadError
-from pebble.extension import part
+from pebble.extension import ours, part
 from pebble.forwarding.forwarder import Routed, barrier
 from pebble.forwarding.names import Names
 from pebble.forwarding.observer import ROBOT, Observers, Step, steps_of
@@ -36,11 +36,9 @@ from pebble.runtime.connections import remote_transport, stops_transport
 from pebble.runtime.parent import Notifier
 from pebble.runtime.service import every
 from pebble.runtime.timers import Timer
-from pebble.services.mqtt_bridge.actions import ACTIONS
 from pebble.services.mqtt_bridge.earlier_names import note_name
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
 from pebble.services.mqtt_bridge.leftovers import Leftovers
-from pebble.services.mqtt_bridge.media import MEDIA
 from pebble.services.mqtt_bridge.motor_owners import CHECK_S, MotorOwners
 from pebble.services.mqtt_bridge.own_requests import OwnRequests
 from pebble.services.mqtt_bridge.passed_stops import REPEAT_S, PassedStops, named
@@ -78,8 +76,8 @@ class MqttBridge(ForwardingService):
 
     @classmethod
     def handles(cls) -> tuple[Channel, ...]:
-        media = (channel for row in MEDIA for channel in (row.flag, row.request))
-        return (REMOTE_MIRROR, *media, *(row.channel for row in ACTIONS))
+        places = (place for extension in ours() for place in extension.requests)
+        return (REMOTE_MIRROR, *(channel for place in places for channel in part(place).channels))
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -95,7 +93,7 @@ class MqttBridge(ForwardingService):
         self._private = PrivateTopics(self.config.base)
         self._is_thin = section.link.profile != "wide"  # or may become so
         self._uplink = uplink_of(self.config, self.addresses, self.remote, self.forwarder, self.clock)
-        self._requests = OwnRequests(self, self.forwarder.mirroring, notifier, self._uplink.note_drive)
+        self._requests = OwnRequests(self, self.forwarder.mirroring, self._uplink.note_drive)
         self._leftovers = Leftovers(
             self.config.base, self.subjects, self.remote, *self._uplink.channels, sparing=self._is_thin
         )
@@ -300,8 +298,8 @@ class MqttBridge(ForwardingService):
         self.check_later()
 
     @every(_RETRY_S)
-    def _send_media_requests(self) -> None:
-        self._requests.send()
+    def _repeat_requests(self) -> None:
+        self._requests.repeat()
 
     @every(PERIOD_S)
     def _vouch(self) -> None:

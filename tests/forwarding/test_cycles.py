@@ -10,7 +10,7 @@ import pytest
 from pebble.forwarding.cycles import Cycles, Finding
 from pebble.forwarding.routing import Side
 from pebble.forwarding.subjects import Subjects
-from pebble.services.mqtt_bridge.actions import Action
+from pebble.services.mqtt_bridge.requests.actions import Action
 from pebble.transports import Message, QoS
 from tests.forwarding.test_forwarding import Clock, grows_no_more
 from tests.forwarding.virtual import Connection, Running, World

@@ -14,7 +14,7 @@ from pebble.contract.payloads import MediaRequest
 from pebble.runtime import notes
 from pebble.runtime.notes import Held, Wanted
 from pebble.runtime.parent import NOTIFY_FD, WANTED, ProgramRequest
-from pebble.services.mqtt_bridge.media import Media
+from pebble.services.mqtt_bridge.requests.media import Media
 from tests.forwarding.virtual import World
 from tests.services.mqtt_bridge.bridge_rig import Client
 

@@ -105,6 +105,8 @@ class HubStore:
 def _size(message: Retained | Will | None) -> int:
     if message is None:
         return 0
-    retained = isinstance(message, Retained)
-    names = (message.key, message.stamp.origin) if retained else (message.topic, message.client)
-    return OVERHEAD + sum(map(len, names)) + len(message.payload)
+    if isinstance(message, Retained):
+        name, sender = message.key, message.stamp.origin
+    else:
+        name, sender = message.topic, message.client
+    return OVERHEAD + len(name) + len(sender) + len(message.payload)

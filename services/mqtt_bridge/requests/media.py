@@ -1,13 +1,15 @@
-"""Requests for media programs: a flag of the operators allows them, a request starts and stops them. Pure."""
+"""Requests for media programs: a flag of the operators allows them, a request starts and stops them."""
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, ClassVar, Final
 
-from pebble.contract import AUDIO_CONTROL, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel
+from pebble.contract import AUDIO_CONTROL, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel, Kind
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
 from pebble.contract.payloads import MediaRequest
-from pebble.runtime.parent import ProgramRequest
+from pebble.runtime.parent import Notifier, ProgramRequest, earlier_requests
+from pebble.runtime.service import Service
+from pebble.services.mqtt_bridge.own_requests import Requests
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,3 +79,22 @@ class Media:
 
 def _first(row: Row, running: Mapping[str, ProgramRequest]) -> ProgramRequest:
     return next((running[name] for name in row.programs if name in running), _NO)
+
+
+class MediaRequests(Requests):
+    """The requests for media programs of a robot, passed on to its launcher."""
+
+    channels: ClassVar[tuple[Channel, ...]] = tuple(channel for row in MEDIA for channel in (row.flag, row.request))
+
+    def __init__(self, service: Service) -> None:
+        super().__init__(service)
+        self._media = Media(service.config.on_demand_programs(), earlier_requests(), Notifier().request)
+
+    def take(self, channel: Channel, value: Any) -> None:
+        if channel.kind is Kind.FLAG:
+            self._media.allow(channel, value)
+        else:
+            self._media.request(channel, value)
+
+    def repeat(self) -> None:
+        self._media.send()
