@@ -44,6 +44,8 @@ _SECTION_KEY = re.compile(r"(services\.)?[A-Za-z]\w*", re.ASCII)
 OURS: Final[Mapping[str, tuple[str, ...]]] = {
     "pebble.extensions.media": ("services.mqtt_bridge.media",),
     "pebble.extensions.paho": (),
+    "pebble.extensions.thin": (),
+    "pebble.services.mqtt_bridge.requests": (),
     "pebble.extensions.operator": (),
     "pebble.extensions.scripts": (),
     "pebble.extensions.recordings": (),
@@ -58,6 +60,7 @@ OURS: Final[Mapping[str, tuple[str, ...]]] = {
     "pebble.services.neighbours": ("services.neighbours",),
     "pebble.extensions.fleet": (),
     "pebble.extensions.page": ("services.web_handler", "web_interface"),
+    "pebble.services.serial_mcu_bridge.imu": (),
     "pebble.services.serial_mcu_bridge.pebble_serial_v1": (),
     "pebble.services.serial_mcu_bridge.devices": (),
     "pebble.extensions.foxglove": (),
@@ -133,6 +136,10 @@ class Extension(Struct, frozen=True, kw_only=True, eq=False):
     programs: str = ""  # a function of the config: its other Programs
     observer: str = ""  # of config and clock: pebble.forwarding.observer.Observer, which sees what the bridge passes
     step: str = ""  # a function of the config: pebble.forwarding.observer.Step, which may refuse it
+    requests: tuple[str, ...] = ()  # pebble.services.mqtt_bridge.own_requests.Requests, which the bridge fulfils
+    uplink: str = ""  # pebble.services.mqtt_bridge.uplink.Uplink, where the link may be thin
+    names: str = ""  # pebble.forwarding.names.Names, where a robot's operators are known by name
+    accounts: str = ""  # pebble.transports.zenoh.hub.admission.Admission, where a hub has a file of access
     offers: str = ""  # a function of config and CapabilitiesValue, which it returns completed
     facts: str = ""  # a function of the config: Facts
     checks: str = ""  # a function of the config, for `pebble doctor`: CheckResults

@@ -1,7 +1,7 @@
-"""How old messages are when they arrive, by the clocks of their senders (T19).
+"""Ages of messages when they arrive, by the clocks of their senders (T19).
 
-Of another clock only this is known: the fastest recent message of its sender took almost no time, so one that took
-longer has waited somewhere.
+A sender's clock may show any time. Its fastest recent message is taken to have needed no time on its way: one that
+seems to have needed longer has waited somewhere.
 """
 
 import threading
@@ -21,10 +21,10 @@ K = TypeVar("K", bound=Hashable)
 
 
 class Patience(Struct, frozen=True):
-    """When a sender whose messages all seem late is believed, because it is its clock that has changed. In seconds.
+    """Seconds after which a sender whose messages all seem late is believed: its clock was changed.
 
-    ``gap_s``: only if no two of them were further apart. ``set_back_s``: if its stamps went back, which no delay does.
-    ``silent_s``: what was not heard for longer is forgotten.
+    ``believed_s`` counts in general, ``set_back_s`` if its stamps went back, as no delay explains that. ``gap_s``: only
+    while no two of its messages are further apart. ``silent_s``: a sender that was not heard for longer is forgotten.
     """
 
     believed_s: float
@@ -34,17 +34,17 @@ class Patience(Struct, frozen=True):
 
 
 class _Clock:
-    """One sender's clock. A difference is what our clock shows when a message arrives, less its stamp."""
+    """The clock of one sender. A *difference* is the time of our clock when a message arrives, less its stamp."""
 
     __slots__ = ("began", "least", "newest", "other", "patience_s", "proved", "received_at")
 
     def __init__(self, sent: float, now: float, patience_s: float = inf) -> None:
         self.began = self.received_at = now
-        self.newest = sent  # stamp
-        self.least = now - sent  # difference: that of the fastest message
-        self.proved = -inf  # what a message without any delay has at least
+        self.newest = sent  # the newest stamp
+        self.least = now - sent  # the difference of the fastest message
+        self.proved = -inf  # a message without any delay has at least this difference
         self.patience_s = patience_s
-        self.other: _Clock | None = None  # what it has become, if all that came since was not late
+        self.other: _Clock | None = None  # the clock as changed, if the messages since were not late
 
     def receive(self, sent: float, now: float) -> None:
         drift = _DRIFT * (now - self.received_at)
@@ -54,15 +54,15 @@ class _Clock:
 
     @property
     def standing(self) -> tuple[float, float]:
-        """It gives way to those that were received for longer, or else later."""
+        """The order in which clocks give way: those received for a shorter time first, then those silent for longer."""
         return self.received_at - self.began, self.received_at
 
 
 class SenderClocks(Generic[K]):
-    """The clocks of at most so many senders, each known by a key.
+    """The clocks of at most ``most`` senders, each known by a key.
 
-    Where there is no room, one that is silent gives way, or else the one that was received for the shortest time: no
-    flood of invented keys takes the place of a sender that goes on. Without a place it is judged as without a stamp.
+    Where there is no room, a silent one gives way, or else the one that was received for the shortest time: a flood of
+    invented keys does not displace a sender that goes on.
     """
 
     def __init__(self, most: int, patience: Patience) -> None:
@@ -76,8 +76,8 @@ class SenderClocks(Generic[K]):
     def age_s(self, key: K, sent: float, waited_s: float, now: float, late_s: float) -> float:
         """Return how many seconds a message stamped ``sent`` has waited at ``now``; more than ``late_s`` is late.
 
-        ``waited_s`` is what is known without the stamp: at most so long. It counts as well until the clock is two
-        seconds old, and until one of its messages was not late by that.
+        ``waited_s`` is the longest time that it can have waited, as far as is known without the stamp. It counts, too,
+        until the clock is two seconds old, and until one of the sender's messages was not late by it.
         """
         with self._lock:
             clock = self._clocks.get(key)
@@ -98,7 +98,7 @@ class SenderClocks(Generic[K]):
             return clock is not None and clock.newest - _JUMP_S < sent < clock.newest
 
     def pass_over(self, key: K, sent: float, now: float) -> None:
-        """Note the stamp of a message that is not judged: what its sender stamped before it comes too late."""
+        """Note the stamp of a message that is not judged: messages that its sender stamped earlier are late."""
         with self._lock:
             clock = self._clocks.get(key)
             if clock is not None and sent - clock.newest < now - clock.received_at + _JUMP_S:
@@ -107,14 +107,14 @@ class SenderClocks(Generic[K]):
     def _begin(self, key: K, clock: _Clock) -> _Clock:
         clocks = self._clocks
         if key not in clocks and len(clocks) >= self._most:
-            leaves = min(clocks, key=lambda one: clocks[one].received_at)
-            if clock.began - clocks[leaves].received_at <= _IDLE_S:
-                leaves = min(clocks, key=lambda one: clocks[one].standing)
-            del clocks[leaves]
+            replaced = min(clocks, key=lambda sender: clocks[sender].received_at)
+            if clock.began - clocks[replaced].received_at <= _IDLE_S:
+                replaced = min(clocks, key=lambda sender: clocks[sender].standing)
+            del clocks[replaced]
         return clock
 
     def _believed(self, key: K, clock: _Clock, sent: float, now: float, late_s: float) -> _Clock:
-        """Return the clock that counts for this message: while all seem late, perhaps another than before."""
+        """Return the sender's clock as it is, or as changed once all its messages have seemed late for long enough."""
         if now - sent - clock.least <= late_s:
             clock.other = None
             return clock
@@ -131,11 +131,11 @@ class SenderClocks(Generic[K]):
 
 
 class MessageAges:
-    """Computes the ages of messages of other processes; one older than ``late_s`` is late. Thread-safe.
+    """Ages of messages of other processes; one older than ``late_s`` is late. Thread-safe.
 
-    Processes that share a boot share a clock that counts since that boot. Any sender can claim any boot, and so make
-    all that comes from that machine seem late: so a clock counts for one topic, on which only some may send. A machine
-    whose messages all seem late was stopped, as a virtual one is when it is paused.
+    All processes of a boot share a clock that counts since that boot. A sender can claim any boot, and so make all
+    messages from that machine seem late: so a clock counts for one topic only, on which few may send. A machine whose
+    messages all seem late was stopped for a while, like a virtual one that was paused.
     """
 
     def __init__(self, boot: int, late_s: float) -> None:
@@ -147,7 +147,10 @@ class MessageAges:
         return len(self._clocks)
 
     def age_s(self, boot: int, topic: str, sent: float, now: float) -> float:
-        """Both times in seconds, each since its own machine's boot. A machine's first message counts as fresh."""
+        """Return the age in seconds; ``sent`` and ``now`` count since the boots of their machines.
+
+        The first message of a machine counts as fresh.
+        """
         if boot == self._boot:
             return now - sent
         return self._clocks.age_s((boot, topic), sent, 0.0, now, self.late_s)

@@ -39,24 +39,24 @@ _WARNING_PERIOD_S = 5.0  # between two log lines about the same overflowing subs
 
 @dataclass(frozen=True, slots=True)
 class Outgoing:
-    """What a transport has accepted and not delivered yet; not the contract's direction ``outgoing``.
+    """Messages that a transport has accepted and not delivered yet; not the contract's direction ``outgoing``.
 
-    Zero from a backend that cannot measure it (T20).
+    All zero from a backend that cannot measure them (T20).
     """
 
     waiting: int = 0  # bytes that the other machine has not confirmed, including some overhead of the protocols
-    round_trip_s: float = 0.0  # the shortest of this connection: what has waited for less is merely travelling
+    round_trip_s: float = 0.0  # the shortest of this connection: bytes that wait for less are merely travelling
     stalled_s: float = 0.0  # how long DELIVERED messages wait and none was acknowledged, beyond two usual round trips
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """How long the other end has taken to answer the newest question, or the oldest one that it has not answered."""
+    """The newest answer of the other end to a ping, or the oldest ping that it has not answered."""
 
-    number: int  # counts the answers of one connection
-    seconds: float
+    number: int  # of answers on this connection
+    seconds: float  # that it took, or has taken so far
     queue_s: float | None  # by so much TCP's own round trips are longer than the shortest; None: the system cannot tell
-    #: All that waited for us when this answer was asked for, so many seconds ago, has been delivered.
+    #: All messages that waited for us when this answer was asked for, so many seconds ago, have been delivered.
     delivered_s: float = 0.0
     late_s: float = 0.0  # by so much longer than usual it took, or the next one takes
 
@@ -172,7 +172,7 @@ class Subscriptions:
         self._all: list[Subscription] = []
 
     def __iter__(self) -> Iterator[Subscription]:
-        """Return those of this moment."""
+        """Iterate over the subscriptions of this moment."""
         with self.lock:
             return iter(list(self._all))
 
@@ -182,7 +182,7 @@ class Subscriptions:
             self.matched.clear()
 
     def remove(self, subscription: Subscription) -> bool:
-        """True if it was one of them."""
+        """Remove a subscription; return True if it was one of them."""
         with self.lock:
             if subscription not in self._all:
                 return False
@@ -197,34 +197,37 @@ class Subscriptions:
             return removed
 
     def matching(self, topic: str) -> tuple[Subscription, ...]:
-        """Remembered by topic: matching takes longer than everything else that happens to a message here."""
+        """Return the subscriptions that match ``topic``.
+
+        They are remembered by topic: matching takes longer than everything else that happens to a message here.
+        """
         with self.lock:
-            found = self.matched.get(topic)
-            if found is None:
-                found = tuple(one for one in self._all if matches(one.filter, topic))
+            matching = self.matched.get(topic)
+            if matching is None:
+                matching = tuple(subscription for subscription in self._all if matches(subscription.filter, topic))
                 if len(self.matched) >= _MATCHED:
                     self.matched.clear()
                 if len(topic) <= REMEMBERED_LENGTH:
-                    self.matched[topic] = found
-            return found
+                    self.matched[topic] = matching
+            return matching
 
 
 @dataclass(slots=True)
 class TopicPolicy:
-    """What the owner of a transport knows of topics and wants of retained messages; it sets them before it opens it."""
+    """Rules about topics and retained messages, which the owner of a transport sets before it opens it."""
 
-    #: Whether a topic is one of stops: where a backend refuses messages because too many wait, it still takes these.
+    #: True for topics of stops: where a backend refuses messages because too many wait, it still takes these.
     is_stop: Callable[[str], bool] = lambda _topic: False
-    #: Whether a topic is one of any number that strangers invent: a backend then stores nothing for it.
+    #: True for topics that strangers invent, any number of them: a backend stores nothing for such a topic.
     is_invented: Callable[[str], bool] = lambda _topic: False
-    #: Whether retained messages of a topic (UTF-8) may be discarded before anything else is done with them: strangers
+    #: True for topics (UTF-8) whose retained messages are discarded before anything else is done with them: strangers
     #: plant 100,000. Called with locks held: it must neither wait nor publish. A backend may ignore it.
     skips_retained: Callable[[bytes], bool] = lambda _topic: False
     #: Deliver a retained message also after a live one of its topic (T8): the live one may have been our own. The owner
     #: then decides which of them counts.
     delivers_late: bool = False
-    #: What is published in place of a message, in this order; the outcome of the first is that of
-    #: :meth:`Transport.publish`. None: the message itself.
+    #: Returns the messages that are published in place of one, in this order; :meth:`Transport.publish` returns the
+    #: outcome of the first. None: the message itself.
     forms: Callable[[Message], Iterable[Message]] | None = None
 
 
@@ -234,18 +237,19 @@ class Transport(ABC):
     All methods may be called from any thread, and from inside handlers.
     """
 
-    #: Whether ``subscribe(echo=False)`` is exact (T16). A backend that cannot provide it sets False once it knows.
+    #: True if ``subscribe(echo=False)`` is exact (T16). A backend that cannot provide it sets False once it knows.
     exact_echo: bool = True
-    #: Received ``retain`` means "retained, or published with retain"; own messages never come back (T7).
+    #: True if ``retain`` of received messages means "retained, or published with retain"; own messages never come back
+    #: then (T7).
     as_published: bool = False
-    #: Whether the other end had older values of what only we publish when the newest connection began: it was restored
+    #: True if the other end had older values of what only we publish when the newest connection began: it was restored
     #: from an earlier save, or is another one. A backend that cannot notice it leaves it False.
     went_back: bool = False
-    #: Whether the newest connection ended because the other end went down, and it was down at every try since: then no
-    #: client can have published there meanwhile without our receiving it.
+    #: True if the newest connection ended because the other end went down, and it was down at every try since: no
+    #: client can have published there without our receiving it.
     was_ended: bool = True
-    #: Whether the link to the other end is thin: keep little in the kernel, where nothing can go ahead of what waits,
-    #: and wait longer for answers, with fewer questions. Set by :meth:`suit_link`; a backend may ignore it.
+    #: True if the link to the other end is thin: keep little in the kernel, where nothing can overtake it, ask less
+    #: often and wait longer for answers. Set by :meth:`suit_link`; a backend may ignore it.
     is_thin: bool = False
 
     def __init__(self, client_id: str, *, will: Message | None = None) -> None:
@@ -271,12 +275,12 @@ class Transport(ABC):
 
     @property
     def outgoing(self) -> Outgoing:
-        """What was accepted and is not delivered yet, where the backend can measure it (T20)."""
+        """The messages that were accepted and are not delivered yet, where the backend can measure them (T20)."""
         return Outgoing()
 
     @property
     def answer(self) -> Answer | None:
-        """How long an answer takes now; None while there is none, and from a backend that asks nothing."""
+        """The newest answer to a ping; None while there is none, and from a backend that sends no pings."""
         return None
 
     @property
@@ -286,17 +290,17 @@ class Transport(ABC):
 
     @property
     def not_received(self) -> str:
-        """What is not delivered to us although there is a connection, and why, in one line; empty: all is."""
-        refused = [one.filter for one in self._subscriptions if one.refused]
+        """One line about subscriptions that the other end refuses; empty: none."""
+        refused = [subscription.filter for subscription in self._subscriptions if subscription.refused]
         more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""
         return f"it refuses to deliver {', '.join(refused[:_NAMED])}{more}" if refused else ""
 
     def suit_link(self, *, thin: bool) -> None:
-        """Suit the link to the other end, from now on: see `is_thin`."""
+        """Set `is_thin`, from now on."""
         self.is_thin = thin
 
     def renew_connection(self, why: str) -> None:  # noqa: B027 - where no other end keeps messages, nothing is to be done
-        """End the connection and make another: what waits for it at the other end is dropped there."""
+        """Replace the connection by another: messages that wait for the old one at the other end are dropped there."""
 
     def on_state(self, watcher: Watcher) -> None:
         """Call ``watcher`` on every change of state, in order, on a thread of the transport: it must return at once."""
@@ -415,19 +419,19 @@ class Transport(ABC):
             check_filter(filter_)
             if self.as_published and echo:
                 raise TransportError(f"an as-published connection never echoes: subscribe {filter_} with echo=False")
-        made = [
+        subscriptions = [
             Subscription(self, filter_, handler, qos=QoS(qos), echo=echo, direct=direct, limit=limit)
             for filter_, handler in handlers.items()
         ]
         with self._subscriptions.lock:
             if self._state is State.CLOSED:
-                for one in made:
-                    one._stop()
+                for subscription in subscriptions:
+                    subscription._stop()
                 raise TransportError(f"transport {self.client_id} is closed")
-            for one in made:
-                self._subscriptions.add(one)
-        self._declare_all(made)
-        return made
+            for subscription in subscriptions:
+                self._subscriptions.add(subscription)
+        self._declare_all(subscriptions)
+        return subscriptions
 
     def ask(self, topics: Collection[str]) -> None:
         """Have the retained messages of ``topics`` delivered to the subscriptions that match; waits, bounded.
@@ -456,7 +460,7 @@ class Transport(ABC):
             self._changes.notify(state)
 
     def _renew(self) -> None:
-        """Backends call this when a new connection begins, before its first message is offered."""
+        """Begin a new connection; backends call this before its first message is offered."""
         for subscription in self._subscriptions:
             subscription.renew()
 

@@ -20,7 +20,7 @@ class BoundedQueue(Generic[V]):
         return len(self._items)
 
     def append(self, item: V, size: int) -> list[V]:
-        """Append ``item``, of ``size`` bytes; returns the items that were dropped for it."""
+        """Append ``item``, of ``size`` bytes; return the items that were dropped for it."""
         dropped = []
         while self._items and (len(self._items) >= self._max_items or self._size + size > self._max_size):
             dropped.append(self.popleft())
@@ -69,7 +69,7 @@ class BoundedTable(MutableMapping[str, V]):
         self._put(topic, value, forget=True)
 
     def put_if_room(self, topic: str, value: V) -> bool:
-        """Stores the value unless another topic would have to be forgotten; returns whether it is stored."""
+        """Store the value, unless another topic would have to be forgotten; return True if it is stored."""
         return self._put(topic, value, forget=False)
 
     def __delitem__(self, topic: str) -> None:

@@ -1,4 +1,4 @@
-"""What a connection to a broker presents, and whom it trusts: as the files say when it is made."""
+"""Password and certificates of connections to a broker, read again from their files when these have changed."""
 
 import ssl
 from pathlib import Path
@@ -9,7 +9,7 @@ from pebble.transports.tls import make_context
 
 
 class Credentials:
-    """Raises TransportError for certificates that cannot be used. Those that come later replace the ones before."""
+    """The credentials of one client. Raises TransportError for certificates that cannot be used."""
 
     def __init__(self, settings: MqttSettings) -> None:
         self._password = settings.password

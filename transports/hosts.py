@@ -1,4 +1,4 @@
-"""Every address of a host gets its turn, whatever way the one before failed."""
+"""Addresses of a host: each gets its turn, in whatever way the one before has failed."""
 
 import socket
 from collections.abc import Callable
@@ -22,7 +22,7 @@ class HostPort(NamedTuple):
 
 
 class Address(NamedTuple):
-    """Where a socket connects to, as `socket.getaddrinfo` returns it."""
+    """An address for a socket, as `socket.getaddrinfo` returns it."""
 
     family: int
     place: tuple[Any, ...]
@@ -35,8 +35,8 @@ class Address(NamedTuple):
 def addresses_of(host: str, port: int) -> list[Address]:
     """Return all addresses of ``host``, each once. Raises OSError; ValueError for a host that cannot be a name."""
     name = host.encode() if host.isascii() else host  # for text Python loads what only other names need, 0.3 MB
-    found = socket.getaddrinfo(name, port, type=socket.SOCK_STREAM)
-    return list(dict.fromkeys(Address(family, place) for family, _type, _protocol, _name, place in found))
+    infos = socket.getaddrinfo(name, port, type=socket.SOCK_STREAM)
+    return list(dict.fromkeys(Address(family, place) for family, _type, _protocol, _name, place in infos))
 
 
 def dial(address: Address, timeout: float | None = None, *, max_segment: int = 0) -> socket.socket:
@@ -64,30 +64,31 @@ def described(failures: dict[str, str]) -> str:
 
 
 class AddressRound:
-    """Whose turn it is among the addresses of one host, which is resolved anew in each round.
+    """A round through the addresses of one host. Each round resolves the host's name again.
 
-    A round ends when each address has failed once; only then there is a pause.
+    It ends when each address has failed once; only then there is a pause.
     """
 
     def __init__(self, host_port: HostPort, resolve: Callable[[str, int], list[Address]] = addresses_of) -> None:
         self.host_port, self._resolve = host_port, resolve
-        self._left: list[Address] = []  # of this round; the first one has its turn
-        self.several = False  # another address has its turn after a failure, without a pause
-        self._steady: Address | None = None  # has lost a connection that held for long: begins the next round
+        self._left: list[Address] = []  # of this round; it is the turn of the first one
+        self.several = False  # addresses: after a failure the next one has its turn without a pause
+        self._steady: Address | None = None  # an address that has lost a connection that held for long: it begins again
         self._is_first = True  # round
         self._failures: dict[str, str] = {}  # why each address failed last, without a success since
-        self._slow: set[Address] = set()  # where TLS took long, or was not there in time
+        self._slow: set[Address] = set()  # addresses where TLS took long, or was not there in time
 
     def address(self) -> Address:
         """Return the address whose turn it is; may wait for a resolver. Raises OSError, ValueError."""
         if not self._left:
-            found = self._resolve(*self.host_port)
-            if not found:
+            addresses = self._resolve(*self.host_port)
+            if not addresses:
                 raise OSError("it has no address")
-            self._left = sorted(found, key=lambda one: one != self._steady)
-            self._steady, self.several = None, len(found) > 1
-            self._slow &= set(found)
-            self._failures = {one.text: self._failures[one.text] for one in found if one.text in self._failures}
+            self._left = sorted(addresses, key=lambda address: address != self._steady)
+            self._steady, self.several = None, len(addresses) > 1
+            self._slow &= set(addresses)
+            texts = {address.text for address in addresses}
+            self._failures = {text: why for text, why in self._failures.items() if text in texts}
         return self._left[0]
 
     @property
@@ -102,15 +103,15 @@ class AddressRound:
 
     @property
     def patience_s(self) -> float:
-        """TLS may be silent for so long at the address whose turn it is."""
+        """Seconds for which TLS may be silent at the address whose turn it is."""
         return HANDSHAKE_S if self._left and self._left[0] in self._slow else CONNECT_TIMEOUT_S
 
     def opened(self, seconds: float) -> None:
-        """TCP and TLS took so long there; an address that has not answered in time was not slow, then, but dead."""
+        """Note how long TCP and TLS took there; addresses that had not answered in time were dead, then, not slow."""
         self._slow = {self._left[0]} if seconds > CONNECT_TIMEOUT_S else set()
 
     def was_slow(self) -> None:
-        """TLS was silent for too long: the next time it gets longer."""
+        """Note that TLS was silent for too long: it gets longer the next time."""
         self._slow.add(self._left[0])
 
     def succeeded(self) -> str:

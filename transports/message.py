@@ -1,4 +1,4 @@
-"""What a transport carries."""
+"""A message, as transports carry it."""
 
 from enum import IntEnum
 

@@ -1,11 +1,11 @@
-"""Whether a file that a process has made, or reads, is still the one at its path."""
+"""Files that a process has made, and that others may remove or replace."""
 
 import os
 from pathlib import Path
 
 
 class OwnFile:
-    """A file that is this process's now: of a socket where it listens, or of memory that it shares."""
+    """A file that this process has made, such as a lock or a saved state."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -23,9 +23,9 @@ class OwnFile:
 
 
 def identity(file: Path | int) -> tuple[int, int] | None:
-    """Return what tells a file from one that has taken its place; None if there is none."""
+    """Return numbers that no other file has at the same time; None if there is no such file."""
     try:
-        found = os.stat(file)  # noqa: PTH116 - of a descriptor as well
+        status = os.stat(file)  # noqa: PTH116 - of a descriptor as well
     except (FileNotFoundError, NotADirectoryError):
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino

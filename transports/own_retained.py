@@ -11,17 +11,17 @@ BYTES = 16 << 20  # the same, with their payloads
 
 
 class OwnRetained(BoundedTable[Message]):
-    """The newest one by topic; empty payloads included. The transport's lock of publishing guards the rest."""
+    """The newest message of each topic, empty payloads included. The transport's lock of publishing guards the rest."""
 
     def __init__(self, counters: Counters) -> None:
         super().__init__(LIMIT, BYTES, lambda message: len(message.payload))
         self.pending: dict[str, None] = {}  # topics whose message is not sent yet, oldest first
         self.shared: set[str] = set()  # topics that others publish on, too
-        self.syncing = False  # while these are sent again
+        self.syncing = False  # True while these are sent again
         self._counters = counters
 
     def remember(self, message: Message, *, sent: bool, shared: bool | None = None) -> bool:
-        """Store a message, to send it again; False, and no older one is sent again, if there is no room.
+        """Store a message, to send it again. False if there is no room; then no older one is sent again either.
 
         ``shared`` None: as the older one.
         """

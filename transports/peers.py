@@ -49,15 +49,15 @@ def make_private(run_dir: Path, *, close: bool = False) -> None:
                     " remove it as that user or root, or set transport.run_dir to another folder"
                 )
         run_dir.mkdir(mode=0o700, exist_ok=True)
-        found = run_dir.lstat()
-        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
+        folder = run_dir.lstat()
+        if not stat.S_ISDIR(folder.st_mode) or folder.st_uid != os.getuid():
             raise TransportError(
                 f"transport.run_dir {run_dir} is not a folder of this user: "
                 "run this as the user of the robot, or remove what is there"
             )
-        if close and found.st_mode & 0o077 and not found.st_mode & stat.S_ISVTX:
+        if close and folder.st_mode & 0o077 and not folder.st_mode & stat.S_ISVTX:
             run_dir.chmod(0o700)
-        elif found.st_mode & 0o022:
+        elif folder.st_mode & 0o022:
             raise TransportError(f"transport.run_dir {run_dir}: others may write there, name a folder of this user")
     except OSError as error:
         raise TransportError(
@@ -109,7 +109,7 @@ class FileLock:
         return _is_at(self.path, self._descriptor)
 
     def write(self, text: bytes) -> None:
-        """Replace what is in the file. A full disk leaves zeros, as many: the lock counts, the text is for people."""
+        """Replace the text in the file. A full disk leaves as many zeros: the lock counts, the text is for people."""
         try:
             os.truncate(self._descriptor, len(text))  # needs no space
             os.pwrite(self._descriptor, text, 0)
@@ -199,7 +199,7 @@ def _no_lock(path: Path, error: OSError, remedy: str = "") -> TransportError:
 
 
 def _owner_if_running(path: Path) -> str | None:
-    """Return what the owner of the lock file wrote; None, and its files removed, if it does not run any more."""
+    """Return the text in a lock file; None if its owner does not run any more: its files are removed then."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError:  # removed meanwhile, or no lock file

@@ -1,4 +1,4 @@
-"""What is made from files that others replace while this process runs: certificates, keys, passwords."""
+"""Values made from files that others replace while this process runs: certificates, keys, passwords."""
 
 import logging
 from collections.abc import Callable, Iterable
@@ -13,16 +13,16 @@ _T = TypeVar("_T")
 
 
 class Renewed(Generic[_T]):
-    """A value that is made again, when it is used, from files that have changed since.
+    """A value that is made again when it is used after its files have changed.
 
-    Files that cannot be used, because they are half written or gone, are reported once; until they can, the last good
-    value stays. ``first`` is the value if the files were read already; else the first one is made now, with its errors.
+    Files that cannot be used, because they are half written or gone, are logged once; until they can, the last good
+    value stays. ``first`` is the value if the files were read already; else it is made now, with its errors.
     """
 
     def __init__(self, files: Iterable[Path], make: Callable[[], _T], first: _T | None = None) -> None:
         self._files = list(files)
         self._make = make
-        self._made_from = self._versions()  # before they are read: what is written meanwhile differs again
+        self._made_from = self._versions()  # before they are read: a change while they are read counts as a later one
         self._value = make() if first is None else first
         self._problem = ""
 
@@ -46,9 +46,9 @@ class Renewed(Generic[_T]):
 
 
 def _version(file: Path) -> tuple[int, ...]:
-    """Differs whenever the file has been written, replaced, removed or given to others."""
+    """Return numbers that change whenever the file is written, replaced, removed or given to others."""
     try:
-        found = file.stat()
+        status = file.stat()
     except OSError:
         return ()
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns

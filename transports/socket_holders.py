@@ -1,4 +1,4 @@
-"""Which processes hold a socket, as far as this user may look: into those of the same user, as root into all."""
+"""Processes that hold a socket, as far as this user may look: into those of the same user, as root into all."""
 
 import errno
 from collections.abc import Collection, Iterator
@@ -10,7 +10,7 @@ _LISTENS = "0A"  # in /proc/net/tcp
 
 
 def _processes_with(inodes: Collection[str]) -> Iterator[tuple[Path, set[str]]]:
-    """Yield the processes that hold some of these sockets: their folders in /proc, and which they hold."""
+    """Yield each process that holds some of these sockets: its folder in /proc, and those that it holds."""
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             links = []
@@ -22,7 +22,7 @@ def _processes_with(inodes: Collection[str]) -> Iterator[tuple[Path, set[str]]]:
 
 
 def _command_of(process: int) -> str:
-    """Return its command, safe to print: a process may choose any bytes."""
+    """Return the command of a process, safe to print: it may have any bytes."""
     try:
         words = Path(f"/proc/{process}/cmdline").read_text(encoding="utf-8", errors="replace")
     except OSError as error:
@@ -36,7 +36,7 @@ def why_not(error: OSError, port: int) -> str:
 
 
 def port_holder(port: int) -> str:
-    """Example: `` (by process 12 of user 1000: 'nc -l 8080')``; "" if no process listens there that can be found."""
+    """Return which process listens at a port, or "": `` (by process 12 of user 1000: 'nc -l 8080')``."""
     users = {}
     for name in ("tcp", "tcp6"):
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""How long the path of a unix socket in a run directory may be."""
+"""The limit on the length of a path of a unix socket."""
 
 import os
 from pathlib import Path

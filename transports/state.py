@@ -1,4 +1,4 @@
-"""The state of a transport's connection, and who learns of its changes."""
+"""The state of a transport's connection, and the watchers of its changes."""
 
 import logging
 import threading
@@ -33,7 +33,7 @@ class StateChanges:
         return self._connected.wait(timeout)
 
     def notify(self, state: State) -> None:
-        """Tell watchers that the state is another one now. Call it with :attr:`lock` held."""
+        """Tell the watchers the new state. Call it with :attr:`lock` held."""
         if state is State.CONNECTED:
             self._connected.set()
         else:

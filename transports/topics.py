@@ -78,12 +78,15 @@ def is_pattern(filter_: str) -> bool:
 
 @remembered
 def beginning(filter_: str) -> str:
-    """Return what every topic that ``filter_`` matches begins with: of hundreds of filters it soon rules most out."""
+    """Return the beginning of every topic that ``filter_`` matches: it soon rules most of hundreds of filters out."""
     return _WILDCARD.split(filter_, maxsplit=1)[0]
 
 
 def matches(filter_: str, topic: str) -> bool:
-    """MQTT's rules: ``+`` is one level, a final ``#`` is the rest and its parent, wildcards skip ``$…`` topics."""
+    """Return True if ``filter_`` matches ``topic``, by MQTT's rules.
+
+    ``+`` is one level, a final ``#`` is the rest and its parent, and wildcards skip topics that begin with ``$``.
+    """
     if filter_ == topic:
         return True
     if not topic.startswith(beginning(filter_)):

@@ -1,4 +1,4 @@
-"""What wakes the one thread that waits: for new work, or for descriptors."""
+"""Wake-ups of a thread that waits for new work, or for descriptors."""
 
 import socket
 import threading
@@ -32,10 +32,10 @@ class Wakeup:
 
 
 class WakeupPipe:
-    """One thread polls it beside its devices, any other or a signal sets it; a set before a poll counts."""
+    """A descriptor that one thread polls beside its devices. Any other or a signal sets it; a set before counts."""
 
     def __init__(self) -> None:
-        self._reader, self._writer = socket.socketpair()  # Windows polls no pipes
+        self._reader, self._writer = socket.socketpair()
         self._reader.setblocking(False)
         self._writer.setblocking(False)
 
@@ -44,7 +44,7 @@ class WakeupPipe:
 
     @property
     def set_fileno(self) -> int:
-        """What sets it when a byte is written to it: for ``signal.set_wakeup_fd``."""
+        """The descriptor that sets it when a byte is written there: for ``signal.set_wakeup_fd``."""
         return self._writer.fileno()
 
     def set(self) -> None:

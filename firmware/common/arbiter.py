@@ -1,4 +1,6 @@
-"""Who moves the motors: none while latched, who has control, people before scripts. Pure; boards share it with Linux.
+"""The arbiter of drive commands: none while latched, the holder of control, people before scripts. Pure.
+
+Boards share it with Linux.
 
 A drive command with all axes 0 is a zero. A person's zero is always judged. Commands of a script carry the number of
 its run, which grows with each start; a run that is barred never moves anything again. The numbers have no end: after
@@ -22,10 +24,10 @@ def newer(run: int, last: int) -> bool:
 
 
 class Arbiter:
-    """``judge`` every drive command; ``stop`` at every emergency stop; ``tick`` regularly."""
+    """An arbiter: ``judge`` every drive command, ``stop`` at every emergency stop, ``tick`` regularly."""
 
     def __init__(self, latch, lease, now: int, diff, watchdog_ms: int) -> None:
-        """``watchdog_ms`` is how long a command moves anything, at most; see latch.py for ``diff``."""
+        """Store the arguments; a command moves anything for ``watchdog_ms`` at most. See latch.py for ``diff``."""
         self.latch = latch
         self.lease = lease
         self.barred = 0  # runs up to this number
@@ -37,7 +39,7 @@ class Arbiter:
         self._held = False  # by a person
         self._held_from = now
         self._resumes = True  # at the end of the hold: the person's last command was a zero that is not final
-        self._scripted = False  # a script is in effect: the newest admitted command is its, and within its deadline
+        self._scripted = False  # the newest admitted command is a script's, and within its deadline
         self._script_from = now
         self._script_ms = 0
 
@@ -46,17 +48,16 @@ class Arbiter:
 
         ``moves``: any axis is not 0. ``run`` may be PERSON, or UNKNOWN_RUN of a zero. ``valid_ms`` < 0: not given.
         ``key`` and ``by`` are those of the lease; ``by`` None: a program of the robot, which needs no key, as no script
-        does where names are not checked. A zero of somebody else than who has control ends a script, too, but is
-        nobody's letting go.
+        does where names are not checked. A zero of a client without control ends a script, too, but releases nothing.
         """
         self.tick(now)
         lease = self.lease
-        own = by is None
+        local = by is None
         if by and run != PERSON and not lease.holds(key, by):  # of a script elsewhere only a zero counts
             if moves:
                 return REFUSED
             run = PERSON
-        if lease.refuses(moves, run != PERSON or own, key, "" if own else by, now):
+        if lease.refuses(moves, run != PERSON or local, key, "" if local else by, now):
             return REFUSED
         ours = run != PERSON or not lease.key or lease.holds(key, by)
         if newer(run, self.barred) and run != self._newest:  # it has begun, even if this command is refused
@@ -78,7 +79,7 @@ class Arbiter:
         return limit if moves else 0
 
     def stop(self, name: str, by: str, why: str, since: int) -> bool:
-        """Latch, and bar all runs so far; False: this stop is known already."""
+        """Latch, and bar all runs so far; return False if this stop is known already."""
         if not self.latch.stop(name, by, why, since):
             return False
         self.bar(self._newest)
@@ -86,7 +87,7 @@ class Arbiter:
         return True
 
     def tick(self, now: int) -> None:
-        """Let what is over end; at least every few minutes, because clocks of boards wrap."""
+        """End holds and scripts that are over; call it at least every few minutes, as clocks of boards wrap."""
         diff = self._diff
         self.latch.tick(now)
         self.lease.tick(now)

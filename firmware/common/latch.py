@@ -1,4 +1,4 @@
-"""The emergency stop of one motor owner: what latches it, and what resets it. Pure; boards and Linux robots share it.
+"""The emergency stop of one motor owner: its latch and the resets. Pure; boards and Linux robots share it.
 
 Stopped means latched: nothing moves until a reset, also after a power cut. Times are milliseconds of any clock;
 ``diff`` subtracts two of them.
@@ -6,26 +6,26 @@ Stopped means latched: nothing moves until a reset, also after a power cut. Time
 
 
 class Latch:
-    """``latched``, and what others need to know of it. A restart begins with a new ``boot`` and a ``count`` of 0."""
+    """A latch, and its published state. A restart begins with a new ``boot`` and a ``count`` of 0."""
 
     def __init__(self, boot: str, names: int, diff) -> None:
-        """``boot`` is random; ``names`` is how many names of stops are remembered."""
+        """Store the arguments; ``boot`` is random, ``names`` the number of names of stops that are remembered."""
         self.latched = False
         self.boot = boot
         self.count = 0  # stops since the start
         self.recent: list[str] = []  # the names of the newest stops, the last one first
-        self.client: list[str | None] = []  # who sent each of them; None: of before the start
+        self.client: list[str | None] = []  # the sender of each of them; None: from before the start
         self.by = ""
         self.why = ""
         self.since = 0  # epoch milliseconds of the newest stop
         self.reset_refused: str | None = None  # "boot", "count" or "old"
         self.names = names
         self._diff = diff
-        self._waits = False  # after a reset, for persons to let go
+        self._waits = False  # after a reset, until persons let go
         self._waits_from = 0
 
     def restore(self, saved: object) -> None:
-        """Begin as ``saved``, a parsed file; anything that ``saved()`` never returns counts as a stop."""
+        """Continue with ``saved``, a parsed file; anything that ``saved()`` never returns counts as a stop."""
         recent = saved.get("recent") if isinstance(saved, dict) else None
         if isinstance(saved, dict) and isinstance(saved.get("latched"), bool) and isinstance(recent, list):
             self.latched = saved["latched"]
@@ -40,7 +40,7 @@ class Latch:
             self.why = "the saved state cannot be read"
 
     def saved(self) -> dict:
-        """Return what ``restore`` needs."""
+        """Return the state for ``restore``."""
         return self._fields("latched", "recent", "by", "why", "since")
 
     def state(self, persisted: bool | None) -> dict:
@@ -50,18 +50,18 @@ class Latch:
         return state
 
     def _fields(self, *names: str) -> dict:
-        found = {}
+        fields = {}
         for name in names:
-            found[name] = getattr(self, name)
-        return found
+            fields[name] = getattr(self, name)
+        return fields
 
     def stop(self, name: str, by: str, why: str, since: int) -> bool:
-        """Latch, unless this stop is known already: then the result is False, and at most its sender changes: one that
-        was not checked has a mark, and gives way.
+        """Latch, unless this stop is known already: then return False.
 
-        ``name`` is never empty: the receiver of a stop without a name makes one. If there are too many names, the
-        oldest of the sender that has the most is forgotten, so that stops of one account do not keep another's from
-        being confirmed. Senders that were not checked are one.
+        A sender that was not checked has a mark; a checked one takes its place when the stop comes again. ``name`` is
+        never empty: the receiver of a stop without a name makes one. If there are too many names, the oldest of the
+        sender with the most is forgotten, so that stops of one account do not keep another's from being confirmed. All
+        senders that were not checked count as one.
         """
         sender = "?" if by[-1:] == "?" else by.split("/")[0]
         if name in self.recent:
@@ -75,7 +75,7 @@ class Latch:
         senders.insert(0, sender)
         self.recent = [name] + self.recent  # a new list: states that were returned have the old one
         if len(senders) > self.names:
-            place = max([(one is None, senders.count(one), at) for at, one in enumerate(senders)])[2]
+            place = max([(other is None, senders.count(other), at) for at, other in enumerate(senders)])[2]
             del self.recent[place], senders[place]
         self.latched = True
         self.count += 1
@@ -87,7 +87,7 @@ class Latch:
         return True
 
     def reset(self, boot: str, count: int, age: int, now: int) -> bool:
-        """End the stop if the sender saw the newest state, and if it was read, ``age`` ago, in the last second.
+        """End the stop if the sender has seen the newest state, and if the reset was read in the last second.
 
         Then persons are refused until one sends a zero, or all pause for half a second.
         """
@@ -113,7 +113,7 @@ class Latch:
         return self._waits
 
     def tick(self, now: int) -> None:
-        """To be called at least every few minutes, because clocks of boards wrap."""
+        """End a pause that is over; call it at least every few minutes, as clocks of boards wrap."""
         if self._waits and self._diff(now, self._waits_from) >= 500:
             self._waits = False
 
@@ -124,24 +124,24 @@ def is_name(name: object) -> bool:
 
 
 def stop_of(body: object) -> tuple[str, str, str]:
-    """``(name, by, why)`` of a parsed stop, of whatever shape; the name is "" if it has none."""
-    found = fields(body)
-    name = found.get("stop")
-    return str(name) if is_name(name) else "", _text(found.get("by"), 32), _text(found.get("why"), 40)
+    """Return ``(name, by, why)`` of a parsed stop, of whatever shape; the name is "" if it has none."""
+    command = fields(body)
+    name = command.get("stop")
+    return str(name) if is_name(name) else "", _text(command.get("by"), 32), _text(command.get("why"), 40)
 
 
 def reset_of(body: object) -> tuple[str, int] | None:
-    """``(boot, count)`` of a parsed reset; None if it is none."""
-    found = fields(body)
-    boot = found.get("boot")
-    count = found.get("count")
+    """Return ``(boot, count)`` of a parsed reset; None if it is none."""
+    command = fields(body)
+    boot = command.get("boot")
+    count = command.get("count")
     if isinstance(boot, str) and isinstance(count, int) and not isinstance(count, bool):
         return boot, count
     return None
 
 
 def fields(body: object) -> dict:
-    """Return what a command contains, bare or wrapped."""
+    """Return the fields of a command, bare or wrapped in ``value``."""
     inner = body.get("value") if isinstance(body, dict) else None
     if isinstance(inner, dict):
         return inner
@@ -149,7 +149,7 @@ def fields(body: object) -> dict:
 
 
 def _text(value: object, limit: int) -> str:
-    """Printable ASCII, without what JSON would have to escape."""
+    """Return printable ASCII, without characters that JSON would have to escape."""
     if not isinstance(value, str):
         return ""
     return "".join([char if " " <= char <= "~" and char not in '"\\' else "?" for char in value[:limit]])

@@ -1,16 +1,16 @@
-"""Who has control of one motor owner: a lease that it gives, renews and ends. Pure; boards and Linux robots share it.
+"""Control of one motor owner: a lease that it gives, renews and ends. Pure; boards and Linux robots share it.
 
 Control orders people; it is no safety function. A stop and a zero need none. A drive command names the control under
-which it is sent by a key, which is new whenever another one gets control: so commands of before have no effect.
+which it is sent by a key, which is new whenever another client gets control: so earlier commands have no effect.
 A client is ``(account, id, by, device)``; the account is "" where names are not checked.
 """
 
 
 class Lease:
-    """``hold`` and ``release`` for requests; ``refuses`` for drive commands; ``tick`` regularly."""
+    """A lease: ``hold`` and ``release`` for requests, ``refuses`` for drive commands, ``tick`` regularly."""
 
     def __init__(self, now: int, diff, random, strangers: int) -> None:
-        """``random(4)`` returns 8 hex digits.
+        """Store the arguments; ``random(4)`` returns 8 hex digits.
 
         ``strangers``: commands without a key move the motors always (0), while control is free (1), or never (2).
         """
@@ -19,7 +19,7 @@ class Lease:
         self.asker: tuple = ()
         self.others = False  # in the last 2 s a command without a key moved something, unless it was refused elsewhere
         self.changed = True  # since the last state
-        self.halts = False  # another one has control, or none: the motors are to be stopped
+        self.halts = False  # another client has control, or none: the motors are to be stopped
         self.strangers = strangers
         self._diff = diff
         self._random = random
@@ -52,13 +52,13 @@ class Lease:
             self.changed = True
 
     def holds(self, key: str, by: str) -> bool:
-        """True if a command of this account is from who has control; its key has those of several motor owners."""
-        own = self.key
-        # no client can try many keys at once
-        return own != "" and (key == own or (len(key) < 80 and own in key.split(" "))) and self.holder[:1] == (by,)
+        """True if a command of this account is from the holder; ``key`` may have those of several motor owners."""
+        if not self.key or self.holder[:1] != (by,):
+            return False
+        return key == self.key or (len(key) < 80 and self.key in key.split(" "))  # nobody can try many keys at once
 
     def refuses(self, moves: bool, script: bool, key: str, by: str, now: int) -> bool:
-        """True if a drive command has no effect; one of who has control renews it. A zero always has an effect.
+        """True if a drive command has no effect; one of the holder renews control. A zero always has an effect.
 
         ``script``: this sender needs no key. Call ``tick`` before.
         """
@@ -79,7 +79,7 @@ class Lease:
         return False
 
     def tick(self, now: int) -> None:
-        """Let what is over end; at least every few minutes, because clocks of boards wrap."""
+        """End control and requests that are over; call it at least every few minutes, as clocks of boards wrap."""
         diff = self._diff
         if self.others and diff(now, self._received) >= 2000:
             self.others = False
@@ -93,7 +93,7 @@ class Lease:
             self._end(now)
 
     def take(self, client: tuple, ms: int, now: int) -> None:
-        """Control passes on to this client, or becomes free."""
+        """Pass control on to this client, or make it free."""
         self.holder = client
         self.asker = ()
         self.key = self._random(4) if ms else ""
@@ -107,7 +107,7 @@ class Lease:
 
 
 def request_of(fields: dict) -> tuple[str, str, str, int] | None:
-    """``(id, by, device, for_ms)``; 0: it is a release. None: it is no request."""
+    """Return ``(id, by, device, for_ms)``, 0 for a release; None if it is no request."""
     name = fields.get("id")
     want = fields.get("want", "hold")
     by = fields.get("by", "")
@@ -123,6 +123,6 @@ def request_of(fields: dict) -> tuple[str, str, str, int] | None:
 
 
 def shown(text: str, limit: int) -> str:
-    """``text`` in the letters of names; "/" separates a server and its person."""
+    """Return ``text`` in the letters of names; "/" separates a server and its person."""
     letters = "abcdefghijklmnopqrstuvwxyz0123456789_-/"
     return "".join([char if char in letters else "_" for char in text.lower()[:limit]])

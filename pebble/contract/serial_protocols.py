@@ -30,11 +30,8 @@ class SerialProtocol(Struct, frozen=True):
         return self.is_imu or (self.describes_itself and instance == _IMU_INSTANCE)
 
 
-_BRIDGE = "pebble.services.serial_mcu_bridge"
-
 #: By the config's ``protocol``; extensions add theirs.
 SERIAL_PROTOCOLS: Final[dict[str, SerialProtocol]] = {
-    "goob_base_v1": SerialProtocol(f"{_BRIDGE}.text.motor_bridge:MotorBridge", drives=True),
-    "imu_mpu6050_v1": SerialProtocol(f"{_BRIDGE}.text.imu_bridge:ImuBridge", is_imu=True),
+    "goob_base_v1": SerialProtocol("pebble.services.serial_mcu_bridge.text.motor_bridge:MotorBridge", drives=True),
 }
 OF_CORE: Final = frozenset(SERIAL_PROTOCOLS)

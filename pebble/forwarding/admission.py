@@ -1,4 +1,4 @@
-"""What a robot takes: how much from outside, where everybody may send it anything."""
+"""Bounds of messages to a robot, to which everybody may send anything."""
 
 import time
 from collections.abc import Callable
@@ -15,17 +15,17 @@ MAX_UNKNOWN_FLAGS = 64  # each is retained on the robot: in its broker or hub, a
 
 
 class Admission:
-    """Bounds what a robot takes: by size, and by number what is no command of the contract.
+    """Bounds by size, and by number for actions and for messages that the contract does not know.
 
-    Flags that the contract does not know: what the robot itself has set counts as well, so a restarted bridge begins no
-    new number, but is always admitted.
+    Unknown flags that the robot itself has set are always admitted and count as well, so a restarted bridge does not
+    begin a new number.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._flags: set[str] = set()
         self._clock = clock
         self._second = 0
-        self._counts: dict[tuple[Kind | Channel, bool], int] = {}  # of this second, with and without a name
+        self._counts: dict[tuple[Kind | Channel, bool], int] = {}  # of this second, with a name and without one
 
     def __len__(self) -> int:
         return len(self._flags)
@@ -33,7 +33,7 @@ class Admission:
     def refuse(self, side: Side, subject: Subject, message: Message, topic: str, *, named: bool = True) -> Drop | None:
         """Return why this message may not pass to ``topic``; None if it may. Hot.
 
-        ``named`` False: it has no name where others have one. Such messages take no places of those.
+        ``named`` False: it has no name where others have one; such messages are counted apart.
         """
         if side is Side.REMOTE and len(message.payload) > MAX_COMMAND_BYTES and _is_bounded(subject):
             return Drop.TOO_LARGE
@@ -44,7 +44,7 @@ class Admission:
             return Drop.TOO_OFTEN
         if subject.kind is not Kind.FLAG or subject.channel is not None:
             return None
-        if not message.payload:  # removed; who removes a million others costs the robot nothing
+        if not message.payload:  # a removal: a million of unknown flags cost the robot nothing
             if side is Side.REMOTE and topic not in self._flags:
                 return Drop.KNOWN
             self._flags.discard(topic)

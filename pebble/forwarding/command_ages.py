@@ -1,7 +1,7 @@
-"""How long commands have waited, by the clocks of their senders.
+"""Ages of commands, by the clocks of their senders.
 
-On a thin link what is known by pings includes the way *up*, which may wait behind pictures. A drive command with its
-sender's clock ``t`` and a ``key`` needs no pings once one of this key was fast; a request for control has its ``id``.
+The age that pings show includes the way *up*, which on a thin link may wait behind pictures. A drive command with its
+sender's clock ``t`` and a ``key`` needs no pings once one with this key was fast; a request for control has its ``id``.
 """
 
 from math import inf
@@ -14,44 +14,26 @@ from pebble.transports import Message, clock
 from pebble.transports.ages import Patience, SenderClocks
 
 MOST = 16  # senders of drive commands, and of requests for control, whose clocks are remembered
-STAMP = b'"t"'  # without it a command does not tell its age
-STAMP_LETTER = ord("t")  # most commands have none, which is known six times as fast
-_RUN_S = 1.0  # late commands that are further apart are no run
+STAMP = b'"t"'  # a command without it does not tell its age
+STAMP_LETTER = ord("t")  # most commands have none, which is found six times as fast
 _LONGEST = 80  # characters of the keys of several motor owners
 _PATIENCE = Patience(believed_s=60.0, set_back_s=2.0, silent_s=60.0)
 
 
-class LateRun:
-    """Commands of senders that do not follow the link: those that were late, soon one after the other."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._since = self._newest_at = 0.0
-
-    def add(self, now: float) -> None:
-        if not self.count or now - self._newest_at > _RUN_S:
-            self.count, self._since = 0, now
-        self.count, self._newest_at = self.count + 1, now
-
-    def seconds(self, now: float) -> float:
-        return now - self._since if self.count else 0.0
-
-
 class CommandAges:
-    """Computes the ages of drive commands and requests for control that tell them; thread-safe.
+    """Ages of drive commands and requests for control that tell them; thread-safe.
 
-    :attr:`keys` are those of control now: others count for nothing, as at the motor owner; none while nobody has
-    control. None: no motor owner gives any, and every sender has a key of its own.
+    :attr:`keys` are the keys of control now: others count for nothing, as at the motor owner. None: no motor owner
+    gives keys, and every sender has one of its own.
     """
 
     def __init__(self) -> None:
         self.keys: frozenset[bytes] | None = None
-        self.late = LateRun()
         self._drivers = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
         self._asking = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
 
     def waited_s(self, subject: Subject, message: Message, account: str) -> float:
-        """Return seconds for which a message has waited that has a STAMP: by that, if it counts.
+        """Return seconds for which a message with a STAMP has waited: by the stamp, if it counts.
 
         A key, or an id, counts for the ``account`` that uses it.
         """
@@ -67,7 +49,7 @@ class CommandAges:
             clocks, key = self._asking, command.id
         if not isinstance(command.t, int) or not key:
             return waited_s
-        if command.ends():  # what ends something may come another way
+        if command.ends():  # it may come another way
             clocks.pass_over((account, key), command.t / 1000, clock.since_boot())
             return waited_s
         if clocks.is_passed((account, key), command.t / 1000):
@@ -76,17 +58,16 @@ class CommandAges:
 
     def _key(self, command: Drive) -> str:
         """Return the key by which its sender is known; empty: none that counts."""
-        found = command.key
-        if not isinstance(found, str) or len(found) > _LONGEST:
+        text, keys = command.key, self.keys
+        if not isinstance(text, str) or len(text) > _LONGEST:
             return ""
-        keys = self.keys
         if keys is None:
-            return found
-        return next((one for one in found.split(" ") if one.encode() in keys), "")
+            return text
+        return next((key for key in text.split(" ") if key.encode() in keys), "")
 
 
 def ends_something(subject: Subject, message: Message) -> bool:
-    """True if a late message passes, because it can only bring something to rest."""
+    """True if a message can only bring something to rest: then it passes, however late it is."""
     if subject.channel is None:
         return False
     try:

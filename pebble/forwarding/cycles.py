@@ -1,9 +1,9 @@
-"""Detects that what we forward comes back by another way, for ever. Pure.
+"""Detects messages that we forward and that come back by another way, for ever. Pure.
 
 Something else may forward the same topics: a broker's own bridge, or a second robot with this id. A probe that we
 publish on one side and receive on the other proves it for its topic. It travels on that topic, because the other way
-may carry no other. Its payload is white space that encodes a random number, so it moves nothing: for something that
-happens once it is nothing else, which no parser accepts; otherwise it follows the topic's value, and changes none.
+may carry no other. Its payload is white space that encodes a random number: on topics of commands nothing else, which
+no parser accepts; on others it follows the topic's value, and does not change it.
 """
 
 import logging
@@ -29,21 +29,19 @@ _MOST_CLOSED = 256  # topics that circulate
 _PAYLOADS = 64  # of one topic, counted at a time
 _LONGEST = 16 * 1024  # bytes that a probe repeats
 
-#: A payload that is received more often within this time may circulate; or an operator holds a key. If something else
-#: circulates, each topic is suspicious. Sensors repeat themselves for hours: their reports are suspicious in a storm.
+#: A payload that is received more often within this time may circulate, unless an operator holds a key. If any topic
+#: circulates, each is suspicious. Sensors repeat themselves for hours: their reports are suspicious in a storm only.
 SUSPICIOUS, _WINDOW_S = 5, 2.0
 #: No operator and no script repeats a payload so often in this time.
 STORM = 150
 PROBE_PERIOD_S, _PERIOD_IN_STORM_S = 1.0, 0.1  # between two probes of a topic
 UNANSWERED = 3  # probes, after which the other way is gone
-#: A stop is published again after 0.5 s at the earliest; what comes back is faster.
+#: A stop is published again after 0.5 s at the earliest; one that comes back is faster.
 _STOP_PERIOD_S = 0.25
-#: Where a mirror and its robot's bridge are on one way, the bridge logs it; it probes every second what circulates.
-_YIELDS_S = 2.5
 
 
 class Finding(Enum):
-    """What is to be done with a received message."""
+    """A finding about a received message, with its consequence."""
 
     PASS = "forward it"  # noqa: S105  (no password)
     SUSPECT = "send a probe, then forward it"
@@ -54,7 +52,7 @@ class Finding(Enum):
 
 @dataclass(slots=True)
 class _Way:
-    """From one side to the other by us, on one topic."""
+    """Our way from one side to the other, on one topic."""
 
     began: float
     counts: dict[int, int] = field(default_factory=dict)  # of payloads, by their hash, since then
@@ -73,48 +71,41 @@ class _Way:
 
 
 class Cycles:
-    """Which topics circulate, by the side they come from. Two threads may call it at once.
+    """Topics that circulate, by the side from which they come. Two threads may call it at once."""
 
-    ``yields``: nothing is logged as an error if another bridge is on the same way, and probes it.
-    """
-
-    def __init__(self, clock: Callable[[], float], *, yields: bool = False) -> None:
-        self._clock, self._yields = clock, yields
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
         self._lock = threading.Lock()
         self._ways: dict[tuple[Side, str], _Way] = {}
         self._ours: dict[bytes, Side] = {}  # our probes, and the side each was sent to
-        #: Theirs, and when we relayed each; long ago once it comes back, so that its sender is not on the way.
-        self._others: dict[tuple[Side, bytes], float] = {}
+        self._others: dict[tuple[Side, bytes], bool] = {}  # probes of other bridges that were relayed
         self._stops: dict[tuple[Side, bytes], float] = {}
-        #: What comes from this side on this topic and is forwarded comes back there.
+        #: Messages from this side on this topic come back there if they are forwarded.
         self.closed_ways: Final[set[tuple[Side, str]]] = set()
-        self._unlogged: tuple[Side, str, float] | None = None  # circulates, and since when this is known
 
     def examine(self, side: Side, subject: Subject, message: Message) -> Finding:
-        """``side`` has sent a message that may be forwarded. Hot.
+        """Return a finding about a message from ``side`` that may be forwarded. Hot.
 
-        What runs something may pass while it circulates, because the caller recognises what comes back.
+        One that runs something may pass while its topic circulates: the caller recognises it when it comes back.
         """
         topic, payload = message.topic, message.payload
         if subject.is_stop:
             return Finding.CIRCULATES if self._repeats_stop(side, topic, payload) else Finding.PASS
-        once, after = subject.kind.one_shot, _after(subject)
+        once, usual = subject.kind.one_shot, _usual_count(subject)
         number = _number_of(payload) if payload[-1:] in _DIGITS else None
         with self._lock:
             if number is not None:
                 return self._receive_probe(side, topic, number)
             way, now = self._ways.get((side, topic)) or self._way(side, topic), self._clock()
             count = way.count(payload, now)
-            # Of what the caller knows more than one copy may come back.
             if way.closed and ((once and not subject.runs) or count > SUSPICIOUS):
                 return Finding.CIRCULATES
             period = _PERIOD_IN_STORM_S if count > STORM and not way.closed else PROBE_PERIOD_S
             never_probed = way.probed_at == float("-inf")
-            suspicious = way.closed or count > after or (never_probed and bool(self.closed_ways))
+            suspicious = way.closed or count > usual or (never_probed and bool(self.closed_ways))
             suspicious = suspicious and (once or len(payload) <= _LONGEST)
-            due = (
-                now - way.probed_at >= period or count == after + 1
-            )  # the other way may be younger than the last probe
+            # The other way may be younger than the last probe: so the first suspicious message is probed at once.
+            due = now - way.probed_at >= period or count == usual + 1
             return Finding.SUSPECT if suspicious and due else Finding.PASS
 
     def _repeats_stop(self, side: Side, topic: str, payload: bytes) -> bool:
@@ -138,13 +129,10 @@ class Cycles:
         return number
 
     def poll(self) -> list[tuple[Side, str]]:
-        """Once a second: what needs a new probe, because it circulated; forget what does so no more."""
+        """Return the topics that need a new probe; open those that circulate no more. Call it once a second."""
         with self._lock:
-            self._log_error()
-            due = []
-            for key in [
-                key for key in self.closed_ways if self._clock() - self._ways[key].probed_at >= PROBE_PERIOD_S / 2
-            ]:
+            now, due = self._clock(), []
+            for key in [key for key in self.closed_ways if now - self._ways[key].probed_at >= PROBE_PERIOD_S / 2]:
                 if self._ways[key].unanswered >= UNANSWERED:
                     self._open(*key)
                 else:
@@ -157,12 +145,9 @@ class Cycles:
         sent_to = self._ours.get(number)
         if sent_to is side.other:
             self._close(side, topic)
-        if (side, number) in self._others:
-            self._others[side, number] = float("-inf")
+        if sent_to is not None or (side, number) in self._others:
             return Finding.PROBE
-        if sent_to is not None:
-            return Finding.PROBE
-        _remember(self._others, (side, number), self._clock())
+        _remember(self._others, (side, number), True)
         return Finding.RELAY
 
     def _close(self, side: Side, topic: str) -> None:
@@ -174,20 +159,6 @@ class Cycles:
         if self.closed_ways:
             log.info("%s circulates, too, from the %s side", topic, side.value)
         else:
-            self._unlogged = side, topic, self._clock()
-            self._log_error()
-        self.closed_ways.add((side, topic))
-
-    def _log_error(self) -> None:
-        if self._unlogged is None:
-            return
-        side, topic, since = self._unlogged
-        if self._yields and self._clock() - since < _YIELDS_S:
-            return
-        circulating = {side for side, _ in self.closed_ways}
-        if self._yields and any(to in circulating and at >= since for (to, _), at in self._others.items()):
-            log.info("%s circulates from the %s side; another bridge on the same way probes it", topic, side.value)
-        else:
             log.error(
                 "%s circulates: something else forwards it from the %s to the %s side. Drive commands that circulate "
                 "are not forwarded. Remove it from the other bridge (a broker's `connection`), or the other robot",
@@ -195,7 +166,7 @@ class Cycles:
                 side.other.value,
                 side.value,
             )
-        self._unlogged = None
+        self.closed_ways.add((side, topic))
 
     def _open(self, side: Side, topic: str) -> None:
         self._ways[side, topic].closed = False
@@ -212,10 +183,10 @@ class Cycles:
         return way
 
 
-def _after(subject: Subject) -> int:
-    """Return how many equal messages within 2 s are not suspicious; of what runs something, none that runs it twice.
+def _usual_count(subject: Subject) -> int:
+    """Return how many equal messages within 2 s are not suspicious; of those that run something, the first only.
 
-    Actions are probed at once. Programs of others need to know of probes on those topics already; on those of other
+    Actions are probed at once. Programs of others need to know of probes on those topics already; on topics of other
     commands they see one only after a repetition.
     """
     if subject.kind.direction == OUTGOING:
@@ -226,7 +197,7 @@ def _after(subject: Subject) -> int:
 
 
 def _number_of(payload: bytes) -> bytes | None:
-    """Return the white space that makes ``payload`` a probe."""
+    """Return the number of a probe, as white space; None if ``payload`` is no probe."""
     text = payload.rstrip(_DIGITS)
     return payload[-_LENGTH:] if len(payload) - len(text) == _LENGTH else None
 

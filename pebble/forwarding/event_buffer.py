@@ -22,7 +22,7 @@ class _Event:
 
 
 class EventBuffer:
-    """Sends events in order; during an outage they wait, and the oldest is dropped when the buffer is full."""
+    """A buffer that sends events in order; during an outage they wait, and the oldest is dropped when it is full."""
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class EventBuffer:
         self._waiting: deque[_Event] = deque()
         self._recent: deque[_Event] = deque(maxlen=limit)
         self._lost_at: float | None = None  # when the connection was lost, until flush()
-        #: Whether a message may be sent now, where a link is thin; what may not waits.
+        #: True if a message may be sent now, where the link is thin; others wait.
         self.has_room: Callable[[Message], bool] | None = None
 
     def watch(self, state: State) -> None:
@@ -55,13 +55,13 @@ class EventBuffer:
             self._append(_Event(message))
 
     def resume(self) -> None:
-        """Send what waits, in order, unless a new connection has to be flushed first."""
+        """Send the waiting events, in order, unless a new connection has to be flushed first."""
         with self._lock:
             if self._lost_at is None or self._transport.state is not State.CONNECTED:
                 self._drain()  # Zenoh accepts messages while the hub is away
 
     def flush(self) -> None:
-        """Send what may have been lost with the last connection, then what waits: a new one is up."""
+        """Begin with a new connection: send events that may have been lost with the last one, then the waiting ones."""
         with self._lock:
             if self._lost_at is not None:
                 recent = [event for event in self._recent if 0 <= self._lost_at - event.sent_at <= RESEND_S]

@@ -5,8 +5,8 @@ for another thread. All retained messages pass under one lock, because both side
 commands and streams never wait for it.
 
 Retained commands are stale. A live emergency stop passes even if it was published to be retained: a stop that does not
-arrive is worse than one that a later subscriber must recognise as old. What happens once is also stale when it has
-waited, in a process that was stopped or stuck, or at the broker; what only ends something never is.
+arrive is worse than one that a later subscriber must recognise as old. Commands and actions are also stale when they
+have waited, in a process that was stopped or stuck, or at the broker; a command that only ends something never is.
 """
 
 import itertools
@@ -28,7 +28,6 @@ from pebble.forwarding.publisher import Publisher
 from pebble.forwarding.retained_topics import RetainedTopics
 from pebble.forwarding.routing import Drop, Forward, Rules, Side, route
 from pebble.forwarding.side import Gate, Sides, SideState
-from pebble.forwarding.sifter import Sifter
 from pebble.forwarding.signatures import unsigned
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.runtime.rate_limit import RateLimitedLog
@@ -44,11 +43,14 @@ _BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCUL
 _WARNED = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN)
 
 
-class Routed(msgspec.Struct, frozen=True):
-    """What became of a received message; ``subject`` is None for a topic that is not this robot's.
+Pass = Callable[[SideState, Subject, Message, Forward], Forward | Drop]
 
-    ``by`` is the sender where names are checked: the topic's account, ``account/person``, or ``-`` (NO_ACCOUNT).
-    Of what is refused the account stands alone. Elsewhere, and of what comes from the robot itself, it is None.
+
+class Routed(msgspec.Struct, frozen=True):
+    """The outcome for a received message; ``subject`` is None for a topic that is not this robot's.
+
+    ``by`` is the sender where names are checked: the topic's account, ``account/person``, or ``-`` (NO_ACCOUNT); for a
+    refused message the account alone. It is None elsewhere, and for messages of the robot itself.
     """
 
     subject: Subject | None
@@ -57,7 +59,7 @@ class Routed(msgspec.Struct, frozen=True):
 
 
 class Mirroring:
-    """Whether commands of the robot's own programs are forwarded as well: the flag remote-mirror."""
+    """The flag remote-mirror: while it is on, commands of the robot's own programs are forwarded as well."""
 
     def __init__(self, sides: Sides) -> None:
         self.on = False
@@ -68,7 +70,7 @@ class Mirroring:
 
     def is_possible(self) -> bool:
         """True if the broker does not send our own commands back: it would repeat each later, also after the stop."""
-        if all(one.transport.exact_echo for one in self._sides.values()):
+        if all(state.transport.exact_echo for state in self._sides.values()):
             return True
         if not self._was_refused:
             self._was_refused = True
@@ -80,16 +82,16 @@ class Mirroring:
 
 
 class Forwarder:
-    """Forwards between two transports.
+    """A forwarder between two transports.
 
     Its owner passes on the state of each in :attr:`sides`, subscribes, and has :attr:`retained` synchronized
     INITIAL_SYNC_S after each subscription.
     ``winner`` is the side whose retained messages count where they differ (see .reconciliation).
-    ``names`` knows the senders of messages on the remote side, where they are checked.
+    ``names`` finds the senders of messages on the remote side, where they are checked.
     ``on_value(subject, payload)`` is called, on any thread and with a lock held, with each new value of a two-way
     retained topic.
-    ``pass_stop(side, payload)`` returns what passes of a stop that was received there. ``steps`` are those of
-    extensions, by their names.
+    ``pass_stop(side, payload)`` returns the payloads that pass for a stop that was received there. ``steps`` are those
+    of extensions, by their names.
     """
 
     def __init__(
@@ -112,17 +114,20 @@ class Forwarder:
             (side, SideState(side, transport, self.counters, clock, wins=side is winner))
             for side, transport in transports.items()
         )
-        #: What :func:`route` has returned. There are not many subjects, so it needs no bound.
+        #: Results of :func:`route`. There are few subjects, so no bound is needed.
         self._routes: dict[tuple[Side, Subject, QoS, bool, bool | None, bool], Forward | Drop] = {}
         self._admission = Admission(clock)
         self.ages = CommandAges()
-        self.cycles = Cycles(clock, yields=not rules.leaves_robot)  # a mirror, to the bridge
+        self.cycles = Cycles(clock)
         both_ways = frozenset(kind for kind in Kind if rules.both_ways(kind))
         self.publisher = Publisher(self.sides, self.cycles, subjects, self.counters, both_ways, stored=rules.stored)
         self.retained = RetainedTopics(self.sides, subjects, self.publisher, winner, both_ways, on_value)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self.mirroring = Mirroring(self.sides)
-        self.sifter = Sifter(self.sides, self._pass)
+        #: Publishes a message that is admitted, at once; an extension may put in its place what lets some wait.
+        self.pass_on: Pass = self.pass_now
+        #: Is told of each command whose age matters, and that does not tell its own, whether it was late.
+        self.note_age: Callable[[bool], None] = lambda _late: None
         for transport in transports.values():
             transport.policy.is_stop = self._is_stop
 
@@ -132,36 +137,36 @@ class Forwarder:
 
     def dropped(self) -> dict[str, int]:
         """Return how many messages did not pass because of a bound, here or in a transport; by reason: ``too_many``."""
-        found = Counter(bounds_reached(*(one.transport.counters for one in self.sides.values())))
-        for one, side in itertools.product(_BOUNDS, Side):
-            found[one.name.lower()] += self.counters[f"{side.value}: {one.value}"]
-        found["events"] = self.counters["events_dropped"]
+        counts = Counter(bounds_reached(*(state.transport.counters for state in self.sides.values())))
+        for drop, side in itertools.product(_BOUNDS, Side):
+            counts[drop.name.lower()] += self.counters[f"{side.value}: {drop.value}"]
+        counts["events"] = self.counters["events_dropped"]
         if shed := self.counters["shed"]:
-            found["shed"] = shed
-        return dict(found)
+            counts["shed"] = shed
+        return dict(counts)
 
     # -- connections
 
     def subscribed(self, side: Side) -> None:
-        """``side`` is connected and subscribed to, and its retained messages have arrived."""
+        """Note that ``side`` is connected and subscribed to, and that its retained messages have arrived."""
         self.sides[side].window.subscribed()
         if self.gate is Gate.OPEN:
             self.sides[side].events.flush()
 
     def open(self) -> None:
-        """Forward from now on; first what has waited."""
+        """Forward from now on, beginning with the messages that have waited."""
         self.retained.open()
-        for one in self.sides.values():
-            one.events.flush()
+        for state in self.sides.values():
+            state.events.flush()
 
     def shut(self) -> None:
         """Forward nothing from now on. Takes no lock: a loop of messages must end at once."""
         self.retained.shut()
-        for one in self.sides.values():
-            one.events.clear()
+        for state in self.sides.values():
+            state.events.clear()
 
     def rearm(self) -> None:
-        """After :meth:`shut`: messages wait for :meth:`open` again, and the remote side is synchronized anew."""
+        """Undo :meth:`shut`: messages wait for :meth:`open`, and the remote side is to be synchronized again."""
         if self.gate is Gate.SHUT:
             self.sides[Side.REMOTE].subscribing()
             self.sides[Side.REMOTE].restarted = True
@@ -170,7 +175,7 @@ class Forwarder:
     # -- the receiving threads
 
     def skips_retained(self, side: Side, topic: bytes) -> bool:
-        """True if a retained message of ``topic`` does not pass, whatever it is: for TopicPolicy.skips_retained."""
+        """True if no retained message of ``topic`` passes; for TopicPolicy.skips_retained."""
         kind = self._subjects.invented(topic)
         if self._names is not None and topic.endswith(_STOP) and self._is_stop(topic.decode(errors="replace")):
             return False  # it may be a live one
@@ -183,26 +188,26 @@ class Forwarder:
         return True
 
     def receive(self, side: Side, message: Message) -> Routed:
-        here = self.sides[side]
+        source = self.sides[side]
         if self._names is not None and side is Side.REMOTE:
-            routed = self._receive_named(here, self._names, message)
+            routed = self._receive_named(source, self._names, message)
         else:
             subject = self._subjects[message.topic]
-            outcome = self._admit(here, subject, message, message.topic, True)
+            outcome = self._admit(source, subject, message, message.topic, True)
             if subject is not None and isinstance(outcome, Forward):
-                outcome = self.sifter.forward(here, subject, message, outcome)
+                outcome = self.pass_on(source, subject, message, outcome)
             routed = Routed(subject, outcome)
         if isinstance(routed.outcome, Drop):
             self.counters.add(f"{side.value}: {routed.outcome.value}")
         else:
-            here.count_forwarded()
+            source.count_forwarded()
         return routed
 
-    def _receive_named(self, here: SideState, names: Names, message: Message) -> Routed:
-        """Return a message with a checked name as it passes: on the topic without the name, with its sender in it."""
+    def _receive_named(self, source: SideState, names: Names, message: Message) -> Routed:
+        """Pass a message whose sender is checked, on the topic without the name and with the sender in the payload."""
         sender = names[message.topic]
         subject, by = sender.subject, sender.account
-        outcome = self._admit(here, subject, message, sender.topic, by != NO_ACCOUNT)
+        outcome = self._admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
         if subject is None:
             outcome = sender.foreign
         elif isinstance(outcome, Forward):
@@ -210,9 +215,9 @@ class Forwarder:
                 case Signed(message, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:
                     outcome = self.retained.change(subject, message)
                 case Signed(message, by):
-                    outcome = self._pass(here, subject, message, outcome, sender.account)
-                case Drop.UNNAMED if outcome.retain:  # the broker may retain what the robot itself has published
-                    outcome = self.retained.receive(here, subject, message, outcome, old=True)
+                    outcome = self.pass_now(source, subject, message, outcome, sender.account)
+                case Drop.UNNAMED if outcome.retain:  # it may be a retained message of the robot itself
+                    outcome = self.retained.receive(source, subject, message, outcome, old=True)
                 case drop:
                     outcome = drop
         if isinstance(outcome, Drop) and outcome in _NAMES:
@@ -220,29 +225,29 @@ class Forwarder:
         return Routed(subject, outcome, by)
 
     def _admit(
-        self, here: SideState, subject: Subject | None, message: Message, topic: str, named: bool
+        self, source: SideState, subject: Subject | None, message: Message, topic: str, named: bool
     ) -> Forward | Drop:
         """Return how to forward it, or why not: no subject, no route, or the first of `_ADMISSION` that holds. Hot.
 
         ``topic`` is the one on which it passes, and would be retained.
         """
         if subject is None or not subject.is_stop:
-            if message.retain:  # they still arrive: a stop may be among them, which does not count: it may be repeated
-                here.window.note()
-        elif not here.window.is_old_stop(message):
+            if message.retain:  # while such messages arrive, a stop among them is an old one
+                source.window.note()
+        elif not source.window.is_old_stop(message):
             message = Message(message.topic, message.payload, message.qos)  # live: passes, and is retained nowhere
         if subject is None:
             return Drop.FOREIGN
-        forward = self._route(here.side, subject, message)
+        forward = self._route(source.side, subject, message)
         if isinstance(forward, Drop):
             return forward
         for reason in self._ADMISSION:
-            if (drop := reason(self, here, subject, message, forward, topic, named)) is not None:
+            if (drop := reason(self, source, subject, message, forward, topic, named)) is not None:
                 return drop
         return forward
 
     def _route(self, side: Side, subject: Subject, message: Message) -> Forward | Drop:
-        """Return what :func:`route` does, which is asked once for each kind of message."""
+        """Return the result of :func:`route`, computed once for each kind of message."""
         mirroring = self.mirroring.on and self.mirroring.is_possible()
         key = side, subject, message.qos, message.retain, message.retain_requested, mirroring
         forward = self._routes.get(key)
@@ -251,29 +256,31 @@ class Forwarder:
         return forward
 
     def _beyond_bound(
-        self, here: SideState, subject: Subject, message: Message, _forward: Forward, topic: str, named: bool
+        self, source: SideState, subject: Subject, message: Message, _forward: Forward, topic: str, named: bool
     ) -> Drop | None:
-        drop = self._admission.refuse(here.side, subject, message, topic, named=named)
+        drop = self._admission.refuse(source.side, subject, message, topic, named=named)
         if drop in _WARNED:
             self._warn(drop, message.topic[:_LOGGED])
         return drop
 
-    def _echo(self, here: SideState, subject: Subject, message: Message, *_: object) -> Drop | None:
-        if not self.cycles.closed_ways and here.transport.exact_echo:
+    def _echo(self, source: SideState, subject: Subject, message: Message, *_: object) -> Drop | None:
+        if not self.cycles.closed_ways and source.transport.exact_echo:
             return None
-        return Drop.ECHO if self.publisher.is_echo(here, subject, message) else None
+        return Drop.ECHO if self.publisher.is_echo(source, subject, message) else None
 
-    def _cycle(self, here: SideState, subject: Subject, message: Message, forward: Forward, *_: object) -> Drop | None:
+    def _cycle(
+        self, source: SideState, subject: Subject, message: Message, forward: Forward, *_: object
+    ) -> Drop | None:
         if self.sides.gate is not Gate.OPEN:
             return None
-        finding = self.cycles.examine(here.side, subject, message)
-        return None if finding is Finding.PASS else self._act_on(finding, here.side, subject, message, forward)
+        finding = self.cycles.examine(source.side, subject, message)
+        return None if finding is Finding.PASS else self._act_on(finding, source.side, subject, message, forward)
 
-    def _refused_by_step(self, here: SideState, subject: Subject, message: Message, *_: object) -> Drop | None:
+    def _refused_by_step(self, source: SideState, subject: Subject, message: Message, *_: object) -> Drop | None:
         for name, step in () if subject.is_stop else self._steps.items():
             try:
-                why = step(here.side, subject, message)
-            except Exception as error:  # noqa: BLE001 - whatever a stranger's code raises: then it has nothing against it
+                why = step(source.side, subject, message)
+            except Exception as error:  # noqa: BLE001 - whatever a stranger's code raises: it is no refusal
                 self._quiet_log.warning(name, "the extension %s failed at %s: %r", name, message.topic[:_LOGGED], error)
                 continue
             if why:
@@ -281,74 +288,71 @@ class Forwarder:
                 return Drop.REFUSED
         return None
 
-    #: Why a message that has a route does not pass, in this order: nothing beyond a bound is compared with what we have
-    #: sent or looked at for cycles, an echo is no cycle, and extensions are asked last.
+    #: Checks of a message that has a route, in this order: one beyond a bound is neither compared with messages that we
+    #: have sent nor examined for cycles, an echo is no cycle, and extensions are asked last.
     _ADMISSION = (_beyond_bound, _echo, _cycle, _refused_by_step)
 
-    def _pass(
-        self, here: SideState, subject: Subject, message: Message, forward: Forward, account: str = ""
+    def pass_now(
+        self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str = ""
     ) -> Forward | Drop:
-        """Publish it on the other side, or say why not. Hot.
+        """Publish an admitted message on the other side, or return why not. Hot.
 
         ``account`` is that of its sender, where names are checked.
         """
         if subject.kind.one_shot and self._is_late(subject, message, forward, account):
             return Drop.LATE
         if forward.unsigned:
-            passing = self._without_script(here, message)
+            passing = self._without_script(source, message)
             if passing is None:
                 return Drop.SIGNED
             message = passing
         if forward.retain:
-            return self.retained.receive(here, subject, message, forward)
-        return self._deliver(here, subject, message, forward)
+            return self.retained.receive(source, subject, message, forward)
+        return self._deliver(source, subject, message, forward)
 
     def _is_late(self, subject: Subject, message: Message, forward: Forward, account: str) -> bool:
-        """True if what happens once has waited for too long, and does not only end something."""
+        """True if a command or action has waited for too long, unless it only ends something."""
         waited_s = message.waited_s
         if forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload:
             waited_s = self.ages.waited_s(subject, message, account)
-        if waited_s > subject.waits_s and not ends_something(subject, message):
-            if forward.stamped and STAMP not in message.payload:  # else its sender keeps to the pace of the link
-                self.ages.late.add(self._clock())
-            return True
-        if forward.stamped:
-            self.ages.late.count = 0
-        return False
+        late = waited_s > subject.waits_s and not ends_something(subject, message)
+        if forward.stamped and not (late and STAMP in message.payload):  # who tells it keeps to the pace of the link
+            self.note_age(late)
+        return late
 
-    def _without_script(self, here: SideState, message: Message) -> Message | None:
-        """Return a drive command that is no script's, or what of a script's ends motion; None: nothing of it passes."""
+    def _without_script(self, source: SideState, message: Message) -> Message | None:
+        """Return a drive command as it may pass: a script's only if it ends motion; None: it does not pass."""
         passing = unsigned(message.payload)
         if passing is message.payload:
             return message
         self._quiet_log.warning(Drop.SIGNED.name, "%s: %s", message.topic[:_LOGGED], Drop.SIGNED.value)
         if passing is None:
             return None
-        self.counters.add(f"{here.side.value}: zeros of a script, passed as a person's")
+        self.counters.add(f"{source.side.value}: zeros of a script, passed as a person's")
         return Message(message.topic, passing, message.qos)
 
-    def _deliver(self, here: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
-        """Publish what is not retained; hold an event while the gate waits."""
-        there = self.sides[here.side.other]
+    def _deliver(self, source: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
+        """Publish a message that is not retained; hold an event while the gate waits."""
+        target = self.sides[source.side.other]
         is_event = subject.kind is Kind.EVENT and message.qos is QoS.DELIVERED
         if self.sides.gate is not Gate.OPEN:
-            return self._hold_event(there, message) if is_event else Drop.CLOSED
+            return self._hold_event(target, message) if is_event else Drop.CLOSED
         if subject.is_stop:
-            payloads = list(self._pass_stop(here.side, message.payload))
+            payloads = list(self._pass_stop(source.side, message.payload))
             for payload in payloads:
-                self.publisher.publish(there, subject, Message(message.topic, payload, message.qos), forward)
+                self.publisher.publish(target, subject, Message(message.topic, payload, message.qos), forward)
             return forward if payloads else Drop.RESET
         if is_event:
-            self.publisher.note_return(there, subject, message)
-            there.events.send(message)
+            self.publisher.note_return(target, subject, message)
+            target.events.send(message)
         else:
-            self.publisher.publish(there, subject, message, forward)
+            self.publisher.publish(target, subject, message, forward)
         return forward
 
     def _act_on(
         self, finding: Finding, side: Side, subject: Subject, message: Message, forward: Forward
     ) -> Drop | None:
-        """Return why a message that is suspicious, or a probe, does not pass; None if it does."""
+        """Act on a finding; return why the message does not pass, None if it does."""
         match finding:
             case Finding.CIRCULATES:
                 return Drop.CIRCULATES
@@ -360,12 +364,12 @@ class Forwarder:
                 self.publisher.publish(self.sides[side.other], subject, message, relayed)
         return Drop.PROBE
 
-    def _hold_event(self, there: SideState, message: Message) -> Drop:
+    def _hold_event(self, target: SideState, message: Message) -> Drop:
         if self.gate is Gate.SHUT:
             return Drop.CLOSED
-        there.events.hold(message)
+        target.events.hold(message)
         if self.gate is not Gate.WAITING:  # it was opened or shut meanwhile, perhaps before this event was there
-            (there.events.resume if self.gate is Gate.OPEN else there.events.clear)()
+            (target.events.resume if self.gate is Gate.OPEN else target.events.clear)()
         return Drop.HELD
 
     def _is_stop(self, topic: str) -> bool:
@@ -377,7 +381,7 @@ class Forwarder:
 
 
 def barrier(transport: Transport, filter_: str) -> None:
-    """Wait, bounded, until the other end of ``transport`` has handled all we sent, and its retained messages are here.
+    """Wait, bounded, until the other end has handled all that we sent, and its retained messages are here.
 
     A subscription is acknowledged after everything before it. ``filter_`` should be within one that is subscribed to
     anyway: a broker may forbid others. A narrow one brings few retained messages.

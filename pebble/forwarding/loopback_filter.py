@@ -13,7 +13,7 @@ EXPIRY_S = 10.0  # an echo that has not arrived by then never will
 
 
 class LoopbackFilter:
-    """Remembers what was published, by topic and in order, until it comes back."""
+    """A memory of published messages, by topic and in order, until they come back."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, expiry_s: float = EXPIRY_S) -> None:
         self._clock, self._expiry_s = clock, expiry_s
@@ -22,11 +22,11 @@ class LoopbackFilter:
         self._messages = 0
 
     def __len__(self) -> int:
-        """Topics with messages that have not come back yet."""
+        """Return the number of topics with messages that have not come back yet."""
         return len(self._out)
 
     def expect(self, topic: str, payload: bytes) -> None:
-        """Call before publishing: the echo may be faster than the return of the call."""
+        """Expect a message to come back; call it before publishing, as the echo may be faster than that call."""
         with self._lock:
             out = self._out.setdefault(topic, deque())
             out.append((self._clock(), _digest(payload)))

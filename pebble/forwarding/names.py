@@ -1,42 +1,23 @@
-"""What becomes of messages to a robot at the level ``named``: who sent each one, and what passes without a name. Pure.
+"""Senders of messages at the level ``named``, where the broker vouches for the account in a message's topic. Pure.
 
-The broker vouches for the account in ``incoming/by/{account}/{metric}``. On the robot itself the topic is without it,
-and the sender stands in the payload: ``"by": "otto"``, or ``"page-1/ann"`` where a page server has put the person
-there. What has no ``by`` is from a program of the robot.
+On the robot itself the topic is without the account, and the sender stands in the payload. What has none is from a
+program of the robot. An extension reads and writes the names.
 """
 
-from functools import lru_cache
-from typing import Any
+from abc import ABC, abstractmethod
 
-import msgspec
 from msgspec import Struct
 
-from pebble.config.security import Strangers
-from pebble.contract import DRIVE, INCOMING, Channel, codec
-from pebble.contract.names import BY, NO_ACCOUNT, stop_topic, unchecked, without_name
-from pebble.contract.payloads import AutonomyCommand, Drive, EstopCommand, MediaRequest, SoundboardCommand
-from pebble.contract.rights import WRITES, Right
-from pebble.errors import PayloadError
 from pebble.forwarding.routing import Drop
-from pebble.forwarding.subjects import Subject, Subjects
-from pebble.motion.lease import shown
+from pebble.forwarding.subjects import Subject
 from pebble.transports import Message
-
-_REMEMBERED = 4096  # topics
-_USUAL_BYTES = 256  # of a drive command
-_LONGEST = 40  # characters of a sender
-_UNSIGNED = (bool, bytes)  # payloads that take no name: a flag has the same bytes from every sender
-#: Payloads that need not be objects; of all others only objects are commands.
-_BARE = (*_UNSIGNED, AutonomyCommand, EstopCommand, MediaRequest, SoundboardCommand)
-
-_decoder, _encoder = msgspec.json.Decoder(), msgspec.json.Encoder()
 
 
 class Sender(Struct, frozen=True):
-    """Who sent a message, as far as its topic tells: the account, or NO_ACCOUNT.
+    """The sender of a message, as far as its topic tells: the account, or NO_ACCOUNT.
 
-    ``topic`` is the one without the name, and ``subject`` what it means; None: nothing to this robot, because of
-    ``foreign``.
+    ``topic`` is the one without the name, and ``subject`` its meaning; None: it means nothing to this robot, because
+    of ``foreign``.
     """
 
     account: str
@@ -52,105 +33,9 @@ class Signed(Struct, frozen=True):
     by: str
 
 
-class Names(dict[str, Sender]):
-    """Senders by topic. ``strangers``: what they may do, who have no name."""
+class Names(dict[str, Sender], ABC):
+    """Senders by the topics of their messages."""
 
-    def __init__(self, base: str, subjects: Subjects, strangers: Strangers) -> None:
-        super().__init__()
-        self._below = f"{base}/{INCOMING}/{BY}/"
-        self._subjects = subjects
-        rights = () if strangers == "refuse" else (Right.LOOK, Right.DRIVE)
-        self._strangers = frozenset(one.suffix for right in rights for one in WRITES[right] if isinstance(one, Channel))
-
-    def __missing__(self, topic: str) -> Sender:
-        if len(self) >= _REMEMBERED:
-            self.clear()
-        sender = self[topic] = self._find(topic)
-        return sender
-
-    def _find(self, topic: str) -> Sender:
-        if not topic.startswith(self._below):
-            return Sender(NO_ACCOUNT, topic, self._subjects[topic])
-        found = without_name(topic)
-        if found is None:
-            plain = stop_topic(topic)
-            if plain is not None:
-                return Sender(NO_ACCOUNT, plain, self._subjects[plain])
-            return Sender(NO_ACCOUNT, topic, None, Drop.MISNAMED)
-        return Sender(found.account, found.topic, self._subjects[found.topic])
-
+    @abstractmethod
     def sign(self, sender: Sender, message: Message) -> Signed | Drop:
-        """``message`` with its sender in the payload, and without in the topic. Hot.
-
-        What stood there as ``by`` is a claim: an account's becomes the person, a stranger's is gone. A stop needs no
-        name; there the claim stays, with a mark.
-        """
-        subject, account, payload = sender.subject, sender.account, message.payload
-        channel = None if subject is None else subject.channel
-        form = None if channel is None else channel.payload
-        if account == NO_ACCOUNT:
-            if form is EstopCommand:
-                return Signed(_moved(message, sender.topic, _doubted(payload)), NO_ACCOUNT)
-            if channel is None or not (channel.suffix in self._strangers or _is_zero(channel, payload)):
-                return Drop.UNNAMED
-        elif (message.retain or message.retain_requested) and form is not EstopCommand:
-            return Drop.STALE
-        found, by = _object(payload), account
-        if found is None:
-            if channel is not None and form not in _BARE:
-                return Drop.UNREADABLE
-        else:
-            body = _body(found)
-            claim = body.get("by")
-            if account != NO_ACCOUNT and isinstance(claim, str) and claim:
-                by = _with_person(account, claim[:_LONGEST])
-            if form not in _UNSIGNED:
-                found.pop("by", None)
-                body["by"] = by
-                payload = _encoder.encode(found)
-        return Signed(_moved(message, sender.topic, payload), by)
-
-
-def _moved(message: Message, topic: str, payload: bytes) -> Message:
-    return Message(topic, payload, message.qos, message.retain, message.retain_requested, message.waiting_since)
-
-
-def _doubted(payload: bytes) -> bytes:
-    """Mark who a stop without a name claims to be from. What cannot be read names no sender to its readers."""
-    found = _object(payload)
-    body = {} if found is None else _body(found)
-    claim = body.get("by")
-    if not isinstance(claim, str) or not claim:
-        return payload
-    body["by"] = unchecked(claim)
-    return _encoder.encode(found)
-
-
-def _body(command: dict[str, Any]) -> dict[str, Any]:
-    """Return the object that holds the fields."""
-    return inner if isinstance(inner := command.get("value"), dict) else command
-
-
-def _is_zero(channel: Channel, payload: bytes) -> bool:
-    try:
-        return channel.payload is Drive and not codec.decode(channel, payload).moves
-    except PayloadError:
-        return False
-
-
-def _object(payload: bytes) -> dict[str, Any] | None:
-    """Return the JSON object in ``payload``, as all readers of the contract find it; None: they find none."""
-    try:
-        usual = payload[:1] == b"{" and payload[-1:] == b"}" and len(payload) <= _USUAL_BYTES
-        if usual and payload.isascii() and b"\0" not in payload:  # else there may be something around it
-            found = _decoder.decode(payload)
-        else:
-            found = codec.plain(DRIVE, payload)
-    except (PayloadError, msgspec.DecodeError):
-        return None
-    return found if isinstance(found, dict) else None
-
-
-@lru_cache(maxsize=256)
-def _with_person(account: str, person: str) -> str:
-    return shown(f"{account}/{person}", _LONGEST)
+        """Return ``message`` with its sender in the payload, and without in the topic, or why it does not pass."""

@@ -1,4 +1,4 @@
-"""What extensions add to the way between operators and a robot: steps that may refuse, observers of what became of it.
+"""Additions of extensions to the way between operators and a robot: steps that may refuse messages, and observers.
 
 Both are called on the threads that receive: they must not wait. No step is asked about an emergency stop.
 """
@@ -26,7 +26,7 @@ Step: TypeAlias = Callable[[Side, Subject, Message], str]
 
 
 class Observer:
-    """Sees what passes to the robot, and what does not. It is made with the config and a clock, before anything passes.
+    """An observer of messages to the robot, passed and refused. It is made with the config and a clock, first of all.
 
     ``by`` is the sender that the broker has checked, ROBOT, or None where no names are checked.
     """
@@ -35,7 +35,7 @@ class Observer:
         """Begin; on the service's thread, as :meth:`close`, :meth:`control` and :meth:`unconfirmed`."""
 
     def close(self) -> None:
-        """End; what was seen until now is kept."""
+        """End; keep the observations until now."""
 
     def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
         """Note a command or a changed flag."""
@@ -44,21 +44,21 @@ class Observer:
         """Note that a message from outside did not pass."""
 
     def control(self, state: ControlState) -> None:
-        """Note what the motor owner that decides says of who has control."""
+        """Note the state of control, from the motor owner that decides."""
 
     def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
         """Note a stop that a motor owner has not confirmed, and that is given up."""
 
 
 class Observers(Observer):
-    """The observers of all extensions. What one of them raises is logged, and costs the others nothing."""
+    """The observers of all extensions. An error of one is logged, and costs the others nothing."""
 
     def __init__(self, config: Config, clock: Callable[[], float]) -> None:
-        self._found: list[Observer] = []
+        self._observers: list[Observer] = []
         for extension in config.installed:
             if extension.observer:
-                with _logged(extension.name):
-                    self._found.append(part(extension.observer)(config, clock))
+                with logged(extension.name):
+                    self._observers.append(part(extension.observer)(config, clock))
 
     def start(self) -> None:
         self._tell("start")
@@ -79,23 +79,24 @@ class Observers(Observer):
         self._tell("unconfirmed", owner, stop)
 
     def _tell(self, method: str, *values: object) -> None:
-        for observer in self._found:
-            with _logged(type(observer).__name__):
+        for observer in self._observers:
+            with logged(type(observer).__name__):
                 getattr(observer, method)(*values)
 
 
 def steps_of(config: Config) -> dict[str, Step]:
     """Return the steps that extensions add, by their names; one that cannot be made is logged, and left out."""
-    found: dict[str, Step] = {}
+    steps: dict[str, Step] = {}
     for extension in config.installed:
         if extension.step:
-            with _logged(extension.name):
-                found[extension.name] = part(extension.step)(config)
-    return found
+            with logged(extension.name):
+                steps[extension.name] = part(extension.step)(config)
+    return steps
 
 
 @contextmanager
-def _logged(name: str) -> Iterator[None]:
+def logged(name: str) -> Iterator[None]:
+    """Log an error of the extension called ``name``, and go on."""
     try:
         yield
     except Exception as error:  # noqa: BLE001 - whatever a stranger's code raises: it must not end the bridge

@@ -28,7 +28,7 @@ def new_probe(now_ms: int, nonce_bytes: int = 8) -> bytes:
 
 
 class Probes:
-    """Compares the probes that the bridge announces with those received from a broker, in either order.
+    """Probes that the bridge has announced and probes received from a broker, compared in either order.
 
     Each counts once: a copy that a client keeps sending, or has retained, proves nothing.
     """
@@ -51,10 +51,10 @@ class Probes:
             return _match(payload, self._announced, self._seen)
 
 
-def _match(payload: bytes, others: deque[bytes], own: deque[bytes]) -> bool:
-    """Return True if the other side has had it and no match since; else it waits for that."""
-    if payload in others:
-        others.remove(payload)
+def _match(payload: bytes, counterparts: deque[bytes], waiting: deque[bytes]) -> bool:
+    """Return True if ``payload`` has a counterpart, which then counts no more; else let it wait for one."""
+    if payload in counterparts:
+        counterparts.remove(payload)
         return True
-    own.append(payload)
+    waiting.append(payload)
     return False

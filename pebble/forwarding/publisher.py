@@ -1,4 +1,4 @@
-"""Publishes on either side of a forwarder, and recognises what of it comes back."""
+"""Publishes on either side of a forwarder, and recognises messages that come back."""
 
 import itertools
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from pebble.transports.counters import Counters
 
 
 class Publisher:
-    """Publishes messages, and probes for cycles; ``both_ways`` are the kinds that pass in both directions."""
+    """A publisher of messages, and of probes for cycles; ``both_ways`` are the kinds that pass in both directions."""
 
     def __init__(
         self,
@@ -27,7 +27,7 @@ class Publisher:
         *,
         stored: bool,
     ) -> None:
-        """``stored``: what is retained is sent again after an outage."""
+        """Store the arguments; ``stored``: retained messages are sent again after an outage."""
         self._sides, self._cycles, self._subjects = sides, cycles, subjects
         self._counters, self._both_ways, self._stored = counters, both_ways, stored
 
@@ -53,22 +53,23 @@ class Publisher:
             to.loopback.forget(topic)
 
     def note_return(self, to: SideState, subject: Subject, message: Message) -> None:
-        """``message`` goes to one side; if its topic circulates, it comes back from the other one.
+        """Expect ``message``, which goes to one side, to come back from the other one if its topic circulates.
 
-        What runs something is noted before it is known whether its topic circulates: its probe is still under way.
+        A command that runs something is noted before it is known whether its topic circulates, while its probe is still
+        under way.
         """
         origin = to.side.other
         if subject.runs or (not subject.kind.one_shot and (origin, message.topic) in self._cycles.closed_ways):
             self._sides[origin].returns.expect(message.topic, message.payload)
 
-    def is_echo(self, here: SideState, subject: Subject, message: Message) -> bool:
-        """True if ``message`` is one of ours, that came back."""
+    def is_echo(self, source: SideState, subject: Subject, message: Message) -> bool:
+        """True if ``message`` is one of ours that came back."""
         topic, payload = message.topic, message.payload
-        if (here.side, topic) in self._cycles.closed_ways and here.returns.is_echo(topic, payload):
+        if (source.side, topic) in self._cycles.closed_ways and source.returns.is_echo(topic, payload):
             return True
-        if here.transport.exact_echo or message.retain or not subject.is_two_way:
+        if source.transport.exact_echo or message.retain or not subject.is_two_way:
             return False
-        return here.loopback.is_echo(topic, payload)
+        return source.loopback.is_echo(topic, payload)
 
     # -- cycles: what we forward to one side comes back from the other
 
@@ -78,10 +79,10 @@ class Publisher:
             self.probe(side, topic, b"")
 
     def probe_again(self, sides: tuple[Side, ...], value: Callable[[str], bytes | None]) -> None:
-        """Find out whether what circulated does so still, and commands from ``sides`` as well; once a second.
+        """Probe topics that circulated, and then also commands from ``sides``; call it once a second.
 
-        ``value`` gives a topic's newest one. Commands were probed when a connection began; the other way may be
-        younger.
+        ``value`` returns the newest value of a topic. Commands were probed when a connection began, but the other way
+        may be younger.
         """
         for side, topic in self._cycles.poll():
             self.probe(side, topic, value(topic) or b"")
@@ -92,12 +93,12 @@ class Publisher:
 
     def probe(self, side: Side, topic: str, value: bytes) -> None:
         """Publish a probe on the other side, where something else may lead back to ``side``."""
-        subject, there = self._subjects[topic], self._sides[side.other]
-        if subject is None or not there.connected:
+        subject, target = self._subjects[topic], self._sides[side.other]
+        if subject is None or not target.connected:
             return
         if subject.kind.one_shot or _is_json(value):
             probe = (b"" if subject.kind.one_shot else value) + self._cycles.probe(side, topic)
-            there.transport.publish(topic, probe, qos=QoS.DELIVERED, urgent=subject.kind in URGENT)
+            target.transport.publish(topic, probe, qos=QoS.DELIVERED, urgent=subject.kind in URGENT)
 
 
 def _is_json(value: bytes) -> bool:

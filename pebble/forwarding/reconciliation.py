@@ -44,7 +44,7 @@ class LastValue:
 
 
 class Known(NamedTuple):
-    """What is known of a topic when one side sends a retained message on it."""
+    """The facts about a topic when one side sends a retained message on it."""
 
     last: LastValue | None  # the newest value, whichever side published it
     winner: Side
@@ -55,9 +55,9 @@ class Known(NamedTuple):
 
 
 def resolve(sender: Side, payload: bytes, known: Known) -> Resolution:
-    """Return what a retained message means. The first line that fits counts; a live message always passes.
+    """Return the resolution for a retained message. The first line that fits counts; a live message always passes.
 
-    | sender | what is known                                     | value             | then      |
+    | sender | known of the topic                                | value             | then      |
     |--------|---------------------------------------------------|-------------------|-----------|
     | winner | the loser has changed it meanwhile                | any               | OVERTAKEN |
     | winner | the winner went back                              | an earlier one    | CORRECT   |
@@ -99,8 +99,8 @@ class Reconciliation:
         self._published = {side: BoundedTable[bytes](TOPICS, BYTES, len) for side in Side}
         self._received: dict[Side, set[str]] = {side: set() for side in Side}  # since the connection began
         # Of topics on which the winner has published nothing since its connection began, as far as has arrived:
-        self._offered: set[str] = set()  # what it seemed to lack, and was sent,
-        self._newer: set[str] = set()  # and what the loser changed since
+        self._offered: set[str] = set()  # those that it seemed to lack, and was sent,
+        self._newer: set[str] = set()  # and those that the loser has changed since
         self._synchronized = dict.fromkeys(Side, False)
         self._overtaken: set[str] = set()  # changed by the loser while the winner was away
 
@@ -114,7 +114,7 @@ class Reconciliation:
         return None if last is None else last.payload
 
     def begin(self, side: Side) -> None:
-        """Begin anew with ``side``, whose connection was lost or is new: its retained messages will arrive again."""
+        """Begin again with ``side``, whose connection was lost or is new: its retained messages will arrive again."""
         self._received[side].clear()
         if side is self._winner:
             self._offered.clear()
@@ -135,7 +135,7 @@ class Reconciliation:
         other_away: bool = False,
         went_back: bool = False,
     ) -> Resolution:
-        """``side`` published ``payload``; ``retained``: a subscription brought it, it may be old.
+        """Resolve a message of ``side``; ``retained``: a subscription brought it, so it may be old.
 
         ``went_back``: ``side`` has older values than it had a moment ago.
         """
@@ -160,11 +160,11 @@ class Reconciliation:
         return resolution
 
     def note_published(self, side: Side, topic: str, payload: bytes) -> None:
-        """``payload`` was forwarded to ``side``."""
+        """Note that ``payload`` was forwarded to ``side``."""
         self._published[side][topic] = payload
 
     def synchronize(self, side: Side) -> list[tuple[Side, str, bytes]]:
-        """Return what is to be published now that the retained messages of ``side`` have arrived, and to which side."""
+        """Note that all retained messages of ``side`` have arrived; return sides, topics and payloads to publish."""
         self._synchronized[side] = True
         due: list[tuple[Side, str, bytes]] = []
         if side is self._winner:
@@ -202,5 +202,5 @@ class Reconciliation:
         return self._synchronized[self._winner] and topic not in self._received[self._winner]
 
     def _is_missing(self, side: Side, topic: str, last: LastValue) -> bool:
-        """True if ``side`` lacks the newest value; it lacks no removal of what it never received."""
+        """True if ``side`` lacks the newest value; a removal counts only if it received the value before."""
         return topic not in self._received[side] and self._published[side].get(topic, b"") != last.payload

@@ -16,7 +16,7 @@ _DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
 
 
 class RetainedTopics:
-    """What is retained on both sides: messages that wait for the gate, and which of two values counts.
+    """Retained messages of both sides: those that wait for the gate, and the choice between two values.
 
     ``on_value(subject, payload)`` is called with the lock held.
     """
@@ -37,20 +37,20 @@ class RetainedTopics:
         self._waiting: dict[str, tuple[Subject, Message, Forward]] = {}
 
     def receive(
-        self, here: SideState, subject: Subject, message: Message, forward: Forward, *, old: bool = False
+        self, source: SideState, subject: Subject, message: Message, forward: Forward, *, old: bool = False
     ) -> Forward | Drop:
-        """Forward ``message``, which will be retained, or say why not. ``old``: not if it was published just now."""
+        """Forward ``message``, which will be retained, or return why not. ``old``: only one that is an old one."""
         with self._lock:
             self._begin_restarted()
             if subject.kind in self._both_ways:
-                drop = self._reconcile(here, subject, message, old=old)
+                drop = self._reconcile(source, subject, message, old=old)
                 if drop is not None:
                     return drop
             gate = self._sides.gate
             if gate is Gate.OPEN:
-                self._publish(here.side.other, subject, message, forward)
+                self._publish(source.side.other, subject, message, forward)
                 return forward
-            if gate is Gate.WAITING and here.side is Side.LOCAL:
+            if gate is Gate.WAITING and source.side is Side.LOCAL:
                 if message.topic in self._waiting or len(self._waiting) < _MAX_WAITING:
                     self._waiting[message.topic] = subject, message, forward
                 return Drop.HELD
@@ -70,7 +70,7 @@ class RetainedTopics:
             return forward
 
     def open(self) -> None:
-        """Open the gate, and publish what has waited."""
+        """Open the gate, and publish the messages that have waited."""
         with self._lock:
             self._sides.gate = Gate.OPEN
             waiting, self._waiting = self._waiting, {}
@@ -83,7 +83,7 @@ class RetainedTopics:
         self._waiting = {}
 
     def synchronize(self, side: Side) -> None:
-        """Publish what the retained messages of ``side``, which have all arrived, have left open."""
+        """Publish the values that are still to be sent now that the retained messages of ``side`` have arrived."""
         with self._lock:
             self._begin_restarted()
             self._sides[side].arrived()
@@ -104,9 +104,9 @@ class RetainedTopics:
         return self._reconciliation.value(topic)
 
     def remove(self, side: Side, topic: str, *, unless: Callable[[str], bool]) -> bool:
-        """Remove what ``side`` retains on ``topic``, unless there is a reason not to; return whether it was removed.
+        """Remove the retained message of ``side`` on ``topic``, unless ``unless(topic)``; return True if that was done.
 
-        Until it is removed no retained message passes, so what is published meanwhile comes after it.
+        No retained message passes before the removal is sent, so one that is published in the meantime comes after it.
         """
         with self._lock:
             if unless(topic):
@@ -116,14 +116,14 @@ class RetainedTopics:
 
     # -- with the lock held
 
-    def _reconcile(self, here: SideState, subject: Subject, message: Message, *, old: bool) -> Drop | None:
+    def _reconcile(self, source: SideState, subject: Subject, message: Message, *, old: bool) -> Drop | None:
         """Return why a two-way message must not pass; None if it may."""
-        side, topic, payload, transport = here.side, message.topic, message.payload, here.transport
-        if message.retain and topic in here.seen and transport.policy.delivers_late and not transport.as_published:
+        side, topic, payload, transport = source.side, message.topic, message.payload, source.transport
+        if message.retain and topic in source.seen and transport.policy.delivers_late and not transport.as_published:
             return Drop.KNOWN  # older than what was seen
-        if len(here.seen) < _MAX_WAITING:
-            here.seen.add(topic)
-        retained = self._sides.gate is not Gate.SHUT and self._is_retained(here, message)
+        if len(source.seen) < _MAX_WAITING:
+            source.seen.add(topic)
+        retained = self._sides.gate is not Gate.SHUT and self._is_retained(source, message)
         if old and not retained:
             return Drop.UNNAMED
         if not retained and self._own_return and self._reconciliation.value(topic) == payload:
@@ -134,7 +134,7 @@ class RetainedTopics:
             payload,
             retained=retained,
             other_away=not self._sides[side.other].connected,
-            went_back=here.has_gone_back,
+            went_back=source.has_gone_back,
         )
         if resolution is Resolution.PASS:
             self._on_value(subject, payload)
@@ -150,18 +150,18 @@ class RetainedTopics:
     @property
     def _own_return(self) -> bool:
         """True if no side distinguishes our own messages exactly."""
-        return not any(one.transport.exact_echo for one in self._sides.values())
+        return not any(state.transport.exact_echo for state in self._sides.values())
 
-    def _is_retained(self, here: SideState, message: Message) -> bool:
-        if not here.transport.as_published:
+    def _is_retained(self, source: SideState, message: Message) -> bool:
+        if not source.transport.as_published:
             return message.retain
-        return here.window.may_be_old(message) and not self._reconciliation.has_received(here.side, message.topic)
+        return source.window.may_be_old(message) and not self._reconciliation.has_received(source.side, message.topic)
 
     def _begin_restarted(self) -> None:
-        for one in self._sides.values():
-            if one.restarted:
-                one.restarted = False
-                self._reconciliation.begin(one.side)
+        for state in self._sides.values():
+            if state.restarted:
+                state.restarted = False
+                self._reconciliation.begin(state.side)
 
     def _publish_value(self, side: Side, topic: str, payload: bytes) -> None:
         subject = self._subjects[topic]

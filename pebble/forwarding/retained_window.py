@@ -1,4 +1,4 @@
-"""Decides whether a message with the retain flag is an old one, or was published just now. Pure but for its clock.
+"""Tells retained messages from live ones that have the retain flag as well. Pure but for its clock.
 
 Where a connection marks live messages with the flag, too, only the time since the subscription distinguishes the two.
 """
@@ -19,7 +19,7 @@ _RETAINED_STOPS_S = 10.0
 
 
 class RetainedWindow:
-    """The time after a subscription in which what ``transport`` has retained still arrives."""
+    """The time after a subscription in which retained messages of ``transport`` still arrive."""
 
     def __init__(self, transport: Transport, clock: Callable[[], float]) -> None:
         self._transport, self._clock = transport, clock

@@ -1,4 +1,4 @@
-"""Which messages pass between a robot's own transport and another one, and how: a pure function of a table."""
+"""Routing of messages between a robot's own transport and another one: a pure function of a table."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Side.LOCAL.other, Side.REMOTE.other = Side.REMOTE, Side.LOCAL
 
 
 class Drop(Enum):
-    """Why a message does not pass."""
+    """A reason why a message does not pass."""
 
     FOREIGN = "no topic of this robot"
     MEDIA = "media has connections of its own"
@@ -59,7 +59,7 @@ class Drop(Enum):
 
 
 class Forward(Struct, frozen=True):
-    """How a message is published on the other side: same topic, same bytes."""
+    """The options with which a message is published on the other side: same topic, same bytes."""
 
     qos: QoS
     retain: bool
@@ -83,7 +83,7 @@ class Rules:
         return all(kind in self.passes[side] for side in Side)
 
 
-#: Between the robot and its operators: the paper's Table A.1. What no table may allow, :func:`route` drops itself.
+#: Between the robot and its operators: the paper's Table A.1. :func:`route` drops messages that no table may allow.
 TABLE_A1: Final = Rules(
     passes={
         Side.LOCAL: frozenset({Kind.STATE, Kind.EVENT, Kind.STREAM, Kind.FLAG, Kind.ACTION}),
@@ -95,20 +95,9 @@ TABLE_A1: Final = Rules(
 #: Between a robot's own transport and a broker on the robot: everything, both ways, except media.
 MIRROR: Final = Rules(passes={side: frozenset(Kind) for side in Side}, leaves_robot=False)
 
-#: Between a hub and a broker, for a robot of the hub whose bridge forwards by the first one.
-GATEWAY: Final = Rules(
-    passes={
-        Side.LOCAL: frozenset({Kind.STATE, Kind.EVENT, Kind.STREAM, Kind.FLAG}),
-        Side.REMOTE: frozenset({Kind.COMMAND, Kind.FLAG, Kind.ACTION, Kind.FEED}),
-    },
-    leaves_robot=True,
-    media=True,
-    stored=False,
-)
-
 
 def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *, mirroring: bool) -> Forward | Drop:
-    """Return how to forward ``message``, received on ``side``, or why not. Pure."""
+    """Return how to forward ``message``, received on ``side``, or why it does not pass. Pure."""
     if subject is None:
         return Drop.FOREIGN
     if not subject.bridged and not rules.media:
@@ -140,7 +129,7 @@ def _qos(subject: Subject, message: Message) -> QoS:
 
 
 def _retain(subject: Subject, message: Message) -> bool:
-    """Retained as published, if that is known; a flag is always retained on both sides."""
+    """Return True if it is to be retained: as published, if that is known; flags always are, on both sides."""
     if subject.kind.one_shot:
         return False
     if subject.kind is Kind.FLAG and subject.retain:

@@ -1,4 +1,4 @@
-"""What bridge and mirror share: a connection on each side, a forwarder between them, and the life of both."""
+"""The base of bridge and mirror: a connection on each side, a forwarder between them, and the life of both."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CHECK_SOON_S = 1.0  # after the first sign that two sides are one: it may have b
 
 
 class Status(Struct, frozen=True):
-    """What a forwarding service does now, for tools and tests."""
+    """The state of a forwarding service, for tools and tests."""
 
     gate: Gate
     mirroring: bool  # by the flag remote-mirror, which does not concern the service mqtt_mirror
@@ -38,7 +38,7 @@ class Status(Struct, frozen=True):
 
 
 class ForwardingService(Service, ABC):
-    """Forwards between the robot's own transport (the local side) and another one (the remote side).
+    """A service that forwards between the robot's own transport (the local side) and another one (the remote side).
 
     Messages are forwarded on the transports' receiving threads (see pebble.forwarding.forwarder); everything else
     happens on the service's own thread, so a burst of messages delays neither a heartbeat nor a probe.
@@ -93,7 +93,7 @@ class ForwardingService(Service, ABC):
         """The side whose retained messages count where those of the two differ."""
 
     def make_names(self) -> Names | None:
-        """Return what checks the names of senders on the remote side; None: nothing does."""
+        """Return the names of senders on the remote side, where they are checked."""
         return None
 
     def make_steps(self) -> Mapping[str, Step]:
@@ -104,7 +104,7 @@ class ForwardingService(Service, ABC):
         """React to the value on which both sides agree; on any thread, with a lock held."""
 
     def pass_stop(self, side: Side, payload: bytes) -> Iterable[bytes]:  # noqa: ARG002
-        """Return what passes of a stop that was received on ``side``; on any thread."""
+        """Return the payloads that pass for a stop received on ``side``; on any thread."""
         return (payload,)
 
     @abstractmethod
@@ -156,9 +156,9 @@ class ForwardingService(Service, ABC):
         ]
 
     def subscribe_remote(self) -> None:
-        """Subscribe anew for each connection, after the transport has sent what changed during the outage.
+        """Subscribe for a new connection, after the transport has sent the robot's changes during the outage.
 
-        So a retained message of the remote side is never older than what the robot has changed.
+        So no retained message of the remote side is older than a change by the robot.
         """
         self.unsubscribe(Side.REMOTE)
         self.forwarder.sides[Side.REMOTE].subscribing()

@@ -1,4 +1,4 @@
-"""What a forwarder knows of each of its two sides, and whether anything passes between them."""
+"""The two sides of a forwarder, and the gate between them."""
 
 from collections.abc import Callable
 from enum import Enum
@@ -10,9 +10,9 @@ from pebble.forwarding.routing import Side
 from pebble.transports import State, Transport
 from pebble.transports.counters import Counters
 
-#: After a longer outage an earlier value at a broker that was restored may have been chosen again by somebody.
+#: After a longer outage an earlier value at a restored broker may have been chosen again by an operator.
 RESTORED_S = 30.0
-#: What circulates comes back within this time; the same message later is new.
+#: A message that circulates comes back within this time; the same message later is new.
 _RETURN_S = 2.0
 
 
@@ -23,7 +23,7 @@ class Gate(Enum):
 
 
 class SideState:
-    """One side: its transport, what waits for it, what may come back from it, and what its retained messages prove.
+    """One side: its transport, messages that wait for it or may come back, and the age of its retained messages.
 
     ``wins``: its retained messages count where those of the two sides differ.
     """
@@ -36,9 +36,9 @@ class SideState:
         self.events = EventBuffer(transport, counters, clock=clock)
         self.window = RetainedWindow(transport, clock)
         self.loopback = LoopbackFilter(clock)  # of a broker without bridge mode
-        self.returns = LoopbackFilter(clock, _RETURN_S)  # what circulates, once each
+        self.returns = LoopbackFilter(clock, _RETURN_S)  # messages that circulate, once each
         self.seen: set[str] = set()  # two-way topics, since we subscribed
-        self.restarted = False  # its retained messages come (again), which the reconciliation has not been told
+        self.restarted = False  # its retained messages come again, and the reconciliation has not been told
         self._clock, self._wins = clock, wins
         self._lost_at = float("-inf")  # -inf: before the first connection, too
         self._went_back = False
@@ -66,13 +66,13 @@ class SideState:
 
     @property
     def has_gone_back(self) -> bool:
-        """True if an earlier value that it retains is an old one: no program can have chosen it again."""
+        """True if an earlier retained value here comes from a restored save, not from a program that chose it again."""
         if self._wins or not self._went_back:
             return self._went_back
         return self._was_brief or self.transport.was_ended
 
     def arrived(self) -> None:
-        """Note that what it retains has arrived: an earlier value from now on was chosen again."""
+        """Note that its retained messages have arrived: an earlier value that comes later was chosen again."""
         self._went_back = False
 
     @property
@@ -81,6 +81,6 @@ class SideState:
 
 
 class Sides(dict[Side, SideState]):
-    """Both sides; ``gate`` is whether messages pass between them."""
+    """Both sides, and the gate between them."""
 
     gate: Gate = Gate.WAITING

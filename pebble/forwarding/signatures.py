@@ -17,8 +17,8 @@ _SCRIPT, _BACKSLASH = SCRIPT.encode(), 0x5C
 def unsigned(payload: bytes) -> bytes | None:
     """Return the drive command ``payload`` as it may pass; None: it may not. Hot: a person's is hardly looked at.
 
-    JSON has no other way to write the letters than as they are or with backslashes. What has either of them and cannot
-    be read does not pass: the parser of a board may be more lenient.
+    JSON writes the letters as they are or with backslashes. A payload with either of them that cannot be read does not
+    pass: the parser of a board may be more lenient.
     """
     if _BACKSLASH not in payload and _SCRIPT not in payload:
         return payload

@@ -1,4 +1,4 @@
-"""What a topic means to one robot: its channel, renamed or not, or the family of an unknown metric."""
+"""The meaning of topics to one robot: a channel, renamed or not, or the family of an unknown metric."""
 
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -25,9 +25,9 @@ _FAMILIES = (
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What all topics of a channel, or of a family, mean. ``channel`` is None for metrics that are not in the contract.
+    """The meaning of all topics of a channel, or of a family; ``channel`` is None for metrics beyond the contract.
 
-    Of each there is one object, so that what is remembered by subject is bounded, and found quickly.
+    There is one object for each, so that tables by subject are bounded, and fast.
     """
 
     kind: Kind
@@ -71,17 +71,17 @@ class Subject:
 
     @cached_property
     def stamped(self) -> bool:
-        """True if its messages may carry their sender's clock and a key, by which their age is known."""
+        """True if its messages may carry their sender's clock and a key, which tell their age."""
         return self.channel is not None and self.channel.payload in (Drive, ControlRequest)
 
     @cached_property
     def runs(self) -> bool:
-        """True if the robot does something because of one message: once, although it may circulate."""
+        """True if one message makes the robot do something: once, although the message may circulate."""
         return self.kind in (Kind.COMMAND, Kind.ACTION) and not self.drives and not self.is_stop
 
     @cached_property
     def counted(self) -> bool:
-        """True if a robot takes a bounded number: of actions, and of what is not in the contract."""
+        """True if a robot takes a bounded number of its messages: of actions, and of those beyond the contract."""
         return self.channel is None or self.kind is Kind.ACTION
 
     @cached_property
@@ -93,8 +93,8 @@ class Subject:
 class Subjects(dict[str, Subject | None]):
     """Subjects by effective topic, those of every serial instance included.
 
-    None: the topic is not this robot's, or not valid. What was looked up before is found without a call of Python's.
-    ``config``: that of the robot, or its base if it renames nothing.
+    None: the topic is not this robot's, or not valid. A topic that was looked up before is found without a call of
+    Python's. ``config``: the robot's, or its base if it renames nothing.
     """
 
     def __init__(self, config: Config | str) -> None:
@@ -109,7 +109,7 @@ class Subjects(dict[str, Subject | None]):
             self._addresses = [Addresses(view_of(config, name)) for name in names]
         self._between_robots = tuple(f"{self._base}/{family}" for family in BETWEEN_ROBOTS)
         self._incoming = f"{self._base}/{INCOMING}/".encode()
-        named = (addresses[one].topic.encode() for addresses in self._addresses for one in CHANNELS)
+        named = (addresses[channel].topic.encode() for addresses in self._addresses for channel in CHANNELS)
         self._named = frozenset(topic.removeprefix(self._incoming) for topic in named)
 
     def __missing__(self, topic: str) -> Subject | None:
@@ -128,7 +128,7 @@ class Subjects(dict[str, Subject | None]):
         return Kind.FLAG if metric.startswith(b"flags/") else Kind.COMMAND
 
     def filters(self, *directions: str) -> list[str]:
-        """Return what to subscribe to for everything of ``directions``: no two of the filters overlap."""
+        """Return the filters for all topics of ``directions``; no two of them overlap."""
         families = [f"{self._base}/{direction}/#" for direction in directions]
         renamed = (
             addresses[channel].topic
@@ -146,13 +146,13 @@ class Subjects(dict[str, Subject | None]):
     @cached_property
     def flags(self) -> list[str]:
         """The topics of the contract's flags."""
-        return self.topics(*(one for one in CHANNELS if one.kind is Kind.FLAG and not one.is_pattern))
+        return self.topics(*(flag for flag in CHANNELS if flag.kind is Kind.FLAG and not flag.is_pattern))
 
     @cached_property
     def probed(self) -> list[str]:
         """The topics on which cycles are looked for at each connection, before they are used."""
-        actions = (one for one in CHANNELS if one.kind is Kind.ACTION)
-        return self.topics(*(one for one in CHANNELS if one.payload is Drive), *actions)
+        actions = (channel for channel in CHANNELS if channel.kind is Kind.ACTION)
+        return self.topics(*(channel for channel in CHANNELS if channel.payload is Drive), *actions)
 
     def _find(self, topic: str) -> Subject | None:
         try:

@@ -1,1 +1,1 @@
-"""What stands between a command and the motors: its inbox, the latch and the arbiter, and the file that outlives us."""
+"""The way of a command to the motors: inbox, latch, arbiter and lease, and the file that outlives the process."""

@@ -1,4 +1,4 @@
-"""Who has control of a Linux robot's motor owner: it answers requests, and publishes its state."""
+"""Control of a Linux robot's motor owner: answers to requests, and the published state."""
 
 import logging
 import operator
@@ -14,7 +14,7 @@ from pebble.runtime.rate_limit import RateLimitedLog
 
 log = logging.getLogger(__name__)
 
-_TICK_S = 0.25  # while a client has control, or others drive: what is over ends so late at most
+_TICK_S = 0.25  # while a client has control, or others drive: control that is over ends so late at most
 _REPEAT_S = 0.5  # of the turn, where there are several owners
 _TURNS_PER_S = 20  # at most: a turn is shown at once, but not each one of a flood
 _NO_CLIENT = ("", "", "", "")
@@ -36,7 +36,7 @@ class Control:
         show_turn: Callable[[], object] = lambda: None,
         bridged: bool = False,
     ) -> None:
-        """``owners``: all of the robot; if there are others, ``show_turn()`` is to send them :meth:`turn`.
+        """Store the arguments; ``owners``: all of the robot; ``show_turn()`` is to send :meth:`turn` to the others.
 
         ``bridged``: silence counts only while :meth:`vouch` says so.
         """
@@ -60,20 +60,20 @@ class Control:
         )  # fmt: skip
 
     def holds(self, drive: Drive) -> bool:
-        """True if this command is from who has control. Any thread may ask."""
+        """True if this command is from the client that has control. Any thread may ask."""
         return isinstance(drive.key, str) and self.lease.holds(drive.key, self.account(drive) or "")
 
     def knows(self, request: ControlRequest) -> bool:
-        """True if this one has control, or is the first who asks for it. Any thread may ask."""
+        """True if its sender has control, or is the first that asks for it. Any thread may ask."""
         client = self.sender(request)
         return client == self.lease.holder[:2] or client == self.lease.asker[:2]
 
     def sender(self, request: ControlRequest) -> tuple[str, str]:
-        """Return what the lease tells clients apart by: the account and the id. Any thread may ask."""
+        """Return the account and the id, by which the lease tells clients apart. Any thread may ask."""
         return self._client(request)[:2]
 
     def request(self, request: ControlRequest, over: bool, now: float) -> None:
-        """Requests and releases; ``over``: without asking."""
+        """Request or release control; ``over``: without asking its holder."""
         client = self._client(request)
         if request.ends():
             self.lease.release(client, _ms(now))
@@ -81,15 +81,15 @@ class Control:
             self.lease.hold(client, int(request.for_ms), over, _ms(now))
 
     def vouch(self, vouched: ControlVouched, now: float) -> None:
-        """Take what the bridge says."""
+        """Note the time for which the bridge vouches."""
         self.lease.vouch(vouched.begin, vouched.end, _ms(now))
 
     def doubt(self, now: float) -> None:
-        """Messages of before may have been lost between the bridge and here."""
+        """Note that earlier messages may have been lost between the bridge and here."""
         self.lease.doubt(_ms(now))
 
     def account(self, drive: Drive) -> str | None:
-        """Return whose command this is, "" where names are not checked; None: it is from a program of the robot."""
+        """Return the account of a command, "" where names are not checked; None: it is from a program of the robot."""
         if not self._named:
             return ""
         return drive.by.partition("/")[0] if isinstance(drive.by, str) else None
@@ -104,12 +104,12 @@ class Control:
         return frozenset() if self._shared is None else self._shared.peers
 
     def receive_turn(self, owner: str, turn: ControlTurn, now: float) -> None:
-        """Take what a peer has sent; then :meth:`note`."""
+        """Take a turn of a peer; call :meth:`note` then."""
         if self._shared is not None:
             self._shared.receive(owner, turn, _ms(now))
 
     def turn(self, barred: int, now: float) -> ControlTurn | None:
-        """Return what the other owners are to receive; ``barred`` is the arbiter's."""
+        """Return the turn for the other owners; ``barred`` is the arbiter's."""
         return None if self._shared is None else self._shared.shown(barred, _ms(now))
 
     def waits(self, now: float) -> bool:
@@ -117,11 +117,11 @@ class Control:
         return self._shared is not None and self._shared.waits(_ms(now))
 
     def left_ms(self, now: float) -> int:
-        """For how long a command that is permitted now may move the motors at most."""
+        """Return for how long a command that is permitted now may move the motors at most."""
         return sys.maxsize if self._shared is None else max(0, self._shared.until - _ms(now))
 
     def note(self, now: float) -> bool:
-        """Publish what has changed; True: control has passed on, so halt the motors first."""
+        """Publish a changed state; return True if control has passed on: halt the motors then."""
         lease = self.lease
         if lease.changed:
             lease.changed = False
@@ -138,12 +138,12 @@ class Control:
 
     @property
     def due(self) -> float | None:
-        """When :meth:`tick` has something to do; None: nothing."""
+        """The time at which :meth:`tick` must run next; None: it need not."""
         times = (self._next, self._state.due, self._turn_due, self._turns.due)
         return min((at for at in times if at is not None), default=None)
 
     def tick(self, now: float) -> None:
-        """Let what is over end; then :meth:`note` and :meth:`show_turn`."""
+        """End control that is over; call :meth:`note` and :meth:`show_turn` then."""
         if self._next is not None and now >= self._next:
             self._next = None
             self.lease.tick(_ms(now))

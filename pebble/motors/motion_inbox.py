@@ -1,4 +1,4 @@
-"""What waits to be judged before it reaches the motors: stops, resets, requests for control and drive commands."""
+"""Messages that wait to be judged before they reach the motors: stops, resets, requests for control, drive commands."""
 
 import threading
 from itertools import chain
@@ -21,8 +21,8 @@ from pebble.transports import State
 _STOPS = 8  # as many names as a latch remembers
 _RESETS = 8
 _REQUESTS = 8
-_SENDERS = 8  # who has control, all other persons, and runs of scripts
-_HOLDER = -2  # in place of the number of a run: who has control
+_SENDERS = 8  # of drive commands: the holder of control, all other persons, and runs of scripts
+_HOLDER = -2  # in place of the number of a run: the holder of control
 
 
 class ReceivedDrive(Struct, frozen=True):
@@ -48,23 +48,23 @@ class ReceivedRequest(Struct, frozen=True):
 
 
 class Batch(Struct):
-    """All that was waiting, to be judged in the order of the fields."""
+    """All messages that were waiting, to be judged in the order of the fields."""
 
     stops: list[EstopCommand]
     resets: list[ReceivedReset]
     requests: list[ReceivedRequest]
     turns: list[tuple[str, ControlTurn]]
-    lost: bool  # messages may have been
+    lost: bool  # messages may have been lost
     drives: list[ReceivedDrive]
     vouched: ControlVouched | None
 
 
 class MotionInbox:
-    """Bounded. Any thread puts, one takes; a ``put`` returns True if nothing was waiting before: wake the one up then.
+    """A bounded inbox. Any thread puts, one takes; a ``put`` returns True if it was empty: wake that thread up then.
 
-    Of drive commands the newest of each sender waits, and before it the zero that it replaced: a zero is always judged.
-    The driver with control is a sender of its own, whom others do not replace. So is each client that requests it, by
-    account and id, as the lease has it: one account may name any number of persons.
+    The newest drive command of each sender waits, and before it the zero that it replaced: a zero is always judged. The
+    holder of control is a sender of its own, whom others do not replace. So is each client that requests control, by
+    account and id, as in the lease: one account may name any number of persons.
     """
 
     def __init__(self, control: Control) -> None:
@@ -77,7 +77,7 @@ class MotionInbox:
         self._turns: dict[str, ControlTurn] = {}  # by owner
         self._lost = False
         self._vouched: ControlVouched | None = None
-        self._drives: dict[int, list[ReceivedDrive]] = {}  # the same
+        self._drives: dict[int, list[ReceivedDrive]] = {}  # by sender, the newest sender last
 
     def put_stop(self, stop: EstopCommand) -> bool:
         with self._lock:
@@ -102,8 +102,8 @@ class MotionInbox:
             sender = self._control.sender(request)
             waiting = self._requests.pop(sender, None)
             if len(self._requests) >= _REQUESTS:
-                known = [key for key, one in self._requests.items() if not self._control.knows(one.request)]
-                del self._requests[known[0]]
+                known = self._control.knows
+                del self._requests[next(key for key, received in self._requests.items() if not known(received.request))]
                 self.dropped += 1
             over = not request.ends() and (over or (waiting is not None and waiting.over))
             self._requests[sender] = ReceivedRequest(request, over, now)
@@ -122,7 +122,7 @@ class MotionInbox:
             return was_empty
 
     def note_state(self, state: State) -> None:
-        """Note that a connection is lost, and messages with it; nothing is to be done until others have come."""
+        """Note that a connection is lost, and messages with it; it counts when the next ones come."""
         if state is not State.CONNECTED:
             with self._lock:
                 self._lost = True
@@ -142,7 +142,7 @@ class MotionInbox:
             return was_empty
 
     def take(self) -> Batch:
-        """Return all that waits, and forget it."""
+        """Remove and return all waiting messages."""
         with self._lock:
             drives = list(chain.from_iterable(self._drives.values()))
             requests, turns = list(self._requests.values()), list(self._turns.items())
@@ -170,7 +170,7 @@ def run_of(drive: Drive) -> int:
 
 
 def _replaced(waiting: list[ReceivedDrive], newest: ReceivedDrive) -> list[ReceivedDrive]:
-    """At most one zero and one command after it.
+    """Return the commands that wait once ``newest`` has come: at most one zero and one command after it.
 
     Two zeros become one: as new as the newer one, and final if either of them is.
     """

@@ -37,8 +37,8 @@ _REFUSED_RESETS = {
 class MotorGuard:
     """The emergency stop and the arbiter of a Linux robot's motor owner; on the service's thread.
 
-    ``publish(state)`` is called with each new state, at most four times a second. Call :meth:`tick` at :attr:`due`.
-    Call :meth:`begin` first. ``file`` outlives a power cut, ``barred_file`` this process, as running scripts do.
+    Call :meth:`begin` first, and :meth:`tick` at :attr:`due`. ``publish(state)`` is called with each new state, at most
+    four times a second. ``file`` outlives a power cut, ``barred_file`` this process, as running scripts do.
     """
 
     def __init__(
@@ -85,18 +85,18 @@ class MotorGuard:
 
     @property
     def persisted(self) -> bool | None:
-        """Whether the file holds the state as it is; None where nothing can be saved."""
+        """True if the file holds the current state; None if this owner cannot save."""
         return self._saving == self._saved if self._can_save else None
 
     def stop(self, command: EstopCommand, now: float) -> None:
         """Latch. The caller has stopped the motors before."""
         name = command.stop if isinstance(command.stop, str) else secrets.token_hex(8)
-        by, why, before = _given(command.by), _given(command.why), self._latch.by
+        by, why, earlier_by = _given(command.by), _given(command.why), self._latch.by
         if self._arbiter.stop(name, by, why, time.time_ns() // 1_000_000):
             self._log.log("stop", logging.WARNING, "emergency stop by %s", _described(by, why))
             self._save()
             self._state.changed(now)
-        elif self._latch.by != before:
+        elif self._latch.by != earlier_by:
             self._save()
             self._state.changed(now)
         elif now >= self._state.last + _REPEAT_S:
@@ -146,11 +146,11 @@ class MotorGuard:
 
     @property
     def due(self) -> float | None:
-        """When :meth:`tick` has something to do; None: nothing."""
+        """The time at which :meth:`tick` must run next; None: it need not."""
         return min((at for at in (self._state.due, self._hold_until) if at is not None), default=None)
 
     def tick(self, now: float) -> None:
-        """Let a person's hold end, and publish a state that had to wait."""
+        """End a person's hold that is over, and publish a state that had to wait."""
         if self._hold_until is not None and now >= self._hold_until:
             self._hold_until = None
             self._arbiter.tick(_ms(now))
@@ -176,17 +176,17 @@ class MotorGuard:
             self._barred_file.save(self._barred)
 
     def appeared_stop(self) -> EstopCommand | None:
-        """Return a stop that is not known here, of a file that has just appeared: its folder was mounted late."""
+        """Return an unknown stop from a file that has just appeared, because its folder was mounted late; else None."""
         saved = None if self._file.busy or not self._can_save else self._file.appeared()
         if saved is None:
             return None
-        found = Latch("", NAMES, operator.sub)
-        found.restore(saved)
-        newest = found.recent[0] if found.recent else secrets.token_hex(8)
-        if found.latched and not self.latched and newest not in self._latch.recent:
+        latch = Latch("", NAMES, operator.sub)
+        latch.restore(saved)
+        newest = latch.recent[0] if latch.recent else secrets.token_hex(8)
+        if latch.latched and not self.latched and newest not in self._latch.recent:
             log.warning("%s has appeared, with an emergency stop", self._file.path)
-            return EstopCommand(stop=newest, by=found.by, why=found.why)
-        self._save()  # what is known here is newer
+            return EstopCommand(stop=newest, by=latch.by, why=latch.why)
+        self._save()  # the state here is newer
         return None
 
     def repeat_state(self, now: float) -> None:
@@ -221,7 +221,7 @@ class MotorGuard:
 
 
 def _described(by: str, why: str) -> str:
-    """Return who and why, of a stop or a reset, fit for a log."""
+    """Return the sender and the reason of a stop or a reset, fit for a log."""
     _, by, why = stop_of({"by": by, "why": why})
     return f"{by or 'an unnamed sender'}{f' ({why})' if why else ''}"
 

@@ -33,7 +33,7 @@ _FINAL_ZERO = Drive(x=0.0, z=0.0, valid_ms=0)
 
 
 class MotorOwner(Service, ABC):
-    """Receives stops, control and drive commands, and moves motors as its guard permits.
+    """A service that receives stops, control and drive commands, and moves motors as its guard permits.
 
     A subclass moves them: :meth:`move`, :meth:`halt`. Both are called on the service's thread or on one of the
     transport's, never on two at once, and must not wait. ``move`` is valid for some time only: :meth:`halt` is called
@@ -82,7 +82,7 @@ class MotorOwner(Service, ABC):
 
     @property
     def drive_timeout_s(self) -> float:
-        """How long a drive command is valid, in seconds."""
+        """Seconds for which a drive command is valid."""
         return 0.75
 
     @abstractmethod
@@ -149,7 +149,7 @@ class MotorOwner(Service, ABC):
     # -- commands
 
     def judge(self) -> None:
-        """Stops first: they void every drive command that waits with them."""
+        """Judge all waiting messages; stops first, as they void every drive command that waits with them."""
         batch = self._waiting.take()
         latches = not batch.stops or self._latches  # without a stop nothing here depends on it
         for stop in batch.stops:
@@ -231,7 +231,7 @@ class MotorOwner(Service, ABC):
 
     @property
     def _latches(self) -> bool:
-        """True if a stop latches. Without the resets it would have no end, and without the stops it is no promise."""
+        """True if a stop latches: without resets it would have no end, and without stops it is no promise."""
         return not (self.refused(c.ESTOP) or self.refused(c.ESTOP_RESET))
 
     def on_connected(self) -> None:
@@ -299,7 +299,7 @@ class MotorOwner(Service, ABC):
         self._arm_guard()
 
     def _publish_state(self, state: EstopState) -> None:
-        """While a stop does not latch, remove it instead, again and again: a bridge may have missed the first time."""
+        """Publish the state; while a stop does not latch, remove it, repeatedly, as a bridge may have missed that."""
         if self._latches:
             self.publish(c.ESTOP_STATE, state, owner=self.owner)
         else:

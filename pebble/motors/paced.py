@@ -7,7 +7,7 @@ STATES_PER_S = 4
 
 
 class Paced:
-    """Calls ``publish()`` at each change, or as soon as the rate allows: at most so many times a second."""
+    """A rate limit: ``publish()`` is called at each change, or as soon as ``per_s`` calls a second allow it."""
 
     def __init__(self, publish: Callable[[], object], per_s: int = STATES_PER_S) -> None:
         self._publish = publish
@@ -16,7 +16,7 @@ class Paced:
 
     @property
     def last(self) -> float:
-        """When the newest state was published."""
+        """The time at which the newest state was published."""
         return self._published[-1]
 
     def changed(self, now: float) -> None:
@@ -29,6 +29,6 @@ class Paced:
             self._publish()
 
     def tick(self, now: float) -> None:
-        """Publish what had to wait; to be called at :attr:`due`."""
+        """Publish a state that had to wait; call it at :attr:`due`."""
         if self.due is not None and now >= self.due:
             self.changed(now)

@@ -20,7 +20,7 @@ class SharedLease(VouchedLease):
     until = sys.maxsize  # when everything stops, unless another turn is received before
 
     def __init__(self, peers: frozenset[str], now: int, *lease: Any) -> None:
-        """``peers``: whose turns are given to :meth:`receive`; ``lease``: what else VouchedLease needs."""
+        """Store the owners whose turns are given to :meth:`receive`; ``lease``: the other arguments of VouchedLease."""
         super().__init__(now, *lease)
         self.peers = peers
 
@@ -38,7 +38,7 @@ class SharedLease(VouchedLease):
 
     @abstractmethod
     def shown(self, barred: int, now: int) -> ControlTurn | None:
-        """Return what the peers are to receive."""
+        """Return the turn that the peers are to receive."""
 
 
 class FirstLease(SharedLease):
@@ -71,7 +71,7 @@ class FirstLease(SharedLease):
 
 
 class FollowingLease(SharedLease):
-    """What another owner knows of the first one's lease: it grants and ends nothing itself."""
+    """The lease of another owner, which follows the first one's: it grants and ends nothing itself."""
 
     until = 0
 
@@ -84,12 +84,11 @@ class FollowingLease(SharedLease):
 
     def receive(self, _owner: str, turn: ControlTurn, now: int) -> None:
         """Follow the newest turn; one with a time to come is of another clock."""
-        before, self._followed = self._followed, turn
-        if turn.t > now or (before is not None and turn.t < before.t):
-            self._followed = before
+        earlier = self._followed
+        if turn.t > now or (earlier is not None and turn.t < earlier.t):
             return
-        self.until = turn.t + FOLLOWS_MS
-        if before is None or (turn.boot, turn.turn) != (before.boot, before.turn):
+        self._followed, self.until = turn, turn.t + FOLLOWS_MS
+        if earlier is None or (turn.boot, turn.turn) != (earlier.boot, earlier.turn):
             self.take((turn.account, turn.id, turn.by, turn.device) if turn.key else (), 0, now)
             self.key = turn.key
         asker = ("", turn.asks_id, turn.asks, "") if turn.asks_id else ()
@@ -107,11 +106,11 @@ class FollowingLease(SharedLease):
         """Do nothing: the first owner answers."""
 
     def tick(self, now: int) -> None:
-        """Do nothing: the first owner ends what is over."""
+        """Do nothing: the first owner ends control that is over."""
 
 
 def lease_of(owner: str, owners: tuple[str, ...], boot: str, *lease: Any) -> VouchedLease:
-    """Return the lease of ``owner``, one of the robot's ``owners``; ``lease``: what VouchedLease needs."""
+    """Return the lease of ``owner``, one of the robot's ``owners``; ``lease``: the arguments of VouchedLease."""
     others, first = frozenset(owners) - {owner}, min(owners, default=owner)
     if not others:
         return VouchedLease(*lease)

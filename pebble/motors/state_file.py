@@ -24,7 +24,7 @@ class Unreadable:
 
 
 class StateFile:
-    """The newest of the values passed to :meth:`save`, as JSON; older ones that wait are not written.
+    """A file with the newest value passed to :meth:`save`, as JSON; older ones that wait are not written.
 
     ``on_saved(number, ok)`` is called on the writing thread after each attempt, with the number that ``save`` returned.
     """
@@ -43,7 +43,7 @@ class StateFile:
 
     @property
     def in_place(self) -> bool:
-        """False: what this process wrote is not there any more."""
+        """True unless the file that this process wrote is not there any more."""
         try:
             return self._own is None or self._own.in_place
         except OSError:  # what is there cannot be seen
@@ -55,7 +55,7 @@ class StateFile:
         return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
 
     def load(self) -> Any:
-        """Return what was saved last; None without a file, Unreadable() if it is damaged."""
+        """Return the value that was saved last; None without a file, Unreadable() if it is damaged."""
         try:
             file = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)  # else a FIFO in its place waits for ever
             try:

@@ -1,4 +1,4 @@
-"""A lease that does not take a flood, an outage or a stalled broker for the silence of who has control. Pure."""
+"""A lease that does not take a flood, an outage or a stalled broker for silence of its holder. Pure."""
 
 from pebble.motion.lease import Lease
 
@@ -16,18 +16,18 @@ class VouchedLease(Lease):
     _received_all_since = 0
 
     def vouch(self, begin: int, end: int, now: int) -> None:
-        """Let this time count; one to come is of another clock."""
+        """Note the time for which the bridge vouches; a time to come is of another clock."""
         if self.vouched is not None and begin <= end <= now:
             self.vouched = max(begin, self._received_all_since), end
 
     def doubt(self, now: int) -> None:
-        """Messages of before may not have been received here, though they were passed on."""
+        """Note that earlier messages may not have been received here, though they were passed on."""
         self._received_all_since = now
 
     def tick(self, now: int) -> None:
-        """Let what is over end, as in Lease, which boards share and whose memory has no room for a method more.
+        """End control that is over, as in Lease; that class has no method for a part of it, to save memory on boards.
 
-        Nothing of what counts as quiet is remembered: it may count no more.
+        No result about quiet time is remembered: that time may not count any more later.
         """
         if self.others and now - self._received >= _OTHERS_MS:
             self.others, self.changed = False, True
@@ -38,7 +38,7 @@ class VouchedLease(Lease):
             self._end(now)
 
     def _quiet_ms(self, since: int, now: int) -> int:
-        """For how long the holder has sent nothing that counts."""
+        """Return for how long the holder has sent nothing, as far as that counts."""
         quiet = now - since
         if self.vouched is None or quiet >= ENDS_AFTER_MS:
             return quiet

@@ -16,11 +16,12 @@ import msgspec
 
 from pebble.contract import CHANNELS, INCOMING, Kind
 from pebble.contract.names import BY
-from pebble.errors import PebbleError
+from pebble.errors import PebbleError, TransportError
 from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_up_logging
 from pebble.runtime.signals import EndSignal
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.zenoh.hub import ZenohHub
+from pebble.transports.zenoh.hub.admission import Admission
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +54,8 @@ def main(arguments: list[str]) -> int:
 def run_hub(settings: ZenohSettings, stop: EndSignal | threading.Event) -> None:
     """Run a hub until ``stop`` is set. Raises TransportError if it cannot open."""
     notify = Notifier()
-    hub = ZenohHub(replace(settings, wills=(*WILLS, *settings.wills), unretained=UNRETAINED)).open()
+    settings = replace(settings, wills=(*WILLS, *settings.wills), unretained=UNRETAINED)
+    hub = ZenohHub(settings, _accounts(settings)).open()
     try:
         notify.ready()
         while not stop.wait(ALIVE_PERIOD_S):
@@ -63,6 +65,19 @@ def run_hub(settings: ZenohSettings, stop: EndSignal | threading.Event) -> None:
         if hub.refused or hub.refused_wills:
             log.info("refused in all: %d retained messages, %d wills", hub.refused, hub.refused_wills)
         hub.close()
+
+
+def _accounts(settings: ZenohSettings) -> Admission | None:
+    """Return what admits accounts of other machines, by the file ``transport.access``; None: there is none."""
+    if settings.access is None:
+        return None
+    from pebble.extension import ours, part  # only who needs it pays for it
+
+    for extension in ours():
+        if extension.accounts:
+            accounts: Admission = part(extension.accounts)(settings.access, settings.wills, settings.unretained)
+            return accounts
+    raise TransportError("transport.access: is of the extension fleet, which is not installed")
 
 
 def _settings(arguments: list[str]) -> ZenohSettings:

@@ -1,7 +1,7 @@
-"""Finds at the remote broker what the robot has taken back while no bridge was running.
+"""Finds retained messages at the remote broker that the robot has removed while no bridge was running.
 
-An earlier bridge process had forwarded it, so only the broker knows of it. Each bridge process looks once, and only for
-retained topics that nobody but the robot publishes.
+An earlier bridge process had forwarded them, so only the broker has them. Each bridge process looks once, and only for
+topics that the robot alone publishes.
 """
 
 from collections.abc import Callable
@@ -11,25 +11,26 @@ from pebble.forwarding.subjects import Subjects
 from pebble.transports import Message, Subscription, Transport
 
 _TOPICS = 10_000  # noted of each side; with more nothing is removed
-_NOT_HERE = (ONLINE, MCU_DESCRIBE)  # the bridge's own, and what MCU_VALUE covers
+_NOT_HERE = (ONLINE, MCU_DESCRIBE)  # the bridge's own, and one that MCU_VALUE covers
 
 
 class Leftovers:
-    """What robot and broker retain. Transports call :meth:`note_local` on their threads."""
+    """Topics that robot and broker retain. Transports call :meth:`note_local` on their threads."""
 
     def __init__(self, base: str, subjects: Subjects, remote: Transport, *own: Channel, sparing: bool = False) -> None:
-        """``own`` are further ones that the bridge itself publishes on the remote side.
+        """Store the arguments; ``own`` are further channels that the bridge itself publishes on the remote side.
 
-        ``sparing``: nothing is asked for that the robot has; the answer would only hold up what is on its way to it.
+        ``sparing``: topics that the robot has are not asked for: the answers would only hold up messages to it.
         """
         self._remote, self._sparing = remote, sparing
-        self._here: set[str] | None = set()  # topics that the robot retains; None: it is over
+        self._here: set[str] | None = set()  # topics that the robot retains; None: the search is over
         self._there: set[str] = set()
         self._subscriptions: list[Subscription] = []
-        states = [one for one in CHANNELS if one.kind is Kind.STATE and one.direction == OUTGOING]
-        ours = [one for one in states if one not in (*_NOT_HERE, *own) and one.synonym_of is None]
-        named = subjects.topics(*(one for one in ours if not one.is_pattern))
-        self._filters = [MCU_VALUE.filter(base), *(one.filter(base) for one in ours if one.is_pattern), *named]
+        states = [channel for channel in CHANNELS if channel.kind is Kind.STATE and channel.direction == OUTGOING]
+        wanted = [state for state in states if state not in (*_NOT_HERE, *own) and state.synonym_of is None]
+        patterns = [state.filter(base) for state in wanted if state.is_pattern]
+        named = subjects.topics(*(state for state in wanted if not state.is_pattern))
+        self._filters = [MCU_VALUE.filter(base), *patterns, *named]
         self._next = 0  # of the filters
 
     @property
@@ -42,7 +43,7 @@ class Leftovers:
             (here.add if message.payload else here.discard)(message.topic)
 
     def begin(self) -> None:
-        """Begin anew: a connection was lost."""
+        """Begin again, because a connection was lost."""
         self._close()
         self._next = 0
         self._there.clear()
@@ -63,7 +64,7 @@ class Leftovers:
         return True
 
     def remove(self, remove: Callable[..., bool]) -> list[str]:
-        """Remove what only the broker retains, and return these topics; the last call.
+        """Remove messages that only the broker retains, and return their topics; the last call.
 
         ``remove(topic, unless=…)`` removes one, unless there is a reason not to, and returns whether it did.
         """

@@ -1,4 +1,4 @@
-"""Whether the robot's motor owners and this process reach each other: what it would send them passes the same way."""
+"""A check that the robot's motor owners and this process reach each other."""
 
 from collections.abc import Iterable
 
@@ -10,7 +10,7 @@ _MISSED_S = 15.0  # owners publish their state every 5 s
 
 
 class MotorOwners:
-    """Reports to the launcher which motor owners it receives; times are seconds of the caller's clock.
+    """Motor owners from which states are received, reported to the launcher; times are of the caller's clock.
 
     The first message of a connection counts for nothing, because it may be a retained one.
     """
@@ -31,12 +31,12 @@ class MotorOwners:
         self._messages[topic] += 1
 
     def check(self, now: float) -> None:
-        """Report what has changed; call it every ``CHECK_S``, on one thread."""
+        """Report changes; call it every ``CHECK_S``, on one thread."""
         for topic, owner in self.topics.items():
-            count, before = self._messages[topic], self._checked[topic]
+            count, checked = self._messages[topic], self._checked[topic]
             self._checked[topic] = count
             received_at = self._received_at[topic]
-            if received_at is None or (count > 1 and count != before):
+            if received_at is None or (count > 1 and count != checked):
                 received_at = self._received_at[topic] = now
             reached = True if count > 1 else self._reported[topic]
             if now - received_at >= _MISSED_S:

@@ -1,99 +1,80 @@
-"""What messages request of the bridge itself: system actions, pictures and sound."""
+"""Requests to the bridge itself: the flag remote-mirror, and those that extensions fulfil."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
-from pebble.contract import DRIVE, REMOTE_MIRROR, Channel, codec
-from pebble.contract.levels import LEVELS
-from pebble.contract.payloads import SCRIPT, Drive
+from pebble.contract import DRIVE, REMOTE_MIRROR, Channel, Kind, codec
 from pebble.errors import PayloadError
+from pebble.extension import part
 from pebble.forwarding.forwarder import Mirroring
-from pebble.runtime.parent import Notifier, earlier_requests
+from pebble.forwarding.observer import logged
 from pebble.runtime.service import Service
-from pebble.services.mqtt_bridge.actions import ACTIONS, system_actions
-from pebble.services.mqtt_bridge.media import MEDIA, Hold, Media
-from pebble.services.mqtt_bridge.uplink import Uplink
+
+
+class Requests(ABC):
+    """Requests that an extension fulfils; made for the bridge's service, and called on its thread."""
+
+    channels: ClassVar[tuple[Channel, ...]]
+
+    def __init__(self, service: Service) -> None:
+        self.service = service
+
+    @abstractmethod
+    def take(self, channel: Channel, value: Any) -> None:
+        """Take the value of a message; of a flag that was removed or cannot be read it is False."""
+
+    def repeat(self) -> None:  # noqa: B027 - most do nothing
+        """Do again what was not possible; called once a second."""
 
 
 class OwnRequests:
-    """Reads them on the transports' threads; what takes longer is done on that of ``service``."""
+    """Requests, read on the transports' threads, and fulfilled on the thread of ``service``.
 
-    def __init__(
-        self,
-        service: Service,
-        mirroring: Mirroring,
-        notifier: Notifier,
-        uplink: Uplink | None,
-    ) -> None:
-        config, section = service.config, service.config.services.mqtt_bridge
-        self._service, self._post, self._clock = service, service.post_message, service.clock
-        self._mirroring, self._uplink = mirroring, uplink
-        self.actions = system_actions(section, config.state_dir(), service.clock)
-        self._media = Media(config.on_demand_programs(), earlier_requests(), notifier.request)
-        self._hold = Hold(config.on_demand_programs(), notifier.hold)
-        self._messages: dict[str, Callable[[bytes], None]] = {
-            **{row.request.suffix: partial(self._on_media_request, row.request) for row in MEDIA},
-            **{row.channel.suffix: partial(self._on_action, row.channel) for row in ACTIONS},
-        }
-        if section.link.profile != "wide":
-            self._messages[DRIVE.suffix] = self._on_drive
-        self._flags: dict[str, Callable[[bytes], None]] = {
-            **{row.flag.suffix: partial(self._on_media_flag, row.flag) for row in MEDIA},
-            REMOTE_MIRROR.suffix: self._on_remote_mirror,
-        }
+    ``note_drive`` is given each drive command from operators.
+    """
+
+    def __init__(self, service: Service, mirroring: Mirroring, note_drive: Callable[[bytes], None]) -> None:
+        self._service, self._mirroring, self._note_drive = service, mirroring, note_drive
+        self._requests: list[Requests] = []
+        for extension in service.config.installed:
+            for place in extension.requests:
+                with logged(extension.name):
+                    self._requests.append(part(place)(service))
+        self._takers = {channel.suffix: requests for requests in self._requests for channel in requests.channels}
 
     def message(self, channel: Channel, payload: bytes) -> None:
         """Take a message that is no flag."""
-        reaction = self._messages.get(channel.suffix)
-        if reaction is not None:
-            reaction(payload)
+        if channel is DRIVE:
+            self._note_drive(payload)
+        elif channel.kind is not Kind.FLAG and (value := self._decoded(channel, payload)) is not None:
+            self._take(channel, value)
 
     def flag(self, channel: Channel, payload: bytes) -> None:
         """Take the value of a flag."""
-        reaction = self._flags.get(channel.suffix)
-        if reaction is not None:
-            reaction(payload)
+        if channel is REMOTE_MIRROR:
+            self._mirroring.switch(on=bool(payload and self._decode(channel, payload)))
+        else:
+            self._take(channel, bool(payload and self._decoded(channel, payload)))
 
-    def send(self) -> None:
-        """Tell the launcher which media programs are to run, and which wait."""
-        self._media.send()
-        self._hold.send(self._clock())
+    def repeat(self) -> None:
+        """Have all requests do again what was not possible."""
+        for requests in self._requests:
+            requests.repeat()
 
-    def _on_remote_mirror(self, payload: bytes) -> None:
-        self._mirroring.switch(on=self._boolean(REMOTE_MIRROR, payload))
-
-    def _on_media_flag(self, flag: Channel, payload: bytes) -> None:
-        self._post(flag, partial(self._media.allow, flag, self._boolean(flag, payload)), newest_of=flag.metric)
-
-    def _on_media_request(self, channel: Channel, payload: bytes) -> None:
-        if (request := self._decoded(channel, payload)) is not None:
-            self._post(channel, partial(self._media.request, channel, request), newest_of=channel.metric)
-
-    def _on_drive(self, payload: bytes) -> None:
-        """Let media wait on a thin link while a person drives; who the robot obeys is decided elsewhere."""
-        with suppress(PayloadError):
-            command: Drive = codec.decode(DRIVE, payload)
-            thin = self._uplink is not None and self._uplink.level is LEVELS["thin"]
-            if thin and command.moves and command.source != SCRIPT:
-                self._post(DRIVE, lambda: self._hold.drive(self._clock()), newest_of="hold")
-
-    def _on_action(self, channel: Channel, payload: bytes) -> None:
-        if self._boolean(channel, payload):
-            self._post(channel, partial(self._run_action, channel), newest_of=channel.metric)
-
-    def _boolean(self, channel: Channel, payload: bytes) -> bool:
-        """True if a boolean control is; an empty payload (a removed flag) and a malformed one are false."""
-        return bool(payload) and bool(self._decoded(channel, payload))
+    def _take(self, channel: Channel, value: Any) -> None:
+        taker = self._takers.get(channel.suffix)
+        if taker is not None:
+            self._service.post_message(channel, partial(taker.take, channel, value), newest_of=channel.metric)
 
     def _decoded(self, channel: Channel, payload: bytes) -> Any:
-        """Return the payload's value; None if it is malformed."""
+        """Return the value of a message that some extension takes; None if it is malformed, or of no interest."""
+        return self._decode(channel, payload) if channel.suffix in self._takers else None
+
+    def _decode(self, channel: Channel, payload: bytes) -> Any:
         try:
             return codec.decode(channel, payload)
         except PayloadError as error:
             self._service.refusals.malformed(channel, error)
             return None
-
-    def _run_action(self, channel: Channel) -> None:
-        self._service.counters.add("actions" if self.actions[channel].request() else "actions_refused")

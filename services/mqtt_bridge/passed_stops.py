@@ -22,7 +22,7 @@ NAMES = 1024  # of stops: a minute of 17 in a second
 
 
 def is_stop(payload: bytes) -> bool:
-    """True unless it removes a retained message, or looks for cycles: any other payload is a stop."""
+    """True unless the payload removes a retained message, or is a probe for cycles: any other is a stop."""
     return bool(payload) and not codec.is_blank(payload)
 
 
@@ -50,7 +50,7 @@ class Pending(Struct, frozen=True):
 
 
 class Owner:
-    """The known state of one motor owner. A new one has not been heard."""
+    """The state of one motor owner, as far as it is known."""
 
     def __init__(self) -> None:
         self.state: EstopState | None = None
@@ -65,20 +65,20 @@ class Owner:
 
     def follow(self, state: EstopState | None, now: float) -> None:
         """Note its newest state; None: it has withdrawn that."""
-        before, self.state = self.state, state
+        earlier, self.state = self.state, state
         if state is None:
             self.withdrawn_at = now if self.withdrawn_at is None else self.withdrawn_at
             return
         self.withdrawn_at = None
         # A restart proves no reset: the file may be older than the stop.
-        if before is not None and before.boot == state.boot and not state.latched:
-            self.freed_at = now if before.latched or state.count > before.count else self.freed_at
+        if earlier is not None and earlier.boot == state.boot and not state.latched:
+            self.freed_at = now if earlier.latched or state.count > earlier.count else self.freed_at
         if self.pending is not None and self.confirms(str(self.pending.stop.stop)):
             self.pending = None
 
 
 class PassedStops:
-    """Remembers the stops that were passed, and which owners have not confirmed theirs. Any thread may use it."""
+    """Stops that were passed, and those that owners have not confirmed. Any thread may use it."""
 
     def __init__(self, owners: Iterable[str], clock: Callable[[], float]) -> None:
         self._owners = {owner: Owner() for owner in owners}
@@ -92,7 +92,7 @@ class PassedStops:
         return {key: owner.pending for key, owner in self._owners.items() if owner.pending is not None}
 
     def accept(self, payload: bytes) -> list[bytes]:
-        """Return what to publish for a stop that has a name; an owner that was reset since gets no copy of it."""
+        """Return the payloads to publish for a stop with a name; an owner that was reset since gets no copy of it."""
         if not is_stop(payload):
             return [payload]
         stop = codec.decode(ESTOP, payload)
@@ -117,13 +117,13 @@ class PassedStops:
             self._owners[owner].follow(state, self._clock())
 
     def repeat(self) -> list[bytes]:
-        """Return what to publish again, on the local side only; call it every ``REPEAT_S``."""
+        """Return the payloads to publish again, on the local side only; call it every ``REPEAT_S``."""
         with self._lock:
             waiting = self.pending.items()
-            return [_addressed(one.stop, key) for key, one in waiting if self._owners[key].withdrawn_at is None]
+            return [_addressed(stop.stop, key) for key, stop in waiting if self._owners[key].withdrawn_at is None]
 
     def give_up(self) -> list[tuple[str, EstopCommand]]:
-        """End the stops of owners that were withdrawn for too long; returns them, with the owner of each."""
+        """End the stops of owners that were withdrawn for too long; return them, with the owner of each."""
         now, ended = self._clock(), []
         with self._lock:
             for key, pending in self.pending.items():

@@ -1,4 +1,4 @@
-"""Keeps on the robot what the serial bridges say is ``local_only`` of a self-describing MCU: one list for each MCU.
+"""Keeps topics on the robot that a self-describing MCU marks ``local_only``: serial bridges publish a list for each.
 
 The order of two topics is undefined: on Zenoh, and behind a full queue of a broker, a value may arrive before the list,
 and at a bridge that starts late it nearly always does. So nothing of an MCU passes before its list.
@@ -19,7 +19,7 @@ _MARK = b'"device_uid"'  # in every value under an alias: the MCU it belongs to
 
 
 class PrivateTopics:
-    """The lists of all MCUs. Called on the transports' threads."""
+    """The lists of all MCUs; used on the transports' threads."""
 
     def __init__(self, base: str) -> None:
         self._base = base
@@ -39,7 +39,7 @@ class PrivateTopics:
         return bool(self._private) and any(topic in topics for topics in list(self._private.values()))
 
     def admit(self, message: Message) -> list[Message]:
-        """Return what may pass now: ``message`` or nothing; with a list, the retained values that waited for it."""
+        """Return the messages that may pass now: ``message`` or none; with a list, the values that waited for it."""
         with self._lock:
             if not message.payload:
                 self._waiting.pop(message.topic, None)  # removed: nothing to forward any more
@@ -50,14 +50,14 @@ class PrivateTopics:
             return self._judge(message)
 
     def _learn(self, uid: str, payload: bytes) -> None:
-        """Learn a list: one that is removed, or cannot be read, lets nothing pass; what was on it stays there."""
+        """Learn a list. One that is removed, or cannot be read, lets nothing pass; its topics stay private."""
         self._listed.discard(uid)
         try:
-            found: McuLocalOnly = codec.decode(MCU_LOCAL_ONLY, payload)
+            listed: McuLocalOnly = codec.decode(MCU_LOCAL_ONLY, payload)
         except PayloadError:
             return
         if uid in self._private or len(self._private) < _DEVICES:
-            metrics = {topic: topic.partition("/")[2] for topic in found.topics}
+            metrics = {topic: topic.partition("/")[2] for topic in listed.topics}
             usable = (topic for topic, metric in metrics.items() if not is_reserved(metric))  # a stop must pass
             self._private[uid] = frozenset(f"{self._base}/{topic}" for topic in usable)
             self._listed.add(uid)
@@ -74,13 +74,13 @@ class PrivateTopics:
         return []
 
     def _uid_of(self, message: Message) -> str | None:
-        """Return the MCU of which this is a value; None: of none, or it is a manifest."""
+        """Return the uid of the MCU that sent a value; None if it is none of an MCU, or a manifest."""
         if message.topic.startswith(self._values):
-            own = message.topic.removeprefix(self._values).partition("/")
-            return None if message.topic.endswith(_QUESTION) else own[0]
+            uid = message.topic.removeprefix(self._values).partition("/")[0]
+            return None if message.topic.endswith(_QUESTION) else uid
         sample = _object(message.payload) if _MARK in message.payload else {}
-        uid = sample.get("device_uid")
-        return uid if isinstance(uid, str) and isinstance(sample.get("interface"), str) else None
+        sender = sample.get("device_uid")
+        return sender if isinstance(sender, str) and isinstance(sample.get("interface"), str) else None
 
 
 def _object(payload: bytes) -> dict[str, Any]:

@@ -19,7 +19,7 @@ _PERIOD_S = 1.0
 
 
 class SameBrokerProbe:
-    """Sends probes in rounds, and remembers in which round one was received on the local side.
+    """Probes, sent in rounds, and the newest round in which one was received on the local side.
 
     On a robot with a mirror each probe is also announced on the robot's own transport. The mirror compares it with what
     it receives from its broker, until it is announced that no probe is under way.
@@ -57,7 +57,7 @@ class SameBrokerProbe:
             self.send()
 
     def report_arrival(self) -> None:
-        """Announce that the remote broker has the newest probe, once it has answered something that was sent later."""
+        """Announce that the remote broker has the newest probe, once it has answered a later message."""
         answer = self._remote.answer
         if self._under_way and answer is not None and answer.delivered_s < self._clock() - self._sent_at:
             self.report_none()
@@ -78,7 +78,7 @@ class SameBrokerProbe:
             self.report_none()
 
     def begin_round(self, remote_topic: str) -> int | None:
-        """Send a probe and wait, bounded, until it would have arrived; None if a connection was lost meanwhile.
+        """Send a probe and wait, bounded, until it would have arrived; return None if a connection was lost.
 
         The barrier is first on the side the probe went to, then on the side where it would arrive.
         """

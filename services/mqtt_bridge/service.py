@@ -14,7 +14,6 @@ from pebble.contract import (
     DRIVE,
     ESTOP,
     ESTOP_STATE,
-    LINK,
     ONLINE,
     REMOTE_MIRROR,
     Channel,
@@ -23,7 +22,8 @@ from pebble.contract import (
 from pebble.contract.levels import LEVELS
 from pebble.contract.names import with_name
 from pebble.contract.payloads import ControlState
-from pebble.errors import PayloadError
+from pebble.errors import ConfigError, PayloadError
+from pebble.extension import ours, part
 from pebble.forwarding.forwarder import Routed, barrier
 from pebble.forwarding.names import Names
 from pebble.forwarding.observer import ROBOT, Observers, Step, steps_of
@@ -36,17 +36,15 @@ from pebble.runtime.connections import remote_transport, stops_transport
 from pebble.runtime.parent import Notifier
 from pebble.runtime.service import every
 from pebble.runtime.timers import Timer
-from pebble.services.mqtt_bridge.actions import ACTIONS
-from pebble.services.mqtt_bridge.earlier_names import EarlierNames
+from pebble.services.mqtt_bridge.earlier_names import note_name
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
 from pebble.services.mqtt_bridge.leftovers import Leftovers
-from pebble.services.mqtt_bridge.media import MEDIA
 from pebble.services.mqtt_bridge.motor_owners import CHECK_S, MotorOwners
 from pebble.services.mqtt_bridge.own_requests import OwnRequests
 from pebble.services.mqtt_bridge.passed_stops import REPEAT_S, PassedStops, named
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.same_broker import SameBrokerProbe, now_ms
-from pebble.services.mqtt_bridge.uplink import POLL_S, Uplink
+from pebble.services.mqtt_bridge.uplink import POLL_S, uplink_of
 from pebble.services.mqtt_bridge.vouching import PERIOD_S, Vouching
 from pebble.transports import Message, QoS, State, Transport
 
@@ -67,7 +65,7 @@ ASK_S = 0.2  # between two questions about what is left at the remote broker
 
 
 class MqttBridge(ForwardingService):
-    """Forwards by Table A.1, once its two sides are known not to be one broker."""
+    """The bridge: it forwards by Table A.1, once its two sides are known not to be one broker."""
 
     name = "mqtt_bridge"
     publishes = (ONLINE, BRIDGE_PROBE, CONTROL_VOUCHED)
@@ -78,8 +76,8 @@ class MqttBridge(ForwardingService):
 
     @classmethod
     def handles(cls) -> tuple[Channel, ...]:
-        media = (channel for row in MEDIA for channel in (row.flag, row.request))
-        return (REMOTE_MIRROR, *media, *(row.channel for row in ACTIONS))
+        places = (place for extension in ours() for place in extension.requests)
+        return (REMOTE_MIRROR, *(channel for place in places for channel in part(place).channels))
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -93,16 +91,13 @@ class MqttBridge(ForwardingService):
         decides = min(self.config.motor_owners, default="")
         self._control_topic = CONTROL_STATE.topic(self.config.base, owner=decides) if decides else ""
         self._private = PrivateTopics(self.config.base)
-        self._uplink: Uplink | None = None
-        if section.link.profile != "wide":
-            self._uplink = Uplink(section, self.addresses[LINK], self.remote, self.forwarder, self.clock)
-        self._requests = OwnRequests(self, self.forwarder.mirroring, notifier, self._uplink)
-        own, sparing = ((), False) if self._uplink is None else ((LINK,), True)
-        self._leftovers = Leftovers(self.config.base, self.subjects, self.remote, *own, sparing=sparing)
-        self._leftover_timer: Timer | None = None
-        self._earlier_names = EarlierNames(
-            self.config, [self.remote, self.transport], lambda seconds, job: self.call_at(self.clock() + seconds, job)
+        self._is_thin = section.link.profile != "wide"  # or may become so
+        self._uplink = uplink_of(self.config, self.addresses, self.remote, self.forwarder, self.clock)
+        self._requests = OwnRequests(self, self.forwarder.mirroring, self._uplink.note_drive)
+        self._leftovers = Leftovers(
+            self.config.base, self.subjects, self.remote, *self._uplink.channels, sparing=self._is_thin
         )
+        self._leftover_timer: Timer | None = None
         asks = section.remote is None or section.remote.kind == "mqtt"
         self._vouching = Vouching(self.remote, self.clock(), None if asks else self._silence_s)
         self._local_changes = 0  # of the connection
@@ -114,7 +109,7 @@ class MqttBridge(ForwardingService):
 
     @property
     def winner(self) -> Side:
-        """Where names are checked, nothing on the remote side but the robot itself can have left a flag there."""
+        """The side whose retained messages count. Where names are checked, the robot alone leaves flags remotely."""
         return Side.LOCAL if self.config.security.named else Side.REMOTE
 
     @property
@@ -123,7 +118,7 @@ class MqttBridge(ForwardingService):
 
     @property
     def _silence_s(self) -> float:
-        """After so long a silent remote side is lost."""
+        """Seconds of silence after which the remote side is lost."""
         section = self.config.services.mqtt_bridge
         return section.remote_mqtt.silence_seconds if section.remote is None else section.remote.lease_ms / 1000
 
@@ -132,7 +127,13 @@ class MqttBridge(ForwardingService):
 
     def make_names(self) -> Names | None:
         security = self.config.security
-        return Names(self.config.base, self.subjects, security.unnamed) if security.named else None
+        if not security.named:
+            return None
+        for extension in self.config.installed:
+            if extension.names:
+                names: Names = part(extension.names)(self.config.base, self.subjects, security.unnamed)
+                return names
+        raise ConfigError("security.level: named is of the extension fleet, which is not installed")
 
     def make_remote(self) -> Transport:
         enabled = self.config.services.mqtt_bridge.heartbeat.enabled
@@ -145,17 +146,16 @@ class MqttBridge(ForwardingService):
             return None
         from pebble.services.mqtt_bridge.stop_connection import StopConnection  # only who needs it pays for it
 
-        notices_s = self._silence_s + _NOTICED_S
         make = partial(StopConnection, transport, self._stop_filters, self._pass_stop, self._forwards, self.clock)
-        uplink = self._uplink
-        if uplink is None:
-            return make(notices_s=notices_s)
+        if not self._is_thin:
+            return make(notices_s=self._silence_s + _NOTICED_S)
         transport.suit_link(thin=True)
-        notices_s = max(notices_s, LEVELS["thin"].silent_s + _NOTICED_S)
-        return make(notices_s=notices_s, grace_s=_THIN_GRACE_S, wanted=lambda: uplink.is_flooded)
+        notices_s = max(self._silence_s, LEVELS["thin"].silent_s) + _NOTICED_S
+        return make(notices_s=notices_s, grace_s=_THIN_GRACE_S, wanted=lambda: self._uplink.is_flooded)
 
     def start(self) -> None:
         super().start()
+        note_name(self.config)
         if self._stops is not None:
             self.on_stop(self._stops.close)
             self.timers.add(self.clock(), self._stops.check, period=_CHECK_STOPS_S)
@@ -164,7 +164,7 @@ class MqttBridge(ForwardingService):
         if self._heartbeat is not None:
             interval = self.config.services.mqtt_bridge.heartbeat.interval_seconds
             self.timers.add(self.clock(), self._publish_heartbeat, period=interval)
-        if self._uplink is not None:
+        if self._is_thin:
             self.timers.add(self.clock(), self._follow_link, period=POLL_S)
         if self._same_broker.announces:
             self.timers.add(self.clock(), self._same_broker.report_arrival, period=_ARRIVAL_S)
@@ -173,25 +173,25 @@ class MqttBridge(ForwardingService):
     # -- the service's thread
 
     def _publish_heartbeat(self, *, at_once: bool = False) -> None:
-        if self._heartbeat is None or not (at_once or self._uplink is None or self._uplink.heartbeat_due()):
+        if self._heartbeat is None or not (at_once or self._uplink.heartbeat_due()):
             return
         if not at_once and self._subscribes_soon:
             return
-        self._heartbeat.publish(self.remote, now_ms(), None if self._uplink is None else self._uplink.heartbeat_qos)
+        self._heartbeat.publish(self.remote, now_ms(), self._uplink.heartbeat_qos)
 
     @property
     def _subscribes_soon(self) -> bool:
-        """True if the heartbeat waits: who sees it sends commands, which would be lost before the subscription."""
+        """True if the heartbeat waits: operators that see it send commands, which would be lost before we subscribe."""
         subscribed = self.subscriptions[Side.REMOTE] or self.forwarder.gate is Gate.SHUT
         return not subscribed and self._same_broker.both_connected
 
     def _follow_link(self) -> None:
-        """Learn what the link carries, and send what has waited for room."""
-        if self._uplink is not None and self._uplink.poll():
+        """Measure the link, and send messages that have waited for room."""
+        if self._uplink.poll():
             self._publish_heartbeat()
 
     def _look_later(self) -> None:
-        """Wait (again) until all that the robot retains is known, and look for what only the remote side retains."""
+        """Look for messages that only the remote side retains, once all of the robot are known; wait for that again."""
         if self._leftovers.done:
             return
         if self._leftover_timer is not None:
@@ -204,7 +204,7 @@ class MqttBridge(ForwardingService):
             self._look_later()
             return
         asked = self._leftovers.ask_next()
-        pause = ASK_S if self._uplink is None else self._uplink.pause(ASK_S)
+        pause = self._uplink.pause(ASK_S)
         wait, then = (pause, self._look_for_leftovers) if asked else (INITIAL_SYNC_S, self._remove_leftovers)
         self._leftover_timer = self.call_at(self.clock() + wait, then)
 
@@ -281,7 +281,6 @@ class MqttBridge(ForwardingService):
             self.forwarder.subscribed(Side.LOCAL)
         self.subscribe_remote()
         self.log.info("forwarding between the robot and its remote side")
-        self._earlier_names.begin()
 
     def found_one_broker(self) -> None:
         self.forward_nothing(CHECK_SOON_S)
@@ -299,8 +298,8 @@ class MqttBridge(ForwardingService):
         self.check_later()
 
     @every(_RETRY_S)
-    def _send_media_requests(self) -> None:
-        self._requests.send()
+    def _repeat_requests(self) -> None:
+        self._requests.repeat()
 
     @every(PERIOD_S)
     def _vouch(self) -> None:
@@ -379,7 +378,7 @@ class MqttBridge(ForwardingService):
         self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
 
     def _receive_stop(self, message: Message) -> None:
-        """Name it before anything else, so that whatever waits for an answer knows it by the same name."""
+        """Give a stop a name before anything else, so that all who wait for its confirmation know the same name."""
         message = msgspec.structs.replace(message, payload=named(message.payload))
         self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
 
@@ -400,9 +399,9 @@ class MqttBridge(ForwardingService):
             self._receive_stop(message)
 
     def _react(self, side: Side, message: Message, routed: Routed) -> None:
-        """Do what the message requests of the bridge itself, whether or not a remote side is connected.
+        """Do as the message requests of the bridge itself, whether or not a remote side is connected.
 
-        What is forwarded to the local side is never received there by the bridge, so this is the only occasion.
+        The bridge does not receive messages that it forwards to the local side, so this is the only occasion.
         """
         channel = routed.subject.channel if routed.subject is not None else None
         local = side is Side.LOCAL
@@ -416,8 +415,8 @@ class MqttBridge(ForwardingService):
         if channel is None or codec.is_blank(message.payload):
             return
         if not message.retain and routed.outcome is not Drop.KNOWN:
-            own = local and self.forwarder.gate is Gate.OPEN
-            self._observers.passed(channel, ROBOT if own else routed.by, message.payload)
+            by_robot = local and self.forwarder.gate is Gate.OPEN
+            self._observers.passed(channel, ROBOT if by_robot else routed.by, message.payload)
         self._requests.message(channel, message.payload)
 
     def on_value(self, subject: Subject, payload: bytes) -> None:

@@ -35,14 +35,14 @@ class Way(Enum):
 
 
 class Copies:
-    """Recognises the second copy of a stop without a name that comes both ways. Any thread may use it.
+    """A memory that recognises the second copy of a stop without a name, which comes both ways; thread-safe.
 
     No stop is lost for it: one that only the main connection has had, while the other was dead and this was not known
     yet, is returned by :meth:`lost`.
     """
 
     def __init__(self, clock: Callable[[], float], notices_s: float) -> None:
-        """``notices_s``: after so long it is known that a connection is lost."""
+        """Store the arguments; ``notices_s``: seconds after which the loss of a connection is known."""
         self._clock, self._notices_s = clock, notices_s
         self._lock = threading.Lock()
         #: By the way on which the copy is to come: hashes, and until when.
@@ -55,16 +55,16 @@ class Copies:
         with self._lock:
             while expected and expected[0][1] < now:
                 expected.popleft()
-            found = next((one for one in expected if one[0] == key), None)
-            if found is not None:
-                expected.remove(found)
+            copy = next((entry for entry in expected if entry[0] == key), None)
+            if copy is not None:
+                expected.remove(copy)
                 if way is Way.MAIN:
                     short = message.payload[:MAX_COMMAND_BYTES]  # a stop as well: it cannot be read
                     self._dropped.append((now, Message(message.topic, short, message.qos)))
                 return True
             if other and not message.retain:  # one with the retain flag may be an old one, of which there is no copy
-                there, wait_s = (Way.STOPS, _PROMPT_S) if way is Way.MAIN else (Way.MAIN, _BEHIND_S)
-                self._expected[there].append((key, now + wait_s))
+                other_way, wait_s = (Way.STOPS, _PROMPT_S) if way is Way.MAIN else (Way.MAIN, _BEHIND_S)
+                self._expected[other_way].append((key, now + wait_s))
             return False
 
     def forget(self) -> None:
@@ -83,11 +83,11 @@ class Copies:
 
 
 class StopConnection:
-    """Keeps the second connection, as long as the broker lets it.
+    """The second connection, kept as long as the broker lets it.
 
-    ``pass_on`` gets each of its stops, on its thread; not one without a name that came over the main connection before.
-    ``main`` tells whether that one is there, and messages are forwarded. Call :meth:`check` once a second and
-    :meth:`main_lost`, on the service's thread.
+    ``pass_on`` gets each of its stops, on its thread, but for those without a name that came over the main connection
+    before. ``main`` returns True while that one is there, and messages are forwarded. Call :meth:`check` once a second
+    and :meth:`main_lost`, on the service's thread.
     """
 
     def __init__(
@@ -102,9 +102,9 @@ class StopConnection:
         grace_s: float = _GRACE_S,
         wanted: Callable[[], bool] = lambda: True,
     ) -> None:
-        """``notices_s``: after so long it is known that the connection is lost; ``grace_s``: so long it may be tried.
+        """Store the arguments; ``notices_s``: seconds after which the loss of the connection is known.
 
-        ``wanted``: whether it is worth what it costs.
+        ``grace_s``: seconds for which it is tried. ``wanted`` returns True while it is worth its cost.
         """
         self._grace_s, self._wanted = grace_s, wanted
         self._transport, self._filters, self._clock = transport, tuple(filters), clock
@@ -143,7 +143,7 @@ class StopConnection:
             self._give_up(self._transport.not_received or self._transport.problem, _AGAIN_S)
 
     def main_lost(self, *, ended: bool) -> None:
-        """``ended``: the broker has closed it."""
+        """Note that the main connection is lost; ``ended``: the broker has closed it."""
         self._copies.forget()
         if self._clock() - self._connected_at >= _KICKED_S:
             self._kicks = 0
@@ -164,11 +164,11 @@ class StopConnection:
         self.close()
         self._report(False, why)
 
-    def _report(self, there: bool, why: str = "") -> None:
-        if there is self._reported:
+    def _report(self, exists: bool, why: str = "") -> None:
+        if exists is self._reported:
             return
-        self._reported = there
-        if there:
+        self._reported = exists
+        if exists:
             log.info("emergency stops have a connection of their own")
         else:
             log.warning("emergency stops have no connection of their own, and may wait behind a flood: %s", why)

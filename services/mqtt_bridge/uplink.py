@@ -1,172 +1,60 @@
-"""Suits what the bridge sends to a link to the remote broker that may be thin, and publishes what it carries."""
+"""The way to the remote broker, as the bridge uses it: it carries everything, unless an extension knows better."""
 
-import logging
-import threading
+from __future__ import annotations
+
 from collections.abc import Callable
-from math import inf
 
-from pebble.config import MqttBridge as BridgeSection
-from pebble.contract import LINK, codec
-from pebble.contract.levels import LEVELS, Level
-from pebble.contract.payloads import LinkState
+from pebble.config import Config
+from pebble.contract import Channel
+from pebble.errors import ConfigError
+from pebble.extension import part
 from pebble.forwarding.forwarder import Forwarder
-from pebble.forwarding.sieve import Rank, Sieve
-from pebble.runtime.addresses import Address
-from pebble.runtime.rate_limit import RateLimitedLog
-from pebble.services.mqtt_bridge.link import LinkMeter, Room
-from pebble.services.mqtt_bridge.same_broker import now_ms
-from pebble.transports import QoS, Transport
-
-log = logging.getLogger(__name__)
+from pebble.runtime.addresses import Addresses
+from pebble.runtime.parent import Notifier
+from pebble.transports import Transport
 
 POLL_S = 0.1
-_STATE_S, _STATES_S = 2.0, 10.0  # between two publications of the state at least, and at most
-_CROWDED_STATE_S = 1.0  # while a queue stands operators have to know soon how long it still is
-_CHANGE_S = 0.05  # a queue that has changed by less is the same, and by less than half a round trip
-_CROWDED_DRIVE, _CROWDED_STREAMS = 2 / 3, 1 / 4  # of what is sent at a level, while a queue stands
-_PAUSE = 25  # so much longer on a thin link what can wait is spread
-_HEARTBEAT_BYTES = 80  # about
-_LATE, _LATE_S = 8, 1.5  # commands, and since when all of them were late: the broker holds more of the kind
-_FLOODED_S = 60.0  # after what was done about it
-RENEW_S = 30.0  # between two connections that are renewed for it, at least: who floods must not keep the robot away
-
-
-class LinkReport:
-    """The retained state by which others know what the link carries: a change of level at once, of its queue soon."""
-
-    def __init__(self, meter: LinkMeter, address: Address, remote: Transport) -> None:
-        self._meter, self._address, self._remote = meter, address, remote
-        self._level, self._crowded, self._queue_s = "", False, 0.0  # that the others know; none yet
-        self._at = -inf
-
-    @property
-    def is_outdated(self) -> bool:
-        """True if the others have to act otherwise."""
-        return (self._meter.level, self._meter.crowded) != (self._level, self._crowded)
-
-    def is_due(self, now: float) -> bool:
-        """True if its figures have changed enough, or are old."""
-        change_s = abs(self._meter.queue_s - self._queue_s)
-        state_s = _CROWDED_STATE_S if self._crowded else _STATE_S
-        changed = now - self._at >= state_s and change_s >= max(_CHANGE_S, self._meter.round_trip_s / 2)
-        return changed or now - self._at >= _STATES_S
-
-    def publish(self, now: float) -> None:
-        """Publish a retained message: without a connection it is sent at the next one."""
-        meter, before = self._meter, self._level
-        self._level, self._crowded, self._queue_s, self._at = meter.level, meter.crowded, meter.queue_s, now
-        trip_ms, queue_ms = round(1000 * meter.round_trip_s), round(1000 * meter.queue_s)
-        if before not in ("", meter.level):
-            log.info(
-                "the link to the remote broker is %s now (it was %s): a round trip of %d ms, and %d ms of queue",
-                meter.level, before, trip_ms, queue_ms
-            )  # fmt: skip
-        drive_hz = round(LEVELS[meter.level].drive_hz * (_CROWDED_DRIVE if meter.crowded else 1), 2)
-        state = LinkState(level=meter.level, drive_hz=drive_hz, rtt_ms=trip_ms, queue_ms=queue_ms, t=now_ms())
-        address = self._address
-        self._remote.publish(address.topic, codec.encode(LINK, state), qos=QoS(address.qos), retain=address.retain)
 
 
 class Uplink:
-    """The link to the remote broker, where a config says that it may be thin. Called on the service's thread."""
+    """A wide link, over which nothing waits. What an extension overrides is called on the service's thread."""
 
-    def __init__(
-        self,
-        section: BridgeSection,
-        address: Address,
-        remote: Transport,
-        forwarder: Forwarder,
-        clock: Callable[[], float],
-    ) -> None:
-        self._remote, self._forwarder, self._clock = remote, forwarder, clock
-        #: QoS 0 saves acknowledgements of MQTT; Zenoh has none, and may deliver the two in another order.
-        self._saves_acks = section.remote is None or section.remote.kind == "mqtt"
-        self._heartbeat_s = section.heartbeat.interval_seconds
-        self._meter, self._room = LinkMeter(section.link.profile, section.link.kbit), Room(section.link.kbit)
-        self._report = LinkReport(self._meter, address, remote)
-        self._guard = threading.Lock()  # of the room: messages take it on the thread that received them
-        self._sieve = Sieve(self._takes, forwarder.counters, clock)
-        self._quiet_log = RateLimitedLog(log, period_s=60.0)
-        self._heartbeat_at = self._flooded_at = -inf
-        self._shed = 0
-        self._suit_transport()
-
-    @property
-    def level(self) -> Level:
-        return LEVELS[self._meter.level]
+    channels: tuple[Channel, ...] = ()  # that it publishes on the remote side itself
 
     @property
     def is_flooded(self) -> bool:
         """True if a client lately sent more commands than the link carries."""
-        return self._clock() - self._flooded_at < _FLOODED_S
+        return False
 
     @property
     def heartbeat_qos(self) -> int | None:
-        return self.level.heartbeat_qos if self._saves_acks else None
+        """The QoS of heartbeats; None: as configured."""
+        return None
 
     def heartbeat_due(self) -> bool:
-        """True if it is time for a heartbeat, and there is room for it."""
-        now, level = self._clock(), self.level
-        if level.heartbeat_s:
-            if now - self._heartbeat_at < max(level.heartbeat_s, self._heartbeat_s) - POLL_S / 2:
-                return False
-            if not self._takes(Rank.HEARTBEAT, _HEARTBEAT_BYTES):
-                return False
-        self._heartbeat_at = now
+        """Return True if it is time for a heartbeat, and there is room for it."""
         return True
 
     def pause(self, seconds: float) -> float:
-        """Return how long to wait between two requests of what can wait."""
-        return seconds * _PAUSE if self._meter.level == "thin" else seconds
+        """Return how long to wait between two requests that can wait."""
+        return seconds
 
     def poll(self) -> bool:
-        """Measure, send what has waited, and publish the state; every POLL_S. Whether heartbeats follow the level."""
-        now = self._clock()
-        outgoing = self._remote.outgoing
-        with self._guard:
-            self._room.poll(outgoing.waiting, outgoing.round_trip_s, now)
-        self._meter.follow(self._remote.answer, now)
-        if self._report.is_outdated:
-            self._suit(now)
-        self._drop_late()
-        self._forwarder.sifter.send_waiting()
-        self._report_shed()
-        if self._report.is_due(now) and self._takes(Rank.STATE, _HEARTBEAT_BYTES):
-            self._report.publish(now)
-        return self.level.heartbeat_s > 0
+        """Measure the link and send what has waited, every POLL_S; True if heartbeats follow these polls."""
+        return False
 
-    def _drop_late(self) -> None:
-        """Drop late commands: more than a thin link carries would fill the broker's queue, where a stop would wait.
+    def note_drive(self, payload: bytes) -> None:
+        """Note a drive command that has come over the link. Any thread may call it."""
 
-        They are worth nothing when they come, and a new connection drops all that wait. From then on stops have a
-        connection of their own.
-        """
-        late, now = self._forwarder.ages.late, self._clock()
-        since_s = now - self._flooded_at
-        if self._meter.level == "thin" and late.count >= _LATE and late.seconds(now) >= _LATE_S and since_s >= RENEW_S:
-            late.count = 0
-            self._flooded_at = now
-            self._remote.renew_connection("only late commands come over a thin link: those that wait there are dropped")
 
-    def _suit(self, now: float) -> None:
-        """Suit the link: its level is another one, or a queue begins or ends to stand."""
-        self._suit_transport()
-        stream_hz = (self.level.stream_hz or 0.0) * (_CROWDED_STREAMS if self._meter.crowded else 1)
-        self._sieve.stream_s = 1 / stream_hz if stream_hz else 0.0
-        self._forwarder.sifter.use(None if self._meter.level == "wide" else self._sieve)
-        self._report.publish(now)
-
-    def _suit_transport(self) -> None:
-        self._remote.suit_link(thin=self._meter.level != "wide")
-
-    def _takes(self, rank: Rank, size: int) -> bool:
-        with self._guard:
-            return self._room.takes(rank, size, self._clock())
-
-    def _report_shed(self) -> None:
-        shed = self._forwarder.counters["shed"]
-        if shed > self._shed:
-            self._quiet_log.warning(
-                "shed", "the link to the remote broker has no room: older values were not sent", times=shed - self._shed
-            )
-            self._shed = shed
+def uplink_of(
+    config: Config, addresses: Addresses, remote: Transport, forwarder: Forwarder, clock: Callable[[], float]
+) -> Uplink:
+    """Return the uplink of a robot. Raises ConfigError if its link may be thin and no extension is there for that."""
+    if config.services.mqtt_bridge.link.profile == "wide":
+        return Uplink()
+    for extension in config.installed:
+        if extension.uplink:
+            uplink: Uplink = part(extension.uplink)(config, addresses, remote, forwarder, Notifier(), clock)
+            return uplink
+    raise ConfigError('services.mqtt_bridge.link.profile: is of the extension thin: pip install "pebble-robot[all]"')

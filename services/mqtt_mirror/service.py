@@ -29,7 +29,7 @@ _REQUEST_PERIOD_S = 1.0  # at most one request so often, but for those of a new 
 
 
 class MqttMirror(ForwardingService):
-    """Forwards between the robot's own transport and a broker on the robot.
+    """The mirror: it forwards between the robot's own transport and a broker on the robot.
 
     Where retained messages differ at a reconnect, the local side is right. If a probe of the bridge arrives from the
     broker, that broker is the remote one: the bridge serves it already, and with a second path messages would
@@ -131,8 +131,9 @@ class MqttMirror(ForwardingService):
             self._request_probe()
 
     def found_one_broker(self) -> None:
-        first, self._is_operators = not self._is_operators, True
-        self._refuse("is the remote one, which the bridge serves already", CHECK_SOON_S if first else CHECK_AGAIN_S)
+        seconds = CHECK_AGAIN_S if self._is_operators else CHECK_SOON_S
+        self._is_operators = True
+        self._refuse("is the remote one, which the bridge serves already", seconds)
 
     def _refuse(self, why: str, seconds: float = CHECK_AGAIN_S) -> None:
         """Forward nothing until the next check: the address may lead to another broker by then."""
@@ -149,7 +150,7 @@ class MqttMirror(ForwardingService):
     # -- the transports' threads
 
     def pass_stop(self, side: Side, payload: bytes) -> Iterable[bytes]:
-        """Return the bridge's repetitions for one motor owner stay on the robot's own transport."""
+        """Return the payloads to pass: repetitions for one motor owner stay on the robot's own transport."""
         addressed = side is Side.LOCAL and bool(payload) and codec.decode(ESTOP, payload).owner is not UNSET
         return () if addressed else (payload,)
 

@@ -1,4 +1,4 @@
-"""Sensors whose values change while the wheels turn: one that then repeats itself shows nothing. Pure."""
+"""Sensors whose values change while the wheels turn: one that repeats itself then is broken. Pure."""
 
 from collections import defaultdict
 from collections.abc import Hashable, Mapping
@@ -23,7 +23,7 @@ class MovingSensors:
 
     @property
     def problem(self) -> str:
-        """The problem; empty: none. A sensor that never changes may not be there, unless no other changes."""
+        """The problem; empty: none. A sensor that never changes may not be connected, unless no other changes."""
         still = [name for name, check in self._checks.items() if check.repeats]
         if len(still) < len(self._checks):
             still = [name for name in still if self._checks[name].changes]

@@ -29,7 +29,7 @@ _INPUT_LIMIT = 65_536  # bytes waiting for the service's thread; 1.4 s of a full
 
 
 class SerialService(Service, ABC):
-    """A subclass sets how its protocol uses the serial line, and parses the received bytes."""
+    """The service of a serial line; a subclass sets how its protocol uses the line, and parses the received bytes."""
 
     name = "serial_mcu_bridge"
     end: ClassVar[bytes] = b"\n"  # of a text line, or a frame
@@ -48,8 +48,8 @@ class SerialService(Service, ABC):
         self._input_lock = threading.Lock()
         self._silence, self._starts = Silence(), Starts()
         self.sensors = MovingSensors()
-        self._still = ""  # what was logged of them
-        self._warned_at = float("-inf")  # that the board starts again and again
+        self._still = ""  # the logged problem of sensors
+        self._warned_at = float("-inf")  # of a board that starts again and again
         self._holders: list[str] = []  # other programs at the device
         self._misread = False
         self._understood = (0, 0)  # which opening of the line, and how often its board was heard since
@@ -107,7 +107,7 @@ class SerialService(Service, ABC):
         self.on_line_state(state)
 
     def note_report(self, understood: bool) -> None:
-        """Something has come: ``understood`` if it is of the board's protocol, and neither noise nor other text."""
+        """Note a report: ``understood`` if it is of the board's protocol, and neither noise nor other text."""
         if understood:
             opened, times = self._understood
             self._understood = self.line.opened, times + 1 if opened == self.line.opened else 1
@@ -119,12 +119,12 @@ class SerialService(Service, ABC):
             self._starts.began(time.monotonic())
 
     def note_clock(self, mcu_ms: int) -> None:
-        """Note what the board's clock shows: ``mcu_ms``, of 32 bits."""
+        """Note the time of the board's clock: ``mcu_ms``, of 32 bits."""
         self._starts.sent(self.line.opened, mcu_ms, time.monotonic())
 
     @every(CHECK_S)
     def report_mcu(self) -> None:
-        """Report to the launcher what has changed of the MCU."""
+        """Report changes of the MCU to the launcher."""
         line, now = self.line, time.monotonic()  # the line's clock
         if line.state is LineState.CLOSED:
             return
@@ -152,11 +152,12 @@ class SerialService(Service, ABC):
             threading.Thread(target=self._name_holders, name="holders", daemon=True).start()  # it takes a while
 
     def _name_holders(self) -> None:
-        path, found = str(self.options.serial.port), holders(str(self.options.serial.port))
-        if found and found != self._holders:
+        path = str(self.options.serial.port)
+        others = holders(path)
+        if others and others != self._holders:
             text = "%s is open in another program, too: %s; two confuse the board: end that one"
-            self.log.warning(text, path, ", ".join(found))
-        self._holders = found
+            self.log.warning(text, path, ", ".join(others))
+        self._holders = others
 
     def _queue_input(self, chunk: bytes) -> None:
         """Queue input on the reading thread, which also parses it if the service is idle.

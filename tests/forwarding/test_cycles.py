@@ -10,7 +10,7 @@ import pytest
 from pebble.forwarding.cycles import Cycles, Finding
 from pebble.forwarding.routing import Side
 from pebble.forwarding.subjects import Subjects
-from pebble.services.mqtt_bridge.actions import Action
+from pebble.services.mqtt_bridge.requests.actions import Action
 from pebble.transports import Message, QoS
 from tests.forwarding.test_forwarding import Clock, grows_no_more
 from tests.forwarding.virtual import Connection, Running, World
@@ -219,26 +219,6 @@ class TestCycles:
         assert (REMOTE, TOPIC) in cycles.closed_ways
         assert cycles.poll() == []
         assert examine(cycles, REMOTE, TOPIC, MOVE) is Finding.PASS
-
-    @pytest.mark.parametrize(
-        ("arrives", "logged"),
-        [((), 1), ((REMOTE,), 0), ((LOCAL,), 1), ((REMOTE, REMOTE), 1)],
-        ids=["none", "on the same way", "on another way", "not from that way: it comes back"],
-    )
-    def test_a_mirror_logs_an_error_unless_another_bridge_probes_the_way(
-        self, clock: Clock, caplog: pytest.LogCaptureFixture, arrives: tuple[Side, ...], logged: int
-    ) -> None:
-        cycles = Cycles(clock, yields=True)
-        examine(cycles, REMOTE, TOPIC, cycles.probe(REMOTE, TOPIC))
-        for _ in range(5):
-            clock.now += 1
-            theirs = Cycles(clock).probe(LOCAL, FLAG)
-            for side in arrives:
-                examine(cycles, side, FLAG, theirs)
-            for side, topic in cycles.poll():
-                examine(cycles, side, topic, cycles.probe(side, topic))
-        assert (REMOTE, TOPIC) in cycles.closed_ways
-        assert len(errors(caplog)) == logged
 
     def test_memory_is_bounded(self, cycles: Cycles) -> None:
 

@@ -16,7 +16,7 @@ from pebble.forwarding.probes import PROBE_REQUEST
 from pebble.forwarding.routing import Side
 from pebble.forwarding.service import CHECK_AGAIN_S
 from pebble.forwarding.side import Gate
-from pebble.services.mqtt_bridge.actions import Action
+from pebble.services.mqtt_bridge.requests.actions import Action
 from pebble.transports.base import Answer
 from tests.forwarding.virtual import Hub, Running, World
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client

@@ -10,11 +10,10 @@ from pathlib import Path
 import pytest
 
 from pebble.transports import Message, MqttSettings, QoS, create
-from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.ending import Silent
 from tests.support import Broker, until
 from tests.transports.received import Received
-from tests.transports.test_mqtt_connection import PONG, Link, sent
+from tests.transports.test_mqtt_connection import Link, sent
 
 
 @pytest.mark.parametrize(
@@ -36,21 +35,6 @@ def test_a_ping_at_least_every_second_and_a_half(monkeypatch: pytest.MonkeyPatch
             link.idle(0.05)
             asked += link.answer_pings()
     assert 6 <= asked <= 10, "a little more, so that two are never a period"
-
-
-def test_a_ping_that_is_soon_due_goes_along_with_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    with closing(Link(monkeypatch)) as link:
-        link.connection.suit(thin=True)
-        written = []
-        for _ in range(20):
-            link.connection.publish(Message("slow/online", b"x", QoS.DELIVERED, retain=True))
-            written.append(link.written())
-            link.sends(PONG * written[-1].count(packets.PINGREQ))
-            link.idle(0.25)
-        pings = sum(one.endswith(packets.PINGREQ) for one in written)
-        assert 5 <= pings <= 10
-        assert b"".join(written).count(packets.PINGREQ) == pings
-        assert packets.PINGREQ not in link.written(), "none of its own"
 
 
 def test_anything_is_a_sign_of_life(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""A network inside one process: the reference for what the promises mean, and a fast stand-in for tests.
+"""A network inside one process: the reference for the meaning of the promises, and a fast stand-in for tests.
 
 `MemoryHub` acts as the broker. It can be stopped and started, lose its retained messages, and crash a client.
 """
@@ -28,7 +28,7 @@ class MemoryHub:
         self.era: int | None = 1  # counts its runs; None while it is stopped
         self._eras = itertools.count(2)
         self._clients: list[MemoryTransport] = []  # all that are open, connected or not
-        self._connected_clients: list[MemoryTransport] = []  # those that are connected
+        self._connected_clients: list[MemoryTransport] = []
 
     def __reduce__(self) -> tuple[type[MemoryHub], tuple[()]]:
         return MemoryHub, ()  # in another process it is another hub
@@ -100,7 +100,7 @@ class _Delivery:
 
 
 class MemoryTransport(Transport):
-    """One client of a `MemoryHub`, with a receiving thread of its own, as a real one has."""
+    """A client of a `MemoryHub`, with a receiving thread of its own, as a real one has."""
 
     def __init__(self, client_id: str, settings: MemoryHub, *, will: Message | None = None) -> None:
         super().__init__(client_id, will=will)

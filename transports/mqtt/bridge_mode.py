@@ -23,12 +23,12 @@ class Result(Enum):
 
 
 class BridgeMode:
-    """How to connect next. Bridge mode is tried again with each connection: an address may lead to another broker."""
+    """The next way to connect. Each connection tries bridge mode again: an address may lead to another broker."""
 
     def __init__(self) -> None:
         self.next_attempt = Attempt.BRIDGE
         self._probed = False  # a plain CONNECT was accepted since the broker hung up
-        self._lacking = False  # a broker at this address has no bridge mode: one hang-up is enough
+        self._lacking = False  # a broker at this address had no bridge mode: one hang-up is enough from then on
 
     def note(self, result: Result) -> None:
         """Note that the next attempt has ended with ``result``."""

@@ -1,4 +1,4 @@
-"""What a broker lacks: retained messages, QoS 1 or wills, as it says on MQTT 5 or shows at CONNECT. Pure."""
+"""Limits of a broker without retained messages, QoS 1 or wills, as MQTT 5 says or a CONNECT shows. Pure."""
 
 from __future__ import annotations
 
@@ -9,20 +9,19 @@ from typing import Final
 from pebble.transports.base import Message, QoS
 from pebble.transports.mqtt.bridge_mode import Result
 
-_LOSSES: Final = 6  # of connections, then less is tried, and something else with each further one
 _VALID_S: Final = 600.0  # after which the next connection is made with everything again
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a broker is used with."""
+    """Limits within which a broker is used."""
 
     retain: bool = True
     qos: int = 1
     will: bool = True
 
     def fit(self, message: Message) -> Message:
-        """``message`` as this broker takes it."""
+        """Return ``message`` as this broker takes it."""
         return Message(message.topic, message.payload, QoS(min(message.qos, self.qos)), message.retain and self.retain)
 
     def fit_will(self, will: Message | None) -> Message | None:
@@ -33,7 +32,7 @@ class Limits:
 
     @property
     def losses(self) -> str:
-        """What does not work with this broker, in words."""
+        """The functions that this broker lacks, in words; empty: none."""
         lost = []
         if not self.retain:
             lost.append(
@@ -50,31 +49,28 @@ class Limits:
 EVERYTHING: Final = Limits()
 #: What a CONNECT is tried with on which the broker hangs up, in this order.
 _STEPS: Final = (EVERYTHING, Limits(qos=0), Limits(retain=False), Limits(retain=False, qos=0), Limits(will=False))
-_LESS: Final = _STEPS[:-1]  # for messages
 
 
 class Asking(Enum):
-    """What the broker is asked at once, in another way than before."""
+    """Another CONNECT that is tried at once, before the next one has its usual turn."""
 
-    NOTHING = "the next CONNECT has its usual turn"
+    NOTHING = "none"
     WITHOUT_WILL = "a CONNECT without a will"
     AGAIN = "a CONNECT with a will, as the limits have it: it takes one without, or has said what it lacks"
 
 
 class BrokerLimits:
-    """What the broker at one address is used with next, by how its CONNECTs ended.
+    """The limits of the broker at one address, learned from how its CONNECTs end.
 
     On 3.1.1 a broker hangs up on a will that is retained or has QoS 1, as mosquitto does, and so does a proxy whose
-    broker is away: a hang-up counts only after the same broker has accepted a CONNECT without a will. A client that has
-    no will learns it from connections that are closed one after the other, while nothing was ever confirmed.
+    broker is away: a hang-up counts only after the same broker has accepted a CONNECT without a will. A client without
+    a will does not learn it: it withholds the topics on which the broker hangs up.
     """
 
     def __init__(self) -> None:
         self.limits = EVERYTHING  # of the next connection
         self._asking = Asking.NOTHING
         self._since = float("-inf")  # when the limits were last reduced
-        self._losses = 0  # in a row
-        self._is_decided = False  # such messages were confirmed, or less did not help: losses have another reason
 
     @property
     def wants_probe(self) -> bool:
@@ -117,23 +113,6 @@ class BrokerLimits:
             self._reduce(_STEPS[_STEPS.index(self.limits) + 1], now)
         elif again and result is not Result.ACCEPTED:
             self.limits = EVERYTHING
-
-    def note_loss(self, *, unconfirmed: bool, confirmed: bool, held: bool, now: float) -> bool:
-        """Note that the broker has closed a connection; return True if that may be for what it lacks.
-
-        ``unconfirmed``, ``confirmed``: there were retained messages or such of QoS 1. ``held``: for a while.
-        """
-        self._is_decided |= confirmed
-        tries_less = self._losses >= _LOSSES  # then none is on its way that could be the reason, and less did not help
-        if self._is_decided or held or not (unconfirmed or tries_less):
-            self._losses = 0
-            return False
-        self._losses += 1
-        step = self._losses - _LOSSES + 1
-        if step > 0:
-            self.limits, self._since = _LESS[step % len(_LESS)], now
-            self._is_decided = step == len(_LESS)
-        return True
 
     def _reduce(self, limits: Limits, now: float) -> None:
         self.limits, self._since, self._asking = limits, now, Asking.AGAIN

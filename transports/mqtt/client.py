@@ -9,8 +9,8 @@ import socket
 import ssl
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterable
+from contextlib import closing, suppress
 from typing import NamedTuple
 
 from pebble.transports.base import Message
@@ -24,20 +24,19 @@ SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its d
 _PIECE = 64 * 1024  # bytes that are read at once
 _ENDING_S = 0.2  # after DISCONNECT
 _MOST_IDS = 65_535  # MQTT's packet identifiers have 16 bits
-_NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", None)  # not on Windows
-_CORK = getattr(socket, "TCP_CORK", None)  # Linux only
+_NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", None)
 _NOT_NOW = (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
 
 
 class Opening(NamedTuple):
-    """What a connection is opened with."""
+    """Parameters with which a connection is opened."""
 
     client_id: str
     settings: MqttSettings
     context: ssl.SSLContext | None  # None: without TLS
     will: Message | None
     address: Address  # one of the host's; TLS checks the name of the host
-    patience_s: float = CONNECT_TIMEOUT_S  # for which TLS may be silent
+    patience_s: float = CONNECT_TIMEOUT_S  # seconds for which TLS may be silent
 
 
 def is_hang_up(error: OSError | None) -> bool:
@@ -50,7 +49,7 @@ class TlsLateError(TimeoutError):
 
 
 def begin_tls(plain: socket.socket, opening: Opening) -> ssl.SSLSocket:
-    """Returns a socket that does not block; takes ``plain`` and closes it if it fails. Raises OSError."""
+    """Return a socket that does not block; ``plain`` is closed with it, or if this fails. Raises OSError."""
     assert opening.context is not None  # noqa: S101 - else there is no TLS
     name = opening.settings.host.partition("%")[0]  # certificates have addresses without a network card
     sock = opening.context.wrap_socket(plain, server_hostname=name, do_handshake_on_connect=False)
@@ -80,7 +79,7 @@ def _shake_hands(sock: ssl.SSLSocket, patience_s: float) -> None:
 
 
 class SendQuota:
-    """How many messages of QoS 1 the broker takes without an answer (Receive Maximum); it holds those beyond that."""
+    """The messages of QoS 1 that the broker takes without an answer (Receive Maximum); those beyond wait here."""
 
     def __init__(self, send: Callable[[bytes], None]) -> None:
         self._send = send
@@ -91,7 +90,7 @@ class SendQuota:
         self._left = self._most = most
 
     def takes(self, packet: bytes) -> bool:
-        """True if ``packet`` may be sent now; else it is sent later."""
+        """Return True if ``packet`` may be sent now; else keep it, to send it later."""
         if self._left <= 0:
             self._held.append(packet)
             return False
@@ -106,25 +105,10 @@ class SendQuota:
 
 
 def keep_unsent(sock: socket.socket, size: int) -> None:
-    """Have the kernel accept about ``size`` bytes at most beyond those on their way, where it can; 0: its own bound."""
+    """Have the kernel accept at most about ``size`` bytes beyond those on their way, where it can; 0: its own bound."""
     if _NOTSENT_LOWAT is not None:
         with suppress(OSError):  # it may be closed already
             sock.setsockopt(socket.IPPROTO_TCP, _NOTSENT_LOWAT, size)
-
-
-@contextmanager
-def one_packet(sock: socket.socket | None) -> Iterator[None]:
-    """Have the kernel send what is written meanwhile in one packet, where it can."""
-    if _CORK is None or sock is None:
-        yield
-        return
-    with suppress(OSError):  # it may be closed already
-        sock.setsockopt(socket.IPPROTO_TCP, _CORK, 1)
-    try:
-        yield
-    finally:
-        with suppress(OSError):
-            sock.setsockopt(socket.IPPROTO_TCP, _CORK, 0)
 
 
 def _mark(sock: socket.socket, dscp: int) -> None:
@@ -137,13 +121,13 @@ def _mark(sock: socket.socket, dscp: int) -> None:
 
 
 class Client:
-    """`open` waits for TCP and TLS, everything else returns at once. ``listener`` is called by `read`."""
+    """One connection's client. `open` waits for TCP and TLS, all else returns at once; `read` calls ``listener``."""
 
     def __init__(self, opening: Opening, listener: Listener, *, bridge: bool) -> None:
         settings = opening.settings
         self.socket: socket.socket | None = None  # None: not open yet, or lost
         self.unwritten = 0  # bytes that the kernel has not accepted yet
-        self.drained = True  # `receive` has taken out everything that had come
+        self.drained = True  # `receive` has emptied the socket
         self.hung_up = False  # the other side has ended the connection, in whatever way
         self.waiting: deque[bytes] = deque()  # to be written, once the socket accepts more
         self._modern = settings.protocol == "5"
@@ -180,7 +164,7 @@ class Client:
         self._send(self._hello)
 
     def close(self) -> None:
-        """Without DISCONNECT."""
+        """Close the socket without DISCONNECT."""
         if self.socket is not None:
             with suppress(OSError):
                 self.socket.close()
@@ -189,9 +173,9 @@ class Client:
     # -- reading
 
     def receive(self) -> int:
-        """Take what has come out of the socket, if all that came before is read; returns how many bytes.
+        """Take bytes out of the socket, once those taken before are read; return how many.
 
-        A connection that the other side has closed has no `socket` afterwards.
+        If the other side has closed the connection, there is no `socket` afterwards.
         """
         sock, self.drained = self.socket, True
         if sock is None:
@@ -205,13 +189,13 @@ class Client:
         if not data:
             self.hung_up = is_hang_up(error)
             self.close()
-        # What TLS has unpacked is no measure of what the socket has.
+        # With TLS the number of unpacked bytes does not tell whether the socket has more.
         self.drained = not data or (len(data) < _PIECE and self._opening.context is None)
         self._reader.feed(data)
         return len(data)
 
     def read(self, most: int) -> int:
-        """Hand up to ``most`` packets to the listener; returns how many bytes are left. Raises MalformedError."""
+        """Hand up to ``most`` packets to the listener; return how many bytes are left. Raises MalformedError."""
         reader = self._reader
         reader.read(most)
         return reader.unread
@@ -222,7 +206,7 @@ class Client:
         return bool(self._reader.acks)
 
     def acknowledge(self) -> None:
-        """Acknowledge what was read, in one piece: after it was handled, which is more urgent."""
+        """Send the acknowledgements of all messages read, in one piece; call it after they were handled."""
         reader = self._reader
         acks, reader.acks = bytes(reader.acks), bytearray()
         self._send(acks)
@@ -230,13 +214,13 @@ class Client:
     # -- writing
 
     def write(self) -> None:
-        """Write what waits, as far as the socket accepts it."""
+        """Write the waiting bytes, as far as the socket accepts them."""
         waiting, self.waiting, self.unwritten = self.waiting, deque(), 0
         for data in waiting:
             self._send(data)  # all the others wait after the first one that is not accepted
 
     def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool, expires_s: int | None) -> int:
-        """Returns the message id, 0 with QoS 0."""
+        """Send a PUBLISH; return its message id, 0 with QoS 0."""
         mid = 0
         if qos:
             mid = self._mid = self._mid % _MOST_IDS + 1
@@ -246,7 +230,7 @@ class Client:
         return mid
 
     def subscribe(self, filters: Iterable[Filter]) -> int:
-        """Returns the message id."""
+        """Send a SUBSCRIBE; return its message id."""
         mid = self._next_id()
         self._send(packets.subscribe(mid, filters, modern=self._modern))
         return mid
@@ -262,8 +246,8 @@ class Client:
     def disconnect(self) -> None:
         """Send DISCONNECT, and close so that it arrives: a connection that is reset may lose it.
 
-        One with unread data is reset when it is closed, and a proxy on the way then resets the broker's. So what comes
-        until the broker closes it, or for `_ENDING_S`, is read, and thrown away.
+        A connection with unread data is reset when it is closed, and a proxy on the way then resets the broker's. So
+        bytes that come until the broker closes it, or for `_ENDING_S`, are read and thrown away.
         """
         self._send(packets.DISCONNECT)
         if self.waiting:
@@ -282,7 +266,7 @@ class Client:
         return self._mid
 
     def _send(self, data: bytes) -> None:
-        """Hot."""
+        """Send bytes, or let them wait behind others. Hot."""
         if self.socket is None:
             return
         if not self.waiting:

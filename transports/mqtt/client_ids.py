@@ -1,4 +1,4 @@
-"""Client ids: what names the connection of a program at a broker. Pure but for random digits."""
+"""Client ids, which name connections at a broker. Pure but for random digits."""
 
 import re
 import secrets
@@ -16,7 +16,7 @@ def unique(name: str) -> str:
 
 
 def _escaped(name: str) -> str:
-    """Return the name without slashes; names that differ in more give results that differ, too: by a hash."""
+    """Return the name in letters that all brokers take; a hash tells names apart that would else be equal."""
     text = _OTHER.sub("_", name)
     if text == name.replace("/", "_"):
         return text

@@ -18,7 +18,7 @@ from pebble.transports.base import Answer, Message, Outgoing, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, Limits
-from pebble.transports.mqtt.client import Client, Opening, TlsLateError, keep_unsent, one_packet
+from pebble.transports.mqtt.client import Client, Opening, TlsLateError, keep_unsent
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
 from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Sink
 from pebble.transports.mqtt.outgoing import (
@@ -55,7 +55,7 @@ class Owner(Sink, Protocol):
 
 
 def ignore(_messages: list[Message]) -> None:
-    """Discard messages: for :meth:`Connection.pump` before a connection is accepted, and at its end."""
+    """Discard messages; :meth:`Connection.pump` takes this before a connection is accepted, and at its end."""
 
 
 class Connection:
@@ -75,10 +75,10 @@ class Connection:
         limits: Limits = EVERYTHING,
         client_class: type[Client] = Client,
     ) -> None:
-        self.opened_s = 0.0  # so long TCP and TLS took
+        self.opened_s = 0.0  # seconds that TCP and TLS took
         self.dialling = True  # connect(2) or a TLS handshake may be blocking, and cannot be interrupted
-        self.limits = limits  # what the broker has, with what it says on MQTT 5
-        self.max_packet: int | None = None  # bytes, as the broker says on MQTT 5
+        self.limits = limits  # of the broker, also those that it states on MQTT 5
+        self.max_packet: int | None = None  # bytes, as the broker states on MQTT 5
         self._owner, self._settings, self._counters = owner, opening.settings, counters
         self._lock = threading.RLock()
         self._backlog = Backlog()
@@ -102,8 +102,8 @@ class Connection:
         try:
             self._client.open()
         except (OSError, ValueError) as error:
-            kind = next((one for known, one in _UNREACHED.items() if isinstance(error, known)), Lost)
-            raise kind(f"{self.where} cannot be reached: {error}") from None
+            ending = next((ending for kind, ending in _UNREACHED.items() if isinstance(error, kind)), Lost)
+            raise ending(f"{self.where} cannot be reached: {error}") from None
         self.opened_s = time.monotonic() - dialled
         self.incoming.answered_at = began = clock.since_boot()
         self.dialling = False
@@ -144,11 +144,11 @@ class Connection:
             self._client.disconnect()
 
     def wake(self) -> None:
-        """Make `pump` return; for other threads."""
+        """Make `pump` return; other threads call it."""
         self._poll.wake()
 
     def suit(self, *, thin: bool) -> None:
-        """Suit the link to the broker: see `Transport.is_thin`."""
+        """Adapt to the link to the broker; see `Transport.is_thin`."""
         with self._lock:
             sock = self._client.socket
             if sock is not None and thin is not self.pings.is_thin:
@@ -158,11 +158,10 @@ class Connection:
     # -- the network thread
 
     def pump(self, timeout: float, receive: Callable[[list[Message]], None]) -> None:
-        """Wait up to ``timeout`` seconds for the socket, read and write, and deliver what was received. Raises Lost.
+        """Wait up to ``timeout`` seconds for the socket, read and write, and deliver messages. Raises Lost.
 
-        A `PendingAck` is completed after ``receive`` was given the messages that came before the answer: a retained
-        message is never delivered later than the confirmation of its subscription. Whether a subscription is refused is
-        known before both.
+        Answers to subscriptions are noted first. Then ``receive`` gets the messages, and after them each `PendingAck`
+        whose answer has come is completed: no retained message is delivered after the confirmation of its subscription.
         """
         readable, now = self._wait(timeout)
         client, incoming = self._client, self.incoming
@@ -199,9 +198,10 @@ class Connection:
             self._in_flight.complete()
 
     def _wait(self, timeout: float) -> tuple[bool, float]:
-        """Return whether there is something to read, and when that was known: what follows goes by that one time.
+        """Return whether the socket is readable, and the time when this was known.
 
-        What is in the socket already has come at an unknown time, unless the socket was empty just before.
+        Bytes that are in the socket already have come at an unknown time, unless it was empty just before: so it is
+        polled without a wait first, unless that was done a moment ago.
         """
         if not self._poll.registered:
             self._register()
@@ -224,7 +224,7 @@ class Connection:
                 waiting.empty(now)  # until just now
         readable, writable, _woken = ready
         if writable:
-            self.incoming.answered_at = now  # the other side's TCP accepted some: slow, but alive
+            self.incoming.answered_at = now  # the other side's TCP accepted some bytes: slow, but alive
         return readable, now
 
     def _register(self) -> None:
@@ -277,12 +277,7 @@ class Connection:
             else:
                 if self._backlog.waiting:
                     self._counters.add("dropped", self._backlog.supersede(message))
-                if self.pings.joins(clock.since_boot()):
-                    with one_packet(client.socket):
-                        self._write_publish(message, expires_s)
-                        self.pings.send(client)
-                else:
-                    self._write_publish(message, expires_s)
+                self._write_publish(message, expires_s)
             blocked = client.socket is None or client.waiting
         if blocked:
             self.wake()
@@ -312,7 +307,7 @@ class Connection:
         wanted = [
             Filter(text, most, no_local, self.incoming.as_published, sends_retained) for text, no_local in filters
         ]
-        return self._request(self._client.subscribe, wanted, [one.text for one in wanted])
+        return self._request(self._client.subscribe, wanted, [filter_.text for filter_ in wanted])
 
     def unsubscribe(self, filters: list[str]) -> PendingAck:
         return self._request(self._client.unsubscribe, filters, [])
@@ -334,12 +329,12 @@ class Connection:
 
     @property
     def where(self) -> str:
-        """The broker, in words."""
+        """The broker in words."""
         return self.incoming.where
 
     @property
     def socket(self) -> socket.socket | None:
-        """None once it is lost."""
+        """The socket; None once it is lost."""
         return self._client.socket
 
     @property
@@ -348,7 +343,7 @@ class Connection:
 
     @property
     def drained(self) -> bool:
-        """True if everything accepted is written, and acknowledged where that is due."""
+        """True if all accepted messages are written, and acknowledged where that is due."""
         with self._lock:
             return not (self._in_flight.unacked or self._backlog.waiting or self._client.waiting)
 
@@ -382,7 +377,7 @@ class Connection:
             return Answer(number, seconds, queue_s, delivered_s, late_s) if number else None
 
     def unconfirmed_retained(self) -> list[Message]:
-        """Retained messages that the broker may not have received, oldest first."""
+        """Return the retained messages that the broker may not have received, oldest first."""
         with self._lock:
             return self._in_flight.unconfirmed_retained()
 
@@ -391,13 +386,8 @@ class Connection:
         """The bytes of the largest message for which the broker was silent to the end of the connection."""
         return self._in_flight.lost_bytes
 
-    @property
-    def has_confirmed(self) -> bool:
-        """True if the broker has confirmed a retained message or one of QoS 1."""
-        return self._in_flight.has_confirmed
-
     def written_before_loss(self) -> dict[str, int] | None:
-        """Return what the other side may have closed the connection for; None: it has not, or for another reason."""
+        """Return the bytes by topic for which the other side may have closed the connection; None: another reason."""
         with self._lock:
             incoming = self.incoming
             if not (incoming.may_concern_message or (self._client.hung_up and not incoming.reason)):

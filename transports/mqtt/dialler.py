@@ -1,4 +1,4 @@
-"""Makes the connections to a broker: at the address whose turn it is, in a way that the broker there accepts."""
+"""Makes connections to a broker: at the address whose turn it is, and as the broker there accepts them."""
 
 import threading
 import time
@@ -29,16 +29,16 @@ class Dialler:
     def __init__(
         self, client_id: str, settings: MqttSettings, will: Message | None, client_class: type[Client] = Client
     ) -> None:
-        # It stays the same over reconnects: the broker closes our own half-dead connection at once.
+        # The same at each reconnect: the broker then closes our own half-dead connection at once.
         self._client_id = client_ids.unique(client_id) if settings.client_id is None else settings.client_id
         self._settings, self._will, self._client_class = settings, will, client_class
         self.addresses = AddressRound(HostPort(settings.host, settings.port))
         self.attempt: Connection | None = None  # the newest connection, in any state
-        self.stalled = False  # the broker may have been suspended, and have old messages to forward first
+        self.stalled = False  # the broker may have been suspended: it forwards old messages first
         self._credentials: Credentials | None = None
         self._address: Address | None = None
         self._bridge_mode, self.limits = BridgeMode(), BrokerLimits()  # of the broker at this address
-        self.reported = EVERYTHING  # what the log says it has
+        self.reported = EVERYTHING  # the limits that were logged
         self._large_lost = 0  # connections in a row that went silent on something large
         self._gone_at = float("-inf")  # when the broker was last known to be gone
 
@@ -49,7 +49,7 @@ class Dialler:
     # -- one attempt
 
     def begin(self) -> None:
-        """Raises Lost if the name of the broker has no address."""
+        """Begin an attempt. Raises Lost if the name of the broker has no address."""
         self.attempt = None  # a resolver cannot be interrupted
         try:
             address = self.addresses.address()
@@ -104,11 +104,11 @@ class Dialler:
 
     @property
     def _asks_for_bridge_mode(self) -> bool:
-        """MQTT 5 has options of its own for the same."""
+        """True if bridge mode is to be tried; MQTT 5 has options of its own for the same."""
         return self._settings.as_published and self._settings.protocol == "3.1.1"
 
     def _probe(self, owner: Owner, counters: Counters, stopping: threading.Event) -> None:
-        """Connect without bridge mode, and leave in order; without our will, which a failure would publish."""
+        """Connect and disconnect, without bridge mode, and without our will, which a failure would publish."""
         probe = self._make(None, owner, counters, as_published=False)
         try:
             probe.connect(stopping)
@@ -127,13 +127,13 @@ class Dialler:
         return not self._asks_for_bridge_mode or self._bridge_mode.next_attempt is Attempt.BRIDGE
 
     def _note_result(self, result: Result) -> None:
-        """Note how a CONNECT has ended: what the broker lacks matters once it is known whether it has bridge mode."""
+        """Note how a CONNECT has ended; the limits of a broker count once it is known whether it has bridge mode."""
         self._bridge_mode.note(result)
         if self._will is not None and (self._is_last_attempt or result is not Result.HUNG_UP):
             self.limits.note_connect(result, time.monotonic())
 
     def _note_probe(self, result: Result) -> None:
-        """Note how a CONNECT without bridge mode and will has ended: it tells something to whichever asked for it."""
+        """Note how a CONNECT without bridge mode and will has ended."""
         if self._bridge_mode.next_attempt is Attempt.PROBE:
             self._bridge_mode.note(result)
         if self._will is not None:  # without one nothing was left out
@@ -145,10 +145,10 @@ class Dialler:
         return self._large_lost >= _LARGE_LOST and not self._settings.max_segment
 
     def _may_have_lost_large(self, lost: Lost) -> bool:
-        """True if the connection ended as one does whose large packets are lost on the way, in whatever direction.
+        """True if the connection may have ended because large packets are lost on the way, in either direction.
 
-        TLS that is late: a certificate is large. Silence after a large message of ours; or soon after the broker has
-        let us in, as what it retains may be large.
+        Signs are a late TLS, as certificates are large; silence after a large message of ours; and silence soon after
+        the broker has accepted us, as messages that it retains may be large.
         """
         attempt = self.attempt
         if attempt is None or not isinstance(lost, Silent):
@@ -168,7 +168,7 @@ class Dialler:
         return self.loses_large
 
     def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
-        """Return whether the other end is gone: nothing listens, or it hangs up as one that is just ending does."""
+        """Return True if the broker has gone: nothing listens, or it hangs up as it does while it ends."""
         now, silent = time.monotonic(), isinstance(lost, Silent)  # then it may be we who stood still
         if connected:
             self._gone_at = now
@@ -182,7 +182,7 @@ class Dialler:
     def failed(self, problem: str, held_s: float) -> tuple[str, bool]:
         """End the turn of the address, unless its broker is to be asked once more in another way.
 
-        Returns the problem in words, empty if it is none yet, and whether it is worth a line in the log.
+        Returns the problem in words, empty if there is none yet, and True if it is worth a line in the log.
         """
         addresses, asks_again = self.addresses, self.limits.asks_again
         if self._is_last_attempt and not asks_again:

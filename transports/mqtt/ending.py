@@ -1,26 +1,26 @@
-"""Why a connection to an MQTT broker is not made, or ends."""
+"""Reasons why a connection to an MQTT broker is not made, or ends."""
 
 from pebble.transports.mqtt.bridge_mode import Result
 
 
 class Lost(Exception):  # noqa: N818  (an event, not a mistake)
-    """The connection was lost, or could not be made. Its text explains why."""
+    """Loss of a connection, or failure to make one. Its text explains why."""
 
 
 class Silent(Lost):
-    """The other side does not answer."""
+    """Silence: the other side does not answer."""
 
 
 class Absent(Lost):
-    """Nothing listens there."""
+    """Absence: nothing listens there."""
 
 
 class TlsLate(Lost):
-    """TCP is there, and TLS was not in time."""
+    """Delay of TLS, after TCP was there in time."""
 
 
 class Refused(Lost):
-    """The broker refused our CONNECT, or closed the connection instead of answering."""
+    """Refusal of our CONNECT, or a connection closed instead of an answer."""
 
     def __init__(self, text: str, result: Result = Result.FAILED) -> None:
         super().__init__(text)

@@ -17,12 +17,12 @@ _LIMIT = 65_536  # topics whose newest retained payload is recognised, per conne
 _BYTES = 8 << 20  # the same, for their names and digests
 
 
-def overlap(one: str, other: str) -> bool:
+def overlap(first: str, second: str) -> bool:
     """True if there is a topic that both filters match."""
-    begin, other_begin = beginning(one), beginning(other)
+    begin, other_begin = beginning(first), beginning(second)
     if not (begin.startswith(other_begin) or other_begin.startswith(begin)):
         return False
-    left, right = one.split("/"), other.split("/")
+    left, right = first.split("/"), second.split("/")
     if "$" in (left[0][:1], right[0][:1]) and left[0] != right[0]:
         return False  # wildcards do not match a first level with a $
     for a, b in zip(left, right, strict=False):
@@ -35,9 +35,9 @@ def overlap(one: str, other: str) -> bool:
     return len(left) == len(right) or longer[shorter] == "#"
 
 
-def cover(one: str, other: str) -> str:
+def cover(first: str, second: str) -> str:
     """Return a filter that matches everything that either of two overlapping filters matches, level by level."""
-    left, right = one.split("/"), other.split("/")
+    left, right = first.split("/"), second.split("/")
     levels: list[str] = []
     for a, b in zip(left, right, strict=False):
         if a == "#" or b == "#":
@@ -50,7 +50,7 @@ class BrokerFilters:
     """The filters a client has subscribed to at its broker; no two of them overlap."""
 
     def __init__(self) -> None:
-        self.lock = threading.RLock()  # to be held: it guards these, and the connection that they belong to
+        self.lock = threading.RLock()  # to be held: it guards the filters, and their connection
         self._subscribed: list[str] = []
 
     def __iter__(self) -> Iterator[str]:
@@ -90,10 +90,9 @@ class OwnMessageFilter:
     """
 
     def __init__(self) -> None:
-        # Digests, by topic, of our newest payload until another client publishes another one,
+        # Digests by topic: of our newest payload, until another client publishes another one,
         self._own = BoundedTable[bytes](_LIMIT, _BYTES, len)
-        # and of the newest payload received.
-        self._seen = BoundedTable[bytes](_LIMIT, _BYTES, len)
+        self._seen = BoundedTable[bytes](_LIMIT, _BYTES, len)  # and of the newest payload received
         self._repeats: set[str] = set()  # topics whose retained message will come a second time
 
     def begin(self) -> None:

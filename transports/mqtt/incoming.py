@@ -1,4 +1,4 @@
-"""What a broker sends on one MQTT connection: read in batches, and made into messages that have an age."""
+"""Packets from a broker on one MQTT connection: read in batches, and made into messages that have an age."""
 
 import logging
 from typing import Protocol
@@ -19,7 +19,7 @@ from pebble.transports.topics import MAX_BYTES
 
 log = logging.getLogger(__name__)
 
-OVERSLEPT_S = 0.1  # poll took so much longer than asked for: the process was stopped, or the machine suspended
+OVERSLEPT_S = 0.1  # a poll that takes so much longer than asked for: the process was stopped, or the machine suspended
 _LOGGED = 200  # bytes of a topic
 _BATCH = 64  # messages read in a row before they are delivered
 _SHOWN = 3  # filters
@@ -27,7 +27,7 @@ _LACKS = {reasons.NO_RETAIN: Result.RETAIN_REFUSED, reasons.NO_QOS: Result.QOS_R
 
 
 class Sink(Protocol):
-    """What is called on the network thread with the connection's lock held: it must neither wait nor publish."""
+    """The owner of a connection, called on the network thread with its lock held: it must neither wait nor publish."""
 
     policy: TopicPolicy
 
@@ -36,7 +36,7 @@ class Sink(Protocol):
 
 
 class Incoming:
-    """Listens to the client of a connection. Not locked: the connection is. ``where`` is the broker, in words."""
+    """The listener of a connection's client. Not locked: the connection is. ``where`` is the broker in words."""
 
     def __init__(
         self,
@@ -51,15 +51,15 @@ class Incoming:
         self.answered_at = clock.since_boot()
         self.silence_s = settings.silence_s
         self.as_published = as_published
-        self.accepted: Accepted | None = None  # what the broker said when it accepted us
+        self.accepted: Accepted | None = None  # the CONNACK of a broker that accepted us
         self._accepted_at = 0.0
         self.where, self._settings = where, settings
         self._refusal: Refused | None = None
-        self.reason = ""  # that of its DISCONNECT
-        self.may_concern_message = False  # that reason
-        self._taken_over = True  # may be: MQTT 3.1.1 has no words for it
+        self.reason = ""  # of its DISCONNECT
+        self.may_concern_message = False  # the reason
+        self._taken_over = True  # possibly: MQTT 3.1.1 has no words for it
         self.messages: list[Message] = []  # read, and not delivered yet
-        self.answers: dict[str, bool] = {}  # filters answered since that was last looked at: refused?
+        self.answers: dict[str, bool] = {}  # new answers: filters, each refused or not
         self.more = False  # a batch ended before the socket was empty
         self._left = 0  # bytes of whole packets that were received, and are not read yet
         self.age = ReadAge(self.answered_at)
@@ -70,7 +70,7 @@ class Incoming:
     # -- called by the connection
 
     def check_silence(self, now: float) -> None:
-        """Raises Silent if the broker has not answered for too long."""
+        """Raise Silent if the broker has not answered for too long."""
         if self.accepted is None:
             return  # `connect` has its own deadline, and gives the first round trip
         silence_s = now - max(self.answered_at, self.age.arriving_at)
@@ -79,28 +79,29 @@ class Incoming:
             raise Silent(f"{self.where} has not answered for {limit:.1f} s")
 
     def read(self, client: Client, now: float) -> None:
-        """Read up to a batch, in pieces: more than fits into one may have come, and TLS unpacks one after the other.
+        """Read up to a batch of packets, piece by piece. ``now``: a time before anything is read. Raises Lost.
 
-        ``now``: a time before anything is read. Raises Lost.
+        More than one piece may have come, and TLS unpacks one after the other.
         """
-        age, first, size = self.age, self._packets, 0
-        while self._packets - first < _BATCH:
+        age, began_with, size = self.age, self._packets, 0
+        while (left := began_with + _BATCH - self._packets) > 0:
             before = self._packets
-            size += self._read_piece(client, now, first + _BATCH - before)
+            size += self._read_piece(client, now, left)
             if not self.more or self._packets == before:
                 break
             now = clock.since_boot()
-        if size and self.pings.is_thin:  # any sign of life: answers wait behind what others have published
+        if size and self.pings.is_thin:  # any sign of life counts: answers wait behind messages of others
             self.answered_at = clock.since_boot()
-        if age.has_retained or (size and self._packets == first):  # the latter is a piece of a long message
+        is_piece = size > 0 and self._packets == began_with  # of a long message
+        if age.has_retained or is_piece:
             age.note_arriving()
         if not self.more:
             age.waiting.empty(age.received_at)
 
     def _read_piece(self, client: Client, now: float, most: int) -> int:
-        """Read up to ``most`` packets of what was received before, else of what is received now; return their bytes.
+        """Read up to ``most`` packets, from the bytes left over or else from the socket; return their bytes.
 
-        `more` tells whether there may be others. Raises Lost.
+        Afterwards `more` is True if there may be others. Raises Lost.
         """
         unread = self._left or self._receive(client, now)
         self.age.update(now, client.socket)
@@ -118,7 +119,7 @@ class Incoming:
         return unread - left
 
     def _receive(self, client: Client, now: float) -> int:
-        """Take a piece out of the socket, and note how much is there; return the bytes of the piece."""
+        """Take a piece out of the socket and return its bytes; note how many are there."""
         age, waiting = self.age, self.age.waiting
         age.received_at = now
         if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:
@@ -129,12 +130,12 @@ class Incoming:
 
     @property
     def answered_s(self) -> float | None:
-        """For how long the broker has answered since it accepted us; None: it has not accepted us."""
+        """Seconds for which the broker has answered since it accepted us; None: it has not accepted us."""
         return None if self.accepted is None else self.answered_at - self._accepted_at
 
     @property
     def lost(self) -> Lost:
-        """Why the other side has closed the connection."""
+        """The error of a connection that the other side has closed, with the reason."""
         why, id_ = self.reason or f"{self.where} closed the connection", self._settings.client_id
         if id_ is not None and self.accepted is not None and self._taken_over:
             why += f' (does another client use the client id "{id_}"? a broker lets in only the newest)'
@@ -199,7 +200,7 @@ class Incoming:
             self.age.delay.acknowledged(sent_at, now)
 
     def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
-        """Hot."""
+        """Make a message of a publication. Hot."""
         age, retain = self.age, bool(first & RETAIN)
         if retain:
             age.has_retained = True

@@ -1,12 +1,14 @@
-"""What one MQTT connection has accepted and not finished sending: the backlog before its socket, and what is in flight.
+"""Messages that one MQTT connection has accepted: the backlog before its socket, and those in flight.
 
 Neither class is locked: their connection is.
 """
 
+import fcntl
 import itertools
 import socket
 import struct
 import sys
+import termios
 import threading
 from collections import deque
 from collections.abc import Sequence
@@ -14,14 +16,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from pebble.transports.base import Message, QoS
-
-try:
-    import fcntl
-    import termios
-except ImportError:  # Windows has neither
-    _can_measure = False
-else:
-    _can_measure = True
 
 BACKLOG_MESSAGES = 64  # that are not retained
 BACKLOG_BYTES = 256 * 1024  # of their payloads; one message may always wait, whatever its size
@@ -80,7 +74,7 @@ class Backlog:
         return self._remove(next(iter(self.waiting)))
 
     def supersede(self, newer: Message) -> int:
-        """Drop what waits on the topic of a DELIVERED message that is sent ahead: it is stale (T8). Return how many."""
+        """Drop messages that wait on the topic of a DELIVERED one that is sent ahead (T8); return how many."""
         stale = [
             key
             for key, message in self.waiting.items()
@@ -99,7 +93,7 @@ class Backlog:
 
 
 class PendingAck:
-    """The answer to a request, to wait for. The loss of the connection completes it, too."""
+    """An answer to wait for. The loss of the connection completes it, too."""
 
     def __init__(self) -> None:
         self._answered = threading.Event()
@@ -131,7 +125,6 @@ class InFlightTable:
         self._round_trips: deque[float] = deque(maxlen=ROUND_TRIPS)  # the latest, seconds
         self._unacked: dict[int, tuple[str, float]] = {}  # by message id: the topic, and when sent
         self._acked_at = float("-inf")  # the newest acknowledgement
-        self.has_confirmed = False  # the broker, a DELIVERED or a retained message
         self._unconfirmed: dict[str, _Unconfirmed] = {}  # newest retained message of each topic, oldest first
         self._requests: dict[int, tuple[PendingAck, Sequence[str]]] = {}  # unanswered, with the filters of a SUBSCRIBE
         self.answered: list[PendingAck] = []  # and not completed yet
@@ -148,16 +141,16 @@ class InFlightTable:
 
     @property
     def unacked(self) -> int:
-        """How many DELIVERED messages the broker has not acknowledged."""
+        """The number of DELIVERED messages that the broker has not acknowledged."""
         return len(self._unacked)
 
     @property
     def waiting_since(self) -> float | None:
-        """Since when DELIVERED messages wait and none was acknowledged; None if none waits."""
+        """The time since when DELIVERED messages wait and none was acknowledged; None if none waits."""
         return max(next(iter(self._unacked.values()))[1], self._acked_at) if self._unacked else None
 
     def unconfirmed_retained(self) -> list[Message]:
-        """Retained messages the broker may not have, oldest first."""
+        """Return the retained messages that the broker may not have, oldest first."""
         return [entry.message for entry in self._unconfirmed.values()]
 
     def accept(self, message: Message) -> None:
@@ -181,10 +174,10 @@ class InFlightTable:
                 entry.ping = self._ping_number + 1
 
     def acknowledge(self, mid: int, now: float) -> float | None:
-        """Process a PUBACK: when its message was sent; None if it belongs to no known message."""
+        """Process a PUBACK; return when its message was sent, None if it belongs to no known message."""
         if mid not in self._unacked:
             return None
-        self._acked_at, self.has_confirmed = now, True
+        self._acked_at = now
         topic, sent_at = self._unacked.pop(mid)
         if topic in self._unconfirmed and self._unconfirmed[topic].mid == mid:
             del self._unconfirmed[topic]
@@ -195,13 +188,16 @@ class InFlightTable:
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
-        """Return the bytes by topic of what was written lately, and was its first message or largest, not yet read."""
-        found: dict[str, int] = {}
+        """Return the bytes by topic of lately written messages that no answer to a ping has confirmed.
+
+        They are the first messages of their topics on this connection, or larger than those before.
+        """
+        sizes: dict[str, int] = {}
         for written in (*(written for _, _, written in self._pings), self._written):
             for topic, (at, size) in written.items():
                 if at >= now - WINDOW_S - self.round_trip_s:
-                    found[topic] = max(size, found.get(topic, 0))
-        return found
+                    sizes[topic] = max(size, sizes.get(topic, 0))
+        return sizes
 
     # -- requests and pings
 
@@ -210,7 +206,7 @@ class InFlightTable:
         self._requests[mid] = ack, filters
 
     def answer(self, mid: int) -> Sequence[str]:
-        """Process a SUBACK or UNSUBACK: returns which filters are subscribed to, or refused."""
+        """Process a SUBACK or UNSUBACK; return the filters that it answers."""
         if mid not in self._requests:
             return ()
         ack, filters = self._requests.pop(mid)
@@ -219,7 +215,7 @@ class InFlightTable:
 
     @property
     def asked(self) -> list[str]:
-        """The filters of each SUBSCRIBE that is not answered."""
+        """The filters of all SUBSCRIBEs that are not answered."""
         return [filter_ for _, filters in self._requests.values() for filter_ in filters]
 
     def complete(self) -> None:
@@ -246,7 +242,6 @@ class InFlightTable:
             _note(self._accepted, topic, at, max(size, SMALL))
         for topic in [t for t, entry in self._unconfirmed.items() if entry.ping and entry.ping <= self._pong_number]:
             del self._unconfirmed[topic]
-            self.has_confirmed = True
         if ack is not None:
             self.answered.append(ack)
 
@@ -255,18 +250,18 @@ class InFlightTable:
 
     @property
     def round_trip_s(self) -> float:
-        """The shortest recent one: an answer that a stalled connection delayed gives the next stall no extra time."""
+        """The shortest recent round trip: a delayed answer gives the next stall no extra time."""
         return min(self._round_trips, default=0.0)
 
     def newest_answer(self, now: float) -> tuple[int, float]:
-        """Return how many pings were answered, and how long the newest answer took, or the next one if longer."""
+        """Return the number of answered pings, and how long the newest answer took, or the next one if longer."""
         waits = now - self._pings[0][0] if self._pings else 0.0
         return self._pong_number, max(self._newest_s, waits)
 
     def end(self) -> None:
         """Complete everything: no answer can come any more."""
-        first = self._pings[0][2] if self._pings else self._written
-        self.lost_bytes = max((size for _, size in first.values()), default=0)
+        unanswered = self._pings[0][2] if self._pings else self._written
+        self.lost_bytes = max((size for _, size in unanswered.values()), default=0)
         self.complete()
         for ack in [*(ack for ack, _ in self._requests.values()), *(ack for _, ack, _ in self._pings if ack)]:
             ack.complete()
@@ -282,24 +277,19 @@ def _note(table: dict[str, tuple[float, int]], topic: str, at: float, size: int)
 
 
 def unconfirmed_bytes(sock: socket.socket) -> int:
-    """Return bytes the kernel has accepted and the other side's TCP has not acknowledged, sent or not (SIOCOUTQ).
-
-    0 where the system does not say.
-    """
-    return _kernel_bytes(sock, "TIOCOUTQ")
+    """Return bytes the kernel has accepted and the other side's TCP has not acknowledged, sent or not (SIOCOUTQ)."""
+    return _kernel_bytes(sock, termios.TIOCOUTQ)
 
 
 def readable_bytes(sock: socket.socket | None) -> int:
-    """Return bytes that the kernel has received and we have not read (FIONREAD); 0 where the system does not say."""
-    return 0 if sock is None else _kernel_bytes(sock, "FIONREAD")
+    """Return bytes that the kernel has received and we have not read (FIONREAD)."""
+    return 0 if sock is None else _kernel_bytes(sock, termios.FIONREAD)
 
 
-def _kernel_bytes(sock: socket.socket, request: str) -> int:
+def _kernel_bytes(sock: socket.socket, request: int) -> int:
     size = bytearray(4)
-    if not _can_measure:
-        return 0
     with suppress(OSError, ValueError):  # closed, or no TCP
-        fcntl.ioctl(sock.fileno(), getattr(termios, request), size)
+        fcntl.ioctl(sock.fileno(), request, size)
     return int.from_bytes(size, sys.byteorder)
 
 

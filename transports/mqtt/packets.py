@@ -36,7 +36,7 @@ _TEXTS = {0x03: 1, 0x08: 1, 0x09: 1, 0x12: 1, 0x15: 1, 0x16: 1, 0x1A: 1, 0x1C: 1
 
 
 class MalformedError(Exception):
-    """What the other side sends is no MQTT. Its text says what is wrong."""
+    """Error for bytes that are no MQTT. Its text says what is wrong."""
 
 
 # -- what a client writes
@@ -63,7 +63,7 @@ def connect(
     username: str | None,
     password: str | None,
 ) -> bytes:
-    """CONNECT with a clean session. ``bridge``: in bridge mode, which is 3.1.1's only."""
+    """Return a CONNECT with a clean session. ``bridge``: in bridge mode, which is 3.1.1's only."""
     flags, payload = _CLEAN, _text(client_id)
     properties = b"\0" if modern else b""
     if will is not None:
@@ -82,7 +82,7 @@ def connect(
 def publish(
     topic: str, payload: bytes, qos: int, mid: int, *, retain: bool, modern: bool, expires_s: int | None
 ) -> bytes:
-    """PUBLISH; ``mid`` counts with QoS 1 only, ``expires_s`` with MQTT 5 only. Hot."""
+    """Return a PUBLISH; ``mid`` counts with QoS 1 only, ``expires_s`` with MQTT 5 only. Hot."""
     name = topic.encode()
     head = len(name).to_bytes(2, "big") + name
     if qos:
@@ -96,13 +96,18 @@ def publish(
 
 
 def subscribe(mid: int, filters: Iterable[Filter], *, modern: bool) -> bytes:
-    wanted = b"".join(_text(one.text) + bytes((_options(one) if modern else one.qos,)) for one in filters)
-    return _packet(_SUBSCRIBE, mid.to_bytes(2, "big"), b"\0" if modern else b"", wanted)
+    options = _options if modern else _qos
+    wanted = [_text(filter_.text) + bytes((options(filter_),)) for filter_ in filters]
+    return _packet(_SUBSCRIBE, mid.to_bytes(2, "big"), b"\0" if modern else b"", *wanted)
 
 
-def _options(one: Filter) -> int:
-    options = one.qos | (_NO_LOCAL if one.no_local else 0) | (_AS_PUBLISHED if one.as_published else 0)
-    return options | (0 if one.sends_retained else _NO_RETAINED)
+def _qos(filter_: Filter) -> int:
+    return filter_.qos
+
+
+def _options(filter_: Filter) -> int:
+    options = filter_.qos | (_NO_LOCAL if filter_.no_local else 0) | (_AS_PUBLISHED if filter_.as_published else 0)
+    return options | (0 if filter_.sends_retained else _NO_RETAINED)
 
 
 def unsubscribe(mid: int, filters: Iterable[str], *, modern: bool) -> bytes:
@@ -139,7 +144,7 @@ def _variable(size: int) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """What a CONNACK without an error says; None: nothing."""
+    """The properties of a CONNACK without an error; None: not given."""
 
     max_packet: int | None = None  # bytes that the broker takes
     receive_maximum: int | None = None  # messages of QoS 1 that may be unacknowledged
@@ -148,7 +153,7 @@ class Accepted:
 
 
 class Listener(Protocol):
-    """Is called with what was read, in the order of the packets."""
+    """Handlers of packets, called in the order of the packets."""
 
     def on_accepted(self, accepted: Accepted) -> None: ...
 
@@ -156,10 +161,10 @@ class Listener(Protocol):
         """Take a CONNACK with an error; ``code`` is 3.1.1's or MQTT 5's, each as the broker sent it."""
 
     def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
-        """``first`` is the first byte of the packet, with QoS and retain."""
+        """Take a PUBLISH; ``first`` is the first byte of the packet, with QoS and retain."""
 
     def on_puback(self, mid: int, code: int) -> None:
-        """``code`` is MQTT 5's; from 128 on it is a refusal."""
+        """Take a PUBACK; ``code`` is MQTT 5's, from 128 on a refusal."""
 
     def on_answer(self, mid: int, codes: bytes) -> None:
         """Take a SUBACK, with a code for each filter, or an UNSUBACK; from 128 on a code is a refusal."""
@@ -176,7 +181,7 @@ class Listener(Protocol):
 
 
 class Quota(Protocol):
-    """Counts the messages that the broker has not acknowledged; it is called before the listener."""
+    """A count of the messages that the broker has not acknowledged; it is called before the listener."""
 
     def begin(self, most: int) -> None:
         """Note how many of them the broker takes."""
@@ -190,7 +195,7 @@ class Reader:
     def __init__(self, listener: Listener, quota: Quota, *, modern: bool) -> None:
         self.acks = bytearray()
         self._listener, self._quota, self._modern = listener, quota, modern
-        self._data, self._at = b"", 0  # what was not read yet begins there
+        self._data, self._at = b"", 0  # received bytes, and where those begin that are not read yet
         self._partial = bytearray()  # a packet that is not whole
         self._needed = 0  # bytes of it until more can be read
         self._discarded = 0  # bytes of a long packet that still come
@@ -207,7 +212,7 @@ class Reader:
         return len(self._partial)
 
     def feed(self, data: bytes) -> None:
-        """Take what was received; to be called when nothing is `unread`."""
+        """Take received bytes; call it when nothing is `unread`."""
         if self._discarded:
             data = self._discard(data)
         if self._partial:
@@ -219,7 +224,7 @@ class Reader:
         self._data, self._at = data, 0
 
     def read(self, most: int) -> int:
-        """Hand up to ``most`` whole packets to the listener; returns how many. Raises MalformedError. Hot."""
+        """Hand up to ``most`` whole packets to the listener; return how many. Raises MalformedError. Hot."""
         data, end, count = self._data, len(self._data), 0
         if not data:
             return 0
@@ -258,13 +263,13 @@ class Reader:
         return count
 
     def _keep(self, size: int) -> None:
-        """Wait for the rest of a packet, of which ``size`` bytes are needed."""
+        """Keep the beginning of a packet until it has ``size`` bytes."""
         self._partial += self._data[self._at :]
         self._needed = size
         self._data, self._at = b"", 0
 
     def _publish(self, data: bytes, first: int, start: int, stop: int) -> None:
-        """Hot."""
+        """Hand a PUBLISH to the listener. Hot."""
         end = start + 2 + int.from_bytes(data[start : start + 2], "big")
         body, topic = end, data[start + 2 : end]
         qos = first & ANY_QOS
@@ -302,7 +307,7 @@ class Reader:
             self._listener.on_disconnect(body[0] if body else 0)
 
     def _properties_size(self, body: bytes) -> int:
-        """Return bytes of the properties behind the first two bytes, with their length; 0 on 3.1.1."""
+        """Return the number of bytes of the properties behind the first two bytes; 0 on 3.1.1."""
         if not self._modern:
             return 0
         size, start = _read_variable(body, 2)
@@ -312,9 +317,8 @@ class Reader:
         if body[1]:
             self._listener.on_refused(body[1])
             return
-        found = properties(body[2 : 2 + self._properties_size(body)])
-        wanted = (_MAXIMUM_PACKET, _RECEIVE_MAXIMUM, _MAXIMUM_QOS, _RETAIN_AVAILABLE)
-        accepted = Accepted(*map(found.get, wanted))
+        given = properties(body[2 : 2 + self._properties_size(body)])
+        accepted = Accepted(*map(given.get, (_MAXIMUM_PACKET, _RECEIVE_MAXIMUM, _MAXIMUM_QOS, _RETAIN_AVAILABLE)))
         if accepted.receive_maximum is not None:
             self._quota.begin(accepted.receive_maximum)
         self._listener.on_accepted(accepted)
@@ -335,7 +339,7 @@ class Reader:
         self.feed(data[at:])
 
     def _discard(self, data: bytes) -> bytes:
-        """Returns what comes after the long packet."""
+        """Discard bytes of a long packet; return those after it."""
         rest = data[self._discarded :]
         self._discarded -= len(data) - len(rest)
         if not self._discarded:
@@ -350,7 +354,7 @@ _SHORTEST = {_CONNACK: 2, _PUBACK: 2, _PUBREL: 2, _SUBACK: 3, _UNSUBACK: 2, _PIN
 
 
 def _read_variable(data: bytes, at: int) -> tuple[int, int]:
-    """Return a length, and where what it counts begins; -1: its end is missing. Raises MalformedError."""
+    """Return a length, -1 if its end is missing, and the place after it. Raises MalformedError."""
     value = shift = 0
     for byte in data[at : at + 4]:
         at += 1
@@ -365,19 +369,19 @@ def _read_variable(data: bytes, at: int) -> tuple[int, int]:
 
 def properties(data: bytes) -> dict[int, int]:
     """Return MQTT 5's properties with numbers as values, by their own numbers. ``data`` begins with their length."""
-    found = dict[int, int]()
+    values = dict[int, int]()
     if not data:
-        return found
+        return values
     _, at = _read_variable(data, 0)
     while at < len(data):
         number, at = data[at], at + 1
         size = _SIZES.get(number)
         if size is not None:
-            found[number] = int.from_bytes(data[at : at + size], "big")
+            values[number] = int.from_bytes(data[at : at + size], "big")
             at += size
         elif number in _TEXTS:
             for _ in range(_TEXTS[number]):
                 at += 2 + int.from_bytes(data[at : at + 2], "big")
         else:
             _, at = _read_variable(data, at)  # a subscription identifier, or one that no version has yet
-    return found
+    return values

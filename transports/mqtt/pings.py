@@ -12,12 +12,11 @@ from pebble.transports.settings import MqttSettings
 _CLEAR = 8 * 1024  # bytes ahead of a ping that do not delay it much
 _LEAST_S = 0.05  # between two pings, however short the allowed silence
 _THIN_S, _THIN_TRIPS, _THIN_INTERVAL_S = 5.0, 8, 1.5  # over a thin link: the limit, and between two pings
-_EARLY_S = 0.6  # over a thin link a ping goes along with a message: half of its packets are saved
 _LEAST_SHARE = 0.75  # of the interval between pings: answers to regular ones could not be told apart
 
 
 class Pings:
-    """Decides when a ping is due, and sends it. The connection's lock is held."""
+    """The schedule of pings. The connection's lock is held."""
 
     def __init__(self, settings: MqttSettings, in_flight: InFlightTable, age: ReadAge) -> None:
         self._in_flight, self._age = in_flight, age
@@ -26,13 +25,8 @@ class Pings:
         self._thin_interval_s = min(_THIN_INTERVAL_S, (settings.keepalive_s or inf) / 2)
         self.is_thin = False
         self.due_at = inf  # once accepted they are sent regularly: other answers come only to what we publish
-        self._stalled_since = (
-            age.waiting.checked_at
-        )  # when the last time without reading began, for which a ping was sent
-
-    def joins(self, now: float) -> bool:
-        """True if a ping goes along with the message that is sent at ``now``."""
-        return self.is_thin and now >= self.due_at - _EARLY_S
+        #: The beginning of the last time without reading for which a ping was sent.
+        self._stalled_since = age.waiting.checked_at
 
     def begin(self, now: float) -> None:
         """Note that the broker has accepted us."""
@@ -49,7 +43,7 @@ class Pings:
         client.ping()
 
     def send_after_stall(self, client: Client, now: float) -> None:
-        """Send one for each time without reading: its answer comes after what has waited at the broker meanwhile."""
+        """Send a ping for each time without reading: its answer comes after all that waited at the broker by then."""
         since = self._age.waiting.checked_at
         if since != self._stalled_since:
             self._stalled_since = since
@@ -59,7 +53,7 @@ class Pings:
 
     @property
     def silence_limit_s(self) -> float:
-        """After so long without an answer the broker is silent."""
+        """Seconds without an answer after which the broker counts as silent."""
         if self.is_thin:
             return max(self._silence_s, _THIN_S, _THIN_TRIPS * self._in_flight.round_trip_s)
         return max(self._silence_s, 4 * self._in_flight.round_trip_s)

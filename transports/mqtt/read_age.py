@@ -1,4 +1,4 @@
-"""Since when what is read may have waited (T19): in the kernel, which does not say when it came, or at the broker."""
+"""The time since when received bytes may have waited (T19): in the kernel, which tells no times, or at the broker."""
 
 import socket
 from collections import deque
@@ -17,10 +17,10 @@ _UPLINK_S = 0.5  # TCP's round trips may be so much longer than usual: more may 
 
 
 class WaitingTime:
-    """Since when the bytes that are read next may have waited in a socket; all times are of one clock.
+    """The time since when the bytes that are read next may have waited in a socket; all times are of one clock.
 
-    Known is when the socket was last empty, and how many bytes were in it at another moment: what is read after these
-    has arrived later.
+    Two facts are known: when the socket was last empty, and how many bytes were in it at one moment since. Bytes that
+    are read after those have arrived later than that moment.
     """
 
     def __init__(self, now: float) -> None:
@@ -33,38 +33,38 @@ class WaitingTime:
         self.checked_at, self._counted = now, 0
 
     def found(self, size: int, now: float) -> None:
-        """``size`` bytes are in the socket at ``now``."""
+        """Note that ``size`` bytes are in the socket at ``now``."""
         if self._counted <= 0:
             self.since, self.checked_at, self._counted = self.checked_at, now, size
 
     def read(self, size: int) -> None:
-        """``size`` bytes were taken out of it."""
+        """Note that ``size`` bytes were taken out of it."""
         self._counted -= size
 
 
 class BrokerDelay:
-    """How long what is received now has waited at the broker, which sends the answer to a ping after it.
+    """The time for which messages that are received now have waited at the broker: it answers a ping after them.
 
-    A ping of which the way there took long itself, behind our own data, says nothing. What is usual is no delay: the
-    shortest answer of this connection, and TCP's own round trips, which do not wait for the broker.
+    A ping that itself took long to get there, behind our own data, tells nothing. The usual time of an answer is no
+    delay: that of the shortest one of this connection, and TCP's own round trips, which do not wait for the broker.
 
-    A broker that stood still reads what its clients have sent meanwhile a packet of each in turn: it may have answered
-    all of our pings before it has read the last old message of another client. So if nothing at all has come since an
-    overdue ping was sent, what comes in the next moment counts as having waited as long.
+    A broker that stood still then reads a packet of each client in turn: it may have answered all our pings before it
+    has read the last old message of another client. So if nothing at all has come since an overdue ping was sent, the
+    messages of the next moment count as having waited as long.
 
     Answers carry no number, and mosquitto drops them where a client's queue is full. A later PUBACK shows that, and so
-    do answers that always come right after the newest ping, which is not sent at regular intervals.
+    do answers that always come right after the newest ping, as pings are not sent at regular intervals.
     """
 
     def __init__(self) -> None:
-        #: Unanswered pings: since when what comes before the answer may have waited, when sent, do they say something.
+        #: Unanswered pings: since when messages before the answer may have waited, when sent, and if it tells anything.
         self._asked: deque[tuple[float, float, bool]] = deque()
-        self._read = self._delivered = 0.0, 0.0  # the newest answer: when it was asked for, and how long it took
+        self._read = self._delivered = 0.0, 0.0  # the newest answer: when its ping was sent, and how long it took
         self._shortest = _FAR_S
         self._newest = 0.0  # seconds until the newest answer
         self._came_at = 0.0  # when something was received last
-        self._stall = 0.0  # how long the newest one took, which counts
-        self._until = 0.0  # then
+        self._stall = 0.0  # seconds for which the broker stood still,
+        self._until = 0.0  # which counts until then
         self._prompt = 0  # answers in a row that came right after the newest of several pings
 
     def usual(self, seconds: float) -> None:
@@ -76,7 +76,7 @@ class BrokerDelay:
         self._asked.append((now, now, clear))
 
     def stalled(self, since: float, now: float) -> None:
-        """Note a ping after nothing was read ``since`` then: what fits into no socket has waited at the broker."""
+        """Note a ping after a time without reading: messages beyond the size of a socket have waited at the broker."""
         self._asked.append((since, now, True))
 
     def answered(self, now: float) -> None:
@@ -94,23 +94,23 @@ class BrokerDelay:
             self._newest = 0.0
 
     def acknowledged(self, sent_at: float, now: float) -> None:
-        """Note an answer to what was sent at ``sent_at``: all pings before it have theirs, or these are lost."""
+        """Note an answer to a message sent at ``sent_at``: pings before it were answered, or their answers are lost."""
         while self._asked and self._asked[0][1] < sent_at:
             self._asked.popleft()
         self._newest = min(self._newest, now - sent_at)
 
     def delivered(self) -> None:
-        """Note that all that was read has been delivered."""
+        """Note that all messages that were read have been delivered."""
         self._delivered = self._read
 
     def delivery(self, now: float) -> tuple[float, float]:
-        """Return how long ago the newest answer was asked for before which all is delivered, and how late it is."""
+        """Return how long ago the ping was sent before whose answer all is delivered, and how late that answer is."""
         sent_at, took = self._delivered
         waits = now - self._asked[0][1] if self._asked else 0.0
         return now - sent_at, max(took, waits) - self._shortest
 
     def seconds(self, now: float, round_trip_s: Callable[[], float]) -> float:
-        """Return how long what is received at ``now`` has waited; ``round_trip_s`` asks for TCP's present round trip.
+        """Return how long messages received at ``now`` have waited; ``round_trip_s`` asks for TCP's present round trip.
 
         | case                                      | it has waited                                         |
         |-------------------------------------------|-------------------------------------------------------|
@@ -119,7 +119,7 @@ class BrokerDelay:
         | the broker stood still until a moment ago | as long as it stood still                             |
         | none of these is longer than usual        | not at all                                            |
 
-        The longest counts, less what the way itself takes.
+        The longest counts, less the time of the way itself.
         """
         since = sent_at = now
         if self._asked:  # the oldest that says something
@@ -134,18 +134,18 @@ class BrokerDelay:
 
 
 class ReadAge:
-    """Since when the batch that is being read may have waited, in the socket or at the broker."""
+    """The time since when the batch that is being read may have waited, in the socket or at the broker."""
 
     def __init__(self, now: float) -> None:
         self.waiting, self.delay = WaitingTime(now), BrokerDelay()
-        self.since = now  # the answer
-        self.received_at = now  # before the socket was emptied, or a piece of what is in it taken out
-        #: When there was the last sign that answers are behind retained messages, or behind a long one.
+        self.since = now  # that time
+        self.received_at = now  # a time before bytes were taken out of the socket
+        #: The last sign that answers are behind retained messages, or behind a long one.
         self.arriving_at = -inf
         self.has_retained = False  # there are retained messages in the batch
 
     def update(self, now: float, sock: socket.socket | None) -> None:
-        """Set `since` for what is read next, at ``now``."""
+        """Set `since` for the bytes that are read next, at ``now``."""
         self.since = self.waiting.since
         waited = self.delay.seconds(now, lambda: 0.0 if sock is None else present_round_trip_s(sock))
         if waited > 0:
@@ -155,6 +155,6 @@ class ReadAge:
         self.arriving_at = clock.since_boot()
 
     def note_handled(self) -> None:
-        """Retained messages were handled: that may have taken longer than an answer may."""
+        """Note that retained messages were handled: that may have taken longer than an answer may."""
         self.note_arriving()
         self.has_retained = False

@@ -38,14 +38,14 @@ class Trial(NamedTuple):
 
 
 class RefusedTopics:
-    """``vital``: filters of topics that are never withheld, except for their size. The lock of publishing guards it."""
+    """Topics that are withheld; ``vital``: filters of those that are so for their size only. Publishing locks it."""
 
     def __init__(self, client_id: str, vital: tuple[str, ...]) -> None:
         self._client_id, self._vital = client_id, vital
         self._losses: dict[str, int] = {}  # in a row, by topic
         self.withheld: dict[str, Withheld] = {}
         self._trial: Trial | None = None
-        self._quiet_at = -inf  # from then on what else is sent was accepted, so that a trial shows something
+        self._quiet_at = -inf  # from then on other messages were accepted, so that a trial shows something
         #: Topics on which the broker takes no messages: why, and when that was last in the log.
         self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)
 
@@ -66,7 +66,7 @@ class RefusedTopics:
         return now >= max(self.withheld[topic].tried_at, self._quiet_at)
 
     def due(self, own: Mapping[str, Message], where: str, now: float) -> Iterator[Message]:
-        """Yield the retained message that is to be sent now, because its topic is tried; end the trial before."""
+        """End a trial that has succeeded, and yield the retained message of the topic that is tried next."""
         if self._trial is not None:
             if now < self._trial.ends_at:
                 return
@@ -81,7 +81,7 @@ class RefusedTopics:
                 return
 
     def note_loss(self, where: str, written: Mapping[str, int] | None, now: float) -> None:
-        """Note a lost connection. ``written``: bytes by topic, just before; None: for no message's sake."""
+        """Note a lost connection. ``written``: bytes by topic, just before; None: it was not lost for a message."""
         written, trial, self._trial = written or {}, self._trial, None
         self._quiet_at = now + QUIET_S
         if trial is not None and {topic for topic in written if not self._is_vital(topic)} == {trial.topic}:

@@ -19,7 +19,7 @@ from pebble.transports.mqtt.dialler import Dialler
 from pebble.transports.mqtt.ending import Lost, Silent
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import PendingAck
-from pebble.transports.mqtt.refused_topics import LARGE, RefusedTopics
+from pebble.transports.mqtt.refused_topics import RefusedTopics
 from pebble.transports.settings import MqttSettings
 
 log = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ _IDLE_S = 60.0  # the connection wakes up earlier, for its pings
 
 
 class _Run:
-    """One run of the network thread, and what other threads want of it."""
+    """One run of the network thread, and requests of other threads to it."""
 
     def __init__(self, target: Callable[[_Run], None], name: str) -> None:
         self.stopping = threading.Event()
@@ -51,7 +51,7 @@ class _Run:
 
 
 class MqttTransport(Transport):
-    """docs/transports.md explains how it implements each promise."""
+    """A client of an MQTT broker; docs/transports.md explains how it implements each promise."""
 
     client_class: ClassVar[type[Client]] = Client
 
@@ -112,7 +112,7 @@ class MqttTransport(Transport):
         self._network.thread.start()
 
     def _close(self, will: Message | None) -> None:
-        """Do not wait for a thread that is connecting: it ends by itself, within HANDSHAKE_S."""
+        """End the network thread. One that is connecting is not waited for: it ends by itself, within HANDSHAKE_S."""
         run = self._network
         if run is None:
             return
@@ -262,29 +262,17 @@ class MqttTransport(Transport):
                 if self._refused.withheld:
                     self._try_withheld(connection)
         except Lost as lost:
-            self._note_loss(connection, lost, held=time.monotonic() > tried_at)
+            self._note_loss(connection, lost)
             raise
 
-    def _note_loss(self, connection: Connection, lost: Lost, *, held: bool) -> None:
-        """Note what the broker may have closed the connection for: what it lacks, or a message on a topic.
-
-        First what it lacks that all such messages need: else each of their topics would seem to be at fault. ``held``:
-        it has lasted for a while.
-        """
-        now = time.monotonic()
+    def _note_loss(self, connection: Connection, lost: Lost) -> None:
+        """Note which messages the broker may have closed the connection for."""
         written = None if isinstance(lost, Silent) else connection.written_before_loss()
-        lacks = written is not None and self._dialler.limits.note_loss(
-            unconfirmed=connection.unacked > 0 or bool(connection.unconfirmed_retained()),
-            confirmed=connection.has_confirmed,
-            held=held,
-            now=now,
-        )
-        if not lacks or max((written or {}).values(), default=0) >= LARGE:
-            with self._publishing:
-                self._refused.note_loss(connection.where, written, now)
+        with self._publishing:
+            self._refused.note_loss(connection.where, written, time.monotonic())
 
     def _try_withheld(self, connection: Connection) -> None:
-        """Send what is retained on a topic that is tried again."""
+        """Send the retained message of a topic that is tried again."""
         with self._publishing:
             for message in self._refused.due(self._own, connection.where, time.monotonic()):
                 self._own.remember(message, sent=self._send(message, False))
@@ -297,7 +285,7 @@ class MqttTransport(Transport):
         self._dialler.reported = limits
 
     def _synchronize(self, connection: Connection, stopping: threading.Event) -> None:
-        """Query which of our retained messages the broker has, subscribe, and send what it lacks."""
+        """Query which of our retained messages the broker has, subscribe, and send those that it lacks."""
         self._renew()
         self._own_message_filter.begin()
         if self._dialler.stalled:
@@ -319,7 +307,7 @@ class MqttTransport(Transport):
         self._dialler.stalled = False
 
     def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
-        """Own topics of which the broker has our newest retained message, or that others publish on as well.
+        """Return own topics that need not be sent again: the broker has our newest message, or others publish there.
 
         A ping's answer follows these messages (QoS 0).
         """
@@ -329,29 +317,31 @@ class MqttTransport(Transport):
             unsure = self._own.shared | {
                 topic for topic, message in own.items() if not self._accepts(connection, message)
             }
-        found = self._find(connection, list(own), stopping)
-        if self.will is not None and found.get(self.will.topic) == self.will.payload:
-            del found[self.will.topic]  # our own will, published although we were running
-        older = {topic for topic, payload in found.items() if topic not in unsure and payload != own[topic].payload}
+        retained = self._find(connection, list(own), stopping)
+        if self.will is not None and retained.get(self.will.topic) == self.will.payload:
+            del retained[self.will.topic]  # our own will, published although we were running
+        older = {topic for topic, payload in retained.items() if topic not in unsure and payload != own[topic].payload}
         self.went_back = bool(older)
-        return found.keys() - older
+        return retained.keys() - older
 
     def _find(self, connection: Connection, topics: list[str], stopping: threading.Event) -> dict[str, bytes]:
-        """Return what the broker has retained on these topics."""
-        found: dict[str, bytes] = {}
+        """Return the payloads that the broker retains on these topics."""
+        retained: dict[str, bytes] = {}
         if not topics:
-            return found
+            return retained
         connection.subscribe([(topic, False) for topic in topics], QoS.LATEST)
 
         def note(messages: list[Message]) -> None:
-            found.update((one.topic, one.payload) for one in messages if one.retain and one.topic in topics)
+            for message in messages:
+                if message.retain and message.topic in topics:
+                    retained[message.topic] = message.payload
 
         self._await(connection, connection.ping(), stopping, note)
         connection.unsubscribe(topics)
-        return found
+        return retained
 
     def _accepts(self, connection: Connection, message: Message) -> bool:
-        """True if the broker has, as far as is known, accepted this retained message."""
+        """True if the broker takes this retained message, as far as is known."""
         return connection.takes(message) and self._refused.accepts(message)
 
     def _await(

@@ -1,4 +1,4 @@
-"""Makes a Zenoh callback of a function by ``direct(f)``: it runs on the thread that receives, which is the fastest way.
+"""Makes Zenoh callbacks of functions by ``direct(f)``: they run on the thread that receives, which is the fastest way.
 
 Two things about these threads are looked after.
 
@@ -42,7 +42,7 @@ ensure_state = ctypes.pythonapi.PyGILState_Ensure
 
 
 class Calls:
-    """How many callbacks one thread has begun and ended, and what the guard found when it looked last."""
+    """The callbacks that one thread has begun and ended, by number, and those that the guard has seen."""
 
     __slots__ = ("begun", "ended", "known", "ran")
 
@@ -52,7 +52,7 @@ class Calls:
 
 
 class Guard:
-    """Looks for callbacks that take long, and has another of Zenoh's threads wait for the sockets in their place."""
+    """A watch for callbacks that take long: it has another of Zenoh's threads wait for the sockets in their place."""
 
     def __init__(self) -> None:
         self.rests = True
@@ -64,17 +64,17 @@ class Guard:
         self._sessions: list[zenoh.Session] = []
 
     def use(self, session: zenoh.Session) -> None:
-        """Any session will do: Zenoh's threads belong to all of them."""
+        """Note a session by which a thread can be given work: any will do, as Zenoh's threads belong to all."""
         with self._lock:
             self._sessions.append(session)
 
     def forget(self, session: zenoh.Session) -> None:
-        """To be called before ``session`` is closed: what refers to it keeps its memory and files."""
+        """Forget a session, before it is closed: a reference to it keeps its memory and files."""
         with self._lock:
-            self._sessions = [one for one in self._sessions if one is not session]
+            self._sessions = [other for other in self._sessions if other is not session]
 
     def watch(self, calls: Calls) -> bool:
-        """False if there are enough."""
+        """Look after a thread; False if there are too many."""
         with self._lock:
             if len(self._calls) >= MOST:
                 return False
@@ -109,16 +109,16 @@ class Guard:
             self.rests, quiet = False, 0
 
     def _look(self) -> bool:
-        """True if a callback has begun since the last time, or is still running."""
-        found = self._suspects = False
+        """Look for callbacks; True if one has begun since the last time, or is still running."""
+        active = self._suspects = False
         for calls in self._calls:
             begun, runs = calls.begun, calls.begun != calls.ended
-            found = found or runs or begun != calls.known
+            active = active or runs or begun != calls.known
             if runs and calls.ran:  # the same one, or many without a pause
                 self._help()
             self._suspects = self._suspects or runs
             calls.known, calls.ran = begun, runs
-        return found
+        return active
 
     def _help(self) -> None:
         self.helped += 1
@@ -140,7 +140,7 @@ use, forget = guard.use, guard.forget
 
 
 def _begin() -> Calls:
-    """Begin with the first callback on this thread, and return its state."""
+    """Note the first callback on this thread, and return the count of its callbacks."""
     calls = _own.calls = Calls()
     # A thread of Python's has its state, and waits for no sockets: it publishes to a handler of its own session.
     if isinstance(threading.current_thread(), threading._DummyThread) and guard.watch(calls):
@@ -149,7 +149,7 @@ def _begin() -> Calls:
 
 
 def direct(function: Callable[[Any], None], at_end: Callable[[], None] | None = None) -> zenoh.handlers.Callback[Any]:
-    """Run on Zenoh's receiving thread. Zenoh's default would queue, and then block that thread for all.
+    """Return a callback that runs on Zenoh's receiving thread; by default Zenoh queues, and then blocks that thread.
 
     ``at_end`` is called when nothing can come any more.
     """

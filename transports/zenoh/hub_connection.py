@@ -1,4 +1,4 @@
-"""What one client tells the hub and asks it: its will, its retained messages, and those of all."""
+"""The messages of one client to the hub: its will, its retained messages, and queries for those of all."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GOODBYE_S = 0.3  # the longest wait for an answer when closing
 
 
 class HubConnection:
-    """A new connection begins every time a hub appears: `watch` says when. ``name`` is this client's in a session."""
+    """The connection to a hub; a new one begins each time `watch` sees a hub. ``name`` names this client's session."""
 
     def __init__(
         self, client_id: str, will: Message | None, own: OwnRetained, count: Callable[[], object], account: str = ""
@@ -39,11 +39,11 @@ class HubConnection:
         self._connection = 0
 
     def open(self) -> None:
-        """Begin when the client opens, once more perhaps."""
+        """Begin when the client is opened, or opened again."""
         self.name, self.watch = "", HubWatch()
 
     def renew(self) -> None:
-        """Begin a new connection: no answer to an older query is offered any more. The lock is held."""
+        """Begin a new connection: answers to older queries are dropped from now on. The lock is held."""
         self._connection += 1
 
     # -- sending
@@ -66,17 +66,17 @@ class HubConnection:
         session.put(wire.RETAINED + topic_to_key(message.topic), message.payload, attachment=stamp.pack(), **wire.BLOCK)
 
     def put_removals(self, session: zenoh.Session, topics: Iterable[str]) -> None:
-        """Send once more which of ``topics`` we have removed."""
+        """Send the removals of those of ``topics`` that we have removed, once more."""
         for topic in [topic for topic in topics if topic in self._removed]:
             self._put(session, Message(topic, b"", QoS.DELIVERED, retain=True), self.retained_count)
 
     # -- queries
 
     def hello(self) -> bytes:
-        """Our will, and what we have published."""
+        """Return a hello, with our will and digests of our retained messages."""
         gone: dict[str, int | None] = {topic_to_key(topic): None for topic in self._removed}
         retained: dict[str, int | None] = {
-            topic_to_key(topic): wire.digest(own.payload) for topic, own in self._own.items() if own.payload
+            topic_to_key(topic): wire.digest(message.payload) for topic, message in self._own.items() if message.payload
         }
         return wire.encode(wire.Hello(self.name, self.retained_count, self._will, gone | retained))
 

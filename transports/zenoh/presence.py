@@ -1,4 +1,4 @@
-"""Which hubs and peers are there: a watch on what appears and disappears, and a barrier that waits for answers."""
+"""The presence of hubs and peers: a watch on their tokens and connections, and a barrier that waits for answers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LOST_SESSIONS_LIMIT = 1000  # sessions whose return would be noticed
 
 
 class HubView(msgspec.Struct, frozen=True):
-    """``version`` changes with every event, ``connection`` only when a hub appears."""
+    """The hubs that are there. ``version`` changes with every event, ``connection`` only when a hub appears."""
 
     version: int
     connection: int
@@ -29,7 +29,7 @@ class HubView(msgspec.Struct, frozen=True):
 
 
 class HubWatch:
-    """Watches for hubs and for connections that were down. Level-triggered: a waiter gets the newest view."""
+    """A watch for hubs, and for connections that were down. Level-triggered: a waiter gets the newest view."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -72,7 +72,7 @@ class HubWatch:
                 self._change(hubs=self._view.hubs - {name})
 
     def _on_connection(self, event: zenoh.TransportEvent) -> None:
-        """Reconnect to a session that comes back under its id: it was running, and we have missed its messages."""
+        """Note a session that comes back under its id: it was running, and we have missed its messages."""
         session = str(event.transport.zid)
         with self._changed:
             if event.kind == zenoh.SampleKind.DELETE:
@@ -89,14 +89,14 @@ class HubWatch:
 
 
 class Barrier:
-    """Waits until every sibling knows this session's declarations, and this session theirs (T3).
+    """A wait until every sibling knows this session's declarations, and this session theirs (T3).
 
     A query is answered only after the declarations sent before it on the same connection have been processed, in both
     directions. So a sibling that has answered ``@sync/<name>`` will send us what we subscribed to, and receive what we
     publish. The answer carries ``retained_count()``. Siblings know this session by its token.
 
-    ``by_name``: each is asked by its name. For clients of hubs elsewhere: there all the others would answer, too
-    (measured with 200 of them: 3.3 to 7.3 s until one had opened, asked by name 1.4 s).
+    ``by_name``: each sibling is asked by its name, for clients of hubs elsewhere: else all others there would answer,
+    too (measured with 200 of them: 3.3 to 7.3 s until one had opened, asked by name 1.4 s).
     """
 
     def __init__(
@@ -119,8 +119,8 @@ class Barrier:
         while wanted := self._missing(expected(), answers):
             left = end - time.monotonic()
             if left <= 0:
-                who = ", ".join(sorted(wanted.values()))
-                log.warning("%s did not answer within %.1f s and will not be waited for again", who, timeout)
+                names = ", ".join(sorted(wanted.values()))
+                log.warning("%s did not answer within %.1f s and will not be waited for again", names, timeout)
                 self._silent |= wanted.keys()
                 break
             if not self._ask(set(wanted), answers, left):
@@ -130,7 +130,7 @@ class Barrier:
         return answers
 
     def _missing(self, expected: dict[str, str], answers: dict[str, int]) -> dict[str, str]:
-        return {name: who for name, who in expected.items() if name not in self._silent and name not in answers}
+        return {name: text for name, text in expected.items() if name not in self._silent and name not in answers}
 
     def _ask(self, wanted: set[str], answers: dict[str, int], left: float) -> bool:
         done = threading.Event()
@@ -148,9 +148,9 @@ class Barrier:
             if len(ended) == len(asked):
                 done.set()
 
-        for one in asked:
+        for name in asked:
             self._session.get(
-                SYNC + one,
+                SYNC + name,
                 zenoh.handlers.Callback(take, end, indirect=False),
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,

@@ -1,4 +1,4 @@
-"""Sends the live messages of one client."""
+"""Publishers of the live messages of one client."""
 
 import threading
 from collections.abc import Callable
@@ -17,12 +17,12 @@ _V = TypeVar("_V")
 
 
 class Publishers:
-    """Declares publishers for topics that this client publishes often. ``is_invented``: strangers choose the topic."""
+    """Publishers, declared for topics that this client publishes often. ``is_invented``: strangers choose the topic."""
 
     def __init__(self, is_invented: Callable[[str], bool]) -> None:
         self._is_invented = is_invented
         self.declared: dict[tuple[str, QoS], zenoh.Publisher] = {}
-        self.thread = 0  # the one that is inside `put`
+        self.thread = 0  # that is inside `put`
         # By topic: with two priorities, messages of a topic would overtake each other (T3).
         self._urgent: dict[str, bool] = {}
 

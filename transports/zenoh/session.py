@@ -9,17 +9,15 @@ import signal
 import socket
 import threading
 import weakref
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Final, Protocol
 
 import zenoh
 
 from pebble.errors import TransportError
 from pebble.transports.settings import TlsSettings, ZenohSettings
-from pebble.transports.zenoh import callbacks
-
-if TYPE_CHECKING:
-    from pebble.transports.zenoh.access import Access
+from pebble.transports.zenoh import callbacks, wire
 
 # By default connections are accepted, opened and read on separate runtimes: a received message wakes a thread that only
 # wakes another one (11.3 wake-ups in a round trip instead of 7.1, 1.15 times the time one way at 20 Hz). Sending has
@@ -39,6 +37,14 @@ _RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor":
 _TLS_SCHEMES = ("tls/", "quic/")
 _SAFE_SCHEMES = (*_TLS_SCHEMES, "unixsock-stream/")
 _LOOPBACK = ("tcp/127.0.0.1:", "tcp/localhost:", "tcp/[::1]:")
+
+# Of Zenoh's access_control: all kinds of messages, the connections of this machine, and the protocols of others.
+ALL_MESSAGES: Final = (
+    *("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable"),
+    *("liveliness_token", "liveliness_query", "declare_liveliness_subscriber"),
+)
+LOCAL: Final[Mapping[str, Any]] = {"id": "this machine", "link_protocols": ["unixsock-stream", "tcp"]}
+OTHER_MACHINES: Final = ["tls", "quic"]
 
 
 class _Closable(Protocol):
@@ -60,17 +66,18 @@ def _numbered(endpoint: str) -> str:
 
 
 def session_config(
-    settings: ZenohSettings, mode: str, *, listen: list[Path], connect: list[Path], access: "Access | None" = None
+    settings: ZenohSettings, mode: str, *, listen: list[Path], connect: list[Path], rules: Mapping[str, Any] = {}
 ) -> str:
-    """Return the configuration of a ``mode`` (router, peer or client) on unix sockets plus the settings' own endpoints.
+    """Return the configuration of a ``mode`` (router, peer or client), on unix sockets and the settings' endpoints.
 
-    ``access``: of a hub, what certificates allow. Raises TransportError for endpoints or certificates that can never
-    work.
+    ``rules``: of a hub, what certificates allow, instead of the settings' ``allowed_names``. Raises TransportError for
+    endpoints or certificates that can never work.
     """
     for name, endpoints in (("listen", settings.listen), ("connect", settings.connect)):
         for endpoint in endpoints:
             _check_endpoint(name, endpoint, settings.tls)
-    config = json.dumps(_config(settings, mode, listen, connect) | _access_control(settings.allowed_names, access))
+    rules = rules or _access_control(settings.allowed_names)
+    config = json.dumps(_config(settings, mode, listen, connect) | {**rules})
     try:
         zenoh.Config.from_json5(config)
     except zenoh.ZError as error:
@@ -154,14 +161,24 @@ def _tls(tls: TlsSettings | None) -> dict[str, Any]:
     return {"tls": link}
 
 
-def _access_control(names: tuple[str, ...] | None, access: "Access | None") -> dict[str, Any]:
-    if access is not None:
-        return {"access_control": access.control, "qos": access.qos}
+def _access_control(names: tuple[str, ...] | None) -> dict[str, Any]:
+    """Let connections of this machine do everything, and those whose certificate has one of ``names``.
+
+    Zenoh does not refuse the others, but drops all that they send, and sends them nothing.
+    """
     if names is None:
         return {}
-    from pebble.transports.zenoh.access import EVERYTHING, access_control  # only who needs it pays for it
-
-    return {"access_control": access_control([(names, EVERYTHING)])}
+    everything = {"id": "all", "permission": "allow", "flows": ["ingress", "egress"], "messages": ALL_MESSAGES}
+    named = {"id": "named", "link_protocols": OTHER_MACHINES, "cert_common_names": names}
+    subjects = [LOCAL, named] if names else [LOCAL]
+    control = {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [everything | {"key_exprs": wire.ALL_KEYS}],
+        "subjects": subjects,
+        "policies": [{"rules": ["all"], "subjects": [subject["id"] for subject in subjects]}],
+    }
+    return {"access_control": control}
 
 
 # -- forks and exits
@@ -179,7 +196,7 @@ def _refuse_fork() -> None:
 
 
 def check_process(opened_by: int | None) -> None:
-    """Raise TransportError if the session was opened by another process, of which this one is a fork."""
+    """Raise TransportError if the session was opened by another process, from which this one was forked."""
     if opened_by is not None and opened_by != os.getpid():
         raise TransportError("Zenoh does not survive a fork: start child processes with spawn or subprocess")
 

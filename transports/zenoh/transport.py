@@ -47,7 +47,7 @@ _RETRY_S = 0.2
 
 
 class ZenohTransport(Transport):
-    """One client of a robot's Zenoh network. In CONNECTING the hub is away; running peers still receive each other."""
+    """A client of a robot's Zenoh network. In CONNECTING the hub is away; running peers still receive each other."""
 
     def __init__(self, client_id: str, settings: ZenohSettings, *, will: Message | None = None) -> None:
         super().__init__(client_id, will=will)
@@ -186,7 +186,7 @@ class ZenohTransport(Transport):
             seen = view.version
 
     def _synchronize(self, timeout: float) -> dict[str, int]:
-        """Wait until all that run surely know our declarations; return how many retained messages each has sent."""
+        """Wait until all siblings know our declarations; return how many retained messages each has sent."""
         if self._barrier is None:
             return {}
 
@@ -228,7 +228,7 @@ class ZenohTransport(Transport):
         return True
 
     def _send_hello(self, session: zenoh.Session) -> bool:
-        """Store the will at the hub and send what the hub lacks, until it lacks nothing that it has room for."""
+        """Store the will at the hub and send messages that it lacks, until it lacks none that it has room for."""
         end = time.monotonic() + HUB_ANSWER_S
         sent: set[str] = set()
         while (left := end - time.monotonic()) > 0:  # looked at once: Zenoh refuses what is not positive
@@ -243,9 +243,9 @@ class ZenohTransport(Transport):
         return False
 
     def _send_lacking(self, session: zenoh.Session, lacking: set[str]) -> bool:
-        """Send the hub what is pending and what it lacks; False if that is nothing.
+        """Send the hub the messages that are pending and those that it lacks; False if there are none.
 
-        Others receive of it what is news to them.
+        Others receive those that are new to them.
         """
         with self._publishing:
             owed = bool(self._own.pending or lacking)
@@ -254,7 +254,7 @@ class ZenohTransport(Transport):
             return owed
 
     def _refresh(self) -> None:
-        """Query all retained messages, as on a new connection: connections have been down."""
+        """Query all retained messages, as on a new connection, because connections have been down."""
         with self._connecting:
             if self._session is None:
                 return

@@ -90,8 +90,8 @@ def read_live(attachment: zenoh.ZBytes | None) -> LiveStamp:
 class Stamp(msgspec.Struct, frozen=True):
     """The origin of a retained message. ``retained_count`` 0: it was sent again, or made by the hub.
 
-    Both are believed, because a hub is not told which session a message came from. Who may retain on a topic can so
-    have a session pass over that message when it begins, or have a query answered half a second too early.
+    Both are believed, because a hub is not told from which session a message has come. A client that may retain on a
+    topic can therefore have a session pass over its message, or a query answered half a second too early.
     """
 
     qos: QoS
@@ -112,7 +112,7 @@ class Stamp(msgspec.Struct, frozen=True):
 
 
 class Will(msgspec.Struct, frozen=True, array_like=True):
-    """``client`` is the id of the client, which stays the same over restarts, unlike the name of its session."""
+    """The will of a client. Its id ``client`` stays the same over restarts, unlike the name of its session."""
 
     topic: str
     payload: bytes
@@ -126,7 +126,7 @@ class Will(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Hello(msgspec.Struct, frozen=True, array_like=True):
-    """``own`` has a digest for each retained key of this client, None for one it has removed.
+    """The message with which a client begins. ``own`` has a digest for each key that it retains, None for removed ones.
 
     A field may be added at the end: msgspec skips what it does not know.
     """

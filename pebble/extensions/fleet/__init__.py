@@ -6,6 +6,8 @@ EXTENSION = Extension(
     name="fleet",
     needs=("operator", "neighbours"),
     observer="pebble.extensions.fleet.robot_audit:Audit",
+    names="pebble.extensions.fleet.names:CheckedNames",
+    accounts="pebble.extensions.fleet.hub_access:AccountAdmission",
     commands={
         "fleet": Command(
             "pebble.extensions.fleet.commands.group", "give robots and people accounts at a broker", "share", 10

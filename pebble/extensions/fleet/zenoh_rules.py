@@ -5,9 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pebble.contract import CHANNELS, ESTOP, INCOMING, OUTGOING, Kind
 from pebble.contract.names import with_name
 from pebble.extensions.fleet.folder import Fleet
-from pebble.extensions.fleet.roles import Account, ProgramRole, Rule
-from pebble.transports.zenoh import wire
-from pebble.transports.zenoh.access import (
+from pebble.extensions.fleet.hub_access import (
     EVERYTHING,
     IN,
     OUT,
@@ -18,6 +16,8 @@ from pebble.transports.zenoh.access import (
     first,
     written,
 )
+from pebble.extensions.fleet.roles import Account, ProgramRole, Rule
+from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.keymap import filter_to_key
 
 _ANY = "+/+/+"  # the levels of any robot

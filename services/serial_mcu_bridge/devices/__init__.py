@@ -5,7 +5,7 @@ from pebble.extension import Extension
 
 EXTENSION = Extension(
     name="devices",
-    needs=("pebble_serial_v1",),
+    needs=("imu", "pebble_serial_v1"),
     protocols={
         "pebble_serial_v1": SerialProtocol(
             "pebble.services.serial_mcu_bridge.devices.described_bridge:DescribedBridge", describes_itself=True

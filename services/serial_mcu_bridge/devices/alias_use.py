@@ -9,7 +9,7 @@ from pebble.transports import Subscription
 
 
 class AliasUse:
-    """``begin`` starts the use of an alias (and returns its subscription, if it has one), ``end`` ends it."""
+    """The aliases in use; ``begin`` starts the use of one and returns its subscription, if any; ``end`` ends it."""
 
     def __init__(
         self,
@@ -19,7 +19,7 @@ class AliasUse:
         end: Callable[[Alias], None],
         owners: Mapping[str, str],
     ) -> None:
-        """``owners``: the uid that the config names for a channel; no other device has it then."""
+        """Store the arguments; ``owners``: the uid that the config names for a channel; no other device has it then."""
         self._log, self._peers, self._begin, self._end, self._owners = log, peers, begin, end, owners
         self.permitted = False  # other devices have had time to object
         self._device: Device | None = None

@@ -6,7 +6,7 @@ from typing import Any
 
 from pebble import contract as c
 from pebble.contract.payloads import McuManifest
-from pebble.services.serial_mcu_bridge import imu
+from pebble.services.serial_mcu_bridge.imu import reports as imu
 
 #: First levels that no MCU may use: switches and actions of the robot itself, and the devices' generic topics.
 _OWN_FAMILIES = ("flags", "mcu")

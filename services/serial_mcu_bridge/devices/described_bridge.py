@@ -16,7 +16,7 @@ from pebble.services.serial_mcu_bridge.devices.alias_use import AliasUse
 from pebble.services.serial_mcu_bridge.devices.aliases import claims, outlet_feature
 from pebble.services.serial_mcu_bridge.devices.device import Alias, Device, Route
 from pebble.services.serial_mcu_bridge.devices.peers import PeerDevices
-from pebble.services.serial_mcu_bridge.imu import FAMILY, MOTION, ImuReports, ImuWatchdog, measured
+from pebble.services.serial_mcu_bridge.imu.reports import FAMILY, MOTION, ImuReports, ImuWatchdog, measured
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import END
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import (

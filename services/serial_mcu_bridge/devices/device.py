@@ -7,8 +7,8 @@ from typing import Any
 from pebble import contract as c
 from pebble.contract.payloads import McuLocalOnly, McuManifest, McuSample, Payload
 from pebble.runtime.addresses import Addresses
-from pebble.services.serial_mcu_bridge import imu
 from pebble.services.serial_mcu_bridge.devices.aliases import Claims, claims
+from pebble.services.serial_mcu_bridge.imu import reports as imu
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import Reading
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import Direction, Interface, InterfaceKind, Manifest
 
@@ -42,7 +42,7 @@ class Route:
 
 
 class Device:
-    """``payload`` is the manifest to publish: as the MCU sent it, with channels renamed as in the robot's config."""
+    """A described MCU. ``payload`` is its manifest as published, with channels renamed as in the robot's config."""
 
     def __init__(self, manifest: Manifest, addresses: Addresses, reports: imu.ImuReports) -> None:
         self._addresses, self._reports = addresses, reports
@@ -51,7 +51,7 @@ class Device:
         interfaces = tuple(map(self._renamed, manifest.interfaces))
         self.payload: McuManifest = Manifest(manifest.hello, interfaces).payload()
         self.claims: Claims = claims(self.payload, self._robots_channel)
-        self.routes = {one.id: self._route(one) for one in interfaces}
+        self.routes = {interface.id: self._route(interface) for interface in interfaces}
 
     @property
     def has_motion(self) -> bool:
@@ -60,7 +60,7 @@ class Device:
 
     @property
     def local_only(self) -> McuLocalOnly:
-        """Return the topics of its interfaces that stay on the robot."""
+        """The topics of its interfaces that stay on the robot."""
         routes = [route for route in self.routes.values() if route.interface.local_only]
         aliases = [route.alias.claim for route in routes if route.alias is not None]
         return McuLocalOnly(topics=[*(route.generic.suffix for route in routes), *aliases])
@@ -103,11 +103,11 @@ class Device:
         channel = self._robots_channel(claim)
         if channel in (c.IMU_FAST, c.IMU):
             return Alias(claim, channel, interface.profile)
-        own = _channel(interface.channel, interface.kind, payload, retain=interface.retain)
+        claimed = _channel(interface.channel, interface.kind, payload, retain=interface.retain)
         # a payload that must stay on the robot names its device, so that the MQTT bridge recognises it
         profiled = interface.profile in (imu.MOTION, imu.SUMMARY) and not interface.local_only
         fits = profiled and imu.fits(interface.profile, {field.name for field in interface.fields})
-        return Alias(claim, own, interface.profile if fits else "")
+        return Alias(claim, claimed, interface.profile if fits else "")
 
     def _renamed(self, interface: Interface) -> Interface:
         """Return it with the channel's effective name, if the config sets one and the name is valid as a channel."""
@@ -125,7 +125,7 @@ class Device:
 
 def _channel(metric: str, kind: InterfaceKind, payload: Any, *, retain: bool = False) -> c.Channel:
     """Return a channel created at run time. Only a state is retained: a retained sample would be stale."""
-    what, qos = _KINDS[kind]
+    of_contract, qos = _KINDS[kind]
     if kind is InterfaceKind.STATE and retain:
-        what = c.Kind.STATE
-    return c.Channel(metric=metric, kind=what, payload=payload, doc="", qos=qos)
+        of_contract = c.Kind.STATE
+    return c.Channel(metric=metric, kind=of_contract, payload=payload, doc="", qos=qos)

@@ -12,16 +12,17 @@ def holders(path: str) -> list[str]:
 
     Example: ``process 812 (python3) of pebble-control.service``.
     """
-    device, found = os.path.realpath(path), []
+    device, others = os.path.realpath(path), []
     for process in Path("/proc").glob("[1-9]*"):
         files = set()
         with suppress(OSError):  # it has ended, or is another user's
             for number in os.listdir(process / "fd"):  # noqa: PTH208 - a Path for each is slow
                 with suppress(OSError):
                     files.add(os.readlink(f"{process}/fd/{number}"))  # noqa: PTH115
-        if device in files and process.name != str(os.getpid()) and not any(one.endswith(_OTHER_END) for one in files):
+        is_board = any(file.endswith(_OTHER_END) for file in files)
+        if device in files and process.name != str(os.getpid()) and not is_board:
             with suppress(OSError):
                 name = (process / "comm").read_text(encoding="utf-8", errors="replace").strip()
                 unit = (process / "cgroup").read_text(encoding="utf-8").strip().rpartition("/")[2]
-                found.append(f"process {process.name} ({name})" + f" of {unit}" * unit.endswith(".service"))
-    return found
+                others.append(f"process {process.name} ({name})" + f" of {unit}" * unit.endswith(".service"))
+    return others

@@ -11,7 +11,7 @@ class _Waiting(NamedTuple):
 
 
 class Outbox:
-    """One slot for drive lines and one per other kind; a newer line replaces an older one. A line may be a frame.
+    """Slots for waiting lines, one per kind; a newer line replaces an older one. A line may be a frame.
 
     Pure: the clock is passed in. A drive line that could not be sent in time is replaced by the stop line.
     """
@@ -21,7 +21,7 @@ class Outbox:
         self.waiting: dict[str, _Waiting] = {}  # by kind
 
     def drive(self, line: bytes, now: float, valid_s: float) -> None:
-        """Add a drive line that is valid for so long, at most for the timeout."""
+        """Add a drive line that is valid for ``valid_s``, at most for the timeout."""
         self._place(_DRIVE, _Waiting(line, now + min(valid_s, self._drive_timeout)))
 
     def halt(self) -> None:

@@ -1,4 +1,4 @@
-"""What is sent to an open serial device: the bytes being written, and after them the lines that wait."""
+"""The output to an open serial device: the bytes being written, and after them the lines that wait."""
 
 from pebble.errors import DeviceError
 from pebble.services.serial_mcu_bridge.line.outbox import Outbox
@@ -9,7 +9,7 @@ _STALL_S = 1.0  # a device that accepts nothing for so long is closed and opened
 
 
 class Output:
-    """It writes without blocking. Its owner passes the port and the monotonic clock, and calls it under one lock.
+    """An output that does not block. Its owner passes the port and the monotonic clock, and calls it under one lock.
 
     A line leaves the outbox only once it can be sent at once, because one in the kernel cannot be replaced.
     """
@@ -17,18 +17,18 @@ class Output:
     def __init__(self, outbox: Outbox, stop: bytes, end: bytes, baud: int) -> None:
         self.outbox, self.stop = outbox, stop
         self.sending = b""  # lines, or the rest of one, not yet written to the kernel
-        self.sent_until = 0.0  # when all that was written has had time to be sent
+        self.sent_until = 0.0  # the time when all bytes written have had time to be sent
         self._end, self._byte_s = end, _BITS_PER_BYTE / baud
         self._blocked_since: float | None = None
 
     def begin(self, port: Port) -> None:
-        """Forget all that waited for an earlier opening; a line end and the stop come first."""
+        """Forget the lines for an earlier opening; begin with a line end and the stop."""
         port.discard_output()  # an earlier process may have left old commands in the kernel
         self.outbox.clear()
         self.sending, self._blocked_since = self._end + self.stop, None
 
     def is_free(self, port: Port, now: float) -> bool:
-        """True if the device has sent all that was written to it."""
+        """True if the device has sent all bytes that were written to it."""
         return now >= self.sent_until and not port.queued()
 
     def write(self, port: Port, now: float, *, ready: bool) -> None:
@@ -42,7 +42,7 @@ class Output:
             self._blocked_since = None
 
     def check_stall(self, port: Port, now: float) -> None:
-        """Raise DeviceError if the device has accepted nothing of what waits; what it has not sent is discarded."""
+        """Raise DeviceError if the device has accepted nothing for too long; discard the bytes that it has not sent."""
         if self._blocked_since is None:
             self._blocked_since = now
         elif now - self._blocked_since > _STALL_S:
@@ -50,7 +50,7 @@ class Output:
             raise DeviceError(f"{port.path} has accepted nothing for {_STALL_S} s")
 
     def replace_by_stop(self, port: Port) -> None:
-        """Discard what is unsent, and send the stop instead."""
+        """Discard unsent bytes, and send the stop instead."""
         port.discard_output()
         port.write(self._end + self.stop)
 

@@ -35,7 +35,7 @@ class Port:
         return self._fd
 
     def read(self) -> bytes:
-        """Return what was received, at most 4096 bytes; empty if nothing was."""
+        """Return received bytes, at most 4096; empty if there are none."""
         try:
             data = os.read(self._fd, _CHUNK)
         except BlockingIOError:
@@ -64,12 +64,12 @@ class Port:
         return int.from_bytes(answer, sys.byteorder)
 
     def discard_output(self) -> None:
-        """Discard what the kernel holds and has not sent."""
+        """Discard the bytes that the kernel holds and has not sent."""
         with suppress(termios.error, ValueError):  # a port that has gone raises at the next read
             termios.tcflush(self.fileno(), termios.TCOFLUSH)
 
     def is_replaced(self) -> bool:
-        """Return whether the path is another device now: a replug often creates a new node for the symlink."""
+        """True if the path is another device now: a replug often creates a new node for the symlink."""
         try:
             return Path(self.path).stat().st_rdev != os.fstat(self.fileno()).st_rdev
         except OSError:

@@ -31,7 +31,7 @@ class LineState(Enum):
 
 
 class _Opening(NamedTuple):
-    """The device, and how it is opened."""
+    """A device, and the parameters of its opening."""
 
     path: str
     baud: int
@@ -50,7 +50,7 @@ class SerialLine:
 
     ``on_bytes(chunk)`` and ``on_state(state, problem)`` run on the reading thread and must return at once.
     ``stop`` is the line that stops the motors, empty where there are none; ``drive_timeout_s`` the age at which a drive
-    line expires. ``end`` is what ends a text line, or a frame; empty where nothing is ever sent.
+    line expires. ``end`` ends a text line, or a frame; empty where nothing is ever sent.
     ``retry_s`` is the longest wait between two attempts to open the device.
     """
 
@@ -234,7 +234,7 @@ class SerialLine:
         self._set_state(LineState.READY)
 
     def _write_waiting(self, port: Port, now: float) -> None:
-        """Write what waits; raise DeviceError for a device that has gone or accepts nothing."""
+        """Write waiting bytes; raise DeviceError for a device that has gone or accepts nothing."""
         with self._lock:
             if self._failure is not None:
                 raise self._failure

@@ -1,4 +1,4 @@
-"""Whether the board on a serial line is heard, and whether its silence means anything. Pure."""
+"""The silence of a board on a serial line, and its meaning. Pure."""
 
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 
@@ -8,10 +8,10 @@ _REGULAR = 5  # checks in a row; our motor boards report at least twice a second
 
 
 class Silence:
-    """Call :meth:`check` about once a second, and when the state of the line changes.
+    """A watch for silence; call :meth:`check` about once a second, and when the state of the line changes.
 
-    A board that has sent something of its own accord in five checks in a row, while nothing was sent to it, is one that
-    reports at rest: if it stops, it hangs, or its wires do. Others may be silent by design.
+    A board that has sent something of its own accord in five checks in a row, while nothing was sent to it, reports at
+    rest: if it stops, it hangs, or its wires do. Others may be silent by design.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Counts of the starts of a board on a serial line, by what it sends and by the line itself. Pure."""
+"""Counts of the starts of a board on a serial line, by its messages and by the line itself. Pure."""
 
 from collections import deque
 
@@ -21,15 +21,15 @@ class Starts:
             self._starts.append(now)
 
     def sent(self, opened: int, mcu_ms: int, now: float) -> None:
-        """Note the board's clock, which begins anew when it starts; ``opened`` counts openings of the line."""
-        before, self._clock = self._clock, (opened, mcu_ms)
-        if before is not None and before[0] == opened:
-            back_ms = (before[1] - mcu_ms) % (1 << _CLOCK_BITS)
+        """Note the board's clock, which begins at 0 when it starts; ``opened`` counts openings of the line."""
+        earlier, self._clock = self._clock, (opened, mcu_ms)
+        if earlier is not None and earlier[0] == opened:
+            back_ms = (earlier[1] - mcu_ms) % (1 << _CLOCK_BITS)
             if _LEAST_MS <= back_ms < 1 << (_CLOCK_BITS - 1):
                 self.began(now)
 
     def within_a_minute(self, opened: int, now: float) -> int:
-        """Count them; each opening of the line but the first is one."""
+        """Return the number of starts; each opening of the line but the first is one."""
         if opened != self._opened:
             if self._opened:
                 self.began(now)

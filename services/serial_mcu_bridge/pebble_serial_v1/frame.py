@@ -46,7 +46,7 @@ class FrameError(PayloadError):
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """``interface`` 0 is the protocol itself; ``timestamp`` is milliseconds of the sender's clock, modulo 2**32."""
+    """A frame. ``interface`` 0 is the protocol itself; ``timestamp`` is in ms of the sender's clock, of 32 bits."""
 
     type: Type
     payload: bytes = b""

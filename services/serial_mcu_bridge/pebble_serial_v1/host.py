@@ -114,7 +114,7 @@ class Session:
     """
 
     def __init__(self, base: str = "") -> None:
-        """``base`` is what the robot's topics begin with."""
+        """Begin without a device; ``base`` is the beginning of the robot's topics."""
         self.manifest: Manifest | None = None
         self.frames = 0  # valid ones from a device
         self.mcu_ms: int | None = None  # what its clock showed when it sent something of its own accord

@@ -104,7 +104,7 @@ def parse_hello(payload: bytes) -> Hello:
 def parse_describe(payload: bytes, base: str = "") -> Manifest:
     """Return the manifest. PayloadError names what is wrong: bytes missing or left over, invalid topic levels, …
 
-    ``base`` is what the robot's topics begin with: names that are too long below it are refused, too.
+    ``base`` is the beginning of the robot's topics: names that are too long below it are refused, too.
     """
     reader = _Reader(payload)
     hello = _hello(reader)
@@ -125,7 +125,7 @@ def parse_describe(payload: bytes, base: str = "") -> Manifest:
 
 
 class _Reader:
-    """Takes little-endian values off the front of a payload."""
+    """A reader that takes little-endian values off the front of a payload."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._at = data, 0
@@ -183,13 +183,13 @@ def _interface(reader: _Reader) -> Interface:
         raise PayloadError(f"{name}: unknown encoding {encoding}")
     if count > _MOST_FIELDS:
         raise PayloadError(f"{name}: {count} fields, more than {_MOST_FIELDS}")
-    way, what = _enum(Direction, direction, name, "direction"), _enum(InterfaceKind, kind, name, "kind")
-    if (way is Direction.IN) != (what is InterfaceKind.COMMAND):
-        raise PayloadError(f"{name}: a {what.name.lower()} cannot go {way.name.lower()}")
+    way, form = _enum(Direction, direction, name, "direction"), _enum(InterfaceKind, kind, name, "kind")
+    if (way is Direction.IN) != (form is InterfaceKind.COMMAND):
+        raise PayloadError(f"{name}: a {form.name.lower()} cannot go {way.name.lower()}")
     fields = tuple(_field(reader, name) for _ in range(count))
     _all_differ(f"field of {name}", [field.name for field in fields])
     retain, local_only = bool(flags & _RETAIN), bool(flags & _LOCAL_ONLY)
-    return Interface(number, name, way, what, retain, local_only, rate_hz, channel, profile, fields)
+    return Interface(number, name, way, form, retain, local_only, rate_hz, channel, profile, fields)
 
 
 def _field(reader: _Reader, interface: str) -> Field:

@@ -36,7 +36,7 @@ class Touch:
 
 @dataclass(frozen=True, slots=True)
 class Charging:
-    """Whether the charger is connected; None where the board cannot tell (``chg=-1``)."""
+    """The state of the charger: connected or not; None where the board cannot tell (``chg=-1``)."""
 
     value: bool | None
 
@@ -77,7 +77,7 @@ def mix(x: float, z: float) -> tuple[float, float]:
 
 
 def drive_line(left: float, right: float) -> bytes:
-    """``M <left> <right>``, each −1..1. Raises PayloadError for NaN and infinities."""
+    """Return ``M <left> <right>``, each −1..1. Raises PayloadError for NaN and infinities."""
     if not (isfinite(left) and isfinite(right)):
         raise _not_finite(left, right)
     # adding 0.0 turns a rounded −0.0 into 0.0: a stop is always the same bytes
@@ -86,12 +86,12 @@ def drive_line(left: float, right: float) -> bytes:
 
 
 def lights_line(blue: float, green: float, red: float) -> bytes:
-    """``L <b> <g> <r>``, each 0..1. Raises PayloadError for NaN and infinities."""
+    """Return ``L <b> <g> <r>``, each 0..1. Raises PayloadError for NaN and infinities."""
     return b"L %.3f %.3f %.3f\n" % _shares(blue, green, red)
 
 
 def flash_line(blue: float, green: float, red: float, period_s: float) -> bytes:
-    """``F <b> <g> <r> <period_s>``: fade from dark to the colour and back once per period, for ever."""
+    """Return ``F <b> <g> <r> <period_s>``: fade from dark to the colour and back once per period, for ever."""
     if not isfinite(period_s):
         raise _not_finite(period_s)
     period = max(SHORTEST_FLASH_S, min(LONGEST_FLASH_S, period_s))
@@ -120,7 +120,7 @@ def _level(fields: dict[bytes, bytes]) -> list[Report]:
 
 
 def _shares(*parts: float) -> tuple[float, ...]:
-    """Return the parts if each is within 0..1. Raises PayloadError."""
+    """Return the parts, each limited to 0..1. Raises PayloadError for NaN and infinities."""
     if not all(map(isfinite, parts)):
         raise _not_finite(*parts)
     return tuple([max(0.0, min(1.0, part)) for part in parts])

@@ -38,7 +38,7 @@ class HallMemory:
         self._problem = ""
 
     def write(self, at_ns: int, values: tuple[int, int, int], charging: bool | None) -> None:
-        """Add a sample, of that time on CLOCK_MONOTONIC. Without a memory it is lost, which is logged once."""
+        """Add a sample of the time ``at_ns`` on CLOCK_MONOTONIC. Without a memory it is lost, which is logged once."""
         if at_ns >= self._check_at_ns:
             self._check_at_ns = at_ns + _CHECK_NS
             self._keep()
@@ -80,7 +80,7 @@ class HallMemory:
         return os.path.samestat(found, os.fstat(descriptor))
 
     def _open(self) -> tuple[int, mmap.mmap, memoryview]:
-        """Make it, or open what is there. It appears whole: a reader maps what it finds, and would keep less."""
+        """Make the memory, or open an existing one. It appears whole: a reader would keep what it maps too early."""
         flags, made = os.O_RDWR | os.O_CLOEXEC, False
         try:
             descriptor = os.open(self._path, flags | os.O_NOFOLLOW)

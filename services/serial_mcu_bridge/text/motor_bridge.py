@@ -32,7 +32,7 @@ _LIGHTS = "lights"  # a steady colour and a fade replace one another
 
 
 class MotorProtocol(Protocol):
-    """What the bridge needs of a text protocol that drives motors; a module can be one, as goob_base is."""
+    """A text protocol that drives motors; a module can be one, as goob_base is."""
 
     def parse(self, line: bytes) -> list[Report]: ...
     def mix(self, x: float, z: float) -> tuple[float, float]: ...
@@ -42,7 +42,7 @@ class MotorProtocol(Protocol):
 
 
 class MotorBridge(MotorOwner, SerialService):
-    """Drives the motors over a serial line.
+    """The motor owner of a serial line.
 
     SerialLine sends the stop at the start, and at the end from its close(), which runs by :meth:`on_stop`.
 
@@ -95,7 +95,7 @@ class MotorBridge(MotorOwner, SerialService):
         self._show_power(0.0, 0.0)
 
     def _show_power(self, left: float, right: float) -> None:
-        """Publish what the wheels are commanded, beside their sensors: each change, and again while they run."""
+        """Publish the commanded power of the wheels, for their sensors: each change, and again while they run."""
         now = self.clock()
         if self._publishes_touch and ((left, right) != self._power or ((left or right) and now >= self._again_at)):
             self._power, self._again_at = (left, right), now + _AGAIN_S

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from pebble.services.serial_mcu_bridge import imu
+from pebble.services.serial_mcu_bridge.imu import reports as imu
 from tests.ext.boards.mcu_wire import M
 from tests.kit.board import ScriptedMcu, SerialRig
 from tests.services.serial_mcu_bridge.test_text_protocols import FAST, SLOW

@@ -12,8 +12,8 @@ import pytest
 
 from pebble.runtime import notes
 from pebble.runtime.parent import NOTIFY_FD
-from pebble.services.serial_mcu_bridge import imu
 from pebble.services.serial_mcu_bridge.devices import peers
+from pebble.services.serial_mcu_bridge.imu import reports as imu
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import host
 from pebble.transports import QoS
 from tests.ext.boards import mcu_wire as wire

@@ -14,7 +14,7 @@ from pebble.extension import ours
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.serial_mcu_bridge.devices.aliases import claims
 from pebble.services.serial_mcu_bridge.devices.peers import CONFIRM_S, PeerDevices
-from pebble.services.serial_mcu_bridge.imu import ImuWatchdog
+from pebble.services.serial_mcu_bridge.imu.reports import ImuWatchdog
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from pebble.transports import Message
 from tests.ext.boards import mcu_wire as wire

@@ -10,8 +10,8 @@ import pytest
 from pebble.config import parse
 from pebble.runtime.process import view_of
 from pebble.services.serial_mcu_bridge.devices.described_bridge import DescribedBridge
+from pebble.services.serial_mcu_bridge.imu.bridge import ImuBridge
 from pebble.services.serial_mcu_bridge.serial_service import bridge_of
-from pebble.services.serial_mcu_bridge.text.imu_bridge import ImuBridge
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.boards.mcu_wire import STATION

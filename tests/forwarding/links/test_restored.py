@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from pebble.forwarding import side as side_module
-from pebble.services.mqtt_bridge.media import Media
+from pebble.services.mqtt_bridge.requests.media import Media
 from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Rig, Side, ZenohEnd
 from tests.support import some, until
 

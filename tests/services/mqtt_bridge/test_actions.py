@@ -12,7 +12,7 @@ import pytest
 
 from pebble.config import SystemControl
 from pebble.contract import CHANNELS, GIT_PULL, REBOOT, Channel, Kind
-from pebble.services.mqtt_bridge.actions import ACTIONS, Action, Row, system_actions
+from pebble.services.mqtt_bridge.requests.actions import ACTIONS, Action, Row, system_actions
 from tests.services.mqtt_bridge.bridge_rig import make_config
 from tests.support import until
 

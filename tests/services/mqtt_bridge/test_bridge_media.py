@@ -14,7 +14,7 @@ from pebble.contract.payloads import MediaRequest
 from pebble.runtime import notes
 from pebble.runtime.notes import Held, Wanted
 from pebble.runtime.parent import NOTIFY_FD, WANTED, ProgramRequest
-from pebble.services.mqtt_bridge.media import Media
+from pebble.services.mqtt_bridge.requests.media import Media
 from tests.forwarding.virtual import World
 from tests.services.mqtt_bridge.bridge_rig import Client
 
@@ -176,8 +176,9 @@ class TestBridge:
     ) -> None:
         bridge.begin(link={"profile": profile})
         bridge.remote.publish(DRIVE, drive)
+        bridge.run(0.1)
         assert [bridge.wanted(program, Held, after=0.0) for program in ALL] == [held, held, ""]
-        bridge.run(1.8)
+        bridge.run(1.7)
         bridge.remote.publish(DRIVE, b'{"z": 0}')
         assert bridge.wanted(CAMERA, Held, after=3.1) == held
         assert bridge.wanted(CAMERA, Held, after=1.2) == held.replace("1", "0")

@@ -10,7 +10,7 @@ from itertools import groupby
 import pytest
 
 from pebble.transports import State
-from tests.forwarding.test_thin import flood
+from tests.ext.thin.test_thin import flood
 from tests.forwarding.virtual import World
 
 STOP, PRESS = "incoming/estop", b"?"  # without a name: each counts

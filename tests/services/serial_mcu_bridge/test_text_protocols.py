@@ -17,10 +17,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pebble.errors import PayloadError
-from pebble.services.serial_mcu_bridge.text import goob_base, imu_mpu6050
+from pebble.services.serial_mcu_bridge.imu import mpu6050 as imu_mpu6050
+from pebble.services.serial_mcu_bridge.imu.mpu6050 import Motion, Summary
+from pebble.services.serial_mcu_bridge.text import goob_base
 from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, is_known
 from pebble.services.serial_mcu_bridge.text.goob_base import Charging, Level, Touch
-from pebble.services.serial_mcu_bridge.text.imu_mpu6050 import Motion, Summary
 from tests.support import cases
 
 FAST = b"I n=17 ms=1234 ax=0.123 ay=-0.5 az=9.807 gx=1.25 gy=-2 gz=0.0001 t=25.5 r=1.5 p=-3.25"

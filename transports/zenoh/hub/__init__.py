@@ -21,7 +21,6 @@ from pebble.transports.peers import FileLock, PeerRegistry, new_name, prepare_ru
 from pebble.transports.renewed import Renewed
 from pebble.transports.settings import TlsSettings, ZenohSettings
 from pebble.transports.socket_holders import why_not
-from pebble.transports.zenoh.access import Access, read_access
 from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.hub.worker import HubWorker
@@ -37,7 +36,7 @@ log = logging.getLogger(__name__)
 class ZenohHub:
     """A hub with its Zenoh session and its worker thread."""
 
-    def __init__(self, settings: ZenohSettings) -> None:
+    def __init__(self, settings: ZenohSettings, admission: Admission | None = None) -> None:
         self.name = new_name()
         self.counters = Counters()
         self._settings = settings
@@ -45,9 +44,8 @@ class ZenohHub:
         self._session: zenoh.Session | None = None
         self._worker: HubWorker | None = None
         self._store: HubStore | None = None
-        self._admission = Admission(settings.wills, settings.unretained)
+        self._admission = admission or Admission(settings.wills, settings.unretained)
         self._certificates = None if settings.tls is None else _renewed(settings.tls)
-        self._access = None if (file := settings.access) is None else Renewed([file], lambda: read_access(file))
         self._used = self._newest
 
     @property
@@ -56,8 +54,10 @@ class ZenohHub:
 
     @property
     def retained(self) -> dict[str, bytes]:
-        """What it retains, by topic."""
-        return {} if self._store is None else {one.key: one.payload for one in self._store.retained()}
+        """The payloads that it retains, by topic."""
+        if self._store is None:
+            return {}
+        return {retained.key: retained.payload for retained in self._store.retained()}
 
     @property
     def refused_wills(self) -> int:
@@ -65,7 +65,7 @@ class ZenohHub:
 
     @property
     def refused(self) -> int:
-        """Retained messages and wills there was no room for."""
+        """The number of retained messages and wills for which there was no room."""
         return 0 if self._store is None else self._store.refused
 
     def open(self) -> ZenohHub:
@@ -83,30 +83,25 @@ class ZenohHub:
         """Listen again, with all that is stored, if a certificate or rule changed; call often.
 
         Zenoh reads certificates and rules when a session begins. Raises TransportError if it cannot listen there again,
-        or if its files were removed: who started this hub starts another one.
+        or if its files were removed: this hub then ends, and its launcher starts another one.
         """
         if self._lock is None or self._worker is None:
             return
         if not self._lock.in_place:
             raise TransportError(f"{self._lock.path} was removed: this hub ends, as what starts now does not reach it")
-        if not self._is_renewed():
+        newest = self._newest
+        if all(new is old for new, old in zip(newest, self._used, strict=True)):
             return
-        self._used = self._newest
+        self._used = newest
         if self._session is not None:
             close_session(self._session)
         self._listen(self._worker)
         log.info("the hub uses renewed certificates or rules")
 
     @property
-    def _newest(self) -> tuple[object, Access | None]:
+    def _newest(self) -> tuple[object, object]:
         """The certificates and rules, as their files are now."""
-        return (
-            None if self._certificates is None else self._certificates.get(),
-            None if self._access is None else self._access.get(),
-        )
-
-    def _is_renewed(self) -> bool:
-        return any(new is not old for new, old in zip(self._newest, self._used, strict=True))
+        return None if self._certificates is None else self._certificates.get(), self._admission.newest()
 
     def close(self) -> None:
         if self._session is not None:
@@ -139,9 +134,8 @@ class ZenohHub:
         siblings = PeerRegistry(self._settings.run_dir).sockets()  # they would connect within 0.5 s; we connect at once
         try:
             settings = replace(self._settings, listen=tuple(filter(self._is_free, self._settings.listen)))
-            _, access = self._used
-            self._admission.accounts = {} if access is None else access.accounts
-            config = session_config(settings, "router", listen=[self._socket], connect=siblings, access=access)
+            rules = self._admission.rules()
+            config = session_config(settings, "router", listen=[self._socket], connect=siblings, rules=rules)
             self._session = open_session(config)
         except zenoh.ZError as error:
             raise TransportError(f"the hub cannot open {self._socket}: {error}") from None
@@ -149,7 +143,10 @@ class ZenohHub:
         worker.serve(self._session)
 
     def _is_free(self, endpoint: str) -> bool:
-        """Say who has taken an endpoint. A robot's hub runs without it, as any user can take a port; others end."""
+        """Return True unless a process has taken the endpoint, which is named in the log or in a TransportError.
+
+        A robot's hub runs without such an endpoint, as any user can take a port; other hubs end.
+        """
         kind = socket.SOCK_DGRAM if endpoint.startswith("quic/") else socket.SOCK_STREAM
         host, _, port = endpoint.partition("/")[2].partition("#")[0].partition("?")[0].rpartition(":")
         try:

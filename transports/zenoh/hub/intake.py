@@ -1,4 +1,4 @@
-"""What arrives at a hub waits for the hub's thread: tasks and queries of Zenoh's threads, within bounds."""
+"""The queue before a hub's thread: tasks and queries of Zenoh's threads, within bounds."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Intake:
             self._changed.notify()
 
     def receive(self, task: Task, size: int) -> None:
-        """Queue what was received, ``size`` bytes. Wait for room, unless too many others do: then drop it."""
+        """Queue a task for a received message of ``size`` bytes. Wait for room; drop it if too many others wait."""
         size += OVERHEAD
         with self._lock:
             if self._outside or not self._has_room(size):
@@ -65,7 +65,7 @@ class Intake:
             query.drop()  # type: ignore[no-untyped-call]
 
     def ask(self, work: _OnQuery, query: zenoh.Query) -> None:
-        """Queue a query. It is answered with nothing if too many wait, or once nothing waits for its answer."""
+        """Queue a query. It gets no answer if too many wait, or once its client does not wait any more."""
         came = monotonic()
 
         def answer() -> None:
@@ -89,7 +89,7 @@ class Intake:
             self._changed.notify()
 
     def take(self, timeout: float | None) -> Task | None:
-        """Return what is to be done next, what does nothing after ``timeout`` seconds, or None at the end."""
+        """Return the next task, one that does nothing after ``timeout`` seconds, or None at the end."""
         with self._lock:
             if not (self._tasks or self._queries or self._ended) and not self._changed.wait(timeout):
                 return _nothing
@@ -105,7 +105,7 @@ class Intake:
             return task
 
     def _has_room(self, size: int) -> bool:
-        """Return True for a task that is larger than all the room if it would have it to itself."""
+        """True if ``size`` bytes fit; a task that is larger than all the room fits if no other waits."""
         return not self._bytes or self._bytes + size <= QUEUE_BYTES
 
     def _note_dropped(self) -> None:
@@ -119,4 +119,4 @@ def _size(query: zenoh.Query) -> int:
 
 
 def _nothing() -> None:
-    """Time has passed."""
+    """Do nothing: time has passed."""

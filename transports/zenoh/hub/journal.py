@@ -21,7 +21,7 @@ _NEVER = float("inf")
 
 
 class Journal:
-    """Use: ``load()`` and ``rewrite()`` with the current records, then ``put()``, finally ``close()``.
+    """A file of records: ``load()`` and ``rewrite()`` with the current ones, then ``put()``, finally ``close()``.
 
     A disk that is full, missing or cannot be written is no error of the caller: one line in the log says so, and
     ``rewrite_at`` when to try again. Until then nothing, or only a part, is stored.
@@ -32,7 +32,7 @@ class Journal:
         self.rewrite_at = _NEVER
         self._clock = clock
         self._database: sqlite3.Connection | None = None
-        self._loaded = False  # else what is in it is not known, and stays
+        self._loaded = False  # False: its records are not known, and stay
         self._dirty, self._closing = threading.Event(), threading.Event()
         self._syncer = threading.Thread(target=self._sync, name="pebble-journal", daemon=True)
 

@@ -1,4 +1,4 @@
-"""What a hub stores, and its journal has: retained messages and wills."""
+"""Records of a hub and its journal: retained messages and wills."""
 
 from __future__ import annotations
 

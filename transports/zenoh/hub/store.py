@@ -18,7 +18,7 @@ OVERHEAD = 400  # bytes of Python's objects for one record, about
 class HubStore:
     """The newest retained message of every key and the wills of running clients, bounded in bytes and in number.
 
-    What has no room is refused, and changes nothing.
+    A record without room is refused, and changes nothing.
     """
 
     def __init__(self, max_wills: int | None = None) -> None:
@@ -53,7 +53,7 @@ class HubStore:
     def lacks(self, hello: Hello) -> list[str]:
         """Return the keys this client should send: those missing here, and those it wrote itself that differ now.
 
-        A value that another client wrote later stays, and so does that another one has removed it.
+        A later value, or removal, by another client stays.
         """
         return [key for key, own in hello.own.items() if self._differs(key, own, hello.name)]
 
@@ -106,7 +106,7 @@ def _size(message: Retained | Will | None) -> int:
     if message is None:
         return 0
     if isinstance(message, Retained):
-        where, who = message.key, message.stamp.origin
+        name, sender = message.key, message.stamp.origin
     else:
-        where, who = message.topic, message.client
-    return OVERHEAD + len(where) + len(who) + len(message.payload)
+        name, sender = message.topic, message.client
+    return OVERHEAD + len(name) + len(sender) + len(message.payload)

@@ -9,16 +9,16 @@ PATIENCE_S = 0.5  # so long each waits
 
 
 class WaitingQueries:
-    """A query names how many retained messages of which clients its answer must include. For the hub's thread."""
+    """Queries, each with the numbers of retained messages of clients that its answer must include; not thread-safe."""
 
     def __init__(self) -> None:
         self._received: dict[str, int] = {}  # how many retained messages have arrived, by client
         self._waiting: deque[tuple[float, dict[str, int], zenoh.Query]] = deque()
         self._awaited: set[str] = set()  # clients whose messages these wait for
-        self._looks = False  # whether some of them may wait no longer
+        self._looks = False  # True if some of them may have waited for long enough
 
     def count_from(self, client: str, count: int) -> None:
-        """Note that all that this client has retained until now is here: ``count`` messages."""
+        """Note that all ``count`` messages that this client has retained until now are here."""
         self._received[client] = count
 
     def received(self, client: str, count: int) -> None:
@@ -34,7 +34,7 @@ class WaitingQueries:
         self._received.clear()
 
     def add(self, needs: dict[str, int], query: zenoh.Query, now: float) -> bool:
-        """Have it wait; False: it is to be answered now."""
+        """Have a query wait; False: it is to be answered now."""
         if len(self._waiting) >= QUERIES or self._has_arrived(needs):
             return False
         self._waiting.append((now + PATIENCE_S, needs, query))
@@ -48,20 +48,20 @@ class WaitingQueries:
         return float("-inf") if self._looks else self._waiting[0][0]
 
     def take(self, now: float) -> list[zenoh.Query]:
-        """Return those that have waited for long enough, or for nothing more."""
+        """Return the queries that have waited for long enough, or for nothing more."""
         due = []
         while self._waiting and now >= self._waiting[0][0]:
             due.append(self._waiting.popleft())
         if self._looks:
             self._looks = False
-            due += [one for one in self._waiting if self._has_arrived(one[1])]
-            self._waiting = deque(one for one in self._waiting if not self._has_arrived(one[1]))
+            due += [entry for entry in self._waiting if self._has_arrived(entry[1])]
+            self._waiting = deque(entry for entry in self._waiting if not self._has_arrived(entry[1]))
         if not self._waiting:
             self._awaited.clear()
         return [query for _, _, query in due]
 
     def drop(self) -> None:
-        """Answer none of them."""
+        """Drop all queries without an answer."""
         for _, _, query in self._waiting:
             query.drop()  # type: ignore[no-untyped-call]
         self._waiting.clear()

@@ -1,4 +1,4 @@
-"""When a hub publishes the will of a client that is gone. Pure."""
+"""Times at which a hub publishes the wills of clients that are gone. Pure."""
 
 from collections.abc import Iterable
 
@@ -7,7 +7,7 @@ RETURN_S = 2.5  # after a restart clients have this long to reconnect before the
 
 
 class WillTimes:
-    """When the wills of clients are due, by the names of their sessions."""
+    """The times at which wills are due, by the names of their clients' sessions."""
 
     def __init__(self) -> None:
         self._due: dict[str, float] = {}
@@ -24,7 +24,7 @@ class WillTimes:
         self._due[name] = now + GONE_S
 
     def on_restart(self, names: Iterable[str], now: float) -> None:
-        """There are wills of before; their clients may come back."""
+        """Note wills of before a restart; their clients may come back."""
         for name in names:
             self._due.setdefault(name, now + RETURN_S)
 

@@ -1,4 +1,4 @@
-"""The thread of a hub: it stores what is retained, publishes wills, and answers clients."""
+"""The thread of a hub: it stores retained messages, publishes wills, and answers clients."""
 
 from __future__ import annotations
 
@@ -144,19 +144,18 @@ class HubWorker:
         if "*" not in text:
             retained = self._store.get(text.removeprefix(wire.RETAINED))
             return [] if retained is None else [retained]
-        begin = text.partition("*")[0].rstrip("$/")  # of all of a fleet's it sorts most out soon
-        every = ((wire.RETAINED + retained.key, retained) for retained in self._store.retained())
-        return [retained for key, retained in every if key.startswith(begin) and wanted.intersects(key)]
+        begin = text.partition("*")[0].rstrip("$/")  # rules most keys of a fleet out, quickly
+        keys = ((wire.RETAINED + retained.key, retained) for retained in self._store.retained())
+        return [retained for key, retained in keys if key.startswith(begin) and wanted.intersects(key)]
 
     # -- clients
 
     def _on_hello(self, query: zenoh.Query) -> None:
         with query:
             account = wire.account_of(str(query.key_expr), wire.HELLO)
-            admitted = self._admission.hello(account, wire.decode_hello(_payload(query)))
-            if admitted is None:
+            hello = self._admission.hello(account, wire.decode_hello(_payload(query)))
+            if hello is None:
                 return
-            hello = admitted
             alive, has_will = hello.name in self.alive_clients, hello.will is not None
             self._wills.on_hello(hello.name, time.monotonic(), alive=alive, has_will=has_will)
             self._end_predecessor(hello)
@@ -231,13 +230,13 @@ class HubWorker:
     # -- store and journal
 
     def apply(self, record: Record) -> None:
-        """Store what is admitted of ``record``."""
+        """Store ``record`` as it is admitted."""
         admitted = self._admission.admitted(record)
         if admitted is not None and self._store.apply(admitted) and self._journal is not None:
             self._journal.put(admitted.id, None if admitted.is_removal else wire.encode(admitted))
 
     def _recall(self, journal: Journal) -> None:
-        """Store what an earlier hub has stored, and only that from now on."""
+        """Store the records of an earlier hub, as far as they are admitted now."""
         decode = msgspec.msgpack.Decoder(Record).decode
         for data in journal.load():
             try:
@@ -252,7 +251,7 @@ class HubWorker:
         journal.rewrite((record.id, wire.encode(record)) for record in self._store.records())
 
     def _await_return(self) -> None:
-        """Clients of a session that was closed have as long to come back as after a restart."""
+        """Give clients of a session that was closed as long to come back as after a restart."""
         self.alive_clients.clear()
         self._waiting.forget_all()
         self._await_wills()

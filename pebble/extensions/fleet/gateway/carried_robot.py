@@ -25,10 +25,20 @@ from pebble.errors import PayloadError
 from pebble.forwarding.cycles import PROBE_PERIOD_S
 from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
-from pebble.forwarding.routing import GATEWAY, Side
+from pebble.forwarding.routing import Rules, Side
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.transports import Handler, Message, Subscription, Transport, clock
 
+#: Between a hub and a broker, for a robot of the hub whose bridge forwards by the paper's table.
+GATEWAY = Rules(
+    passes={
+        Side.LOCAL: frozenset({Kind.STATE, Kind.EVENT, Kind.STREAM, Kind.FLAG}),
+        Side.REMOTE: frozenset({Kind.COMMAND, Kind.FLAG, Kind.ACTION, Kind.FEED}),
+    },
+    leaves_robot=True,
+    media=True,
+    stored=False,
+)
 #: What the robot sends of each medium, by what allows and what requests it.
 _MEDIA = ((CAMERA, MQTT_VIDEO, VIDEO_CONTROL), (AUDIO, MQTT_AUDIO, AUDIO_CONTROL))
 LARGEST = 1024 * 1024  # bytes of a message; the brokers of `pebble fleet` take no more

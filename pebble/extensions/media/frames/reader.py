@@ -69,7 +69,7 @@ class FrameReader:
     # -- opening and closing
 
     def open(self) -> Self:
-        """Raises TransportError in a folder that cannot contain a socket, or is not this user's."""
+        """Open. Raises TransportError in a folder that cannot contain a socket, or is not this user's."""
         prepare_run_dir(self._names.folder)
         with self._changing:
             self._latest.reopen()
@@ -131,7 +131,7 @@ class FrameReader:
 
     @property
     def shared(self) -> bool:
-        """False: frames are sent to this reader as bytes; `problem` explains why, unless that is its own choice."""
+        """True if frames come through shared memory; else `problem` explains why, unless it is the reader's choice."""
         return self._sharing and not self.problem
 
     @property
@@ -158,7 +158,7 @@ class FrameReader:
         return None
 
     def __iter__(self) -> Iterator[Frame]:
-        """Until the reader is closed."""
+        """Iterate over frames until the reader is closed."""
         while not self._latest.closed:
             frame = self.read()
             if frame is not None:
@@ -174,9 +174,9 @@ class FrameReader:
         view = views.array(buffer, len(payload))
         if self._views and view is not None:
             return Frame(info, view, shared=True, buffer=buffer)
-        own = _copy(bytes(buffer)) if view is None else view.copy()
+        copy = _copy(bytes(buffer)) if view is None else view.copy()
         if buffer.is_valid():
-            return Frame(info, own, shared=True)
+            return Frame(info, copy, shared=True)
         self.counters.add("torn")
         return None
 

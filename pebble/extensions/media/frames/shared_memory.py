@@ -42,7 +42,7 @@ class SharedPool:
         return f"{found[1]}.zenoh" if found else ""
 
     def allocate(self, size: int) -> Chunk | None:
-        """Memory for one frame of ``size`` bytes; None if no slot is free."""
+        """Return memory for a frame of ``size`` bytes; None if no slot is free."""
         chunk = self._allocate(size)
         if chunk is None and self._starving():
             self._provider.garbage_collect_unsafe()  # what no running reader has confirmed for 0.1 s

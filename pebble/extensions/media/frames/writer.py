@@ -39,7 +39,7 @@ _DROP, _BLOCK_FIRST = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOC
 
 
 class FrameWriter:
-    """The one writer of a stream. One thread at a time may write; `wanted`, `readers` and `close` work on any thread.
+    """The writer of a stream. One thread at a time may write; `wanted`, `readers` and `close` work on any thread.
 
     ``capacity`` is the size of the largest frame in bytes, ``slots`` how many of them the shared memory holds: two in
     use by the writer and on their way, and one for every reader that holds a frame while it works. A frame without a
@@ -73,7 +73,7 @@ class FrameWriter:
     # -- opening and closing
 
     def open(self) -> Self:
-        """Raises TransportError if it cannot listen in that folder, for example because another writer does."""
+        """Open. Raises TransportError if it cannot listen in that folder, for example because another writer does."""
         prepare_run_dir(self._names.folder)
         self._sweep()
         self.problem = self._why_not_shared()
@@ -172,7 +172,7 @@ class FrameWriter:
 
     @property
     def shared(self) -> bool:
-        """False: frames are sent as bytes; `problem` explains why, unless they are small."""
+        """True if frames are sent through shared memory; else `problem` explains why, unless they are small."""
         return self._pool is not None
 
     @property
@@ -204,7 +204,7 @@ class FrameWriter:
         return self._put(slot.take(), info, shared=True)
 
     def slot(self, size: int) -> Slot | None:
-        """Shared memory to build a frame in, without a copy. None: use `write`.
+        """Return shared memory to build a frame in, without a copy. None: use `write`.
 
         It contains data of earlier frames: fill it completely.
         """
@@ -265,7 +265,7 @@ class Slot:
         return self._take(keep=True).view()
 
     def send(self, info: FrameInfo) -> bool:
-        """False if there are no readers any more."""
+        """Send the frame; False if there are no readers any more."""
         buffer = self._take().take()
         return self._writer._is_wanted() and self._writer._put(buffer, info, shared=True)
 

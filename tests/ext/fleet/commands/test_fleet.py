@@ -20,12 +20,12 @@ from pebble.config import load
 from pebble.config.raw import deep_merge
 from pebble.extensions.fleet import authority, certificates
 from pebble.extensions.fleet.folder import CONF, FLEET, ZENOH
+from pebble.extensions.fleet.hub_access import read_access
 from pebble.extensions.fleet.hub_file import load_hub
 from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.roles import Role
 from pebble.extensions.lab.rig.processes import python
 from pebble.extensions.operator.places import mosquitto_path
-from pebble.transports.zenoh.access import read_access
 from tests.ext.fleet.broker_client import BrokerClient, Place
 from tests.kit.terminal import Terminal
 from tests.support import ROOT, Child, free_port, listening, until

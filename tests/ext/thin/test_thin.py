@@ -9,7 +9,7 @@ import pytest
 
 from pebble.contract import LINK, codec
 from pebble.contract.payloads import LinkState
-from pebble.services.mqtt_bridge.uplink import RENEW_S
+from pebble.extensions.thin.uplink import RENEW_S
 from pebble.transports import Outgoing, QoS
 from tests.forwarding.virtual import World
 from tests.services.mqtt_bridge.bridge_rig import BASE

@@ -9,8 +9,8 @@ from itertools import pairwise
 import pytest
 
 from pebble.contract.payloads import LinkLevel
-from pebble.forwarding.sieve import Rank
-from pebble.services.mqtt_bridge.link import LinkMeter, Room
+from pebble.extensions.thin.link import LinkMeter, Room
+from pebble.extensions.thin.sieve import Rank
 
 PING_S = 0.5
 

@@ -8,7 +8,8 @@ import pytest
 
 from pebble.contract import CHANNELS, CONTROL, DRIVE, ESTOP, INCOMING, Channel, codec
 from pebble.contract.rights import WRITES, Right
-from pebble.forwarding.names import Names, Signed
+from pebble.extensions.fleet.names import CheckedNames
+from pebble.forwarding.names import Signed
 from pebble.forwarding.routing import Drop, Side
 from pebble.forwarding.subjects import Subjects
 from pebble.transports import Message
@@ -16,7 +17,7 @@ from tests.forwarding.virtual import World
 from tests.services.mqtt_bridge.bridge_rig import BASE, make_config
 
 SUBJECTS = Subjects(make_config())
-NAMES = {strangers: Names(BASE, SUBJECTS, strangers) for strangers in ("drive", "free", "refuse")}
+NAMES = {strangers: CheckedNames(BASE, SUBJECTS, strangers) for strangers in ("drive", "free", "refuse")}
 KEYED = '{"x":0,"z":0.5,"key":"0badf00d"%s}'
 MOVE, ZERO = b'{"x":0,"z":0.5}', b'{"x":0,"z":0}'
 
@@ -149,7 +150,7 @@ class TestTopics:
         assert (sender.subject, sender.foreign) == (None, Drop.FOREIGN)
 
     def test_what_is_remembered_of_invented_topics_is_bounded(self) -> None:
-        names = Names(BASE, SUBJECTS, "refuse")
+        names = CheckedNames(BASE, SUBJECTS, "refuse")
         for number in range(10_000):
             assert names[f"{BASE}/incoming/by/ann/junk{number}"].account == "ann"
         assert len(names) <= 4096

@@ -1,32 +1,29 @@
-"""Passes on what leaves a robot through a sieve, while the link to its remote side is thin."""
+"""Passes messages that leave a robot through a sieve, while the link to its remote side is thin."""
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
+from pebble.extensions.thin.sieve import Rank, Sieve, Waiting
+from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.routing import Drop, Forward, Side
-from pebble.forwarding.side import Gate, Sides, SideState
-from pebble.forwarding.sieve import Rank, Sieve, Waiting
+from pebble.forwarding.side import Gate, SideState
 from pebble.forwarding.subjects import Subject
 from pebble.transports import Message
 
-Pass = Callable[[SideState, Subject, Message, Forward], Forward | Drop]
-
 
 class Sifter:
-    """Passes messages on by ``pass_``, which publishes one on the other side, or says why not; thread-safe."""
+    """The sieve in a forwarder, for messages that leave the robot; thread-safe."""
 
-    def __init__(self, sides: Sides, pass_: Pass) -> None:
-        self._sides, self._pass = sides, pass_
+    def __init__(self, forwarder: Forwarder) -> None:
+        self._forwarder, self._sides = forwarder, forwarder.sides
         self._sieve: Sieve | None = None
         self._lock = threading.RLock()  # so that a message which has waited is not sent after a newer one
-        #: Passes a message on now or later. Hot.
-        self.forward = pass_
 
     def use(self, sieve: Sieve | None) -> None:
-        """Pass what leaves the robot through ``sieve``, whose owner calls :meth:`send_waiting`; None: no more."""
+        """Pass messages through ``sieve``, whose owner calls :meth:`send_waiting`; None: pass them at once."""
         with self._lock:
             before, self._sieve = self._sieve, sieve
-            self.forward = self._pass if sieve is None else self._sift
+            self._forwarder.pass_on = self._forwarder.pass_now if sieve is None else self._sift
             events = self._sides[Side.REMOTE].events
             events.has_room = None if sieve is None else sieve.takes_event
             if before is not None and sieve is None:
@@ -34,7 +31,7 @@ class Sifter:
                 events.resume()
 
     def send_waiting(self) -> None:
-        """Send what waits in the sieve, as far as there is room."""
+        """Send the messages that wait in the sieve, as far as there is room."""
         with self._lock:
             if self._sieve is not None:
                 self._send(self._sieve.due(Rank.STATE))
@@ -43,15 +40,15 @@ class Sifter:
 
     def _send(self, waiting: Iterable[Waiting]) -> None:
         here = self._sides[Side.LOCAL]
-        for one in waiting:
-            if isinstance(self._pass(here, one.subject, one.message, one.forward), Forward):
+        for entry in waiting:
+            if isinstance(self._forwarder.pass_now(here, entry.subject, entry.message, entry.forward), Forward):
                 here.count_forwarded()
 
     def _sift(self, here: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
         if here.side is not Side.LOCAL or subject.prompt:
-            return self._pass(here, subject, message, forward)
+            return self._forwarder.pass_now(here, subject, message, forward)
         with self._lock:
             sieve = self._sieve
             if sieve is not None and self._sides.gate is Gate.OPEN and sieve.keeps(subject, message, forward):
                 return Drop.NO_ROOM
-            return self._pass(here, subject, message, forward)
+            return self._forwarder.pass_now(here, subject, message, forward)

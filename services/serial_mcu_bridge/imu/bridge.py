@@ -8,17 +8,17 @@ from pebble.contract import IMU, IMU_FAST
 from pebble.errors import DeviceError
 from pebble.runtime.lines import LineSplitter
 from pebble.runtime.service import every
-from pebble.services.serial_mcu_bridge.imu import ImuReports, ImuWatchdog, measured
+from pebble.services.serial_mcu_bridge.imu.mpu6050 import Motion, Report, Summary, parse
+from pebble.services.serial_mcu_bridge.imu.reports import ImuReports, ImuWatchdog, measured
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 from pebble.services.serial_mcu_bridge.serial_service import SerialService
 from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, is_known
-from pebble.services.serial_mcu_bridge.text.imu_mpu6050 import Motion, Report, Summary, parse
 
 _WATCH_S = 0.5
 
 
 class ImuBridge(SerialService):
-    """Sends nothing to the sensor. From drive commands it knows when the sensor must not repeat itself."""
+    """The service of a sensor, which is sent nothing. Drive commands tell when it must not repeat itself."""
 
     publishes = (IMU_FAST, IMU)
     receive_only = True

@@ -1,16 +1,15 @@
-"""Which media programs are to run: a flag of the operators allows them, a request starts and stops them. Pure.
-
-On a thin link those that send pictures or sound wait while a person drives: both share what the modem carries.
-"""
+"""Requests for media programs: a flag of the operators allows them, a request starts and stops them."""
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, ClassVar, Final
 
-from pebble.contract import AUDIO_CONTROL, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel
+from pebble.contract import AUDIO_CONTROL, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel, Kind
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
 from pebble.contract.payloads import MediaRequest
-from pebble.runtime.parent import ProgramRequest
+from pebble.runtime.parent import Notifier, ProgramRequest, earlier_requests
+from pebble.runtime.service import Service
+from pebble.services.mqtt_bridge.own_requests import Requests
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,14 +26,12 @@ MEDIA: Final = (
     Row(MQTT_VIDEO, VIDEO_CONTROL, ALL_VIDEO, ("camera_publisher", "video_stream")),
     Row(MQTT_AUDIO, AUDIO_CONTROL, ALL_SOUND, ("audio_publisher", "audio_receiver")),
 )
-HELD: Final = ("camera_publisher", "video_stream", "audio_publisher")
-HOLD_S: Final = 5.0  # after the newest command that moves something: each beginning costs 2 KB of states and logs
 _ROWS: Final = {channel.suffix: row for row in MEDIA for channel in (row.flag, row.request)}
 _NO: Final = ProgramRequest(on=False)
 
 
 class Media:
-    """The newest flag and request of each medium of a robot that has ``programs``; the launcher is sent each change.
+    """The newest flag and request of each medium of a robot that has ``programs``; each change goes to the launcher.
 
     ``running`` are the programs that an earlier bridge process had requested. They count as requested, because a
     request is never retained and the operator does not know that the bridge was restarted. Until the flag of a medium
@@ -65,7 +62,7 @@ class Media:
         self.send()
 
     def requests(self) -> dict[str, ProgramRequest]:
-        """By program; without those whose flag has to be known first."""
+        """Return the requests by program, without those whose flag has to be known first."""
         requests: dict[str, ProgramRequest] = {}
         for row, request in self._requested.items():
             if not request.on or row in self._allowed:
@@ -74,32 +71,30 @@ class Media:
         return {name: request for name, request in requests.items() if name in self._programs}
 
     def send(self) -> None:
-        """Send what has changed, and again what the launcher did not accept."""
+        """Send the requests that have changed, and again those that the launcher did not accept."""
         for program, request in self.requests().items():
             if self._sent.get(program) != request and self._send_one(program, request):
                 self._sent[program] = request
 
 
-class Hold:
-    """Tells the launcher which of ``programs`` wait; ``send_one`` returns False if it is busy."""
-
-    def __init__(self, programs: Collection[str], send_one: Callable[[str, bool], bool]) -> None:
-        self._sent = dict.fromkeys((name for name in HELD if name in programs), False)
-        self._send_one = send_one
-        self._driven_at = float("-inf")
-
-    def drive(self, now: float) -> None:
-        """Note that a command that moves something has come over a thin link."""
-        self._driven_at = now
-        self.send(now)
-
-    def send(self, now: float) -> None:
-        """Send what has changed with time, and again what the launcher did not accept."""
-        on = now - self._driven_at < HOLD_S
-        for program, sent in self._sent.items():
-            if sent is not on and self._send_one(program, on):
-                self._sent[program] = on
-
-
 def _first(row: Row, running: Mapping[str, ProgramRequest]) -> ProgramRequest:
     return next((running[name] for name in row.programs if name in running), _NO)
+
+
+class MediaRequests(Requests):
+    """The requests for media programs of a robot, passed on to its launcher."""
+
+    channels: ClassVar[tuple[Channel, ...]] = tuple(channel for row in MEDIA for channel in (row.flag, row.request))
+
+    def __init__(self, service: Service) -> None:
+        super().__init__(service)
+        self._media = Media(service.config.on_demand_programs(), earlier_requests(), Notifier().request)
+
+    def take(self, channel: Channel, value: Any) -> None:
+        if channel.kind is Kind.FLAG:
+            self._media.allow(channel, value)
+        else:
+            self._media.request(channel, value)
+
+    def repeat(self) -> None:
+        self._media.send()

@@ -1,4 +1,7 @@
-"""What connections from other machines may do at a hub, by the name in their certificate: Zenoh's access_control."""
+"""Rights of connections from other machines at a hub, by the name in their certificate: Zenoh's access_control.
+
+The hub itself refuses what Zenoh cannot: wills, and what is retained, of accounts that it is not for.
+"""
 
 from __future__ import annotations
 
@@ -7,23 +10,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+from msgspec.structs import replace
 
 from pebble.errors import TransportError
+from pebble.transports.renewed import Renewed
+from pebble.transports.topics import matches
 from pebble.transports.zenoh import wire
+from pebble.transports.zenoh.hub.admission import Admission
+from pebble.transports.zenoh.keymap import key_to_topic
+from pebble.transports.zenoh.session import ALL_MESSAGES, LOCAL, OTHER_MACHINES
 
-_MESSAGES = (
-    "put",
-    "delete",
-    "declare_subscriber",
-    "query",
-    "reply",
-    "declare_queryable",
-    "liveliness_token",
-    "liveliness_query",
-    "declare_liveliness_subscriber",
-)
 IN, OUT = ("ingress",), ("egress",)  # as the hub sees it
-_OTHER_MACHINES = ["tls", "quic"]  # the protocols by which they connect
 _COMMANDS = {"priority": "interactive_high", "congestion_control": "drop"}
 _STOPS = {"priority": "real_time", "congestion_control": "block"}
 _FIELDS = ("flows", "messages", "key_exprs")
@@ -37,7 +34,7 @@ class Grant(NamedTuple):
     keys: tuple[str, ...]
 
 
-EVERYTHING = (Grant((*IN, *OUT), _MESSAGES, wire.ALL_KEYS),)
+EVERYTHING = (Grant((*IN, *OUT), ALL_MESSAGES, wire.ALL_KEYS),)
 
 
 class HubAccount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -52,7 +49,7 @@ class _Metadata(msgspec.Struct, frozen=True):
 
 
 class _File(msgspec.Struct, frozen=True):
-    """Also a configuration of Zenoh, which lets others keep what they like in its ``metadata``."""
+    """The access file. It is a configuration of Zenoh, too, which lets others use its ``metadata``."""
 
     access_control: dict[str, Any]
     metadata: _Metadata
@@ -81,7 +78,7 @@ def read_access(file: Path) -> Access:
 
 
 def written(access: Access) -> bytes:
-    """``access`` as a file."""
+    """Return ``access`` as a file."""
     text = msgspec.json.encode(_File(dict(access.control), _Metadata(dict(access.accounts)), dict(access.qos)))
     return msgspec.json.format(text, indent=1) + b"\n"
 
@@ -92,11 +89,10 @@ def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dic
     Equal grants become one rule, because Zenoh reads 1 MB a second. It does not refuse the others, but drops all that
     they send, and sends them nothing. It reads this once.
     """
-    local = {"id": "this machine", "link_protocols": ["unixsock-stream", "tcp"]}
     rules: dict[Grant, dict[str, Any]] = {}
-    subjects: list[dict[str, Any]] = []
+    subjects: list[Mapping[str, Any]] = []
     policies: list[dict[str, Any]] = []
-    for subject, grants in [(local, EVERYTHING), *((_named(names), grants) for names, grants in rows if names)]:
+    for subject, grants in [(LOCAL, EVERYTHING), *((_named(names), grants) for names, grants in rows if names)]:
         own = [rules.setdefault(grant, _rule(len(rules), grant)) for grant in grants if grant.keys]
         subjects.append(subject)
         policies.append({"rules": [rule["id"] for rule in own], "subjects": [subject["id"]]})
@@ -110,14 +106,14 @@ def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dic
 
 
 def first(commands: Sequence[str], stops: Sequence[str]) -> dict[str, Any]:
-    """Zenoh's qos: of what connections from other machines send, ``stops`` alone have the first priority, and wait.
+    """Return Zenoh's qos: of what other machines send, ``stops`` alone have the first priority, and wait.
 
     Else a sender chooses: with that priority it would hold up the stops of others, and with what waits for room it
     would have the hub close the connection of a receiver that reads slower than it sends. Both are keys; stops are
     commands.
     """
     rows = (("commands", commands, _COMMANDS), ("stops", stops, _STOPS))
-    here = {"messages": ["put"], "flows": [*IN], "link_protocols": _OTHER_MACHINES}
+    here = {"messages": ["put"], "flows": [*IN], "link_protocols": OTHER_MACHINES}
     network = [{"id": name, "key_exprs": [*keys], "overwrite": changes, **here} for name, keys, changes in rows]
     return {"network": network}
 
@@ -127,4 +123,51 @@ def _rule(number: int, grant: Grant) -> dict[str, Any]:
 
 
 def _named(names: Sequence[str]) -> dict[str, Any]:
-    return {"id": names[0], "link_protocols": _OTHER_MACHINES, "cert_common_names": list(names)}
+    return {"id": names[0], "link_protocols": OTHER_MACHINES, "cert_common_names": list(names)}
+
+
+class AccountAdmission(Admission):
+    """The admission of clients at a hub, also of accounts of other machines, by the access file."""
+
+    def __init__(self, file: Path, wills: Sequence[tuple[str, bool]], unretained: Sequence[str] = ()) -> None:
+        super().__init__(wills, unretained)
+        self._access = Renewed([file], lambda: read_access(file))
+        self.accounts: Mapping[str, HubAccount] = {}
+
+    def newest(self) -> Access:
+        return self._access.get()
+
+    def rules(self) -> Mapping[str, Any]:
+        control, self.accounts, qos = self._access.get()
+        return {"access_control": control, "qos": qos}
+
+    def hello(self, account: str, hello: wire.Hello) -> wire.Hello | None:
+        """Return ``hello`` without what this account may not; None: it is not answered.
+
+        Its certificate allows an account to ask under its own name only.
+        """
+        if not account:
+            return hello
+        known = self.accounts.get(account)
+        if known is None or not self.owns(account, hello.name):
+            self.log(account, "hello", "its session must be named after an account that is known")
+            return None
+        offered = hello.own if known.retains else {}
+        own = {key: digest for key, digest in offered.items() if _any(known.retains, key_to_topic(key))}
+        return replace(hello, will=self._of_account(account, known, hello.will), own=own)
+
+    def owns(self, account: str, session: str) -> bool:
+        return not account or session.startswith(account + wire.OF)
+
+    def _of_account(self, account: str, known: HubAccount, will: wire.Will | None) -> wire.Will | None:
+        if will is None:
+            return None
+        will = replace(will, client=f"{account}{wire.OF}{will.client}")  # so that it is no one else's predecessor
+        if _any(known.wills, will.topic):
+            return will
+        self.refuse_will(will, "an account leaves a will for its own robot only")
+        return None
+
+
+def _any(filters: Sequence[str], topic: str) -> bool:
+    return any(matches(filter_, topic) for filter_ in filters)

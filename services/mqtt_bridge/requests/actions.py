@@ -8,12 +8,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from pebble.config import MqttBridge, SystemControl
 from pebble.contract import GIT_PULL, REBOOT, SERVICE_RESTART, Channel
 from pebble.runtime.environment import child_environment
 from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.runtime.service import Service
+from pebble.services.mqtt_bridge.own_requests import Requests
 
 if TYPE_CHECKING:
     import subprocess
@@ -42,7 +44,7 @@ ACTIONS: Final = (
 
 
 class Action:
-    """Runs one command at a time, no more often than its cooldown allows. Not thread-safe.
+    """A command that runs once at a time, and no more often than its cooldown allows. Not thread-safe.
 
     Operators read the log, and a command's words or output may hold a token: they stay in a file in ``folder``.
     """
@@ -63,7 +65,7 @@ class Action:
         return self._process is not None and self._process.poll() is None
 
     def request(self) -> bool:
-        """Run the command; False, with a log line, if that is refused."""
+        """Run the command; return False, with a log line, if that is refused."""
         if not self.control.command:
             if not self._warned:
                 self._warned = True
@@ -131,5 +133,20 @@ def shorten(file: int) -> None:
 
 
 def system_actions(section: MqttBridge, folder: Path, clock: Callable[[], float]) -> dict[Channel, Action]:
-    """Return the whole table, for one robot's config."""
+    """Return all actions of a robot."""
     return {row.channel: Action(row, getattr(section, row.section), folder=folder, clock=clock) for row in ACTIONS}
+
+
+class SystemActions(Requests):
+    """The actions of a robot, each requested by true on its channel."""
+
+    channels: ClassVar[tuple[Channel, ...]] = tuple(row.channel for row in ACTIONS)
+
+    def __init__(self, service: Service) -> None:
+        super().__init__(service)
+        config = service.config
+        self.actions = system_actions(config.services.mqtt_bridge, config.state_dir(), service.clock)
+
+    def take(self, channel: Channel, value: Any) -> None:
+        if value:
+            self.service.counters.add("actions" if self.actions[channel].request() else "actions_refused")

@@ -35,19 +35,19 @@ def measured(values: Values) -> dict[str, tuple[Any, ...]]:
 
 
 def fits(profile: str, names: Collection[str]) -> bool:
-    """Return whether fields of these names include all fields of the profile."""
+    """True if fields of these names include all fields of the profile."""
     return _FIELDS[profile] <= set(names)
 
 
 class ImuReports:
-    """Makes the payloads of one sensor; a summary repeats the newest sample."""
+    """The payloads of one sensor; a summary repeats the newest sample."""
 
     def __init__(self, *, device: str, protocol: str, instance: str) -> None:
         self._device, self._protocol, self._instance = device, protocol, instance
         self._newest: ImuFastValues | None = None
 
     def motion(self, t: int, seq: int, mcu_ms: int, values: Values) -> ImuFast:
-        """``values``: m/s², degrees per second, °C and degrees, by the names of the profile's fields."""
+        """Return a sample; ``values`` by the profile's fields, in m/s², degrees per second, °C and degrees."""
         self._newest = ImuFastValues(
             accel_mps2=_vector(values, "ax", "ay", "az"),
             gyro_dps=_vector(values, "gx", "gy", "gz"),
@@ -92,7 +92,7 @@ class ImuWatchdog:
 
     @property
     def timeout_s(self) -> float:
-        """0 for never."""
+        """Seconds without a sample after which the watchdog expires; 0: never."""
         return TIMEOUT_S if self._is_imu else 0.0
 
     def found_imu(self) -> None:

@@ -1,8 +1,7 @@
-"""What leaves a robot over a thin link: of each stream the newest, so often, and nothing that can wait for room.
+"""A sieve for messages that leave a robot over a thin link: the newest of each stream, while there is room.
 
-Pure: the owner guards it, and passes on what comes out of it.
-
-Stops and whatever else is on its way *to* the robot never come here, nor do flags, and states that are ``prompt``.
+Pure: the owner guards it, and sends the messages that come out of it. Stops and all other messages *to* the robot never
+come here, nor do flags, and states that are ``prompt``.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,12 +16,12 @@ from pebble.forwarding.subjects import Subject
 from pebble.transports import Message, QoS
 from pebble.transports.counters import Counters
 
-TOPICS = 512  # of which the newest message waits, or is known to have been sent
-OVERDUE_S = 10.0  # what has waited for so long gives way no more
+TOPICS = 512  # whose newest message waits, or is known to have been sent
+OVERDUE_S = 10.0  # a message that has waited for so long gives way no more
 
 
 class Rank(IntEnum):
-    """What leaves a robot waits in this order: streams as soon as there is little room, heartbeats last."""
+    """The order in which messages wait: streams as soon as there is little room, heartbeats last."""
 
     STREAM = 1
     STATE = 2
@@ -40,13 +39,13 @@ class Waiting(Struct, frozen=True):
 
 
 class Sieve:
-    """``takes(rank, size)`` is whether so many bytes are sent now; times are those of ``clock``.
+    """A sieve; ``takes(rank, size)`` returns True if so many bytes are sent now, times are those of ``clock``.
 
-    ``stream_s``: seconds between two messages of a stream, at least. Counted as ``thinned`` are those that more of
-    their stream followed, and as ``shed`` messages for which there was no room while there was a newer one.
-    What waits for room goes in the order in which it began to wait, and states go before events, which go before
-    streams: else a large message never finds any, while smaller ones take it. After OVERDUE_S a stream has its place
-    among the states, and an event goes before them, so that none waits for ever.
+    ``stream_s``: seconds between two messages of a stream, at least. Messages of a stream that newer ones replaced are
+    counted as ``thinned``, and as ``shed`` where there was no room for them.
+    Messages that wait for room go in the order in which they began to wait, states before events before streams: else
+    smaller ones would take the room that a large one needs. After OVERDUE_S a stream has its place among the states,
+    and an event goes before them, so that none waits for ever.
     """
 
     def __init__(self, takes: Callable[[Rank, int], bool], counters: Counters, clock: Callable[[], float]) -> None:
@@ -54,7 +53,7 @@ class Sieve:
         self._takes, self._counters, self._clock = takes, counters, clock
         self._waiting: dict[str, Waiting] = {}  # by topic, in the order of their last turns
         self._sent_at: dict[str, float] = {}  # of streams, the oldest first
-        self._short: set[Rank] = set()  # of which one waits for room
+        self._short: set[Rank] = set()  # ranks with a message that waits for room
         self._event_since = inf  # since when the next event waits
         self._event_asked = False  # whether there is room, in vain
 
@@ -62,7 +61,7 @@ class Sieve:
         return len(self._waiting)
 
     def takes_event(self, message: Message) -> bool:
-        """True if an event is sent now. Each counts, so they wait elsewhere, in order."""
+        """Return True if an event is sent now; else note since when one waits. Events wait elsewhere, in order."""
         overdue = self._event_is_overdue
         if (overdue or Rank.STATE not in self._short) and self._takes(Rank.STATE, _size(message)):
             self._event_since = inf
@@ -71,7 +70,7 @@ class Sieve:
         return False
 
     def keeps(self, subject: Subject, message: Message, forward: Forward) -> bool:
-        """True if ``message`` waits here, for itself or in vain; else it is sent now."""
+        """Keep ``message`` and return True, or return False if it is sent now. One without room may be dropped."""
         rank, topic = _rank(subject, message), message.topic
         if rank is None:
             return False
@@ -91,7 +90,7 @@ class Sieve:
         return True
 
     def due(self, rank: Rank) -> Iterator[Waiting]:
-        """Yield what of this rank is sent now, one after the other; of states none while an event is overdue."""
+        """Yield the waiting messages of this rank that are sent now. States wait while an event is overdue."""
         if rank is Rank.STATE and self._event_is_overdue:
             asked, self._event_asked = self._event_asked, False
             if asked:  # since the last time: else it has gone
@@ -100,16 +99,16 @@ class Sieve:
             self._event_since = inf
         self._short.discard(rank)
         overdue = self._clock() - OVERDUE_S
-        for topic, one in list(self._waiting.items()):
-            if rank is (Rank.STATE if one.since <= overdue else one.rank) and self._is_turn(one.rank, topic):
-                if not self._passes(rank, one.message):
+        for topic, entry in list(self._waiting.items()):
+            if rank is (Rank.STATE if entry.since <= overdue else entry.rank) and self._is_turn(entry.rank, topic):
+                if not self._passes(rank, entry.message):
                     return
-                self._note(one.rank, topic)
+                self._note(entry.rank, topic)
                 del self._waiting[topic]
-                yield one
+                yield entry
 
     def empty(self) -> Iterator[Waiting]:
-        """Yield all that waits: there is room enough from now on."""
+        """Yield all waiting messages: there is room enough from now on."""
         self._short.clear()
         while self._waiting:
             yield self._waiting.pop(next(iter(self._waiting)))
@@ -119,18 +118,18 @@ class Sieve:
         return self._clock() - self._event_since >= OVERDUE_S
 
     def _is_turn(self, rank: Rank, topic: str) -> bool:
-        """True if the last message of a stream is long enough ago."""
+        """True if the stream may send again."""
         return rank is Rank.STATE or self._clock() - self._sent_at.get(topic, -inf) >= self.stream_s
 
     def _passes(self, rank: Rank, message: Message) -> bool:
-        """True if there is room, and none of this rank waits for it."""
+        """Return True if there is room, and no message of this rank waits for it."""
         if rank in self._short or not self._takes(rank, _size(message)):
             self._short.add(rank)
             return False
         return True
 
     def _note(self, rank: Rank, topic: str) -> None:
-        """Note that it is sent: a stream's next turn is later."""
+        """Note that a message is sent: a stream's next turn is later."""
         if rank is not Rank.STREAM:
             return
         self._sent_at.pop(topic, None)
@@ -144,7 +143,7 @@ def _size(message: Message) -> int:
 
 
 def _rank(subject: Subject, message: Message) -> Rank | None:
-    """Return the rank in which it waits; None: it never does."""
+    """Return the rank of a message; None: it never waits."""
     if subject.kind is Kind.STREAM or (subject.kind is Kind.EVENT and message.qos is QoS.LATEST):
         return Rank.STREAM
     return Rank.STATE if subject.kind is Kind.STATE else None

@@ -1,6 +1,6 @@
-"""What the way to the remote broker carries: its level by measurement, and how much may be on its way. Pure.
+"""The capacity of the way to the remote broker: its level by measurement, and the bytes that may be on it. Pure.
 
-Losses alone lower nothing: what was lost and sent again delays an answer, and TCP's own round trips leave it out.
+Losses alone lower nothing: a lost packet that is sent again delays an answer, but not TCP's own round trips.
 """
 
 from collections import deque
@@ -8,7 +8,7 @@ from collections import deque
 from msgspec import Struct
 
 from pebble.contract.payloads import LinkLevel
-from pebble.forwarding.sieve import Rank
+from pebble.extensions.thin.sieve import Rank
 from pebble.runtime.rate import InFlight
 from pebble.transports import Answer
 
@@ -27,6 +27,7 @@ _MOST = 256  # messages that are remembered
 _SLACK_BYTES = 64  # of pings and headers
 _CARRIED = 0.75  # of what a link carries; the rest are headers of small packets
 _POLL_S = 0.1  # so late an acknowledgement is noticed
+_RUN_S = 1.0  # late commands that are further apart are no run
 
 
 class _Rule(Struct, frozen=True):
@@ -64,7 +65,7 @@ class ShortestTrip:
 
 
 class Crowd:
-    """Whether a queue stands: then operators and streams send less until it has drained, else it would stay."""
+    """The finding that a queue stands: operators and streams then send less until it has drained."""
 
     def __init__(self) -> None:
         self.stands = False
@@ -80,7 +81,7 @@ class Crowd:
 
 
 class LinkMeter:
-    """Decides the level from answers: at `auto` by the queue, which is how much longer than the shortest one they take.
+    """The level of a link, from answers to pings: at `auto` by the queue, their time beyond that of the shortest one.
 
     A level ends early for the next lower one, and late for the next higher one. Each rise that fails doubles the time
     without a queue that the next one takes, up to ten minutes.
@@ -109,7 +110,7 @@ class LinkMeter:
         return self._shortest.seconds
 
     def follow(self, answer: Answer | None, now: float) -> None:
-        """Follow what the connection knows of its newest question: an answer counts once, its absence again."""
+        """Follow the newest answer of the connection: it counts once, its absence again and again."""
         if answer is None:
             self.lost()
         elif answer.number != self._answers or (
@@ -129,7 +130,7 @@ class LinkMeter:
             self._decide(now)
 
     def lost(self) -> None:
-        """Note that the connection is lost: what is measured next does not follow what was measured."""
+        """Note that the connection is lost: the next measurements are of another one."""
         self._answers = 0
         self._crowd = Crowd()
         self._forget()
@@ -163,10 +164,10 @@ class LinkMeter:
 
 
 class Room:
-    """How much may be on its way to the remote broker, so that nothing waits there for long.
+    """The bytes that may be on their way to the remote broker, so that nothing waits there for long.
 
-    Of a known link what drains within 150 ms beyond a round trip. Else it is learned: a little more with each message
-    that is confirmed without delay, a good deal less with one that is not.
+    For a known link they drain within 150 ms beyond a round trip. Else they are learned: a little more with each
+    message that is confirmed without delay, a good deal less with one that is not.
     """
 
     def __init__(self, kbit: float | None = None) -> None:
@@ -174,24 +175,24 @@ class Room:
         self._bytes = float(_FIRST_BYTES if self._rate is None else _LEAST_BYTES)
         self._in_flight = InFlight(_SLACK_BYTES, _MOST)
         self._waiting = 0
-        self._used = False  # there was no room
+        self._used = False  # a message found no room
 
     def poll(self, waiting: int, round_trip_s: float, now: float) -> None:
-        """So many bytes are not confirmed; the shortest round trip is merely the way there and back."""
+        """Note how many bytes are not confirmed; the shortest round trip is merely the way there and back."""
         self._waiting = waiting
         confirmed = self._in_flight.acknowledge(waiting)
         if self._rate is not None:
             self._bytes = max(_LEAST_BYTES, self._rate * (round_trip_s + _SOON_S))
-        elif any(now - one.at - round_trip_s > _SOON_S + _POLL_S for one in confirmed):
+        elif any(now - sent.at - round_trip_s > _SOON_S + _POLL_S for sent in confirmed):
             self._bytes = max(_LEAST_BYTES, 0.7 * self._bytes)
         elif self._used:
-            self._bytes = min(_MOST_BYTES, self._bytes + sum(one.size for one in confirmed))
+            self._bytes = min(_MOST_BYTES, self._bytes + sum(sent.size for sent in confirmed))
         self._used = False
 
     def takes(self, rank: Rank, size: int, now: float) -> bool:
-        """True if so many bytes of this rank are sent now, of which it takes note; one message is always on its way.
+        """Return True if ``size`` bytes of this rank are sent now, and note them; one message is always on its way.
 
-        One that is larger than the room takes as much: what waits last leaves some for it.
+        A message that is larger than the room takes all of it: the last ranks leave some for it.
         """
         fits = not self._waiting or self._waiting + min(size, self._bytes) <= self._bytes * rank
         self._used = self._used or not fits
@@ -199,3 +200,24 @@ class Room:
             self._in_flight.sent(size, now)
             self._waiting += size
         return fits
+
+
+class LateRun:
+    """Commands of senders that do not follow the link: late ones, one soon after the other, since a prompt one."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._since = self._newest_at = 0.0
+
+    def note(self, late: bool, now: float) -> None:
+        """Note a command that does not tell its age."""
+        if not late:
+            self.count = 0
+            return
+        if not self.count or now - self._newest_at > _RUN_S:
+            self.count, self._since = 0, now
+        self.count, self._newest_at = self.count + 1, now
+
+    def seconds(self, now: float) -> float:
+        """Return how long all of them were late."""
+        return now - self._since if self.count else 0.0

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from pebble.extensions.fleet.hub_access import Access, AccountAdmission, HubAccount, access_control, written
 from pebble.transports import QoS
-from pebble.transports.zenoh.access import HubAccount
-from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.records import Retained
 from pebble.transports.zenoh.wire import Hello, Stamp, Will, account_of, asked
 
@@ -16,23 +17,23 @@ OWN = {f"{GOOB}/outgoing/online": 1, "pebble/robots/fred/outgoing/online": 2, "@
 
 
 @pytest.fixture
-def admission() -> Admission:
-    admission = Admission([], ("+/+/+/incoming/by/#",))
-    admission.accounts = {
-        "goob": HubAccount((f"{GOOB}/outgoing/#",), (f"{GOOB}/#",)),
-        "otto": HubAccount(),
-    }
+def admission(tmp_path: Path) -> AccountAdmission:
+    accounts = {"goob": HubAccount((f"{GOOB}/outgoing/#",), (f"{GOOB}/#",)), "otto": HubAccount()}
+    file = tmp_path / "access"
+    file.write_bytes(written(Access(access_control([]), accounts)))
+    admission = AccountAdmission(file, [], ("+/+/+/incoming/by/#",))
+    admission.rules()
     return admission
 
 
-def test_a_robot_leaves_its_will_and_learns_what_the_hub_lacks_of_it(admission: Admission) -> None:
+def test_a_robot_leaves_its_will_and_learns_what_the_hub_lacks_of_it(admission: AccountAdmission) -> None:
     hello = admission.hello("goob", Hello("goob~1", 3, WILL, OWN))
     assert hello is not None
     assert hello.will == Will(WILL.topic, b"0", QoS.DELIVERED, True, "goob~goob-bridge"), "nobody else's predecessor"
     assert (hello.retained_count, hello.own) == (3, {f"{GOOB}/outgoing/online": 1})
 
 
-def test_a_person_leaves_nothing(admission: Admission, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_person_leaves_nothing(admission: AccountAdmission, caplog: pytest.LogCaptureFixture) -> None:
     hello = admission.hello("otto", Hello("otto~1", 0, WILL, OWN))
     assert hello == Hello("otto~1", 0, None, {})
     assert admission.refused == 1
@@ -45,12 +46,12 @@ def test_a_person_leaves_nothing(admission: Admission, caplog: pytest.LogCapture
 @pytest.mark.parametrize(
     ("account", "name"), [("otto", "goob~1"), ("otto", "otto"), ("otto", "0badf00d"), ("x", "x~1")]
 )
-def test_a_session_is_named_after_its_account(admission: Admission, account: str, name: str) -> None:
+def test_a_session_is_named_after_its_account(admission: AccountAdmission, account: str, name: str) -> None:
     assert admission.hello(account, Hello(name, 0, None, {})) is None
     assert admission.hello("", Hello(name, 0, WILL, OWN)) == Hello(name, 0, WILL, OWN), "from this machine"
 
 
-def test_nothing_is_retained_under_a_name(admission: Admission) -> None:
+def test_nothing_is_retained_under_a_name(admission: AccountAdmission) -> None:
     def taken(key: str) -> bool:
         return admission.admitted(Retained(key, b"{}", Stamp(QoS.DELIVERED, 1, "x"))) is not None
 

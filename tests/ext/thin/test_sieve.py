@@ -9,9 +9,9 @@ from math import inf
 import pytest
 
 from pebble.contract import Kind
-from pebble.forwarding import sieve as module
+from pebble.extensions.thin import sieve as module
+from pebble.extensions.thin.sieve import Rank, Sieve
 from pebble.forwarding.routing import Forward
-from pebble.forwarding.sieve import Rank, Sieve
 from pebble.forwarding.subjects import Subject
 from pebble.transports import Message, QoS
 from pebble.transports.counters import Counters

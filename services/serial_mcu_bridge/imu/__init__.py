@@ -1,0 +1,12 @@
+"""Inertial sensors: the service of one with a line of text of its own, and what the lines of all of them become."""
+
+from pebble.contract.serial_protocols import SerialProtocol
+from pebble.extension import Extension
+
+EXTENSION = Extension(
+    name="imu",
+    protocols={
+        "imu_mpu6050_v1": SerialProtocol("pebble.services.serial_mcu_bridge.imu.bridge:ImuBridge", is_imu=True),
+    },
+    page="docs/ext/boards.md",
+)
