@@ -176,7 +176,7 @@ def _config(
     lacking = [Note(tuple(one.key.split(".", 1)), one.reason) for one in missing]
     (notes.warnings if lenient else notes.problems).extend(lacking)
     tree, kind, rules = _tree(installed)
-    reader = Reader(folder, env, rules, notes, other_forms=True)
+    reader = Reader(folder, env, rules, notes, file=path, other_forms=True)
     merged = with_instances(own)
     unread = [*extension.keys_of_missing(installed), *(key for one in found if core_only for key in one.sections)]
     root = reader.section(tree, without(merged, unread))

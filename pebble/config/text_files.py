@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 from pebble.errors import PebbleError
+from pebble.ownership import read_for
 
 PASSWORD = "PEBBLE_PASSWORD"  # noqa: S105 - the name of an environment variable
 
@@ -17,13 +18,13 @@ def read_text(path: Path) -> str:
     return text_of(path.read_bytes())
 
 
-def read_password(file: Path, option: str) -> str:
+def read_password(file: Path, option: str, place: Path | None = None) -> str:
     """Return the text of the file that ``option`` names, without its final newline. Raises PebbleError.
 
-    It does not repeat the name of the file, which may be the password itself.
+    It does not repeat the name of the file, which may be the password itself. ``place``: a file that names it.
     """
     try:
-        return read_text(file).rstrip("\n")
+        return text_of(file.read_bytes() if place is None else read_for(place, file)).rstrip("\n")
     except OSError as error:
         raise PebbleError(f"{option}: {error.strerror}: name a file with the password in it") from None
     except NotTextError as error:

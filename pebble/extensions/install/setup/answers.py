@@ -111,7 +111,7 @@ def read_file(file: Path) -> tuple[dict[str, Any], Secrets]:
     if unknown := [key for key in given if key not in KEYS]:
         raise AnswersError(f"{file}: {unknown[0]}: unknown key; there are {', '.join(KEYS)}")
     files = {key: given.pop(key) for key in (_PASSWORD, _BROKER_PASSWORD) if key in given}
-    passwords = {key: read_password(Path(str(named)), key) for key, named in files.items()}
+    passwords = {key: read_password(Path(str(named)), key, file) for key, named in files.items()}
     if _PASSWORD in passwords:
         usable(passwords[_PASSWORD])
     return given, Secrets(password=passwords.get(_PASSWORD), broker_password=passwords.get(_BROKER_PASSWORD))

@@ -245,6 +245,7 @@ def _path(member: tarfile.TarInfo, backup: Backup, name: str) -> str:
     path = PurePosixPath(member.name)
     if (
         not member.isfile()
+        or member.issparse()  # a few bytes may stand for a whole memory
         or path.is_absolute()
         or ".." in path.parts
         or str(path) != member.name
