@@ -11,7 +11,7 @@ from msgspec.structs import asdict
 
 from pebble.config import hosts
 from pebble.config.hosts import is_loopback
-from pebble.config.text_files import read_password
+from pebble.config.text_files import read_password, read_text
 from pebble.contract.identity import LEVEL, LEVEL_RULE, untypeable
 from pebble.contract.names import NAME
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
@@ -102,7 +102,7 @@ _PASSWORD, _BROKER_PASSWORD = "password_file", "broker_password_file"
 def read_file(file: Path) -> tuple[dict[str, Any], Secrets]:
     """Read a file of answers, and the passwords in the files that it names. Raises PebbleError."""
     try:
-        given = msgspec.json.decode(file.read_bytes(), type=dict[str, Any])
+        given = msgspec.json.decode(read_text(file), type=dict[str, Any])
     except OSError as error:
         raise AnswersError(f"--answers {file}: {error.strerror}") from None
     except msgspec.MsgspecError as error:
