@@ -10,6 +10,8 @@ from typing import BinaryIO, NamedTuple
 
 from pebble.errors import PebbleError
 
+SUBUIDS = Path("/etc/subuid")  # whom users may be in containers of theirs: NAME:FIRST:COUNT
+
 
 class Owner(NamedTuple):
     """A user and a group, by their numbers."""
@@ -65,7 +67,7 @@ def _has_name(uid: int) -> bool:
     with suppress(KeyError):
         return bool(pwd.getpwuid(uid))
     with suppress(OSError, ValueError):
-        ranges = [line.split(":")[1:] for line in Path("/etc/subuid").read_text(encoding="utf-8").splitlines()]
+        ranges = [line.split(":")[1:] for line in SUBUIDS.read_text(encoding="utf-8").splitlines()]
         return any(int(first) <= uid < int(first) + int(count) for first, count in ranges)
     return False
 

@@ -52,8 +52,8 @@ def run(
     folder = folder or usual
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if folder == usual and folder.lstat().st_uid not in (0, os.getuid()):
-            raise DeviceError(f"{folder} is of another user: choose another one with --folder")
+        if folder == usual and (uid := folder.lstat().st_uid) not in (0, os.getuid()):
+            raise DeviceError(f"{folder} belongs to user {uid}: choose another one with --folder")
     except OSError as error:
         raise DeviceError(f"{error.filename}: {error.strerror}") from None
     with ExitStack() as stack:
