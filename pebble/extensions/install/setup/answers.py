@@ -11,7 +11,7 @@ from msgspec.structs import asdict
 
 from pebble.config import hosts
 from pebble.config.hosts import is_loopback
-from pebble.config.text_files import read_password, read_text
+from pebble.config.text_files import NotTextError, read_password, read_text
 from pebble.contract.identity import LEVEL, LEVEL_RULE, untypeable
 from pebble.contract.names import NAME
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
@@ -105,7 +105,7 @@ def read_file(file: Path) -> tuple[dict[str, Any], Secrets]:
         given = msgspec.json.decode(read_text(file), type=dict[str, Any])
     except OSError as error:
         raise AnswersError(f"--answers {file}: {error.strerror}") from None
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, NotTextError) as error:
         raise AnswersError(f"{file}: {error}: write an object with the keys {', '.join(KEYS)}") from None
     given = {key: value for key, value in given.items() if not key.startswith("//")}
     if unknown := [key for key in given if key not in KEYS]:
