@@ -10,12 +10,14 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import pytest
 
 from pebble import ownership
 from pebble.config import load
 from pebble.errors import PebbleError
+from pebble.extensions.checks.report.report import make
 from pebble.extensions.checks.report.secrets_here import secrets_of
 from pebble.extensions.fleet import applying
 from pebble.extensions.fleet.applying import pid_of
@@ -210,3 +212,15 @@ def test_what_a_user_names_root_neither_reads_nor_runs(
     assert re.search("denied|belongs to (user|all)", told)
     assert "of root" not in told
     assert os.geteuid() == 0
+
+
+def test_who_asks_as_a_user_has_no_variables_of_roots(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[dict[str, Any]] = []
+    monkeypatch.setenv("TOKEN_OF_ROOT", "x")
+    monkeypatch.setattr("pebble.extensions.checks.report.report.output_of", lambda *_, **how: asked.append(how) or "")
+    (place / "theirs").mkdir()
+    os.chown(place / "theirs", NOBODY, NOBODY)
+    text = json.dumps({"robot": {"id": "goob"}, "transport": {"run_dir": str(place / "theirs")}})
+    (place / "robot.json").write_text(text)
+    make(Places(place), place / "robot.json")
+    assert ["TOKEN_OF_ROOT" in how["env"] for how in asked if "user" in how] == [False]
