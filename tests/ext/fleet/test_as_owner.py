@@ -220,7 +220,7 @@ def test_who_asks_as_a_user_has_no_variables_of_roots(place: Path, monkeypatch: 
     monkeypatch.setattr("pebble.extensions.checks.report.report.output_of", lambda *_, **how: asked.append(how) or "")
     (place / "theirs").mkdir()
     os.chown(place / "theirs", NOBODY, NOBODY)
-    text = json.dumps({"robot": {"id": "goob"}, "transport": {"run_dir": str(place / "theirs")}})
+    text = json.dumps({"robot": {"id": "goob"}, "transport": {"kind": "mqtt", "run_dir": str(place / "theirs")}})
     (place / "robot.json").write_text(text)
     make(Places(place), place / "robot.json")
     assert ["TOKEN_OF_ROOT" in how["env"] for how in asked if "user" in how] == [False]
