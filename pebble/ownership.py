@@ -3,10 +3,14 @@
 import errno
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from pebble.errors import PebbleError
+
+SUBUIDS = Path("/etc/subuid")  # whom users may be in containers of theirs: NAME:FIRST:COUNT
 
 
 class Owner(NamedTuple):
@@ -16,11 +20,12 @@ class Owner(NamedTuple):
     gid: int
 
 
-def owner_of(folder: Path, *, nameless: bool = True) -> Owner:
+def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Owner:
     """Return the one user besides root who may change what lies in ``folder``, or root; it need not be there yet.
 
-    ``nameless``: users without an entry count, too; in a container they are those of the machine around it. Raises
-    PebbleError where several users may, and for a link on the way that a user besides root can change.
+    It may be a file as well. ``nameless``: users without an entry count, too; in a container they are those of the
+    machine around it. Raises PebbleError where several users may, for a link on the way that a user besides root can
+    change, and for what should be ``there`` and is not: its owner may have removed it since it was read.
     """
     place, owner = Path("/"), Owner(0, 0)
     system = place.lstat().st_uid  # in a user namespace root's files may seem to be of another user
@@ -29,13 +34,15 @@ def owner_of(folder: Path, *, nameless: bool = True) -> Owner:
         place /= names.pop(0)
         try:
             found = place.lstat()
-        except OSError:  # it is missing, or not to be seen by this user
+        except OSError as error:  # it is missing, or not to be seen by this user
+            if there:
+                raise PebbleError(f"{place}: {error.strerror}") from None
             break
         uid = 0 if found.st_uid == system or not (nameless or _has_name(found.st_uid)) else found.st_uid
         if stat.S_ISLNK(found.st_mode):
             if owner.uid or uid:
                 raise PebbleError(f"{place} is a link of user {uid or owner.uid}: name the folder itself")
-            return owner_of(place.parent.joinpath(place.readlink(), *names), nameless=nameless)
+            return owner_of(place.parent.joinpath(place.readlink(), *names), nameless=nameless, there=there)
         if owner.uid not in (0, uid):
             raise PebbleError(f"{place} belongs to user {uid}, and lies in a folder of user {owner.uid}: move it")
         if uid == 0 and _is_shared(found):
@@ -54,19 +61,30 @@ def others_in(folder: Path) -> str:
 
 
 def _has_name(uid: int) -> bool:
+    """True for a user with an entry, and for those whom such a user may be in a container."""
     import pwd  # which Windows lacks
 
-    try:
-        pwd.getpwuid(uid)
-    except KeyError:
-        return False
-    return True
+    with suppress(KeyError):
+        return bool(pwd.getpwuid(uid))
+    with suppress(OSError, ValueError):
+        ranges = [line.split(":")[1:] for line in SUBUIDS.read_text(encoding="utf-8").splitlines()]
+        return any(int(first) <= uid < int(first) + int(count) for first, count in ranges)
+    return False
 
 
 def _is_shared(found: os.stat_result) -> bool:
     """True if others than the owner can replace what is in a folder; where it is sticky they cannot."""
     writers = stat.S_IWOTH | (stat.S_IWGRP if found.st_gid else 0)
     return bool(found.st_mode & writers) and stat.S_ISDIR(found.st_mode) and not found.st_mode & stat.S_ISVTX
+
+
+def is_open(folder: Path) -> bool:
+    """True for a folder where every user may make files, as in /tmp, though not remove those of others."""
+    try:
+        found = folder.stat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and bool(found.st_mode & stat.S_IWOTH)
 
 
 def open_plain(file: Path) -> BinaryIO:
@@ -78,7 +96,49 @@ def open_plain(file: Path) -> BinaryIO:
     raise OSError(errno.EINVAL, "is no plain file", str(file))
 
 
-def read_plain(file: Path) -> bytes:
-    """Return what is in such a file. Raises OSError."""
+def read_plain(file: Path, most: int = 1 << 28) -> bytes:
+    """Return what is in such a file. Raises OSError, also for one with more than ``most`` bytes: holes cost nothing."""
     with open_plain(file) as opened:
-        return opened.read()
+        if os.fstat(opened.fileno()).st_size > most:
+            raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(file))
+        return opened.read(most)
+
+
+def read_for(place: Path, file: Path) -> bytes:
+    """Return what is in such a file that ``place`` names; to root, what the owner of that may read.
+
+    Raises OSError, and PebbleError as :func:`owner_of`.
+    """
+    if hasattr(os, "geteuid") and os.geteuid() == 0 and (owner := owner_of(place, nameless=False, there=True)).uid:
+        with as_user(owner):
+            return read_plain(file)
+    return read_plain(file)
+
+
+@contextmanager
+def as_user(owner: Owner) -> Iterator[None]:
+    """Take the rights of a user, and only these, for a while; of a process with one thread, which root has started."""
+    before, groups = Owner(os.geteuid(), os.getegid()), os.getgroups()
+    _take(*_rights_of(owner))
+    try:
+        yield
+    finally:
+        _take(before, groups)
+
+
+def _take(owner: Owner, groups: list[int]) -> None:
+    os.seteuid(0)
+    os.setgroups(groups)
+    os.setegid(owner.gid)
+    os.seteuid(owner.uid)
+
+
+def _rights_of(owner: Owner) -> tuple[Owner, list[int]]:
+    """Return the user with the folder's group, if it is one of the user's: a folder has it from the one above, too."""
+    import pwd  # which Windows lacks
+
+    with suppress(KeyError):  # a user without an entry has no groups
+        user = pwd.getpwuid(owner.uid)
+        groups = os.getgrouplist(user.pw_name, user.pw_gid)
+        return Owner(owner.uid, owner.gid if owner.gid in groups else user.pw_gid), groups
+    return Owner(owner.uid, owner.uid), [owner.uid]

@@ -169,7 +169,7 @@ def _config(
     about_missing = [Note(tuple(lost.key.split(".", 1)), lost.reason) for lost in missing]
     (notes.warnings if lenient else notes.problems).extend(about_missing)
     tree, kind, rules = _tree(installed)
-    reader = Reader(folder, env, rules, notes, other_forms=True)
+    reader = Reader(folder, env, rules, notes, file=path, other_forms=True)
     merged = with_instances(written)
     unread = extension.keys_of_missing(installed)
     if core_only:

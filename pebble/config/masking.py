@@ -64,4 +64,6 @@ def masked(value: Any, key: str = "") -> Any:
 
 
 def _object(items: dict[str, Any]) -> dict[str, Any]:
+    if is_secret(str(items.get("key", ""))):  # an option of a script
+        items = items | {"default": HIDDEN}
     return {without_secrets(key): masked(value, key) for key, value in items.items() if value is not None}

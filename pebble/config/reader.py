@@ -35,6 +35,7 @@ def _known(kind: type[Section]) -> dict[str, FieldInfo]:
 class Reader:
     """Reads one file. Relative paths start at ``folder``; ``env`` is the environment for secrets.
 
+    ``file``: what it reads; of files that this names, root reads only what its owner may.
     With ``other_forms`` it reads what the original accepts as well; where that changes a value, it is a warning.
     """
 
@@ -45,8 +46,10 @@ class Reader:
         rules: Sequence[Rule],
         notes: problems.Notes | None = None,
         *,
+        file: Path | None = None,
         other_forms: bool = False,
     ) -> None:
+        self.file = file or folder
         self.folder, self.env, self.notes, self._other_forms = folder, env, notes or problems.Notes(), other_forms
         self.password_variables: dict[str, None] = {}  # the names that were read, in order
         self._rules = rules

@@ -5,8 +5,12 @@ import re
 HIDDEN = "***"
 _NAMES = "pass|secret|token|credential|(?:api|access|private|auth).?key"
 _KEY = re.compile(_NAMES, re.IGNORECASE).search
-_WORD = re.compile(rf"(\b[\w-]{{0,40}}(?:{_NAMES}|pwd)[\w-]{{0,40}}=)[^&\s]+", re.IGNORECASE)  # of a query or an option
-is_secret_option = re.compile(rf"--?[\w-]{{0,40}}(?:{_NAMES}|pwd)[\w-]{{0,40}}", re.IGNORECASE).fullmatch
+_NAME = rf"[\w-]{{0,40}}(?:{_NAMES}|pwd)[\w-]{{0,40}}"
+_WORD = re.compile(rf"(\b(?:{_NAME}|[\w-]{{0,40}}\bsig(?:nature)?)=)[^&\s]+", re.IGNORECASE)  # of a query or an option
+_END = r"(?<!_file)(?<!_env)"  # of a name; what is in a file or a variable stays there
+#: A member of an object in JSON, and in JSON that is itself a text there.
+_MEMBER = re.compile(rf'("{_NAME}{_END}"\s*:\s*")(?:[^"\\]|\\.)+|(\\"{_NAME}{_END}\\"\s*:\s*\\")[^"\\]+', re.IGNORECASE)
+is_secret_option = re.compile(rf"--?{_NAME}", re.IGNORECASE).fullmatch
 # URLs in a URL are percent-encoded: %3A is a colon, %2F a slash, %40 an @.
 _AT = re.compile("@|%40")
 _SLASHES = re.compile("://|%3A%2F%2F", re.IGNORECASE)
@@ -27,7 +31,8 @@ def without_secrets(text: str) -> str:
     """
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
-    return _WORD.sub(rf"\1{HIDDEN}", text) if "=" in text else text
+    text = _WORD.sub(rf"\1{HIDDEN}", text) if "=" in text else text
+    return _MEMBER.sub(lambda found: f"{found[1] or found[2]}{HIDDEN}", text) if '":' in text else text
 
 
 def _without_login(match: re.Match[str]) -> str:

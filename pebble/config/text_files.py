@@ -1,11 +1,14 @@
 """Text files that people write, read as UTF-8 on every system and in every locale."""
 
+import errno
 import os
 from pathlib import Path
 
 from pebble.errors import PebbleError
+from pebble.ownership import read_for
 
 PASSWORD = "PEBBLE_PASSWORD"  # noqa: S105 - the name of an environment variable
+_LONGEST = 1 << 24  # bytes of a text that a person has written
 
 
 class NotTextError(PebbleError):
@@ -14,16 +17,20 @@ class NotTextError(PebbleError):
 
 def read_text(path: Path) -> str:
     """Return the file's text, without a byte order mark, with ``\\n`` after each line. Raises OSError, NotTextError."""
-    return text_of(path.read_bytes())
+    with path.open("rb") as file:  # a pipe, too; a device may have no end
+        data = file.read(_LONGEST + 1)
+    if len(data) > _LONGEST:
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
+    return text_of(data)
 
 
-def read_password(file: Path, option: str) -> str:
+def read_password(file: Path, option: str, place: Path | None = None) -> str:
     """Return the text of the file that ``option`` names, without its final newline. Raises PebbleError.
 
-    It does not repeat the name of the file, which may be the password itself.
+    It does not repeat the name of the file, which may be the password itself. ``place``: a file that names it.
     """
     try:
-        return read_text(file).rstrip("\n")
+        return (read_text(file) if place is None else text_of(read_for(place, file))).rstrip("\n")
     except OSError as error:
         raise PebbleError(f"{option}: {error.strerror}: name a file with the password in it") from None
     except NotTextError as error:

@@ -22,6 +22,7 @@ from pebble.launcher.run_lock import RunLock
 from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.launcher.status import StatusPublisher
 from pebble.runtime import notes
+from pebble.runtime.as_owner import require_own
 from pebble.runtime.connections import check_connections
 from pebble.runtime.parent import LAUNCHER_PID
 from pebble.transports import segments
@@ -68,6 +69,8 @@ class Launcher:
         Raises PebbleError if the robot runs already or its run directory cannot be used. Main thread only.
         """
         config = self._config
+        if config.path is not None:
+            require_own(config.path, "runs nothing of it", there=True)
         own_records = OwnRecords(self._logs, config.log_level)
         in_state_dir = config.state_file("launcher").with_suffix(".lock")
         with own_records, RunLock(config.run_dir(), config.base, in_state_dir) as lock:

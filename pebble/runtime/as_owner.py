@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 
 from pebble.errors import PebbleError
-from pebble.ownership import Owner, owner_of
+from pebble.ownership import Owner, as_user, is_open, owner_of
 from pebble.runtime.whole_file import is_root
 
 
@@ -31,7 +31,7 @@ def as_owner(folder: Path, *modules: str, make: bool = False) -> Iterator[None]:
         return
     for name in modules:
         import_module(name)
-    with _as_user(owner):
+    with as_user(owner):
         yield
 
 
@@ -39,42 +39,21 @@ def as_owner(folder: Path, *modules: str, make: bool = False) -> Iterator[None]:
 def as_before() -> Iterator[None]:
     """Be root again for a moment, inside of :func:`as_owner`."""
     if hasattr(os, "getresuid") and os.getresuid()[2] == 0 != os.geteuid():
-        with _as_user(Owner(0, os.getgid())):
+        with as_user(Owner(0, os.getgid())):
             yield
     else:
         yield
 
 
-def require_own(folder: Path) -> None:
-    """Raise PebbleError for root in a folder of another user, where a program runs for long, or with threads."""
-    if is_root() and (uid := owner_of(folder, nameless=False).uid):
-        raise PebbleError(
-            f"{folder} belongs to user {uid}, so root does not write there: run it as that user, or name another folder"
-        )
+def require_own(folder: Path, does: str = "does not write there", *, there: bool = False) -> None:
+    """Raise PebbleError for root in a folder of another user, where a program runs for long, or with threads.
 
-
-@contextmanager
-def _as_user(owner: Owner) -> Iterator[None]:
-    """Take the rights of a user, and only these, for a while."""
-    before, groups = Owner(os.geteuid(), os.getegid()), os.getgroups()
-    _take(owner, _groups_of(owner))
-    try:
-        yield
-    finally:
-        _take(before, groups)
-
-
-def _take(owner: Owner, groups: list[int]) -> None:
-    os.seteuid(0)
-    os.setgroups(groups)
-    os.setegid(owner.gid)
-    os.seteuid(owner.uid)
-
-
-def _groups_of(owner: Owner) -> list[int]:
-    import pwd  # which Windows lacks
-
-    with suppress(KeyError):  # a user without an entry has no other groups
-        user = pwd.getpwuid(owner.uid)
-        return os.getgrouplist(user.pw_name, owner.gid)
-    return [owner.gid]
+    The same in a folder where every user may make files, such as /tmp. It may be a file as well, and may have to be
+    ``there``. ``does``: what root does not, then.
+    """
+    if not is_root():
+        return
+    owner = owner_of(folder, nameless=False, there=there)
+    who = f"user {owner.uid}" if owner.uid else "all users" if is_open(folder) else ""
+    if who:
+        raise PebbleError(f"{folder} belongs to {who}, so root {does}: run it as that user, or name another folder")

@@ -16,9 +16,11 @@ import pebble
 from pebble.config import Config
 from pebble.config.home import in_home
 from pebble.contract.identity import meant
+from pebble.errors import PebbleError
 from pebble.extensions.operator.client.forms import MAX_SETTINGS, Setting, form
 from pebble.extensions.scripts.config import AutonomyManager
 from pebble.extensions.scripts.config import Script as ScriptSection
+from pebble.runtime.as_owner import require_own
 from pebble.services.autonomy_manager.describe import (
     MANIFEST,
     BrokenScriptError,
@@ -169,6 +171,11 @@ class Catalogue:
     def _asked(self, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
         """Read the files, and ask the script if ``asks`` and it is one of ours: that takes up to 20 s."""
         described, problem = Description(), ""
+        try:
+            if folder.parent != _OWN_SCRIPTS:
+                require_own(entry, "runs nothing of it")
+        except PebbleError as error:
+            return _Answer(described, problem=str(error), broken=True)
         try:
             described = read_manifest(folder / MANIFEST) or described
         except DescribeError as error:

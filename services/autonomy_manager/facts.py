@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from contextlib import suppress
 from pathlib import Path
@@ -17,6 +18,7 @@ from pebble.errors import PebbleError
 from pebble.extension import Facts
 from pebble.extensions.media.offers import files_offer
 from pebble.extensions.scripts.config import AutonomyManager
+from pebble.ownership import owner_of
 
 if TYPE_CHECKING:
     from pebble.services.autonomy_manager.script import Script
@@ -41,29 +43,31 @@ def facts(config: Config) -> Facts:
         return Facts()
     found: list[dict[str, Script]] = []
     Catalogue(config, asks=False).scan(found.append)
-    return Facts(table=tuple(("script", name, _fitness(script)) for name, script in found[-1].items()))
+    return Facts(table=tuple(("script", name, _fitness(config, script)) for name, script in found[-1].items()))
 
 
-def _fitness(script: Script) -> str:
+def _fitness(config: Config, script: Script) -> str:
     if script.broken or script.ours:
         return f"does not run: {script.broken}" if script.broken else "runs, Pebble's own"
     from pebble.services.autonomy_manager.environment import environment
     from pebble.services.autonomy_manager.interpreter import lacking
 
-    is_asked = not script.own_program and _may_run(script.command[0])
-    missing = lacking(script.command, script.folder, environment(script.environment, ours=False)) if is_asked else []
+    is_asked = not script.own_program and _may_run(config, script)
+    missing = lacking(script.command, script.folder, environment(ours=False)) if is_asked else []
     return f"runs with {script.command[0]}" + (f", which lacks {', '.join(missing)}" if missing else "")
 
 
-def _may_run(program: str) -> bool:
-    """True unless this is root, and the program is of another user."""
-    from pebble.runtime.as_owner import require_own
+def _may_run(config: Config, script: Script) -> bool:
+    """True for a Python of this machine, without variables of the config: that may be a stranger's, and run its own."""
+    from pebble.services.autonomy_manager.environment import local_login
 
+    program = Path(shutil.which(script.command[0]) or "/")
+    if script.environment.keys() - local_login(config) or program.is_relative_to(config.folder):
+        return False
     try:
-        require_own(Path(shutil.which(program) or program).parent)
+        return owner_of(program, nameless=False).uid in (0, os.geteuid())
     except PebbleError:
         return False
-    return True
 
 
 def complete_scripts(context: Any) -> list[str]:

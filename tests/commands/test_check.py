@@ -194,7 +194,12 @@ def test_check_lists_every_script_and_whether_it_runs(run: Run, tmp_path: Path) 
     (other / "program").write_text(f"#!/bin/sh\ntouch {ran}\n")
     (other / "program").chmod(0o755)
     (other / "script.json").write_text(json.dumps({"command": ["./program", str(other / "run.py")]}))
-    manager = {"enabled": True, "scripts": {"patrol": {"python": sys.executable}}}
+    for name in ("own-python", "own-path"):
+        (tmp_path / "autonomy" / name).mkdir()
+        (tmp_path / "autonomy" / name / "run.py").write_text("import cv3")
+    (other / "sitecustomize.py").write_text(f"open({str(ran)!r}, 'w')")
+    scripts = {"patrol": {"python": sys.executable}, "own-python": {"python": "./autonomy/other/program"}}
+    manager = {"enabled": True, "scripts": scripts | {"own-path": {"env": {"PYTHONPATH": str(other)}}}}
     assert run("check", config_file(tmp_path, services={"autonomy_manager": manager}), columns=300) == 0
     lines = [" ".join(line.split()) for line in run.out.splitlines()]
     for expected in (

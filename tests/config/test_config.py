@@ -767,11 +767,15 @@ class TestPasswords:
         [
             ({"password_file": "none"}, "password_file: there is no such file in /"),
             ({"password_file": "."}, "password_file: "),
+            ({"password_file": "fifo"}, "password_file: /"),
+            ({"password_file": "key"}, "password_file: holds several lines, a password is one"),
             ({"password_env": "NOT_SET"}, "password_env: the environment variable NOT_SET is not set"),
             ({"password": SECRET, "password_env": "X"}, "password_env: is a second password beside password"),
         ],
     )
     def test_mistakes_do_not_show_the_password(self, folder: Path, keys: dict[str, Any], expected: str) -> None:
+        os.mkfifo(folder / "fifo")
+        (folder / "key").write_text("4711\n4711\n")
         found = only_problem(self.remote(**keys), {}, folder)
         assert found.startswith(f"services.mqtt_bridge.remote_mqtt.{expected}")
         assert self.SECRET not in found

@@ -158,6 +158,7 @@ def test_the_resolved_config_hides_them(tmp_path: Path) -> None:
     raw = config(f"{REMOTE}/password", SECRET)
     raw["services"]["mqtt_bridge"]["remote_mqtt"]["username"] = "rover"
     raw["services"]["mqtt_bridge"]["reboot_control"] = {"command": ["curl", "--token", SECRET, f"http://a:{SECRET}@b"]}
+    raw["services"]["autonomy_manager"] = {"scripts": {"walk": {"args": [{"key": "api_key", "default": SECRET}]}}}
     assert problems(tmp_path, raw) == ""
     assert SECRET not in json.dumps(resolved(load(tmp_path / "c.json")))
 
@@ -171,6 +172,10 @@ def test_the_resolved_config_hides_them(tmp_path: Path) -> None:
         (f"mqtt://a:{SECRET}@b:1", "mqtt://***@b:1"),
         (f'"a:{SECRET}@b"', '"***@b"'),
         (f"x?token={SECRET}&y=1", "x?token=***&y=1"),
+        (f"x?X-Sig={SECRET}&design=1", "x?X-Sig=***&design=1"),
+        (f'{{"api_key": "{SECRET}", "x": 1}}', '{"api_key": "***", "x": 1}'),
+        (f'"{{\\"api_key\\": \\"{SECRET}\\"}}"', '"{\\"api_key\\": \\"***\\"}"'),
+        ('{"password_file": "x", "token": ""}', '{"password_file": "x", "token": ""}'),
     ],
 )
 def test_only_what_is_secret_is_hidden(text: str, shown: str) -> None:

@@ -1,6 +1,5 @@
 """Checks between keys, and of files and passwords on this machine."""
 
-import os
 import re
 from pathlib import Path as FilePath
 
@@ -11,11 +10,13 @@ from pebble.config.reader import Reader, Rule
 from pebble.config.rules.doors import check_doors
 from pebble.config.rules.exposure import warn_if_readable, warn_of_known_id, warn_of_logins_in_clear
 from pebble.config.rules.shared_topics import shared_topics
-from pebble.config.text_files import NotTextError, read_text
+from pebble.config.text_files import NotTextError, text_of
 from pebble.config.transport import Mqtt, RemoteMqtt, Tls, TransportSection
 from pebble.config.tree import MqttBridge, Root, SerialBridge, Services
 from pebble.config.types import Secret
 from pebble.contract.identity import GATEWAYS, SERVERS
+from pebble.errors import PebbleError
+from pebble.ownership import read_for
 
 _TLS = ("tls/", "quic/")  # endpoints of Zenoh that are encrypted
 #: Words in commands of the original's configs, and why they do harm, or nothing, here.
@@ -200,6 +201,8 @@ def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
     elif mqtt.password_file is not None:
         password = _contents(reader, mqtt.password_file, (*path, "password_file"))
         warn_if_readable(reader.notes, (*path, "password_file"), mqtt.password_file, "this password")
+        if "\n" in (password or ""):  # a key, or another file: what is in it would be sent to the broker
+            reader.notes.problem((*path, "password_file"), "holds several lines, a password is one")
     if password is None:
         return mqtt
     if len(password.encode()) > _LONGEST_TEXT:
@@ -219,15 +222,17 @@ def _variable(reader: Reader, name: str, path: Path) -> str | None:
 def _contents(reader: Reader, file: FilePath, path: Path) -> str | None:
     """Return the file's text without its final newline; if it cannot be read, note the problem and return None."""
     try:
-        return read_text(file).rstrip("\n")
+        return text_of(read_for(reader.file, file)).rstrip("\n")
     except FileNotFoundError:
         # a password that was written instead of a file's name is not repeated
         shown = f"there is no file {file}" if path[-1] != "password_file" else f"there is no such file in {file.parent}"
         reader.notes.problem(path, shown)
     except NotTextError as error:
         reader.notes.problem(path, f"{file} {error}")
+    except PebbleError as error:
+        reader.notes.problem(path, f"cannot be read: {error}")
     except OSError as error:
-        reader.notes.problem(path, f"{file} cannot be read: {os.strerror(error.errno or 0)}")
+        reader.notes.problem(path, f"{file} cannot be read: {error.strerror}")
     return None
 
 

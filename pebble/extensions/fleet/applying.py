@@ -26,6 +26,8 @@ def make(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None,
     """
     if (folder / CONF).exists():
         raise FleetError(f"{folder / CONF} exists already: name another folder")
+    if not str(folder).isprintable():
+        raise FleetError(f"{folder}: this name cannot stand in {CONF}: name another folder")
     server = fleet.brokers[0]
     certificates.init(folder, [*names_of(server), *others])
     set_mode(folder, 0o700)
@@ -164,7 +166,8 @@ def _reload(folder: Path) -> str:
             process = os.pidfd_open(pid)
             try:
                 if _is_broker(pid):  # still
-                    _await_handler(pid)
+                    if not _handles_signal(pid):
+                        raise FleetError(f"mosquitto (process {pid}) would end by SIGHUP: give this command again")
                     signal.pidfd_send_signal(process, signal.SIGHUP)
             finally:
                 os.close(process)
@@ -173,12 +176,13 @@ def _reload(folder: Path) -> str:
     return "at once"
 
 
-def _await_handler(pid: int) -> None:
+def _handles_signal(pid: int) -> bool:
     """Wait while mosquitto starts: it listens before it handles SIGHUP, which would end it (2.0.11, measured)."""
     deadline = time.monotonic() + _STARTING_S
     while time.monotonic() < deadline:
         status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
         caught = next((line.split()[1] for line in status.splitlines() if line.startswith("SigCgt:")), "0")
         if int(caught, 16) >> (signal.SIGHUP - 1) & 1:
-            return
+            return True
         time.sleep(0.01)
+    return False

@@ -1,7 +1,8 @@
 """Certificates of one's own, so that browsers and phones in a lab can use https: their files, names and dates."""
 
+import re
 import socket
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -12,6 +13,7 @@ from pebble.errors import PebbleError
 
 CA_CERT, CA_KEY, SERVER_CERT, SERVER_KEY = "ca.pem", "ca.key", "server.pem", "server.key"
 ACCOUNTS = "accounts"  # folder of the certificates with names of accounts
+_CERTIFICATE = re.compile(rb"-----BEGIN CERTIFICATE-----[\w+/=\s]+-----END CERTIFICATE-----", re.ASCII).findall
 
 
 class CertificateError(PebbleError):
@@ -36,7 +38,7 @@ def init(folder: Path, names: Sequence[str]) -> None:
     """Write a new authority and a server certificate for ``names``. Raises CertificateError; overwrites nothing."""
     from pebble.extensions.fleet import authority  # needs the package cryptography, which a robot may lack
 
-    hosts = _hosts(names)
+    hosts = hosts_of(names)
     for name in (CA_CERT, CA_KEY, SERVER_CERT, SERVER_KEY):
         if (folder / name).exists():
             raise CertificateError(
@@ -55,7 +57,7 @@ def renew(folder: Path, names: Sequence[str] = ()) -> None:
     from pebble.extensions.fleet import authority
 
     signer = authority.read(folder / CA_CERT, folder / CA_KEY)
-    hosts = _hosts(names or show(folder / SERVER_CERT).names)
+    hosts = hosts_of(names or show(folder / SERVER_CERT).names)
     signer.sign("Pebble operator page", hosts, folder / SERVER_CERT, folder / SERVER_KEY, is_client=False)
 
 
@@ -69,7 +71,7 @@ def of_account(folder: Path, account: str, hosts: Sequence[str] = ()) -> tuple[P
     files = folder / ACCOUNTS / f"{account}.pem", folder / ACCOUNTS / f"{account}.key"
     signer = authority.read(folder / CA_CERT, folder / CA_KEY)
     files[0].parent.mkdir(mode=0o700, exist_ok=True)
-    signer.sign(account, _hosts(hosts) if hosts else [], *files, is_client=True)
+    signer.sign(account, hosts_of(hosts) if hosts else [], *files, is_client=True)
     return files
 
 
@@ -80,6 +82,11 @@ def show(file: Path) -> Shown:
     certificate = authority.certificate_in(file)
     names, until = authority.names_of(certificate), certificate.not_valid_after_utc
     return Shown(file, names, until, authority.fingerprint(certificate))
+
+
+def only_certificates(content: bytes) -> bytes:
+    """Return the certificates in a file that others get, and nothing else of it: a config may name any file."""
+    return b"\n".join([*_CERTIFICATE(content), b""])
 
 
 def own_names() -> list[str]:
@@ -94,7 +101,7 @@ def own_names() -> list[str]:
     return names
 
 
-def _hosts(names: Sequence[str]) -> list[str]:
+def hosts_of(names: Iterable[str]) -> list[str]:
     """Return host names and addresses, each once and in its one spelling. Raises CertificateError."""
     try:
         hosts = list(dict.fromkeys(host_of(name).lower() for name in names))

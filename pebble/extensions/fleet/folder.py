@@ -12,6 +12,7 @@ import msgspec
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
+from pebble.config import hosts
 from pebble.contract.identity import SERVERS, Identity
 from pebble.contract.names import NAME
 from pebble.errors import ConfigError, PebbleError
@@ -90,6 +91,11 @@ def load(folder: Path) -> Fleet:
         raise FleetError(f"{file}: {error.strerror}") from None
     except msgspec.MsgspecError as error:
         raise FleetError(f"{file}: {error}") from None
+    for server in fleet.brokers:
+        try:
+            hosts.host(server.host)
+        except hosts.HostError as error:
+            raise FleetError(f"{file}: brokers: a host {error}") from None
     if len(fleet.accounts) > MAX_ACCOUNTS:
         raise FleetError(f"{file}: {len(fleet.accounts)} accounts; a broker's files have {MAX_ACCOUNTS} at most")
     for name, account in fleet.accounts.items():

@@ -38,7 +38,7 @@ def load_hub(path: Path, env: Mapping[str, str] = os.environ) -> tuple[HubFile, 
     """Read such a file; returns it and its run directory. Raises ConfigError with every problem in it."""
     path = path.absolute()
     raw = decode(read_text(path), path.name)
-    reader = Reader(path.parent, env, CHECKS)
+    reader = Reader(path.parent, env, CHECKS, file=path)
     hub = reader.section(HubFile, plain(raw, reader.notes))
     if not hub.listen:
         reader.notes.problem(("listen",), 'is missing: a hub is reached there, such as ["tls/0.0.0.0:7447"]')

@@ -23,6 +23,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.types import Lifespan
 from starlette.websockets import WebSocket
 
+from pebble.extensions.fleet import certificates
 from pebble.extensions.fleet.audit import Audit
 from pebble.extensions.fleet.database import DatabaseError
 from pebble.extensions.fleet.people import People
@@ -128,9 +129,10 @@ def _static_of(request: Request) -> StaticFiles:
 async def _authority(request: Request) -> Response:
     """Return the certificate of our authority, which phones are asked to trust; it is public."""
     path = request.app.state.settings.authority
-    if path is None or not path.is_file():
+    content = b"" if path is None or not path.is_file() else certificates.only_certificates(path.read_bytes())
+    if not content:
         return PlainTextResponse("this server has no certificate authority of its own", 404)
-    return Response(path.read_bytes(), media_type="application/x-x509-ca-cert")
+    return Response(content, media_type="application/x-x509-ca-cert")
 
 
 async def _health(request: Request) -> Response:

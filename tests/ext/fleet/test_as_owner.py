@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import pytest
 
+from pebble import ownership
+from pebble.config import load
 from pebble.errors import PebbleError
+from pebble.extensions.checks.report.report import make
+from pebble.extensions.checks.report.secrets_here import secrets_of
+from pebble.extensions.fleet import applying
 from pebble.extensions.fleet.applying import pid_of
-from pebble.extensions.fleet.folder import PID
+from pebble.extensions.fleet.folder import PID, Fleet, FleetError, Server
+from pebble.extensions.fleet.folder import load as load_fleet
 from pebble.extensions.fleet.people import People
+from pebble.extensions.install.setup.answers import read_file
+from pebble.extensions.lab.simulation.world import program
+from pebble.extensions.operator.places import Places
 from pebble.extensions.page.commands.people import opened
-from pebble.runtime.as_owner import as_before, as_owner
-from tests.support import Child, needs_root
+from pebble.launcher.launcher import Launcher
+from pebble.runtime.as_owner import as_before, as_owner, require_own
+from pebble.services.autonomy_manager.catalogue import Catalogue
+from pebble.services.autonomy_manager.script import Script
+from tests.support import Child, needs_root, until
 
 NOBODY = 65534
 pytestmark = needs_root
@@ -66,13 +82,14 @@ def test_a_link_leads_it_nowhere(write: Callable[[Path], None], there: bool, pla
 def test_what_it_writes_is_theirs_and_a_link_is_no_folder(place: Path) -> None:
     folder = place / "theirs"
     folder.mkdir()
-    os.chown(folder, NOBODY, NOBODY)
+    os.chown(folder, NOBODY, 0)
     with opened(folder / "people.sqlite"), as_before():
         assert os.geteuid() == 0
     assert (folder / "people.sqlite").stat().st_uid == NOBODY
     (place / "link").symlink_to(folder)
     with as_owner(place / "link"):
         assert os.geteuid() == NOBODY, "a link of root's is followed"
+        assert 0 not in (os.getegid(), *os.getgroups()), "the group of a folder may be that of the one above"
     assert os.geteuid() == 0
 
 
@@ -80,6 +97,16 @@ def test_a_number_in_a_folder_of_others_aims_no_signal(place: Path) -> None:
     with Child([sys.executable, "-c", "import time; time.sleep(60)", "/etc/mosquitto.conf"]) as process:
         (place / PID).write_text(str(process.pid))
         assert pid_of(place) is None
+        process.kill()
+    applying.make(place / "hall", Fleet(level="login", brokers=(Server(host="127.0.0.1"),)))
+    shutil.copy("/bin/sleep", place / "mosquitto")
+    with Child([str(place / "mosquitto"), "60"]) as process:  # SIGHUP would end it
+        (place / "hall" / PID).write_text(str(process.pid))
+        assert until(lambda: pid_of(place / "hall"))
+        with pytest.raises(FleetError, match="would end by SIGHUP"):
+            applying.apply(place / "hall", load_fleet(place / "hall"))
+        assert process.poll() is None
+        process.kill()
 
 
 def linked(theirs: Path) -> Path:
@@ -110,3 +137,90 @@ def test_where_others_could_put_a_folder_it_does_nothing(
     os.chown(folder, NOBODY, NOBODY)
     with pytest.raises(PebbleError, match=why), as_owner(path_of(folder)):
         pass
+
+
+def config(theirs: Path, **services: object) -> Path:
+    """Return a config of a user, and of this user all else that is there."""
+    file = theirs / "robot.json"
+    file.write_text(json.dumps({"robot": {"id": "goob"}, "services": services}))
+    for path in (theirs, *theirs.rglob("*")):
+        os.chown(path, NOBODY, NOBODY)
+    return file
+
+
+def password(theirs: Path, secret: Path) -> object:
+    return load(config(theirs, mqtt_bridge={"remote_mqtt": {"username": "a", "password_file": str(secret)}}))
+
+
+def answers(theirs: Path, secret: Path) -> object:
+    (file := config(theirs)).write_text(json.dumps({"broker_password_file": str(secret)}))
+    return read_file(file)[1].broker_password
+
+
+def robot(theirs: Path, _: Path) -> object:
+    return Launcher(load(config(theirs))).run()
+
+
+def script(theirs: Path, _: Path) -> object:
+    (theirs / "autonomy/walk").mkdir(parents=True)
+    (theirs / "autonomy/walk/run.py").touch()
+    found: list[dict[str, Script]] = []
+    Catalogue(load(config(theirs))).scan(found.append)
+    return found[-1]["walk"].broken
+
+
+def report(theirs: Path, secret: Path) -> object:
+    (theirs.parent / "var/lib").mkdir(parents=True)
+    theirs.rename(theirs.parent / "var/lib/pebble")
+    (theirs.parent / "var/lib/pebble/password").symlink_to(secret)
+    known = secrets_of(Places(theirs.parent), None)
+    return f"denied: {known.unread}, {known.known}" if known.unread else known.known
+
+
+def container(theirs: Path, _: Path) -> object:
+    os.chown(theirs, 100_999, 100_999)  # of no user, but of one in a container
+    return require_own(theirs)
+
+
+def everybody(theirs: Path, _: Path) -> object:
+    theirs.chmod(0o1777)
+    os.chown(theirs, 0, 0)
+    return People(theirs / "people.sqlite")
+
+
+def world(theirs: Path, _: Path) -> object:
+    theirs.rename(theirs.with_name("pebble-world-room"))  # in the folder for temporary files
+    return program.run(program.ROOM)
+
+
+@pytest.mark.parametrize("act", [password, answers, robot, script, report, container, everybody, world])
+def test_what_a_user_names_root_neither_reads_nor_runs(
+    act: Callable[[Path, Path], object], place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (secret := place / "secret").write_text("of root")
+    secret.chmod(0o600)
+    (theirs := place / "theirs").mkdir()
+    os.chown(theirs, NOBODY, NOBODY)
+    (place / "subuid").write_text("ann:100000:65536\n")
+    monkeypatch.setattr(ownership, "SUBUIDS", place / "subuid")
+    monkeypatch.setattr(program, "EndSignal", lambda: None)
+    monkeypatch.setattr("tempfile.tempdir", str(place))
+    try:
+        told = str(act(theirs, secret))
+    except PebbleError as error:
+        told = str(error)
+    assert re.search("denied|belongs to (user|all)", told)
+    assert "of root" not in told
+    assert os.geteuid() == 0
+
+
+def test_who_asks_as_a_user_has_no_variables_of_roots(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[dict[str, Any]] = []
+    monkeypatch.setenv("TOKEN_OF_ROOT", "x")
+    monkeypatch.setattr("pebble.extensions.checks.report.report.output_of", lambda *_, **how: asked.append(how) or "")
+    (place / "theirs").mkdir()
+    os.chown(place / "theirs", NOBODY, NOBODY)
+    text = json.dumps({"robot": {"id": "goob"}, "transport": {"kind": "mqtt", "run_dir": str(place / "theirs")}})
+    (place / "robot.json").write_text(text)
+    make(Places(place), place / "robot.json")
+    assert ["TOKEN_OF_ROOT" in how["env"] for how in asked if "user" in how] == [False]

@@ -254,6 +254,7 @@ def test_who_may_be_added(tmp_path: Path, name: str, account: Account, why: str)
     [
         ({"level": "open"}, "Invalid enum value 'open'"),
         ({"brokers": []}, "brokers"),
+        ({"brokers": [{"host": "hall\nuser root"}]}, "brokers: a host holds U+000A"),
         ({"accounts": {"Ann": {"roles": ["driver"]}}}, "accounts.Ann: 'Ann' is no name"),
         ({"accounts": {"ann": {"roles": ["boss"]}}}, "'boss' is no role"),
         ({"extra": {"drive": ["#"]}}, "'#' is no metric"),

@@ -185,7 +185,13 @@ def test_without_a_folder_and_without_a_session(broker: Broker, folder: Path, tm
         assert post(closed, "exports", {}).status_code == 401
 
 
-def test_the_process_that_reads_is_replaced_if_it_dies(folder: Path) -> None:
+def test_the_process_that_reads_is_replaced_if_it_dies(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "multiprocessing.py").write_text("raise SystemExit('of the folder that it was started in')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+
     async def run() -> None:
         process = archive_process.ArchiveProcess(folder)
         first = await process.ask(os.getpid)

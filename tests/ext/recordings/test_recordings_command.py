@@ -81,7 +81,9 @@ def test_search(folder: Path, run: Run) -> None:
 
 def test_lines_there_and_back(folder: Path, tmp_path: Path, run: Run) -> None:
     lines, again = tmp_path / "a.jsonl", tmp_path / "again.mcap"
+    (tmp_path / f".a.jsonl.{os.getpid()}").symlink_to(tmp_path / "of-another")
     assert run("recordings", "export", folder, lines) == 0
+    assert not (tmp_path / "of-another").exists()
     assert run("recordings", "import", lines, again) == 0
     assert messages(again) == messages(folder) == 201
     assert run("recordings", "export", folder, lines) == 1

@@ -36,6 +36,7 @@ _JOURNAL_LINES = 2000
 _PROGRAM_S = 20.0
 _LONGEST_PART = 8 << 20  # bytes
 _STATES_S = 1.0  # until all have come
+_VARIABLES = ("PATH", "PYTHONPATH", "LANG", "LC_ALL", "TMPDIR", "XDG_RUNTIME_DIR")  # that say where things are
 _UNITS = ("etc/systemd/system", "usr/lib/systemd/system", "lib/systemd/system", "usr/local/lib/systemd/system")
 
 
@@ -123,7 +124,10 @@ def _status(here: Here) -> str:
     if here.config is None:
         raise PebbleError("the config cannot be read")
     user, file = user_of(here.config.run_dir()), str(here.file.absolute())
-    who: dict[str, Any] = {} if user is None else {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": []}
+    who: dict[str, Any] = {}
+    if user is not None:  # who sees the variables of such a process
+        env = {name: os.environ[name] for name in (*_VARIABLES, *here.config.password_variables) if name in os.environ}
+        who = {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": [], "env": env}
     topics = f"{here.config.base}/{OUTGOING}/#"
     echo = ("-Pm", "pebble.cli", "topic", "echo", topics, "--seconds", str(_STATES_S), "--config", file)
     return output_of(sys.executable, *echo, seconds=_PROGRAM_S, **who)

@@ -15,8 +15,10 @@ from pebble.config import Config
 from pebble.config.masking import values_of
 from pebble.config.secret_text import HIDDEN
 from pebble.config.types import Secret
+from pebble.errors import PebbleError
 from pebble.extensions.operator.places import Places
 from pebble.ownership import read_plain
+from pebble.runtime.as_owner import as_owner
 
 _SHORTEST = 4  # characters: a shorter one is in every text
 _LARGEST = 1 << 20  # bytes of a file of passwords; others are no such files
@@ -65,9 +67,10 @@ def secrets_of(places: Places, config: Config | None, more: Collection[Path] = (
     unread: set[str] = set()
     for file in dict.fromkeys(_walk([*folders, *more], unread)):
         try:
-            if file.is_file() and file.stat().st_size <= _LARGEST:
-                values += [(value, str(file)) for value in values_in(file.name, read_plain(file))]
-        except OSError:
+            with as_owner(file.parent):
+                if file.is_file() and file.stat().st_size <= _LARGEST:
+                    values += [(value, str(file)) for value in values_in(file.name, read_plain(file))]
+        except (OSError, PebbleError):
             unread.add(str(file))
     known = frozenset(value for value, _ in values if len(value) >= _SHORTEST)
     short = {where for value, where in values if len(value) < _SHORTEST}

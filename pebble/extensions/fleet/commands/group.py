@@ -238,8 +238,9 @@ def certificate(
         is_hub = ProgramRole.HUB in account.roles
         if is_hub and not hosts:
             raise FleetError(f"{name} is a hub: name where others reach it, `pebble fleet certificate {name} HOST`")
-        others = {*fleet.accounts, *(() if is_hub else (broker.host for broker in fleet.brokers))} - {name}
-        if taken := others & {*(hosts or ())}:
+        of_brokers = certificates.hosts_of(host for server in fleet.brokers for host in applying.names_of(server))
+        asked = set(certificates.hosts_of(hosts)) if hosts else set[str]()
+        if taken := asked & {*fleet.accounts, *(() if is_hub else of_brokers)} - {name}:
             raise FleetError(f"{name} cannot be {min(taken)}: that is a broker of this fleet, or another account")
         files = certificates.of_account(place, name, hosts or ())
         _print_certificate(place, fleet, name, files)

@@ -55,7 +55,7 @@ class GatewayFile(Section, frozen=True, kw_only=True):
 def load_gateway(path: Path, env: Mapping[str, str] = os.environ) -> tuple[GatewayFile, str, Path]:
     """Read such a file; returns it, the gateway's name, and its run directory. Raises ConfigError with all problems."""
     path = path.absolute()
-    reader = Reader(path.parent, env, (*CHECKS, *RULES))
+    reader = Reader(path.parent, env, (*CHECKS, *RULES), file=path)
     problem = reader.notes.problem
     gateway = reader.section(GatewayFile, plain(decode(read_text(path), path.name), reader.notes))
     operators = gateway.operators

@@ -11,7 +11,7 @@ from msgspec.structs import asdict
 
 from pebble.config import hosts
 from pebble.config.hosts import is_loopback
-from pebble.config.text_files import read_password
+from pebble.config.text_files import NotTextError, read_password, read_text
 from pebble.contract.identity import LEVEL, LEVEL_RULE, untypeable
 from pebble.contract.names import NAME
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
@@ -102,16 +102,16 @@ _PASSWORD, _BROKER_PASSWORD = "password_file", "broker_password_file"
 def read_file(file: Path) -> tuple[dict[str, Any], Secrets]:
     """Read a file of answers, and the passwords in the files that it names. Raises PebbleError."""
     try:
-        given = msgspec.json.decode(file.read_bytes(), type=dict[str, Any])
+        given = msgspec.json.decode(read_text(file), type=dict[str, Any])
     except OSError as error:
         raise AnswersError(f"--answers {file}: {error.strerror}") from None
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, NotTextError) as error:
         raise AnswersError(f"{file}: {error}: write an object with the keys {', '.join(KEYS)}") from None
     given = {key: value for key, value in given.items() if not key.startswith("//")}
     if unknown := [key for key in given if key not in KEYS]:
         raise AnswersError(f"{file}: {unknown[0]}: unknown key; there are {', '.join(KEYS)}")
     files = {key: given.pop(key) for key in (_PASSWORD, _BROKER_PASSWORD) if key in given}
-    passwords = {key: read_password(Path(str(named)), key) for key, named in files.items()}
+    passwords = {key: read_password(Path(str(named)), key, file) for key, named in files.items()}
     if _PASSWORD in passwords:
         usable(passwords[_PASSWORD])
     return given, Secrets(password=passwords.get(_PASSWORD), broker_password=passwords.get(_BROKER_PASSWORD))

@@ -29,7 +29,8 @@ _PLACES = {
     "etc/mosquitto/pebble": (MOSQUITTO, 0o700),
     "etc/mosquitto": ("root:root", 0o755),
 }
-_RUNS = ("command", "extensions", "env")  # keys of programs, and of what these are told
+_RUNS = ("command", "extensions", "env", "python", "entrypoint")  # keys of programs, and of what these are told
+_SCRIPT = ("/run.py", "/script.json")  # by these a folder is one
 _OWN = ("/etc/pebble/", "/var/lib/pebble/", "/dev/")  # what a robot may name without a question
 
 
@@ -38,7 +39,7 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
 
     Before anything is written, raises BackupError for what is no whole backup, and SetupError for one that would write
     elsewhere, and for a machine that has other files in these places. ``agree`` is called with what its config runs
-    and names beyond its own files, and raises if that should not be.
+    and names beyond its own files, and with its scripts, and raises if that should not be.
     """
     backup, places = backups.read(file), system.places
     config, manifest = (str(file.relative_to(places.root)) for file in (places.config, places.manifest))
@@ -54,7 +55,8 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
             if os.path.lexists(target) and _content(target) != files[name].content:
                 why = "is there already, with other content: only a blank machine becomes this robot"
                 raise SetupError(f"{target} {why}")
-    if beyond := [*_beyond(plain(decode(text_of(files[config].content), config), Notes()))]:
+    scripts = (f"/{name}" for name in files if name.endswith(_SCRIPT))
+    if beyond := [*_beyond(plain(decode(text_of(files[config].content), config), Notes())), *scripts]:
         agree(beyond)
     for place in {_place(name) for name in files}:
         system.owner(_PLACES[place][0])  # without mosquitto the robot's broker has no owner
@@ -116,7 +118,7 @@ def _beyond(value: Any, *keys: str) -> Iterator[str]:
 
 def _is_beyond(text: str) -> bool:
     """True if a text may be the path of a file that is not the robot's."""
-    if not text.startswith(("/", "~")) and ".." not in text.split("/"):
+    if not text.startswith(("/", "~", "file:")) and ".." not in text.split("/"):
         return False
     path = os.path.normpath(text if text[0] in "/~" else f"/etc/pebble/{text}")
     return not f"{path}/".startswith(_OWN)

@@ -67,7 +67,7 @@ def set_up(system: System, answers_file: Path | None, backup_file: Path | None) 
 
 def _agree(lines: Sequence[str]) -> None:
     """Show what a restored config runs and names. Raises Abort."""
-    say("The config of this backup runs programs, or names what is not the robot's own:")
+    say("The robot of this backup runs programs, or names what is not its own:")
     for line in lines:
         say(shown(line), 2)
     typer.confirm("Shall the robot have these?", default=False, abort=True)

@@ -42,6 +42,7 @@ from pebble.extensions.install.setup.system import MOSQUITTO, ROBOTS, SetupError
 from pebble.extensions.operator.places import Places
 from pebble.extensions.page.config import WebHandler, WebInterface
 from pebble.extensions.page.setting import people_of
+from pebble.ownership import read_plain
 from pebble.runtime.as_owner import as_owner
 from pebble.runtime.connections import check_connections
 
@@ -181,9 +182,11 @@ class Job:
             return
         given = Path(str(self.answers.broker_ca))
         try:
-            content = given.read_bytes()
+            content = certificates.only_certificates(read_plain(given))
         except OSError as error:
             raise SetupError(f"broker_ca: {given}: {error.strerror}") from None
+        if not content:
+            raise SetupError(f"broker_ca: {given} holds no certificate")
         yield self._file("authority of the broker", self.places.etc / BROKER_CA, content)
 
     def _certificate(self) -> Iterator[Step]:

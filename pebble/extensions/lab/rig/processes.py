@@ -265,7 +265,7 @@ class Processes:
 
 
 def python(module: str, *arguments: object) -> list[str]:
-    return [sys.executable, "-m", module, *map(str, arguments)]
+    return [sys.executable, "-Pm", module, *map(str, arguments)]  # nothing of the folder that we are in
 
 
 def end_all(programs: Iterable[Program], within_s: float = _END_S) -> None:

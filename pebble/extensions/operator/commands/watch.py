@@ -14,6 +14,8 @@ from pebble.errors import PebbleError
 from pebble.extensions.operator.client.connection import Target, connected, put_names
 from pebble.extensions.operator.commands.options import BrokerUrl, CaCert, PasswordFile
 from pebble.extensions.operator.signals import interrupted_by_signals
+from pebble.runtime.as_owner import as_owner
+from pebble.runtime.whole_file import write
 
 if TYPE_CHECKING:
     from pebble.extensions.media.cameras import Picture
@@ -85,11 +87,11 @@ def _save(picture: Picture, file: Path) -> None:
     import cv2
 
     try:
-        written = cv2.imwrite(str(file), picture)
+        _, content = cv2.imencode(file.suffix, picture)
     except cv2.error:
         raise PebbleError(f"{file}: cannot write this kind of picture, name it .png or .jpg") from None
-    if not written:
-        raise PebbleError(f"{file} cannot be written")
+    with as_owner(file.parent):
+        write(file, content.tobytes(), 0o644, PebbleError)
 
 
 def _target(robot: str, url: str | None, password_file: Path | None, ca_cert: Path | None) -> Target:

@@ -2,11 +2,13 @@
 
 import asyncio
 import multiprocessing
+import os
 import signal
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnContext
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -14,11 +16,16 @@ from pebble.errors import PebbleError
 from pebble.extensions.recordings.seek import questions
 
 MOST_WAITING: Final = 64  # questions
-_SPAWN: Final = multiprocessing.get_context("spawn")
 _END_S: Final = 2.0
 SILENT_S: Final = 300.0  # after a sign of life of a job
 
 AnswerT = TypeVar("AnswerT")
+
+
+def _spawn() -> SpawnContext:
+    """Return how to start a process that imports nothing of the folder that we are in."""
+    os.environ["PYTHONSAFEPATH"] = "1"
+    return multiprocessing.get_context("spawn")
 
 
 class BusyError(PebbleError):
@@ -64,7 +71,7 @@ class ArchiveProcess:
     def _started(self) -> ProcessPoolExecutor:
         if self._pool is None:
             self._pool = ProcessPoolExecutor(
-                1, mp_context=_SPAWN, initializer=questions.begin, initargs=(self._folder,)
+                1, mp_context=_spawn(), initializer=questions.begin, initargs=(self._folder,)
             )
         return self._pool
 
@@ -78,8 +85,8 @@ class Job:
         self.ready = False
         self.why = ""  # it failed
         self.unread = ""  # it is ready, but this could not be read
-        answers, theirs = _SPAWN.Pipe(duplex=False)
-        self._process = _SPAWN.Process(target=function, args=(theirs, *arguments), daemon=True)
+        answers, theirs = multiprocessing.Pipe(duplex=False)
+        self._process = _spawn().Process(target=function, args=(theirs, *arguments), daemon=True)
         try:
             self._process.start()
         except OSError as error:

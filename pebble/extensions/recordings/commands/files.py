@@ -14,7 +14,7 @@ from pebble.extensions.operator.client.names import base_of
 from pebble.extensions.recordings.catalogue import Query, check_names
 from pebble.extensions.recordings.commands.options import RobotOption, Since, Until, period
 from pebble.extensions.recordings.commands.progress import progress
-from pebble.extensions.recordings.commands.report import period_words, report_left, report_unread
+from pebble.extensions.recordings.commands.report import errors_of_files, period_words, report_left, report_unread
 from pebble.extensions.recordings.files.reader import RecordingFile
 from pebble.extensions.recordings.files.recorded import Recorded, RecordingError
 from pebble.extensions.recordings.files.rewrite import Keeps, rewrite
@@ -142,7 +142,8 @@ def _mend_file(source: Path, target: Path | None) -> int:
         raise PebbleError(f"{source}: name a new file for what can be read: pebble recordings mend {source} OUT")
     if target.exists():
         raise PebbleError(f"{target} exists already")
-    made = rewrite(source, target)
+    with as_owner(target.parent), errors_of_files(target):
+        made = rewrite(source, target)
     typer.echo(f"{target}: {made.messages:,} messages, {made.missing:,} missing")
     report_unread([f"{source}: {made.unread}"] if made.unread else [])
     return 0 if made.messages else 1

@@ -5,7 +5,7 @@ import re
 import shutil
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -71,7 +71,9 @@ def record(
     for filter_ in chosen:
         check_filter(filter_)
     recorder = Recorder(into, options, {"filters": " ".join(chosen)})
-    with as_owner(into):
+    with as_owner(into), suppress(OSError):  # which the recorder meets as well
+        into.mkdir(mode=0o750, parents=True, exist_ok=True)
+    with as_owner(into):  # another user may have been faster
         _run(recorder, Source(recorder, kind, transport, chosen), where, length)
     _print_end(recorder, into)
     return 0

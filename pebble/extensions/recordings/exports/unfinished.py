@@ -1,9 +1,9 @@
 """A file that is there when it is whole."""
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from pebble.extensions.recordings.files.recorded import RecordingError
 from pebble.runtime.as_owner import as_owner
@@ -19,15 +19,12 @@ def unfinished(target: Path) -> Iterator[Path]:
         raise RecordingError(f"{target} exists already")
     if not target.parent.is_dir():
         raise RecordingError(f"{target.parent}: there is no such folder")
-    path = target.with_name(f".{target.name}.{os.getpid()}")
-    try:
-        with as_owner(target.parent):
-            try:
-                yield path
-                if target.exists():
-                    raise RecordingError(f"{target} exists already")
-                path.replace(target)
-            finally:
-                path.unlink(missing_ok=True)
+    try:  # in a folder of its own: in a shared one others could make this file first, or a link
+        with as_owner(target.parent), TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as folder:
+            path = Path(folder, target.name)
+            yield path
+            if target.exists():
+                raise RecordingError(f"{target} exists already")
+            path.replace(target)
     except OSError as error:
         raise RecordingError(f"{target}: {error.strerror or error}") from None

@@ -7,6 +7,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from pebble.errors import PebbleError
+from pebble.runtime.as_owner import as_owner
 
 _name = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,62}").fullmatch
 
@@ -19,7 +20,8 @@ def write(name: str, folder: Path) -> Iterator[Path]:
     try:
         if (alike := _alike(target)) is not None:
             raise PebbleError(f"{alike} exists already: choose another name, or another --folder")
-        target.mkdir(parents=True)
+        with as_owner(folder):
+            target.mkdir(parents=True)
     except OSError as error:
         raise PebbleError(f"{target}: {error.strerror}") from None
     test = f"test_{name.replace('-', '_')}.py"
@@ -31,7 +33,8 @@ def write(name: str, folder: Path) -> Iterator[Path]:
         "pytest.ini": _text("pytest.ini"),
     }
     for file, text in texts.items():
-        (target / file).write_text(text, encoding="utf-8")
+        with as_owner(target):
+            (target / file).write_text(text, encoding="utf-8")
         yield target / file
 
 

@@ -218,6 +218,8 @@ def test_zenoh_hubs_have_the_same_accounts(hall: Path, monkeypatch: pytest.Monke
     rules = hall / "hall" / ZENOH
     for line in ("add ann --role driver", "add goob --role robot", "zenoh", "certificate ann"):
         run(f"pebble fleet {line}", hall)
+    for host in ("LocalHost.", "127.0.0.1", "Ann"):
+        assert "another account" in pebble(f"pebble fleet certificate goob {host}", hall).stderr
     printed = run("pebble fleet certificate goob goob.local 10.0.0.7", hall)
     for name in ("goob.pem", "goob.key"):
         (hall / "hall" / "accounts" / name).rename(hall / name)

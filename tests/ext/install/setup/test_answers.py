@@ -54,6 +54,7 @@ def test_a_missing_answer_is_named_by_its_key(
         ({"broker": "ann:secret-1@broker.lab"}, "broker: write HOST or HOST:PORT; user and password have keys"),
         ({"broker": "none"}, "page: a page needs a broker"),
         ({"broker_ca": "/nowhere", "broker": "127.0.0.1"}, "broker_ca: /nowhere: No such file or directory"),
+        ({"broker_ca": "/etc/passwd", "broker": "127.0.0.1"}, "broker_ca: /etc/passwd holds no certificate"),
         ({"user": "Ann Lee"}, "user: 'Ann Lee' is no name"),
         ({"page": "yes"}, "answers: Expected `bool"),
         ({"colour": "red"}, "colour: unknown key; there are id, port"),

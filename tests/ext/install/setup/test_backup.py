@@ -114,6 +114,7 @@ FOREIGN: dict[str, tuple[bytes, str]] = {
     "absolute": (tar_of(ABOUT_IT, ("/etc/shadow", b"x")), "'/etc/shadow' is not what a backup has"),
     "beyond the root": (tar_of(ABOUT_IT, ("etc/../../x", b"x")), "is not what a backup has"),
     "a link": (tar_of(ABOUT_IT, ("etc/x", b""), kind=tarfile.SYMTYPE), "is not what a backup has"),
+    "a hole": (tar_of(ABOUT_IT, ("etc/x", b""), kind=tarfile.GNUTYPE_SPARSE), "is not what a backup has"),
     "a device": (tar_of(ABOUT_IT, ("etc/x", b""), kind=tarfile.CHRTYPE), "is not what a backup has"),
     "a broken name": (tar_of(ABOUT_IT, ("etc/./x", b"x")), "is not what a backup has"),
     "twice": (tar_of(ABOUT_IT, ("etc/x", b"1"), ("etc/x", b"2")), "is in it twice"),

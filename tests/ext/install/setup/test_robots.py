@@ -200,13 +200,15 @@ def changed(files: dict[str, Saved], more: dict[str, bytes], keys: dict[str, Any
         ({"git_pull_control": {"command": ["sh", "-c", "evil"]}}, "mqtt_bridge.git_pull_control.command: sh -c evil"),
         ({"remote_mqtt": {"password_file": "/etc/shadow"}}, "remote_mqtt.password_file: /etc/shadow"),
         ({"remote_mqtt": {"password_file": "../shadow"}}, "remote_mqtt.password_file: ../shadow"),
+        ({}, "/etc/pebble/autonomy/walk/run.py"),
     ],
 )
 def test_what_a_restored_config_runs_and_names_is_asked_for_first(
     keys: dict[str, Any], shown: str, root: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     set_up(root)
-    (tmp_path / "evil.tar").write_bytes(changed(make(Places(root)).files, {}, keys))
+    script = {"etc/pebble/autonomy/walk/run.py": b"evil"}
+    (tmp_path / "evil.tar").write_bytes(changed(make(Places(root)).files, script if not keys else {}, keys))
     other = machine_root(tmp_path / "other")
     at(other, monkeypatch)
     monkeypatch.setattr("sys.stdin", io.StringIO("\n"))

@@ -30,9 +30,11 @@ def config(tmp_path: Path) -> Iterator[Path]:
 
 def test_a_picture_is_of_the_local_camera(run: Run, config: Path) -> None:
     file = config.with_name("view.png")
+    file.symlink_to(config)  # another user may have made it
     assert run("watch", config, "--picture", file) == 0, run.err
     assert run.out == f"{file}: {WIDTH}×{HEIGHT}\n"
     assert run.err == f"pebble: {config} names no remote broker: this machine's camera\n"
+    assert not file.is_symlink()
     picture = cv2.imread(str(file))
     assert picture is not None
     assert picture[5, 5].tolist() == [10, 20, 30]

@@ -1,6 +1,7 @@
 """A simulated world as a program: the MCUs of its robots behind pseudo terminals, and their poses for their cameras."""
 
 import math
+import os
 import sys
 import tempfile
 import threading
@@ -47,9 +48,12 @@ def run(
     """
     end, path = EndSignal(), file.absolute()
     world = read_world(path)
-    folder = folder or Path(tempfile.gettempdir(), f"pebble-world-{path.stem}")
+    usual = Path(tempfile.gettempdir(), f"pebble-world-{path.stem}")
+    folder = folder or usual
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        if folder == usual and (uid := folder.lstat().st_uid) not in (0, os.getuid()):
+            raise DeviceError(f"{folder} belongs to user {uid}: choose another one with --folder")
     except OSError as error:
         raise DeviceError(f"{error.filename}: {error.strerror}") from None
     with ExitStack() as stack:
