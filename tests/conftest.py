@@ -26,7 +26,6 @@ import pytest
 from hypothesis import settings
 
 from pebble.transports import segments
-from tests.ext.recordings.replayed import recording as recording  # a fixture for all tests
 from tests.kit import rows
 from tests.kit.workers import pytest_addoption as pytest_addoption  # of the initial conftest
 from tests.kit.workers import pytest_configure as pytest_configure

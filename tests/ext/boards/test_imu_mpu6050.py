@@ -7,7 +7,6 @@ import time
 
 import pytest
 
-from pebble.services.serial_mcu_bridge.imu import reports as imu
 from tests.ext.boards.mcu_wire import M
 from tests.kit.board import ScriptedMcu, SerialRig
 from tests.services.serial_mcu_bridge.test_text_protocols import FAST, SLOW
@@ -42,14 +41,6 @@ def test_samples_and_summaries_are_published(memory_rig: SerialRig) -> None:
         for message in memory_rig.world.received
     }
     assert topics == {"sensors/imu-fast": 0, "sensors/imu": 1}
-
-
-def test_silence_ends_the_process(memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(imu, "TIMEOUT_S", 0.3)
-    plugged(memory_rig)
-    running = memory_rig.bridge(protocol="imu_mpu6050_v1")
-    assert until(lambda: not running.alive, 6)
-    assert str(running.error) == "no sample for 0.3 s"
 
 
 def test_malformed_lines_are_logged_and_nothing_is_ever_sent(

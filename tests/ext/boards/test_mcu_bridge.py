@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import random
 import time
 from contextlib import suppress
 
@@ -15,12 +14,10 @@ from pebble.runtime.parent import NOTIFY_FD
 from pebble.services.serial_mcu_bridge.devices import peers
 from pebble.services.serial_mcu_bridge.imu import reports as imu
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import host
-from pebble.transports import QoS
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.boards.mcu_wire import IMU, LAMP, STATION, F, I, M
-from tests.ext.boards.test_pebble_serial_hostile import ATTACKS
 from tests.kit.board import SerialRig, motion, summary
-from tests.support import cases, until
+from tests.support import until
 
 
 def test_the_launcher_is_notified_of_outlets_while_they_are_in_use(
@@ -46,39 +43,6 @@ def test_the_launcher_is_notified_of_outlets_while_they_are_in_use(
     memory_rig.close()
     os.close(pipe)
     os.close(end)
-
-
-@pytest.mark.alone
-def test_it_is_found_within_two_seconds_and_publishes_its_manifest(rig: SerialRig) -> None:
-    mcu = rig.mcu(IMU, plugged=False, sends_hello=False)
-    rig.bridge()
-    time.sleep(0.5)  # the port is absent at first
-    mcu.stream(100, motion())
-    mcu.plug()
-    rig.described("goob-imu-nano")
-    assert rig.got("sensors/imu-fast")
-    assert rig.world.first("mcu/goob-imu-nano/describe") - mcu.plugged_at < 2
-    assert rig.world.first("mcu/goob-imu-nano/imu_fast") - mcu.plugged_at < 2
-    assert rig.world.first("sensors/imu-fast") - mcu.plugged_at < 2
-    (described,) = rig.world.payloads("mcu/goob-imu-nano/describe")
-    assert described["schema_hash"] == "goob-imu-v2"
-    assert rig.world.received[0].topic == f"{rig.base}/outgoing/mcu/goob-imu-nano/local-only"
-    late = rig.listener("late")
-    assert until(lambda: late.on("mcu/goob-imu-nano/describe"))
-    assert late.on("mcu/goob-imu-nano/describe")[0].retain
-
-
-@pytest.mark.alone
-def test_a_hundred_samples_a_second_without_loss(rig: SerialRig) -> None:
-    mcu, _ = rig.up(IMU)
-    mcu.stream(100, motion())
-    seconds = cases(2, 5)
-    time.sleep(seconds)
-    mcu.silent = True
-    assert until(lambda: len(rig.world.on("sensors/imu-fast")) == mcu.samples_sent)
-    assert mcu.samples_sent >= 90 * seconds
-    for metric in ("mcu/goob-imu-nano/imu_fast", "sensors/imu-fast"):
-        assert [body["seq"] for body in rig.world.payloads(metric)] == list(range(1, mcu.samples_sent + 1))
 
 
 def test_the_bodies_of_an_inertial_sensor(memory_rig: SerialRig) -> None:
@@ -128,6 +92,7 @@ def test_the_bodies_of_an_inertial_sensor(memory_rig: SerialRig) -> None:
 
 def test_qos_and_retain_follow_the_interface(rig: SerialRig) -> None:
     mcu, _ = rig.up(LAMP)
+    assert rig.world.received[0].topic == f"{rig.base}/outgoing/mcu/lamp-1/local-only"
     mcu.send(wire.frame(wire.STATE, b"\x0b", 2), wire.frame(wire.STATE, b"\1", 3), wire.frame(wire.SAMPLE, bytes(4), 4))
     assert rig.got("mcu/lamp-1/glow")
     assert rig.values("lights/lamp") == [{"level": 5.5}]
@@ -246,18 +211,6 @@ def test_a_partial_frame_of_an_earlier_host_does_not_damage_the_first_command(
     assert running.service.counters["unanswered"] == 0
 
 
-def test_another_device_at_the_same_line(memory_rig: SerialRig) -> None:
-    mcu, _ = memory_rig.up(LAMP)
-    mcu.unplug()
-    mcu.manifest = LAMP.but(uid="lamp-2", hash="other")
-    mcu.plug()
-    memory_rig.described("lamp-2")
-    assert until(lambda: memory_rig.world.newest_raw("mcu/lamp-1/describe") == [])
-    memory_rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
-    memory_rig.world.command("mcu/lamp-2/lamp", {"level": 1, "on": True})
-    assert mcu.obeyed() == [(1, b"\2\1")]
-
-
 def test_new_firmware_while_it_runs(rig: SerialRig) -> None:
     mcu, _ = rig.up(LAMP)
     mcu.send(wire.frame(wire.STATE, b"\x0b", 2))
@@ -274,14 +227,6 @@ def test_new_firmware_while_it_runs(rig: SerialRig) -> None:
     mcu.send(wire.frame(wire.STATE, b"\x0c", 2), wire.frame(wire.STATE, b"\x0d", 12))
     assert until(lambda: len(rig.world.payloads("mcu/lamp-1/lamp")) == 2)
     assert rig.world.payloads("mcu/lamp-1/lamp")[-1]["value"] == {"level": 6.5}
-
-
-def test_a_stopping_bridge_clears_its_retained_messages(rig: SerialRig) -> None:
-    mcu, running = rig.up(LAMP)
-    mcu.send(wire.frame(wire.STATE, b"\x0b", 2))
-    assert rig.got("mcu/lamp-1/lamp")
-    running.stop()
-    assert rig.cleared("mcu/lamp-1/describe", "mcu/lamp-1/lamp")
 
 
 def test_a_stale_manifest_of_a_killed_bridge_is_cleared_by_the_next(
@@ -301,43 +246,6 @@ def test_a_stale_manifest_of_a_killed_bridge_is_cleared_by_the_next(
     assert rig.world.newest_raw("mcu/ghost/describe")
     assert rig.cleared("mcu/ghost/describe")
     assert rig.world.newest_raw("mcu/lamp-1/describe")
-
-
-def test_invalid_messages_about_other_devices_do_not_stop_the_bridge(rig: SerialRig) -> None:
-    stranger = rig.network.client("stranger").open(10)
-    odd = b'{"protocol":"pebble_serial_v1","schema_version":1,"interface_count":1,"schema_hash":"h",' \
-          b'"device_uid":"odd","firmware_version":"1","model":"m","interfaces":[{"name":"a","channel":"sensors/imu",' \
-          b'"profile":"imu.summary.v1","encoding":{"fields":5}}]}'  # fmt: skip
-    stranger.publish(f"{rig.base}/outgoing/mcu/odd/describe", odd, qos=QoS.DELIVERED, retain=True)
-    stranger.publish(f"{rig.base}/outgoing/mcu//describe", odd, qos=QoS.DELIVERED, retain=True)
-    rig.described("odd")
-    rig.mcu(LAMP)
-    running = rig.bridge()
-    rig.described("lamp-1")
-    stranger.publish(f"{rig.base}/incoming/mcu//describe", b'{"from": "x"}', qos=QoS.DELIVERED)
-    stranger.publish(f"{rig.base}/incoming/mcu/lamp-1/describe", b'{"from": {"x": [1]}, "has": 3}', qos=QoS.DELIVERED)
-    rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
-    assert until(rig.mcus["one"].commands)
-    assert running.alive
-    assert running.service.counters["refused"] == 2
-    assert running.service.transport.counters["handler_errors"] == running.service.counters["handler_errors"] == 0
-    stranger.close()
-
-
-def test_thousands_of_hostile_frames_do_not_stop_the_bridge(memory_rig: SerialRig) -> None:
-    mcu, running = memory_rig.up(STATION)
-    chance = random.Random(8)
-    for _ in range(cases(40, 200)):
-        mcu.pour(b"".join(chance.choice(ATTACKS)(chance) for _ in range(100)))
-    before = len(memory_rig.world.on("mcu/hs105-sta/o1_state"))
-
-    def understood() -> bool:
-        mcu.pour(b"\0" + wire.frame(wire.DESCRIBE, STATION.describe()) + wire.frame(wire.STATE, b"\1\0\1", 2))
-        return len(memory_rig.world.on("mcu/hs105-sta/o1_state")) > before
-
-    assert until(understood, 10, step=0.1)
-    assert running.alive
-    assert running.service.counters["crc"] > 100
 
 
 # -- health

@@ -9,9 +9,7 @@ from pathlib import Path
 import pytest
 
 from pebble.extensions.lab.simulation.pty import PtyMcu
-from tests.ext.boards import mcu_wire as wire
-from tests.ext.boards.mcu_wire import IMU
-from tests.kit.board import SerialRig, motion
+from tests.kit.board import SerialRig
 from tests.support import cases, until
 
 FAST, SLOW = "sensors/imu-fast", "sensors/imu"
@@ -73,26 +71,3 @@ def test_found_within_two_seconds_and_again_when_plugged_in_again_and_every_samp
     rig.described(uid)
     assert running.alive
     assert until(lambda: len(numbers(rig, count)) > 50)
-
-
-def test_a_second_sensor_claims_the_same_channels_and_the_board_refuses_what_it_does_not_support(
-    rig: SerialRig, board: PtyMcu
-) -> None:
-    """It still answers and sends samples after garbage and a command for an unknown interface."""
-    other, running = rig.mcu(IMU.but(uid="imu-2"), "other", plugged=False), rig.bridge("imu")
-    rig.bridge("other")
-    uid = uid_of(rig)
-    line = running.service.line  # type: ignore[attr-defined]
-    assert line.send("rubbish", b"\xff\xfe rubbish \0" + wire.frame(wire.CMD, b"\1", 77, 4711))
-    assert line.send("ping", wire.frame(wire.PING))
-    assert until(lambda: running.service.counters["nack"] == 1), "the host did not send that command"
-    assert until(lambda: rig.world.on(FAST))
-    other.stream(50, motion())
-    other.plug()
-    assert until(lambda: rig.world.on("mcu/imu-2/imu_fast"), 3)
-    time.sleep(0.3)
-    count, generic = len(rig.world.on(FAST)), len(rig.world.on(f"mcu/{uid}/imu_fast"))
-    assert until(lambda: len(rig.world.on(f"mcu/{uid}/imu_fast")) > generic + 30)
-    assert len(rig.world.on(FAST)) == count
-    other.unplug()
-    assert until(lambda: len(rig.world.on(FAST)) > count, 3)

@@ -233,27 +233,3 @@ def test_nothing_private_leaves_the_robot_in_any_start_order(rig: SerialRig, wor
     assert {metric for metric in PRIVATE if rig.world.on(metric)} == set(PRIVATE), "they were published locally"
     assert received & set(PRIVATE) == set()
     assert {"mcu/spy-1/slow", "lab/slow", "mcu/spy-1/describe"} <= received
-
-
-def test_private_commands_are_for_the_robot_only(rig: SerialRig, world: World) -> None:
-    mcu = rig.mcu(SPY)
-    rig.bridge()
-    world.start()
-    assert world.operator.got("mcu/spy-1/describe")
-    assert rig.claimed()
-
-    def received(value: int) -> list[int]:
-        return [command.interface for command in mcu.commands() if command.payload == bytes([value])]
-
-    def samples_under_alias() -> list[int]:
-        """Send a command to the alias: its start is not announced, so the test tries until one arrives."""
-        world.operator.command("lab/set", {"v": 3})
-        return received(3)
-
-    assert until(samples_under_alias, step=0.2)
-    for metric in ("mcu/spy-1/tune", "lab/tune", "mcu/spy-1/set", "lab/set"):
-        world.operator.command(metric, {"v": 1})
-    assert until(lambda: len(received(1)) == 2)
-    rig.world.command("lab/tune", {"v": 2})
-    assert until(lambda: received(2))
-    assert (received(1), received(2)) == ([4, 4], [5])

@@ -223,15 +223,6 @@ class TestFiles:
         assert len(payloads(running.root)) == 2
         assert len(library.files([running.root])) >= 2
 
-    @pytest.mark.parametrize("payload", [b"PBAT" + b"\xff" * 20, b"PBVD" + b"\xff" * 20, b'{"t": -1e999}', b"", b"{"])
-    def test_no_payload_ends_it(self, running: Running, payload: bytes) -> None:
-        running.send(topic=f"{BASE}/outgoing/x", payload=payload)
-        running.send()
-        running.stop()
-        assert payloads(running.root, f"{BASE}/outgoing/x") == [payload]
-        assert payloads(running.root) == [b"1"]
-        assert running.recorder.counters["errors"] == 0
-
     def test_events_cannot_be_forged(self, running: Running) -> None:
         running.recorder.receive(EVENTS, b'{"event":"gap"}', 1, False)
         running.stop()

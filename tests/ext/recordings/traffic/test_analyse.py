@@ -20,15 +20,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return demo_folder(tmp_path / "recordings")
 
 
-@pytest.mark.thorough
-def test_a_folder_that_is_recorded_to(run, folder, tmp_path):
-    assert run("analyse", folder) == 0
-    assert {"goob", "fred", "minilamp", "benjr"} <= {line.split()[0] for line in run.out.splitlines() if line.strip()}
-    assert "Written: report/traffic.html" in run.out
-    assert (tmp_path / "report" / "traffic.html").exists()
-    assert run.err == ""
-
-
 def test_some_robots_some_time_and_csv(run, folder, tmp_path):
     arguments = ["--robot", "fred", "-r", "pebble/robots/benjr", "--since", "2026-11-22T23:46:05", "--until", "+5s"]
     assert run("analyse", folder, *arguments, "--output", tmp_path / "out", "--csv") == 0

@@ -160,8 +160,8 @@ def heartbeats(base: str, times: Iterable[float]) -> list[Sent]:
     ]
 
 
-def steady(base: str, *missing: tuple[float, float], seconds: float = 60.0, rate_hz: float = 4.0) -> list[Sent]:
-    times = (number / rate_hz for number in range(int(seconds * rate_hz)))
+def steady(base: str, *missing: tuple[float, float], seconds: float = 60.0) -> list[Sent]:
+    times = (number / 4 for number in range(int(seconds * 4)))
     return heartbeats(base, [at for at in times if not any(since < at < until for since, until in missing)])
 
 

@@ -154,27 +154,3 @@ def test_scripts_inherit_nothing_of_the_launchers(mqtt: ManagerRig, monkeypatch:
     assert not variables.keys() & {"PEBBLE_WANTED", "PEBBLE_RUN", "PEBBLE_NOTIFY_FD"}
     assert (variables["TEA"], variables["CUP"], variables["PEBBLE_CONFIG"]) == ("hot", "1", str(mqtt.path))
     assert (leads_group, stdin) == (True, "")
-
-
-def test_scripts_are_listed_at_once_and_started_when_it_is_known_what_they_need(mqtt: ManagerRig) -> None:
-    mqtt.script("first")
-    slow = mqtt.root / "slow"
-    slow.mkdir()
-    (slow / "run.py").write_text("import os, time\nwhile not os.path.exists('go'): time.sleep(0.01)\n" + OURS + SLEEPER)
-    mqtt.script("needs", dependencies=[{"file": "slow"}])
-    mqtt.start()
-    for file, why in (
-        ("slow", "Failed to start slow"),
-        ("needs", "Failed to start needs: slow"),
-    ):
-        mqtt.launch(file)
-        why += ": it is still asked what it needs: scripts are still being listed, try again"
-        assert mqtt.becomes(error=why), mqtt.status
-    assert mqtt.newest("autonomy-files")["files"][-1] == {
-        "file": "slow",
-        "label": "slow",
-        "configs": [],
-        "asked": False,
-    }
-    (slow / "go").touch()
-    mqtt.run_script("slow")

@@ -24,6 +24,7 @@ SCRIPTS = {
     "eyes": script("eyes"),
     "new": structs.replace(script("new"), asked=False),
     "lost": script("lost", Dependency("nose")),
+    "late": script("late", Dependency("new")),
     "torn": structs.replace(script("torn"), broken="run.py, line 3: invalid syntax"),
     "needy": script("needy", Dependency("torn")),
     "fast": script("fast", Dependency("eyes", {"speed": 9})),
@@ -55,6 +56,7 @@ def test_a_script_is_started_by_a_name_that_looks_the_same(there: str, typed: st
         ("torn", {"speed": 2}, "Failed to start torn: run.py, line 3: invalid syntax"),
         ("needy", {}, "Failed to start needy: torn: run.py, line 3: invalid syntax"),
         ("new", {}, "Failed to start new: it is still asked what it needs"),
+        ("late", {}, "Failed to start late: new: it is still asked what it needs"),
         ("fast", {}, "Failed to start fast: Invalid config for eyes: speed above maximum 1"),
     ],
 )

@@ -136,9 +136,9 @@ def test_a_file_that_is_no_calibration_is_named(tmp_path: Path, text: str) -> No
 RIGHT, FAR = (1.0, 0.3), (2.0, 0.1)  # metres, radians
 
 
-def seen(distance_m: float, angle_rad: float, *, number: int = 13, edge: float | None = None) -> Tag:
-    """A tag in that place, with an edge of so many pixels: by default what it has at that distance."""
-    edge, x = edge or 100.0 / distance_m, 320.0 + 500.0 * angle_rad
+def seen(distance_m: float, angle_rad: float, *, number: int = 13) -> Tag:
+    """A tag in that place, with an edge of as many pixels as it has at that distance."""
+    edge, x = 100.0 / distance_m, 320.0 + 500.0 * angle_rad
     corners = np.array([[x, 200], [x + edge, 200], [x + edge, 200 + edge], [x, 200 + edge]])
     return Tag(number, corners, Place(distance_m, angle_rad))
 
