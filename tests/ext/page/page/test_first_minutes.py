@@ -100,7 +100,7 @@ def test_a_visitor_sees_drives_stops_starts_a_script_and_takes_a_film_home(demo:
         visitor.did("Goob is open")
         visitor.presses("take")
         since_ns = time.monotonic_ns()
-        trace = trace_path(demo.folders()[0] / "goob", "goob")
+        trace = trace_path(demo.folders()[0] / "world", "goob")
         motors = lambda: [one.motors for one in read_trace(trace) if one.ns > since_ns and one.motors is not None]
         visitor.drives(lambda: any(map(any, motors())), "KeyS", "KeyW")
         visitor.did("it drives")
