@@ -148,7 +148,7 @@ class PageServer(Program):
 class Testbed(Processes):
     """Two brokers, two Linux robots with an MCU each, and two robots that are an MCU; or only those of ``names``.
 
-    ``keep``: the folder with the logs stays after the demo. ``world``: the folder of the room in which Goob and Fred are.
+    ``keep``: the folder with the logs stays after the demo. ``world``: the folder of Goob's and Fred's room.
     ``broker_port`` is that of the operators' broker, on loopback.
     """
 
