@@ -118,7 +118,7 @@ def test_a_visitor_sees_drives_stops_starts_a_script_and_takes_a_film_home(demo:
         opened.test("script-apriltag-follow").click()
         visitor.sees(lambda: opened.test("start-script").is_enabled())
         visitor.presses("start-script")
-        visitor.sees(lambda: "runs" in opened.test("script-state").inner_text())
+        visitor.sees(lambda: "running" in opened.test("script-state").inner_text())
         visitor.did("a script runs")
         visitor.presses("end-script")
         visitor.sees(lambda: "No script runs" in opened.test("script-state").inner_text())

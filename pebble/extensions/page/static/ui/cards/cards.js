@@ -76,16 +76,6 @@ export const CARDS = [
     part: styled(async (again) => (await import("./plots.js" + again)).Plots, "plots.css", "vendor/uPlot.css"),
   },
   {
-    id: "lights",
-    sends: true,
-    title: "Lights",
-    icon: "light",
-    tab: "more",
-    height: 210,
-    wants: (offers) => ["solid", "flash", "available"].some((kind) => offers.section("lights")[kind] === true),
-    part: styled(async (again) => (await import("./lights.js" + again)).Lights, "commands.css"),
-  },
-  {
     id: "voice",
     title: "Listen and talk",
     icon: "mic",
@@ -103,6 +93,16 @@ export const CARDS = [
     height: 510,
     wants: (offers) => offers.has("soundboard"),
     part: styled(async (again) => (await import("./sounds.js" + again)).Sounds, "commands.css"),
+  },
+  {
+    id: "lights",
+    sends: true,
+    title: "Lights",
+    icon: "light",
+    tab: "more",
+    height: 210,
+    wants: (offers) => ["solid", "flash", "available"].some((kind) => offers.section("lights")[kind] === true),
+    part: styled(async (again) => (await import("./lights.js" + again)).Lights, "commands.css"),
   },
   {
     id: "outlets",

@@ -63,7 +63,7 @@ export function Choose() {
       The recordings cannot be listed: ${problem} <${Button} onPress=${again}>Try again<//>
     </p>`}
     ${(shown || (!days && !problem)) &&
-    html`<div class="loading bones" role="status"><span class="sr">Looking for recordings…</span><i></i><i></i><i></i></div>`}
+    html`<div class="loading bones" role="status"><span class="sr">Looking for recordings…</span><i></i><i></i></div>`}
     ${days &&
     !days.length &&
     html`<div class="empty">
