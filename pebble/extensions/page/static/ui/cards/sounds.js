@@ -8,6 +8,7 @@ import { plain } from "../parts/more-words.js";
 import { useMemo } from "../../vendor/hooks.mjs";
 
 const MOST = 60; // clips that are listed at a time
+const FEW = 8; // they need no filter
 
 export function Sounds({ at }) {
   const page = useReasons(at);
@@ -50,7 +51,8 @@ function Clips({ at, page, sounds, why }) {
   const { playing, file: now } = useValue(at, "soundboard-status") ?? {};
   if (!files) return html`<p class="dim">No list of clips was received yet: is soundboard_handler enabled in its config?</p>`;
   if (!files.length) return html`<p class="dim">No clips: put sound files into ${name}'s folder of sounds.</p>`;
-  return html`<input
+  return html`${(files.length > FEW || filter) &&
+    html`<input
       type="search"
       class="wide"
       data-test="sound-filter"
@@ -58,7 +60,7 @@ function Clips({ at, page, sounds, why }) {
       placeholder=${`Filter ${files.length} clips`}
       value=${filter}
       onInput=${(event) => sounds.set({ filter: event.currentTarget.value })}
-    />
+    />`}
     <div class="clips" data-test="clips" role="group" aria-label="Clips" tabindex="0" data-arrows>
       ${shown.folders.map(
         ([folder, names]) => html`<section key=${folder} aria-label=${folder ? plain(folder) : "clips"}>

@@ -9,13 +9,6 @@ import { RecordingsLink } from "../fleet/recordings-link.js";
 
 const THEMES = { auto: "As the system", light: "Light", dark: "Dark" };
 const SIDES = { left: "On the left", right: "On the right" };
-const RIGHTS = {
-  drive: "drive",
-  reset: "reset stops",
-  take: "take over from others",
-  system: "restart and update robots",
-  people: "manage users",
-};
 const MORE = [
   { name: "help", icon: "help", text: "Help" },
   { name: "phone", icon: "phone", text: "Open on a phone" },
@@ -95,12 +88,11 @@ function WhoAmI() {
   useModel(connection);
   const { you } = connection;
   if (!you) return html`<p class="dim">Not connected yet.</p>`;
-  const rights = (you.rights ?? []).map((one) => RIGHTS[one] ?? one);
   return html`<section class="who" aria-label="Who I am">
     <span class="badge"><${Icon} name="person" /></span>
     <p>
       <b>${you.login ? you.user : "No login on this machine"}</b>
-      <span class="dim">${you.role} at ${you.server}. May ${["stop", ...rights].join(", ")}.</span>
+      <span class="dim">${you.role} at ${you.server}</span>
     </p>
     ${you.login
       ? html`<${Button} icon="out" onPress=${() => commands.logOut()}>Log out<//>`
