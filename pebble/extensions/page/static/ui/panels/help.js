@@ -16,7 +16,6 @@ export function HelpPanel({ onClose }) {
   const mapping = pad ? mappingOf(pad) : USUAL;
   const standard = pad?.mapping === "standard";
   const shown = ACTIONS.filter(({ id }) => extra || id !== "auxiliary");
-  const ways = shown.map(({ id, words, touch, ...more }) => [words, padWords({ id, ...more }, mapping, standard), touch]);
   return html`<${Panel} id="help" onClose=${onClose} title="Help" className="wide-panel">
     <section class="panel-text" aria-label="Keys">
       <ul class="bindings">
@@ -26,7 +25,7 @@ export function HelpPanel({ onClose }) {
       <details class="folded">
         <summary data-test="help-ways">Gamepad and touch</summary>
         <ul class="bindings">
-          ${ways.map(([words, button, touch]) => html`<li key=${words}><b>${words}</b><span>${button}</span><span>${touch}</span></li>`)}
+          ${shown.map((action) => html`<li key=${action.id}><b>${action.words}</b><span>${padWords(action, mapping, standard)}</span><span>${action.touch}</span></li>`)}
         </ul>
         <p class="dim">Buttons are those of ${pad ? padName(pad) : "a usual gamepad: press one of its buttons on this page, browsers show it only then"}.</p>
       </details>

@@ -8,7 +8,7 @@ import { driverName, inner } from "../parts/words.js";
 import { Extra, Icon, Part, RouteLink, useName } from "../parts/parts.js";
 import { Robot } from "../robot/robot.js";
 import { Frame, SnapshotButton } from "../robot/video.js";
-import { Choose, timeWords } from "./choose.js";
+import { Choose, Opening, timeWords } from "./choose.js";
 import { Replay as Model } from "./model.js";
 import { PlayerBar } from "./player-bar.js";
 
@@ -86,16 +86,6 @@ function Shown({ at, replay }) {
     <${Boundary} what="What plays it"><${PlayerBar} at=${at} replay=${replay} /><//>
   </div>`;
 }
-
-/** The shape of the page until its recording is here. */
-const Opening = ({ name, problem }) => html`<div class="robot" aria-busy="true">
-  <h1 class="sr">${name}</h1>
-  <div class="stage">
-    <div class="picture"><div class="canvas"><canvas width="640" height="360" aria-hidden="true"></canvas></div></div>
-    <p class="sr" role="status">${problem || "Loading the recording…"}</p>
-    <div class="picture-bar loading">${problem || html`<i class="bone" aria-hidden="true"></i>`}</div>
-  </div>
-</div>`;
 
 /** Who had control then; "" it is not known, or nobody. @param {import("../../core/store.js").Store} store @param {string} ref */
 function driverThen(store, ref) {
