@@ -148,8 +148,9 @@ async def _snapshot(request: Request) -> Response:
     still = await state.media.snapshot(ref)
     if still is None:
         return Response(status_code=204, headers=NO_STORE)
-    age = str(round(time.monotonic() - still.at))
-    return Response(still.jpeg, media_type="image/jpeg", headers={**NO_STORE, "age": age})
+    jpeg, at = still
+    headers = {**NO_STORE, "age": str(round(time.monotonic() - at))}
+    return Response(jpeg, media_type="image/jpeg", headers=headers)
 
 
 async def _estop(request: Request) -> Response:

@@ -161,11 +161,6 @@ class Robots:
 
     # -- pages
 
-    @property
-    def shows_fleet(self) -> bool:
-        """True if a page has no component open."""
-        return any(not interest.watched for interest in self.interests)
-
     def join(self, interest: Interest) -> None:
         """Send everything to this page."""
         self.interests.add(interest)

@@ -3,8 +3,7 @@
 import asyncio
 import struct
 import time
-from contextlib import suppress
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -21,25 +20,7 @@ _ANSWER: Final = struct.Struct(">IB")  # number of a frame, and what became of i
 _MOST_STILLS: Final = 200  # of cameras that rest; the oldest goes
 _FRESH_S: Final = 4.5  # of a camera that is on, no still is older: key frames come each 4 s
 _GLIMPSE_S: Final = 6.0  # until a camera sends a key frame
-
-
-class Still(NamedTuple):
-    """A picture as a JPEG, and when it came, monotonic."""
-
-    jpeg: bytes
-    at: float
-
-
-class _Reports(msgspec.Struct):
-    """A media status, as far as it is needed here."""
-
-    class Program(msgspec.Struct):
-        running: bool = False
-
-    camera_publisher: Program = msgspec.field(default_factory=Program)
-
-
-_reports = msgspec.json.Decoder(_Reports)
+_TURN_S: Final = 5.0  # until the next camera's turn
 
 
 class MediaHub(Streams[PictureStream]):
@@ -49,7 +30,7 @@ class MediaHub(Streams[PictureStream]):
         super().__init__(CAMERA, lambda ref: PictureStream(broker, robots, ref))
         self._robots = robots
         self._last: dict[str, tuple[bytes, float]] = {}  # key frames of streams that have ended
-        self._taking: dict[str, asyncio.Task[Still | None]] = {}
+        self._looking: dict[str, asyncio.Task[None]] = {}
 
     async def serve(self, websocket: WebSocket, ref: str, can: frozenset[str]) -> None:
         """Send the pictures of ``ref`` to a page that decodes ``can``, until either end closes the socket."""
@@ -62,39 +43,32 @@ class MediaHub(Streams[PictureStream]):
             lambda stream: _receive(websocket, stream, viewer),
         )
 
-    async def snapshot(self, ref: str) -> Still | None:
-        """Return the newest picture, of a camera that rests its last one; it starts no camera."""
-        if ref not in self._taking:
-            self._taking[ref] = task = asyncio.create_task(self._take(ref))
-            task.add_done_callback(lambda _: self._taking.pop(ref, None))
-        return await asyncio.shield(self._taking[ref])
+    async def snapshot(self, ref: str) -> tuple[bytes, float] | None:
+        """Return the newest key frame as a JPEG, of a camera that rests its last one, and when it came, monotonic.
+
+        It starts no camera. Of one that is on for others a picture is fetched meanwhile: who asks waits for nothing.
+        """
+        reports = self._robots.value(ref, MEDIA_STATUS.metric)
+        is_on = reports is not None and msgspec.json.decode(reports).get("camera_publisher", {}).get("running", False)
+        if is_on and not self._has_fresh(ref) and ref not in self._looking:
+            self._looking[ref] = asyncio.create_task(self._glimpse(ref))
+        key = self._key(ref)
+        jpeg = None if key is None else await asyncio.to_thread(rescue.newest_jpeg, [key[0]])
+        return None if key is None or jpeg is None else (jpeg, key[1])
 
     async def look_in_turn(self) -> None:
-        """Switch on one camera after another for a moment, while a page shows the fleet."""
+        """Switch on one camera after another for a moment, while a page has no component open."""
         while True:
             await asyncio.sleep(1.0)
             for ref in list(self._robots.components):
-                if self._robots.shows_fleet and not refusal(ref, self._robots.capabilities(ref), "video"):
+                is_shown = any(not interest.watched for interest in self._robots.interests)
+                if is_shown and not refusal(ref, self._robots.capabilities(ref), "video"):
                     await self._glimpse(ref)
-                    await asyncio.sleep(1.0)
-
-    async def _take(self, ref: str) -> Still | None:
-        if self._is_on(ref) and not self._has_fresh(ref):
-            await self._glimpse(ref)
-        key = self._key(ref)
-        jpeg = None if key is None else await asyncio.to_thread(rescue.newest_jpeg, [key[0]])
-        return None if key is None or jpeg is None else Still(jpeg, key[1])
+                    await asyncio.sleep(_TURN_S)
 
     def _key(self, ref: str) -> tuple[bytes, float] | None:
         stream = self.get(ref)
         return (None if stream is None else stream.key) or self._last.get(ref)
-
-    def _is_on(self, ref: str) -> bool:
-        """True if the camera sends pictures, to any program."""
-        raw = self._robots.value(ref, MEDIA_STATUS.metric)
-        with suppress(msgspec.MsgspecError):
-            return raw is not None and _reports.decode(raw).camera_publisher.running
-        return False
 
     def _has_fresh(self, ref: str) -> bool:
         key = self._key(ref)
@@ -110,6 +84,7 @@ class MediaHub(Streams[PictureStream]):
                 await asyncio.sleep(0.1)
         finally:
             stream.leave(viewer)
+            self._looking.pop(ref, None)
 
     def _forget(self, ref: str, task: asyncio.Task[None]) -> None:
         if (key := self._key(ref)) is not None:
