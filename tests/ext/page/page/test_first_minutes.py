@@ -91,6 +91,8 @@ def test_a_visitor_sees_drives_stops_starts_a_script_and_takes_a_film_home(demo:
         visitor = Visitor(opened)
         visitor.sees("document.querySelectorAll('.fleet-card').length >= 4", START_S)
         visitor.did("all robots are there")
+        visitor.sees("document.querySelector('.thumbnail img')", 15)
+        visitor.did("what a camera sees is on the fleet")
         visitor.sees(lambda: f"the robots are yours: {url}" in demo.output, 120)
         visitor.did("they are the visitor's")
 
