@@ -157,7 +157,7 @@ function ResetAll() {
   const reset = () => refs.forEach((ref) => commands.reset(ref, store.get(ref, STOP)?.value.owners));
   return html`<div class="banner stopped">
     <div class="banner-text"><b>Look at all: is everybody clear?</b></div>
-    <${HoldButton} test="reset-all" onHeld=${reset}>Hold to reset all ${refs.length}<//>
+    <${HoldButton} key=${refs.join()} test="reset-all" onHeld=${reset}>Hold to reset all ${refs.length}<//>
   </div>`;
 }
 

@@ -28,12 +28,11 @@ export function Telemetry({ at }) {
 /** One large figure: in percent with its bar, where the cells are known. */
 function Battery({ at, online }) {
   const level = useMetric(at, "charging-level");
-  const charger = charging(useValue(at, "charging-status"));
+  const status = useValue(at, "charging-status");
   const { cells } = looksOf(at, useValue(at, "capabilities"));
-  if (!level) return null;
-  const percent = isGone(level, online) ? null : charge(level.value, cells);
-  const more = [percent !== null && cells ? battery(level.value) : "", charger].filter(Boolean).join(", ");
-  return html`<p class="figure"><b><${Charge} at=${at} level=${level} online=${online} /></b> <span class="dim">${more}</span></p>
+  const percent = !level || isGone(level, online) ? null : charge(level.value, cells);
+  const more = [percent !== null && cells ? battery(level.value) : "", online ? charging(status) : ""].filter(Boolean).join(", ");
+  return html`<p class="figure">${level && html`<b><${Charge} at=${at} level=${level} online=${online} /></b> `}<span class="dim">${more}</span></p>
     ${percent !== null && html`<i class=${`meter ${percent < LOW_PERCENT ? "low" : ""}`} aria-hidden="true"><i style=${{ width: `${percent}%` }}></i></i>`}`;
 }
 
