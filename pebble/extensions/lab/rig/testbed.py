@@ -34,8 +34,8 @@ _POLL_S = 0.02
 HORN = struct.pack("<40h", *[8000] * 20, *[-8000] * 20) * 400  # the clip: 1 s of 400 Hz
 #: After the first round of driving Goob looks at the tag, with Fred in sight, and both have space for further rounds.
 _START = {
-    "goob": {"kind": "goob", "x": -0.3, "y": 0.2, "heading_deg": 0.0},
-    "fred": {"kind": "fred", "x": 0.18, "y": -1.34, "heading_deg": 0.0, "tag": 2},
+    "goob": {"kind": "goob", "x": -0.3, "y": 0.2, "heading_deg": 0.0, "tag": 1},
+    "fred": {"kind": "fred", "x": 0.64, "y": -1.86, "heading_deg": 180.0, "tag": 2},
 }
 
 
@@ -175,7 +175,7 @@ class Testbed(Processes):
             broker.wait(self._ending)
         self.broker_port = self.remote_broker.port
         for name in self._names:
-            self.robots[name] = (McuRobot if name in _BOARDS else LinuxRobot)(self, name)
+            self.robots[name] = McuRobot(self, name) if name in _BOARDS else LinuxRobot(self, name)
 
     def start_page(self, port: int = 0, **settings: Any) -> PageServer:
         """Return the operator page's server, which is starting, instead of an earlier one; ``port`` 0 is a free one."""
