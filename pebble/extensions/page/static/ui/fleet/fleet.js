@@ -2,7 +2,6 @@
 
 import { ROOT } from "../../core/browser.js";
 import * as more from "../../core/browser-more.js";
-import { scriptName } from "../../core/reasons.js";
 import { doubtOf } from "./doubt.js";
 import { Bands, progressOf } from "../banner.js";
 import { Liveness } from "../header.js";
@@ -10,6 +9,7 @@ import {
   Boundary,
   html,
   useEffect,
+  useLater,
   useMetric,
   useModel,
   usePage,
@@ -307,7 +307,6 @@ function FleetCard({ at, plain }) {
         <${BatteryFact} at=${at} online=${connection.isOpen} />
         ${connection.isOpen && html`<${DoubtFact} at=${at} />`}
         <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} estop=${estop} pictured=${pictured} />
-        <${ScriptFact} at=${at} online=${connection.isOpen} />
         ${typeOf(at) !== "robots" ? html`<${StatusFact} at=${at} />` : html`<${ServiceFact} at=${at} />`}
       </ul>
       ${estop?.latched
@@ -363,14 +362,6 @@ function DriverFact({ at, offers, online, estop, pictured }) {
   return html`<${Fact} icon="wheel" className="">${view.you ? html`<b>driven by you</b>` : `driven by ${driverName(view)}`}<//>`;
 }
 
-/** What runs beside who drives. */
-function ScriptFact({ at, online }) {
-  const status = useValue(at, "autonomy-status");
-  const itself = useItself(at);
-  if (!status?.running || itself || !online) return null;
-  return html`<${Fact} icon="script">${scriptName(status)} ${status.overridden ? "waits" : "runs"}<//>`;
-}
-
 /** In a word or two, what a component reports that is no robot. */
 function StatusFact({ at }) {
   const status = inner(useValue(at, "status"));
@@ -384,7 +375,6 @@ function Thumbnail({ at, has, looks }) {
   const runs = useValue(at, "media-status")?.camera_publisher?.running === true;
   const isOn = flows || runs;
   const [{ src, takenAt }, take] = useState({ src: "", takenAt: 0 });
-  useTick(src ? 1000 : 0);
   useEffect(() => {
     if (!has) return undefined;
     const look = async () => {
@@ -400,6 +390,8 @@ function Thumbnail({ at, has, looks }) {
   useEffect(() => () => URL.revokeObjectURL(src), [src]);
   const age = performance.now() - takenAt;
   const isLive = isOn && age < LIVE_MS;
+  useTick(src && !isLive ? 2000 : 0);
+  useLater(isLive ? LIVE_MS - age : Infinity);
   return html`<div class=${`thumbnail ${src ? "" : "faced"}`}>
     ${src ? html`<img alt=${`What ${looks.name} sees`} src=${src} />` : html`<${Drawing} picture=${looks.picture} />`}
     ${src && html`<span class=${`tag ${isLive ? "live" : ""}`}>${isLive ? "live" : `${roughly(age)} ago`}</span>`}
