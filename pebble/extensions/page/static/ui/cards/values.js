@@ -17,8 +17,9 @@ export function Values({ at }) {
 
 /** How its heartbeats come, where that is known: for people they say only whether it is online. */
 function Heartbeat({ at }) {
-  const { interval_ms: interval, latency_ms: late, average_latency_ms: average, whole_seconds: coarse } = useMetric(at, "web/liveness")?.value ?? {};
-  if (!interval) return null;
+  const view = useMetric(at, "web/liveness")?.value;
+  if (!view?.interval_ms) return null;
+  const { interval_ms: interval, latency_ms: late, average_latency_ms: average, whole_seconds: coarse } = view;
   const lateness = coarse || late === null ? "its clock does not tell how late" : `late by ${span(late)}, on average ${span(average ?? late)}`;
   return html`<p class="dim" data-test="heartbeat">Heartbeats every ${span(interval)}, ${lateness}</p>`;
 }
