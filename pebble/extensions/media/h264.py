@@ -26,6 +26,10 @@ SMALLEST_EDGE: Final = 16  # one macroblock
 _SEAL: Final = b"\x00\x00\x00\x01\x1f"
 _SEAL_BYTES: Final = len(_SEAL) + 5
 _WORST_CRF: Final = 51.0
+_REST_S: Final = 1.0  # so long a picture rests before it is sent sharp, once in each key frame
+_SHARPER: Final = "10"  # ipratio: a key frame has this part of the other pictures' coarseness
+_GRID: Final = (40, 24)  # the size to which pictures are reduced to compare them: it averages noise away
+_RESTS: Final = 3.0  # of 255: no part of a picture that rests differs more
 
 
 def quality_to_crf(quality: float) -> float:
@@ -39,7 +43,8 @@ def quality_to_crf(quality: float) -> float:
 class H264Encoder:
     """BGR pictures to access units; ``interval``: pictures from one key frame to the next.
 
-    Another size or quality starts a new encoder, with a key frame.
+    Another size or quality starts a new encoder, with a key frame. So does a picture that rests: its key frames are
+    sharp, and what follows leaves them as they are.
     """
 
     def __init__(self, fps: float, interval: int) -> None:
@@ -55,13 +60,15 @@ class H264Encoder:
         self._opened_for: tuple[object, ...] = ()
         self._count = 0
         self._i420: Pixels | None = None
+        self._reduced: Pixels | None = None  # the picture with which others are compared
+        self._resting = 0  # pictures that have not differed from it
 
     def encode(self, picture: Pixels, quality: float, *, keyframe: bool = False) -> bytes:
         """Return one access unit. A last odd row or column is left out: colour is stored for two by two pixels."""
         height, width = picture.shape[0] & ~1, picture.shape[1] & ~1
         if min(height, width) < SMALLEST_EDGE:
             raise PebbleError(f"h264: a picture of {picture.shape[1]}x{picture.shape[0]} is too small")
-        context = self._ready(width, height, quality)
+        context = self._ready(width, height, quality, rests=self._rests(picture))
         even, buffer = picture[:height, :width], self._fitting(width, height)
         self._i420 = cast(Pixels, cv2.cvtColor(even, cv2.COLOR_BGR2YUV_I420, buffer))
         frame = self._av.VideoFrame.from_ndarray(self._i420, "yuv420p")
@@ -77,13 +84,21 @@ class H264Encoder:
         self.keyframe = any(packet.is_keyframe for packet in packets)
         return seal(b"".join(bytes(packet) for packet in packets))
 
-    def _ready(self, width: int, height: int, quality: float) -> av.VideoCodecContext:
-        settings = (width, height, quality)
+    def _rests(self, picture: Pixels) -> bool:
+        """True if it shows what those of the last second showed."""
+        reduced = cv2.resize(picture, _GRID, interpolation=cv2.INTER_AREA)
+        if self._reduced is None or cv2.absdiff(reduced, self._reduced).max() > _RESTS:
+            self._reduced, self._resting = cast(Pixels, reduced), 0
+        self._resting += 1
+        return self._resting > self._rate * _REST_S
+
+    def _ready(self, width: int, height: int, quality: float, *, rests: bool) -> av.VideoCodecContext:
+        settings = (width, height, quality, rests)
         if self._context is None or self._opened_for != settings:
-            self._context, self._opened_for = self._open(width, height, quality), settings
+            self._context, self._opened_for = self._open(width, height, quality, rests=rests), settings
         return self._context
 
-    def _open(self, width: int, height: int, quality: float) -> av.VideoCodecContext:
+    def _open(self, width: int, height: int, quality: float, *, rests: bool) -> av.VideoCodecContext:
         context: av.VideoCodecContext = self._av.CodecContext.create("libx264", "w")
         context.width, context.height, context.pix_fmt = width, height, "yuv420p"
         context.time_base, context.framerate = 1 / self._rate, self._rate
@@ -93,7 +108,8 @@ class H264Encoder:
         context.colorspace = 6  # SMPTE 170M, what cv2 converts to
         context.color_range = 1  # 16..235
         # No look-ahead, no waiting; veryfast: 3 ms for 640x480 where medium takes 10 and saves nothing at this latency.
-        options = {"preset": "veryfast", "tune": "zerolatency", "forced-idr": "1", "x264-params": "scenecut=0"}
+        more = "scenecut=0" + (f":ipratio={_SHARPER}" if rests else "")
+        options = {"preset": "veryfast", "tune": "zerolatency", "forced-idr": "1", "x264-params": more}
         context.options = options | {"crf": f"{quality_to_crf(quality):.2f}"}
         return context
 

@@ -144,10 +144,15 @@ async def _health(request: Request) -> Response:
 async def _snapshot(request: Request) -> Response:
     if login.session_of(request) is None:
         return PlainTextResponse("log in first", 401)
-    picture = await request.app.state.media.snapshot(request.query_params.get("ref", ""))
-    if picture is None:
-        return PlainTextResponse("no picture flows", 404, headers=NO_STORE)
-    return Response(picture, media_type="image/jpeg", headers=NO_STORE)
+    ref, state = request.query_params.get("ref", ""), request.app.state
+    if ref not in state.robots.components:
+        return PlainTextResponse("no such component", 404)
+    still = await state.media.snapshot(ref)
+    if still is None:
+        return Response(status_code=204, headers=NO_STORE)
+    jpeg, at = still
+    headers = {**NO_STORE, "age": str(round(time.monotonic() - at))}
+    return Response(jpeg, media_type="image/jpeg", headers=headers)
 
 
 async def _estop(request: Request) -> Response:

@@ -88,6 +88,8 @@ class Server:
         self.spawn(self._tick())
         if self.settings.login:
             self.spawn(self._watch_people())
+        if self.settings.cameras_in_turn:
+            self.spawn(self.pictures.look_in_turn())
 
     async def close(self) -> None:
         """Stop what pages move, then disconnect."""

@@ -36,6 +36,7 @@ class WebSettings:
     key: Path | None = None
     recordings: Path | None = None  # the folder of a recorder, to look at; None: none
     authority: Path | None = None  # offered for download, so that phones can trust it
+    cameras_in_turn: bool = False  # for a moment each, while a page shows the fleet: the demo's
     plain_http_drive: bool = True  # False: over plain http from another machine nothing drives
 
     @property

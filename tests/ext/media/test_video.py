@@ -116,6 +116,15 @@ def test_h264_is_annex_b_with_parameter_sets_in_every_key_frame() -> None:
         assert (VideoDecoder().feed(packet) is not None) is (number % 4 == 0)
 
 
+def test_h264_sharpens_what_rests_within_two_seconds_and_sends_little_of_it() -> None:
+    encoder, decoder = make_encoder("h264", fps=15, keyframe_interval=60), VideoDecoder()
+    packets = [*send(encoder, 5), *(encoder.encode(picture(5), T0 + n * 66) for n in range(5, 40))]
+    shown = [decoder.feed(packet) for packet in packets]
+    blurred, sharp = (cv2.PSNR(one.picture, picture(5)) for one in (shown[6], shown[34]) if one is not None)
+    assert sharp > blurred + 6
+    assert sum(map(len, packets[30:])) < len(packets[0])
+
+
 @pytest.mark.thorough
 def test_errors_do_not_pile_up_between_key_frames() -> None:
     encoder, decoder = make_encoder("pbvd", fps=15, keyframe_interval=60), VideoDecoder()

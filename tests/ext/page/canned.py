@@ -187,8 +187,11 @@ class CannedServer:
     async def _static(self, request: Request) -> Response:
         return self.static.answer(request, request.path_params["name"], _headers())
 
-    async def _snapshot(self, _request: Request) -> Response:
-        return Response(flat() if self.state.still else picture(0), media_type="image/jpeg", headers=_headers())
+    async def _snapshot(self, request: Request) -> Response:
+        """The cameras of other robots than goob rest."""
+        age = "0" if request.query_params["ref"].endswith("goob") else "40"
+        still = flat() if self.state.still else picture(0)
+        return Response(still, media_type="image/jpeg", headers=_headers() | {"age": age})
 
     async def _audit(self, _request: Request) -> Response:
         return JSONResponse(self.state.audit)

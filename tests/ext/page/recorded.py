@@ -70,6 +70,7 @@ def _log(at: int) -> dict[str, Any]:
 STREAMS: Final[list[tuple[str, int, Callable[[int], Any]]]] = [
     ("online", 250, lambda at: {"t": at - 42}),
     ("capabilities", 60_000, lambda _at: states.capabilities("zenoh")),
+    ("control/base", 60_000, lambda _at: {"by": "ann", "id": "1", "key": "k"}),
     ("charging-level", 5000, lambda at: {"value": 7.92 - (at - START) / 4e6, "unit": "v"}),
     ("charging-status", 20_000, lambda _at: {"value": False}),
     ("sensors/imu", 200, states.attitude),

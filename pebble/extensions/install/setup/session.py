@@ -49,7 +49,7 @@ def set_up(system: System, answers_file: Path | None, backup_file: Path | None) 
     for step in steps:
         say(step.what, 2)
     if asks and steps:
-        typer.confirm("Do it?", default=True, abort=True)
+        typer.confirm("Go ahead?", default=True, abort=True)
     is_started = job.do(steps)
     failures = [*_failures(job, is_started=is_started)]
     for line in failures:

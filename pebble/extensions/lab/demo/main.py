@@ -9,9 +9,11 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
 from typing import Any
+from urllib.request import urlopen
 
 from rich.console import Console
 
@@ -42,6 +44,7 @@ Goob also with inertial sensor, loudspeaker and scripts, in a room with tags.
 MiniLAMP and BenJr are MCUs that use MQTT themselves: their firmware, on
 simulated pins."""
 _GOOB = Identity("pebble", "robots", "goob")
+_INDEX_S = 40.0
 _RECORDED = ("--keep", "256M", "--rotate", "5min")
 
 
@@ -88,6 +91,8 @@ class Demo:
         testbed.start_brokers(kind.program)
         console.print(_ROBOTS)
         self._start_page(opened)
+        if opened is None and self._seconds is None:
+            threading.Thread(target=self._index, name="pebble-demo-index", daemon=True).start()
         self._broker_url = f"mqtt://{HOST}:{testbed.broker_port}"
         self._invite()
         testbed.start_robots()
@@ -129,12 +134,19 @@ class Demo:
         recordings = testbed.folder / "recordings"
         recordings.mkdir()
         testbed.start_recorder(recordings, *_RECORDED)
-        settings = {} if opened is None else opened.settings
+        settings = {"cameras_in_turn": self._seconds is None, **({} if opened is None else opened.settings)}
         self._page_url = usual_or_free(testbed, self._ending, recordings=recordings, **settings).url
         print_line(console, f"See and drive them in a browser: {self._page_url}")
         print_line(console, f"Its Recordings show what they do, from {recordings}, which the demo deletes at its end.")
         if opened is not None:
             opened.show(self._page_url, console)
+
+    def _index(self) -> None:
+        """Ask now and then for what Recordings open with, so that the server has indexed it when a visitor does."""
+        while not self._ending.wait(_INDEX_S):
+            asked = f"archive/timeline?day={datetime.now(UTC):%Y-%m-%d}&robot={_GOOB.base}"
+            with suppress(OSError), urlopen(self._page_url + asked, timeout=_INDEX_S):  # noqa: S310 - its own page
+                pass
 
     def _invite(self) -> None:
         """Print the broker's address, and what can be pasted into another terminal in this folder."""

@@ -32,31 +32,39 @@ _RESTART = ["sh", "-c", "kill $PPID"]  # the bridge alone, which runs it: the de
 _RATE = 16_000
 _POLL_S = 0.02
 HORN = struct.pack("<40h", *[8000] * 20, *[-8000] * 20) * 400  # the clip: 1 s of 400 Hz
-#: After the first round of driving Goob looks at the tag, and has space for further rounds wherever it is then.
-_START = {"goob": {"kind": "goob", "x": -0.3, "y": 0.2, "heading_deg": 0.0}}
+#: After the first round of driving Goob looks at the tag, with Fred in sight, and both have space for further rounds.
+_START = {
+    "goob": {"kind": "goob", "x": -0.3, "y": 0.2, "heading_deg": 0.0, "tag": 1},
+    "fred": {"kind": "fred", "x": 0.64, "y": -1.86, "heading_deg": 180.0, "tag": 2},
+}
 
 
 class LinuxRobot(Robot):
     """Goob or Fred: the real launcher and services; camera, microphone, MCUs and loudspeaker are simulated.
 
-    ``instances`` are the configs of its self-describing MCUs, to which others may be added before it is brought up.
+    Both are in the room that comes with Pebble: their motor MCUs are part of it, and their cameras see it. A simulated
+    loudspeaker records what Goob ``played``. ``instances`` are the configs of its self-describing MCUs, to which
+    others may be added before it is brought up.
     """
 
     runs_on = "Linux, SAMD21"
     has_media = True
+    running: Testbed
 
     def __init__(self, running: Testbed, name: str) -> None:
         own = _config(name)
         remote, folder = (HOST, running.broker_port), running.folder / name
         super().__init__(running, own["transport"]["kind"], remote, name=name, folder=folder)
+        self.has_scripts = name == "goob"
         self.local_port = running.local_broker.port
+        self.port, self._trace = port_path(running.world, name), trace_path(running.world, name)
         self.voice = folder / "voice"  # where its loudspeaker records what it plays of operators' voices
+        self.played = folder / "played"
         self._imu = folder / "imu"  # a serial port
         self.instances: dict[str, Config] = {}
-        if name == "goob":
-            self.instances["imu"] = {"protocol": "pebble_serial_v1", "serial": {"port": str(self._imu)}}
         self._own = own | {"services": own["services"] | {"av_daemon": {}}}
         raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
+        camera = {"video": {"device": f"{running.room_file}#{name}"}}
         self._services = {
             "mqtt_bridge": {
                 "service_restart_control": {"command": _RESTART},
@@ -66,8 +74,18 @@ class LinuxRobot(Robot):
                 "instances": self.instances,
                 "telemetry": {"publish_touch_sensors": self.has_scripts},
             },
-            "av_daemon": MEDIA["av_daemon"],
+            "av_daemon": deep_merge(MEDIA["av_daemon"], camera),
         }
+        if self.has_scripts:
+            self.instances["imu"] = {"protocol": "pebble_serial_v1", "serial": {"port": str(self._imu)}}
+            self._services |= {"soundboard_handler": {"playback": self._playback()}}
+
+    def _playback(self) -> Config:
+        sounds = self.folder / "sounds"
+        (sounds / "signals").mkdir(parents=True)
+        for clip, seconds in {CLIP: 1.0, "signals/beep.wav": 0.15, "signals/long.wav": 0.6}.items():
+            write_wav(sounds / clip, HORN[: 2 * round(seconds * _RATE)], _RATE)
+        return {"directory": str(sounds), "player_command": _loudspeaker(self.played)}
 
     def bring_up(self, ending: threading.Event) -> None:
         """Start the MCUs first, so that their ports exist, then the robot."""
@@ -78,35 +96,12 @@ class LinuxRobot(Robot):
         self.start(self.name, python("pebble.cli", "up", self.config))
 
     def _start_motors(self) -> Program:
-        return self._start_board(self.name, self.port, self._trace)
-
-
-class RoomRobot(LinuxRobot):
-    """Goob in the room that comes with Pebble, alone, with a tag on each wall: its MCU is part of the room.
-
-    Its camera sees the ``room``, and a simulated loudspeaker records what it ``played``.
-    """
-
-    has_scripts = True
-
-    def __init__(self, running: Testbed, name: str) -> None:
-        super().__init__(running, name)
-        self.room, self.played = self.folder / "room.json", self.folder / "played"
-        self.port, self._trace = port_path(self.folder, name), trace_path(self.folder, name)
-        room = json.loads((files("pebble.extensions.lab.simulation.world") / "room.json").read_text())
-        self.room.write_text(json.dumps(room | {"robots": _START}, indent=1))
-        sounds = self.folder / "sounds"
-        (sounds / "signals").mkdir(parents=True)
-        for clip, seconds in {CLIP: 1.0, "signals/beep.wav": 0.15, "signals/long.wav": 0.6}.items():
-            write_wav(sounds / clip, HORN[: 2 * round(seconds * _RATE)], _RATE)
-        playback = {"directory": str(sounds), "player_command": _loudspeaker(self.played)}
-        self._services |= {
-            "av_daemon": deep_merge(MEDIA["av_daemon"], {"video": {"device": f"{self.room}#{name}"}}),
-            "soundboard_handler": {"playback": playback},
-        }
-
-    def _start_motors(self) -> Program:
-        return self._start_mcu("world", self.room, "--folder", self.folder, "--trace", self.folder)
+        """Return the room's program, which the first robot starts."""
+        running = self.running
+        if running.room is None:
+            folder = running.world
+            running.room = self._start_mcu("world", running.room_file, "--folder", folder, "--trace", folder)
+        return running.room
 
 
 def _config(name: str) -> Any:
@@ -153,18 +148,24 @@ class PageServer(Program):
 class Testbed(Processes):
     """Two brokers, two Linux robots with an MCU each, and two robots that are an MCU; or only those of ``names``.
 
-    ``keep``: the folder with the logs stays after the demo. ``room``: Goob is in a simulated room, and sees it.
+    ``keep``: the folder with the logs stays after the demo. ``world``: the folder of Goob's and Fred's room.
     ``broker_port`` is that of the operators' broker, on loopback.
     """
 
     ends_s = (1.0, 2.5, 1.0, 1.0)  # with the operator's disconnect: every process ends within five seconds
     keep = True
     server: PageServer  # the newest
+    room: Program | None = None  # once it runs
 
-    def __init__(self, ending: threading.Event, names: Sequence[str] = ROBOTS, *, room: bool = True) -> None:
+    def __init__(self, ending: threading.Event, names: Sequence[str] = ROBOTS) -> None:
         super().__init__("pebble-demo-")
         self.robots: dict[str, LinuxRobot | McuRobot] = {}
-        self._ending, self._names, self._room = ending, names, room
+        self._ending, self._names = ending, names
+        self.world = self.folder / "world"
+        self.world.mkdir()
+        self.room_file = self.world / "room.json"
+        room = json.loads((files("pebble.extensions.lab.simulation.world") / "room.json").read_text())
+        self.room_file.write_text(json.dumps(room | {"robots": _START}, indent=1))
 
     def start_brokers(self, program: str | None = None) -> None:
         """Start the operators' remote broker and Fred's local one, see Broker. Raises PebbleError if one fails."""
@@ -174,8 +175,7 @@ class Testbed(Processes):
             broker.wait(self._ending)
         self.broker_port = self.remote_broker.port
         for name in self._names:
-            linux = RoomRobot if name == "goob" and self._room else LinuxRobot
-            self.robots[name] = McuRobot(self, name) if name in _BOARDS else linux(self, name)
+            self.robots[name] = McuRobot(self, name) if name in _BOARDS else LinuxRobot(self, name)
 
     def start_page(self, port: int = 0, **settings: Any) -> PageServer:
         """Return the operator page's server, which is starting, instead of an earlier one; ``port`` 0 is a free one."""

@@ -20,7 +20,6 @@ _MAX_CHAIN: Final = 240  # pictures since a key frame
 _MAX_CHAIN_BYTES: Final = 8 << 20  # of these pictures
 _HEAD: Final = struct.Struct(">IB")
 _RESCUE_HEAD: Final = struct.Struct(">IBQ")
-_SNAPSHOT_S: Final = 0.5  # a snapshot this recent is used again
 _AT_REST: Final = PictureView(state="rest", why="", encoding="", per_second=0, kbits=0, viewers=0)
 
 
@@ -41,10 +40,8 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         self._sequence = PictureSequence()
         self._chain: list[bytes] = []  # the newest key frame and all pictures since; empty: it would be too long
         self._chain_bytes = 0
+        self.key: tuple[bytes, float] | None = None  # the newest key frame, and when it came, monotonic
         self._seq = 0
-        self._taking = asyncio.Lock()  # guards the snapshot
-        self._snapshot: bytes | None = None
-        self._snapshot_at = float("-inf")
 
     # -- pages
 
@@ -59,16 +56,6 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         viewer.wakeup.set()
         if what:
             self._request.wake()
-
-    async def snapshot(self) -> bytes | None:
-        """Return the newest picture as a JPEG, if pictures are flowing."""
-        async with self._taking:
-            if not self._chain or not self._arrivals.flowing(time.monotonic()):
-                return None
-            if time.monotonic() - self._snapshot_at > _SNAPSHOT_S:
-                self._snapshot = await asyncio.to_thread(rescue.newest_jpeg, list(self._chain))
-                self._snapshot_at = time.monotonic()
-            return self._snapshot
 
     # -- pictures
 
@@ -88,6 +75,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
     def _extend_chain(self, payload: bytes, header: PictureHeader, *, fits: bool) -> None:
         grown = self._chain_bytes + len(payload)
         if header.keyframe:
+            self.key = payload, time.monotonic()
             self._chain, self._chain_bytes = [payload], len(payload)
         elif fits and self._chain and len(self._chain) < _MAX_CHAIN and grown <= _MAX_CHAIN_BYTES:
             self._chain.append(payload)

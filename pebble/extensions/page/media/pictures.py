@@ -1,18 +1,26 @@
-"""Robots' pictures for pages: one request per robot, however many pages show it."""
+"""Robots' pictures for pages: one request per robot, however many pages show it, and a still of each."""
 
+import asyncio
 import struct
 import time
 from typing import Final
 
+import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from pebble.contract import CAMERA
+from pebble.contract import CAMERA, MEDIA_STATUS
 from pebble.extensions.operator.client.broker import Broker
+from pebble.extensions.operator.client.media_request.offer import BEST_FIRST, refusal
+from pebble.extensions.page.media import rescue
 from pebble.extensions.page.media.picture_stream import PageViewer, PictureStream
 from pebble.extensions.page.media.stream import Streams
 from pebble.extensions.page.robots import Robots
 
 _ANSWER: Final = struct.Struct(">IB")  # number of a frame, and what became of it
+_MOST_STILLS: Final = 200  # of cameras that rest; the oldest goes
+_FRESH_S: Final = 4.5  # of a camera that is on, no still is older: key frames come each 4 s
+_GLIMPSE_S: Final = 6.0  # until a camera sends a key frame
+_TURN_S: Final = 5.0  # until the next camera's turn
 
 
 class MediaHub(Streams[PictureStream]):
@@ -20,6 +28,9 @@ class MediaHub(Streams[PictureStream]):
 
     def __init__(self, broker: Broker, robots: Robots) -> None:
         super().__init__(CAMERA, lambda ref: PictureStream(broker, robots, ref))
+        self._robots = robots
+        self._last: dict[str, tuple[bytes, float]] = {}  # key frames of streams that have ended
+        self._looking: dict[str, asyncio.Task[None]] = {}
 
     async def serve(self, websocket: WebSocket, ref: str, can: frozenset[str]) -> None:
         """Send the pictures of ``ref`` to a page that decodes ``can``, until either end closes the socket."""
@@ -32,10 +43,56 @@ class MediaHub(Streams[PictureStream]):
             lambda stream: _receive(websocket, stream, viewer),
         )
 
-    async def snapshot(self, ref: str) -> bytes | None:
-        """Return the newest picture as a JPEG, if pictures are flowing; it starts no camera."""
+    async def snapshot(self, ref: str) -> tuple[bytes, float] | None:
+        """Return the newest key frame as a JPEG, of a camera that rests its last one, and when it came, monotonic.
+
+        It starts no camera. Of one that is on for others a picture is fetched meanwhile: who asks waits for nothing.
+        """
+        reports = self._robots.value(ref, MEDIA_STATUS.metric)
+        is_on = reports is not None and msgspec.json.decode(reports).get("camera_publisher", {}).get("running", False)
+        if is_on and not self._has_fresh(ref) and ref not in self._looking:
+            self._looking[ref] = asyncio.create_task(self._glimpse(ref))
+        key = self._key(ref)
+        jpeg = None if key is None else await asyncio.to_thread(rescue.newest_jpeg, [key[0]])
+        return None if key is None or jpeg is None else (jpeg, key[1])
+
+    async def look_in_turn(self) -> None:
+        """Switch on one camera after another for a moment, while a page has no component open."""
+        while True:
+            await asyncio.sleep(1.0)
+            for ref in list(self._robots.components):
+                is_shown = any(not interest.watched for interest in self._robots.interests)
+                if is_shown and not refusal(ref, self._robots.capabilities(ref), "video"):
+                    await self._glimpse(ref)
+                    await asyncio.sleep(_TURN_S)
+
+    def _key(self, ref: str) -> tuple[bytes, float] | None:
         stream = self.get(ref)
-        return None if stream is None else await stream.snapshot()
+        return (None if stream is None else stream.key) or self._last.get(ref)
+
+    def _has_fresh(self, ref: str) -> bool:
+        key = self._key(ref)
+        return key is not None and time.monotonic() - key[1] < _FRESH_S
+
+    async def _glimpse(self, ref: str) -> None:
+        """Look at a robot's camera, as a page would, until there is a picture."""
+        viewer = PageViewer(frozenset(name for name in BEST_FIRST["video"] if not rescue.unavailable(name)))
+        stream, end = self._open(ref), time.monotonic() + _GLIMPSE_S
+        stream.join(viewer)
+        try:
+            while not self._has_fresh(ref) and not stream.task.done() and time.monotonic() < end:
+                await asyncio.sleep(0.1)
+        finally:
+            stream.leave(viewer)
+            self._looking.pop(ref, None)
+
+    def _forget(self, ref: str, task: asyncio.Task[None]) -> None:
+        if (key := self._key(ref)) is not None:
+            self._last.pop(ref, None)
+            self._last[ref] = key
+        if len(self._last) > _MOST_STILLS:
+            del self._last[next(iter(self._last))]
+        super()._forget(ref, task)
 
 
 async def _send(websocket: WebSocket, viewer: PageViewer) -> None:

@@ -83,7 +83,7 @@ def answered(robot: Robot) -> str:
         ("everything [", "ann"),
         ("Password of ann: ", PASSWORD),
         ("Again: ", PASSWORD),
-        ("Do it? [Y/n]", ""),
+        ("Go ahead? [Y/n]", ""),
     ):
         terminal.answers(prompt, text)
     terminal.ends(300)  # 1 where the self-test misses its deadlines on a busy machine: the phone decides

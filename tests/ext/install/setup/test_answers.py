@@ -125,7 +125,7 @@ def test_six_questions_in_a_terminal(root: Path) -> None:
         ("everything [", "ann"),
         ("ann: ", PASSWORD),
         ("Again: ", PASSWORD),
-        ("Do it? [Y/n]", ""),
+        ("Go ahead? [Y/n]", ""),
     ):
         asking.answers(prompt, text)
     assert asking.ends() == 1, "systemd does not run there"
@@ -146,7 +146,7 @@ def test_a_login_that_the_broker_refused_is_asked_again(root: Path, tmp_path: Pa
             asking.answers(prompt, "")
         asking.answers("goob at the broker (empty: as before): ", typed)
         if typed:
-            asking.answers("Do it?", "")
+            asking.answers("Go ahead?", "")
         asking.ends()
         assert "the broker 127.0.0.1:9 does not" in " ".join(asking.shown.split())
         assert password.read_text() == f"{left}\n"

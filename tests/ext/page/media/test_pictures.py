@@ -13,7 +13,7 @@ from pebble.extensions.media.decode import VideoDecoder
 from pebble.extensions.media.picture_header import read_header
 from pebble.extensions.operator.client.media_request.queue import NO_FRAME
 from pebble.extensions.page.media import rescue
-from pebble.transports import QoS
+from pebble.transports import Message, QoS
 from tests.ext.page.media.robots import (
     EVERYTHING,
     REF,
@@ -122,16 +122,34 @@ async def test_without_pyav_there_is_a_reason(monkeypatch: pytest.MonkeyPatch) -
         assert page.frames == []
 
 
-async def test_a_snapshot_is_the_newest_picture_and_starts_no_camera(robot: PictureRobot, server: Server) -> None:
+async def test_a_still_is_the_newest_key_frame_and_the_last_one_of_a_camera_that_rests(
+    robot: PictureRobot, server: Server
+) -> None:
     assert await server.media.snapshot(REF) is None
     assert await server.media.snapshot("#") is None
     assert robot.published == []
     page = server.open(PicturePage())
     await until(lambda: len(page.frames) > 30)
-    taken = await asyncio.gather(*(server.media.snapshot(REF) for _ in range(10)))
-    assert len(set(taken)) == 1
-    picture = cv2.imdecode(np.frombuffer(taken[0] or b"", np.uint8), cv2.IMREAD_COLOR)
-    assert len(robot.sent) - 20 <= (read_counter(picture) or 0) <= len(robot.sent)
+    stills = await asyncio.gather(*(server.media.snapshot(REF) for _ in range(10)))
+    assert len({still and still[0] for still in stills}) == 1
+    picture = cv2.imdecode(np.frombuffer(stills[0][0] if stills[0] else b"", np.uint8), cv2.IMREAD_COLOR)
+    assert len(robot.sent) - 70 <= (read_counter(picture) or 0) <= len(robot.sent)
     robot.mute = True
     await until(lambda: server.view.state == "silent")
-    assert await server.media.snapshot(REF) is None
+    assert await server.media.snapshot(REF) is not None
+
+
+async def test_a_camera_that_is_on_for_others_gives_a_still_and_stays_theirs(
+    robot: PictureRobot, server: Server
+) -> None:
+    with type(robot.transport)("other", robot.hub) as operator:
+        status = Message(f"{REF}/outgoing/media-status", b'{"value":{"camera_publisher":{"running":true}}}')
+        server.robots.receive(status, time.monotonic())
+        operator.publish(VIDEO["flag_topic"], b'{"value":true}', retain=True, qos=QoS.DELIVERED)
+        operator.publish(VIDEO["command_topic"], b'{"enabled":true,"encoding":"pbvd"}', qos=QoS.DELIVERED)
+        await until(lambda: len(robot.sent) > 5)
+        before = len(robot.requests)
+        assert await server.media.snapshot(REF) is None
+        await asyncio.sleep(6.0)
+        assert not [one for one in robot.requests[before:] if not one.get("keyframe")]
+        assert await server.media.snapshot(REF) is not None

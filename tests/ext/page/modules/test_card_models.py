@@ -167,7 +167,7 @@ SOUNDS: Rows = {
 # -- forms of scripts
 
 forms = Script(
-    {"ui/cards/form-model.js": "filled, hint, lastScript, moreWords, remember, remembered, scripts"},
+    {"ui/cards/form-model.js": "filled, hint, moreWords, remember, remembered, scripts"},
     _STORED,
 )
 
@@ -223,21 +223,20 @@ FORMS: Rows = {
         const [{ more }] = scripts({ files: [{ file: "x", configs: ["a", "b", "c", "d"].map((key) => ({ key })) }] });
         const words = (fields, texts) => moreWords(fields, new Map(texts));
         result = [words(more, []), words([...more, ...more], []), words(more, [["d", "1"]])];
-        """, ["1 more, at its default", "2 more, all at their defaults", "1 more, 1 changed"]),
+        """, ["1 more option", "2 more options", "1 more option, 1 changed"]),
     "forms are remembered by robot and script": ("""
         remember("goob", "a", new Map([["x", "1"]]));
         remember("goob", "b", new Map([["x", "2"]]));
         remember("fred", "a", new Map([["x", "3"]]));
-        result = [texts(remembered("goob", "a")), texts(remembered("goob", "b")), texts(remembered("fred", "b")),
-          lastScript("goob"), lastScript("fred"), lastScript("lamp")];""",
-        [{"x": "1"}, {"x": "2"}, {}, "b", "a", ""]),
+        result = [texts(remembered("goob", "a")), texts(remembered("goob", "b")), texts(remembered("fred", "b"))];""",
+        [{"x": "1"}, {"x": "2"}, {}]),
     "the memory of forms is bounded": ("""
         for (let n = 0; n < 40; n++) remember("goob", `script ${n}`, new Map([["x", "y".repeat(200)]]));
         result = [JSON.parse(stored.get("pebble forms")).length, texts(remembered("goob", "script 39")).x.length];""",
         [32, 200]),
     **{f"a memory of something else is none: {found}": (f"""
         stored.set("pebble forms", {json.dumps(found)});
-        result = [texts(remembered("goob", "a")), lastScript("goob")];""", [{}, ""]) for found in NOT_STORED},
+        result = texts(remembered("goob", "a"));""", {}) for found in NOT_STORED},
 }
 # fmt: on
 

@@ -9,7 +9,7 @@ import pytest
 
 from tests.ext.page.browser import Tab
 from tests.ext.page.canned import CannedServer, Show, State
-from tests.ext.page.states import ASKED, GOOB, MINE, STATES, at, changed, devices, outlet, setting
+from tests.ext.page.states import ASKED, FRED, GOOB, MINE, STATES, at, changed, devices, outlet, setting
 
 pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
 
@@ -46,6 +46,7 @@ SENDS: dict[str, tuple[str, str, str, list[dict[str, Any]]]] = {
     "a stop of all": ("driving", "stop-all", "estop", [{"ref": ""}]),
     "a stop in the fleet": ("fleet", "stop-goob", "estop", [{"ref": GOOB}]),
     "a reset": ("stopped", "reset reset-hold!", "estop-reset", [{"ref": GOOB}]),
+    "a reset of all": ("fleet-stopped", "stopped reset-all!", "estop-reset", [{"ref": GOOB}, {"ref": FRED}]),
 }  # fmt: skip
 
 

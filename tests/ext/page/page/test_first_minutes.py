@@ -91,6 +91,8 @@ def test_a_visitor_sees_drives_stops_starts_a_script_and_takes_a_film_home(demo:
         visitor = Visitor(opened)
         visitor.sees("document.querySelectorAll('.fleet-card').length >= 4", START_S)
         visitor.did("all robots are there")
+        visitor.sees("document.querySelector('.thumbnail img')", 15)
+        visitor.did("what a camera sees is on the fleet")
         visitor.sees(lambda: f"the robots are yours: {url}" in demo.output, 120)
         visitor.did("they are the visitor's")
 
@@ -100,7 +102,7 @@ def test_a_visitor_sees_drives_stops_starts_a_script_and_takes_a_film_home(demo:
         visitor.did("Goob is open")
         visitor.presses("take")
         since_ns = time.monotonic_ns()
-        trace = trace_path(demo.folders()[0] / "goob", "goob")
+        trace = trace_path(demo.folders()[0] / "world", "goob")
         motors = lambda: [one.motors for one in read_trace(trace) if one.ns > since_ns and one.motors is not None]
         visitor.drives(lambda: any(map(any, motors())), "KeyS", "KeyW")
         visitor.did("it drives")
@@ -118,7 +120,7 @@ def test_a_visitor_sees_drives_stops_starts_a_script_and_takes_a_film_home(demo:
         opened.test("script-apriltag-follow").click()
         visitor.sees(lambda: opened.test("start-script").is_enabled())
         visitor.presses("start-script")
-        visitor.sees(lambda: "runs" in opened.test("script-state").inner_text())
+        visitor.sees(lambda: "running" in opened.test("script-state").inner_text())
         visitor.did("a script runs")
         visitor.presses("end-script")
         visitor.sees(lambda: "No script runs" in opened.test("script-state").inner_text())

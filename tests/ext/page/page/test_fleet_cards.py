@@ -92,4 +92,4 @@ def test_a_stop_of_all_shows_how_many_have_confirmed_it(show: Show) -> None:
         assert opened.until(lambda: opened.test("tally").inner_text() == "STOP ALL: 997 of 1000 confirmed.")
         opened.page.evaluate(confirm.replace("number - 3", "number"), 1000)
         assert opened.until(lambda: opened.test("tally").inner_text() == "STOP ALL: all 1000 confirmed.")
-        assert opened.page.locator(".stops .banner").count() <= 50
+        assert opened.page.locator(".stops .banner").count() <= 51  # one resets all

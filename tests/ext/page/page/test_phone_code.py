@@ -52,6 +52,7 @@ def test_the_code_has_the_address_of_this_screen_and_none_that_no_phone_can_open
         assert opened.until(lambda: _read(opened) == f"{origin}/", 3)
         assert opened.complaints() == []
     with tab(browser, canned.url) as opened:
+        opened.test("fleet-more").click()
         opened.test("phone").click()
         assert opened.until(lambda: opened.test("only-here").count() == 1)
         assert f"A phone cannot open 127.0.0.1:{canned.port}" in opened.test("only-here").inner_text()

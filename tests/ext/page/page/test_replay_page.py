@@ -77,7 +77,8 @@ def test_the_way_to_a_day_and_a_robot(show: Show) -> None:
 
 
 def test_a_time_in_the_address_is_shown_and_follows_seeks(replay: Tab):
-    assert "Recording of 22 Nov, 10:00:30" in replay.test("badge").inner_text()
+    assert "22 Nov, 10:00:30" in replay.test("badge").inner_text()
+    assert replay.test("then").inner_text() == "ann drove"
     assert replay.test("time").inner_text().startswith("10:00:30.000")
     assert "10:00:29.960" in replay.test("picture-time").inner_text()  # when it was taken
     seek(replay, AT + 12_345)

@@ -25,7 +25,7 @@ def test_the_fleet_never_starts_a_camera(browser: Browser, stage: Stage, wire: W
     with tab(browser, stage.url) as fleet:
         assert fleet.until(lambda: fleet.page.locator(".fleet-card").count() == 4)
         asked = len(wire.received)
-        assert fleet.test("card-fred").get_by_text("camera rests").is_visible()
+        assert fleet.test("card-fred").locator(".faced").is_visible()
         fleet.test("card-fred").hover()
         fleet.page.wait_for_timeout(1000)
         assert not [one for one in wire.received[asked:] if one[0].endswith("/front-camera") and one[1]["enabled"]]

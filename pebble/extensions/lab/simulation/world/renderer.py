@@ -146,9 +146,9 @@ class Renderer:
             return
         area = (columns[1] - columns[0]) * (rows[:, 1] - rows[:, 0]).mean()
         area *= self._share(surface, plan)
-        fine = [texture for texture in surface.textures if texture.shape[0] * texture.shape[1] >= area]
-        texture = fine[-1] if fine else surface.textures[0]  # the smallest that is not enlarged
-        size = len(texture)
+        fine = [level for level, texture in enumerate(surface.textures) if len(texture) ** 2 >= area]
+        level = fine[-1] if fine else 0  # the smallest that is not enlarged
+        size = len(surface.textures[level])
         whole = self._to_camera(np.array((surface.left, surface.right)), me)
         (ahead, beside), (ahead2, beside2) = whole
         down = (surface.bottom - surface.top) / size
@@ -159,7 +159,15 @@ class Renderer:
                 [(ahead2 - ahead) / size, 0.0, ahead],
             ]
         )
-        self._warp(texture, to_space, (x0, y0, x1, y1), out)
+        box = (x0, y0, x1, y1)
+        if not surface.masks:
+            self._warp(surface.textures[level], to_space, box, out)
+            return
+        drawn, mask = out.copy(), np.zeros(out.shape[:2], np.uint8)
+        self._warp(surface.textures[level], to_space, box, drawn)
+        self._warp(surface.masks[level], to_space, box, mask)
+        part = np.s_[y0:y1, x0:x1]
+        np.copyto(out[part], drawn[part], where=mask[part][..., None] > 127)
 
     @staticmethod
     def _share(surface: Surface, plan: _Floats) -> float:

@@ -1,4 +1,4 @@
-"""The upright surfaces of a world: walls, tags and robots, as the renderer draws them."""
+"""The upright surfaces of a world: walls, drawings, tags and robots, as the renderer draws them."""
 
 import math
 from collections.abc import Mapping
@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pebble.extensions.lab.simulation.world.poses import RobotPose
-from pebble.extensions.lab.simulation.world.world_file import Wall, World
+from pebble.extensions.lab.simulation.world.world_file import Drawing, Wall, World
 
 MODULE_PX: Final = 32  # of a tag's texture; halves to 1 without a rest
+_DRAWING_PX, _SMALLEST_PX = 256, 16  # of a drawing's textures
 _SIDE, _TAG_SIDE = 1.6, 1.2  # of a robot's box and of the tag on it, in radii: the box is about as wide as the circle
 _ABOVE_LENS_M = 0.04  # a robot's box ends so far above its camera
 
@@ -22,7 +23,8 @@ _BODY_COLOURS: Final[tuple[Colour, ...]] = ((60, 150, 60), (60, 60, 180), (170, 
 
 class Surface(NamedTuple):
     """An upright rectangle from ``left`` to ``right`` as seen from its front; where it covers another exactly, the
-    higher ``layer`` is in front. It has a colour, or a texture in several sizes, the largest first."""
+    higher ``layer`` is in front. It has a colour, or a texture in several sizes, the largest first, perhaps with masks
+    of what is not transparent."""
 
     left: tuple[float, float]
     right: tuple[float, float]
@@ -31,6 +33,7 @@ class Surface(NamedTuple):
     layer: int
     colour: Colour = (0, 0, 0)
     textures: tuple[Image, ...] = ()
+    masks: tuple[Image, ...] = ()
 
 
 class Surfaces:
@@ -47,6 +50,7 @@ class Surfaces:
                 for surface in [_left_side(wall, index)]
             ),
             *(surface for index, wall in enumerate(world.walls) for surface in _both_sides(wall, index)),
+            *map(_drawn, world.drawings),
             *(self._tag(tag.id, tag.size_m, tag.x, tag.y, tag.z, math.radians(tag.yaw_deg)) for tag in world.tags),
         ]
 
@@ -78,7 +82,7 @@ class Surfaces:
         if number not in self._textures:
             self._textures[number] = _tag_textures(self._world.family, number)
         half = size / 2 * self._margin / (self._margin - 2)
-        return Surface(*_edges(x, y, half, yaw), z - half, z + half, 1, textures=self._textures[number])
+        return Surface(*_edges(x, y, half, yaw), z - half, z + half, 2, textures=self._textures[number])
 
 
 def _edges(x: float, y: float, half: float, yaw: float) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -88,13 +92,32 @@ def _edges(x: float, y: float, half: float, yaw: float) -> tuple[tuple[float, fl
 
 
 def _left_side(wall: Wall, index: int) -> Surface:
-    colour = _WALL_COLOURS[index % len(_WALL_COLOURS)]
+    colour = _bgr(wall.colour) if wall.colour else _WALL_COLOURS[index % len(_WALL_COLOURS)]
     return Surface((wall.x2, wall.y2), (wall.x1, wall.y1), 0.0, wall.height_m, 0, colour)
 
 
 def _both_sides(wall: Wall, index: int) -> tuple[Surface, Surface]:
     left_side = _left_side(wall, index)
     return left_side, left_side._replace(left=left_side.right, right=left_side.left)
+
+
+def _bgr(colour: str) -> Colour:
+    return int(colour[5:7], 16), int(colour[3:5], 16), int(colour[1:3], 16)
+
+
+def _drawn(drawing: Drawing) -> Surface:
+    """Return its surface, beside whose shapes the colour of the first one is drawn, and masked."""
+    import cv2
+
+    picture = np.full((_DRAWING_PX, _DRAWING_PX, 3), _bgr(drawing.shapes[0].colour), np.uint8)
+    mask = np.zeros((_DRAWING_PX, _DRAWING_PX), np.uint8)
+    for shape in drawing.shapes:
+        points = np.round(np.array(shape.points).reshape(1, -1, 2) * _DRAWING_PX).astype(np.int32)
+        cv2.fillPoly(picture, points, _bgr(shape.colour))
+        cv2.fillPoly(mask, points, 255)
+    edges = _edges(drawing.x, drawing.y, drawing.width_m / 2, math.radians(drawing.yaw_deg))
+    low, high = drawing.z - drawing.height_m / 2, drawing.z + drawing.height_m / 2
+    return Surface(*edges, low, high, 1, textures=_halved(picture, _SMALLEST_PX), masks=_halved(mask, _SMALLEST_PX))
 
 
 def _modules(world: World) -> int:
@@ -109,8 +132,15 @@ def _tag_textures(family: str, number: int) -> tuple[Image, ...]:
     modules = dictionary.markerSize + 2
     grey = cv2.aruco.generateImageMarker(dictionary, number, modules * MODULE_PX)
     white = np.pad(np.asarray(grey, np.uint8), MODULE_PX, constant_values=255)
-    textures: list[Any] = [cv2.cvtColor(white, cv2.COLOR_GRAY2BGR)]
-    while len(textures[-1]) > modules + 2:
+    return _halved(cv2.cvtColor(white, cv2.COLOR_GRAY2BGR), modules + 2)
+
+
+def _halved(texture: Any, smallest: int) -> tuple[Image, ...]:
+    """Return a square texture, and halves of it down to a size."""
+    import cv2
+
+    textures = [texture]
+    while len(textures[-1]) > smallest:
         smaller = len(textures[-1]) // 2
         textures.append(cv2.resize(textures[-1], (smaller, smaller), interpolation=cv2.INTER_AREA))
     return tuple(textures)

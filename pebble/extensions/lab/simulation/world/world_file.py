@@ -33,6 +33,8 @@ Metres = Annotated[float, Meta(ge=-100, le=100)]
 Length = Annotated[float, Meta(gt=0, le=10)]
 Degrees = Annotated[float, Meta(ge=-3600, le=3600)]
 TagId = Annotated[int, Meta(ge=0, le=2319)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+Colour = Annotated[str, Meta(pattern="^#[0-9a-f]{6}$(?!\\n)", extra={"expected": 'a colour such as "#2f7d32"'})]
 
 
 class Lens(Section, frozen=True, kw_only=True):
@@ -58,6 +60,25 @@ class Tag(Section, frozen=True, kw_only=True):
     z: Annotated[float, Meta(ge=0, le=10)] = 0.2
     yaw_deg: Degrees = 0.0
     size_m: Length = 0.25
+
+
+class Shape(Section, frozen=True, kw_only=True):
+    """A polygon of a drawing; ``points``: x, y, x, y … as shares of the drawing, from its upper left."""
+
+    colour: Colour
+    points: tuple[Share, ...]
+
+
+class Drawing(Section, frozen=True, kw_only=True):
+    """A window, a plant: its middle is at x, y, z, its front looks to ``yaw_deg``; later shapes cover earlier ones."""
+
+    x: Metres
+    y: Metres
+    z: Annotated[float, Meta(ge=0, le=10)]
+    yaw_deg: Degrees = 0.0
+    width_m: Length
+    height_m: Length
+    shapes: tuple[Shape, ...]
 
 
 class Start(Section, frozen=True, kw_only=True):
@@ -107,6 +128,7 @@ class Wall(Section, frozen=True, kw_only=True):
     x2: Metres
     y2: Metres
     height_m: Length = 0.6
+    colour: Annotated[Colour | None, doc("Without one it is light.")] = None
 
     def distance(self, x: float, y: float) -> float:
         """Return the way from a point to the nearest point of the wall."""
@@ -125,6 +147,7 @@ class World(Section, frozen=True, kw_only=True):
     robots: Annotated[dict[str, Start], doc("By their names.")] = EMPTY
     room: Room | None = None
     walls: tuple[Wall, ...] = ()
+    drawings: Annotated[tuple[Drawing, ...], doc("Nothing stops at them.")] = ()
 
     @property
     def all_walls(self) -> tuple[Wall, ...]:
@@ -177,6 +200,9 @@ def _check(world: World, notes: Notes) -> None:
     for index, wall in enumerate(world.walls):
         if (wall.x1, wall.y1) == (wall.x2, wall.y2):
             notes.problem(("walls", index), "begins where it ends")
+    for index, drawing in enumerate(world.drawings):
+        if not drawing.shapes or any(len(shape.points) < 6 or len(shape.points) % 2 for shape in drawing.shapes):
+            notes.problem(("drawings", index), "needs shapes of three points or more, each x and y")
     if (room := world.room) is not None:
         for axis, low, high in (("x", room.x_min, room.x_max), ("y", room.y_min, room.y_max)):
             if low >= high:

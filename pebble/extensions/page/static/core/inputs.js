@@ -43,6 +43,9 @@ export const MAPPINGS = [
 /** @param {{id: string, mapping: string}} pad @returns {Mapping} */
 export const mappingOf = ({ id, mapping }) => (mapping !== "standard" && MAPPINGS.find((known) => known.id.test(id))) || USUAL;
 
+/** What people call it: browsers add its numbers. @param {{id: string}} pad */
+export const padName = ({ id }) => String(id).split(" (")[0].replace(/^([0-9a-f]{4}-){2}/i, "").replace(/^(\w+) (?=\1 )/, "").slice(0, 24).trim() || "Gamepad";
+
 /** Presses of the buttons that stop, on every gamepad. */
 export class PadStops {
   /** @type {Set<string>} what is pressed, by gamepad */

@@ -1,7 +1,7 @@
 /** Lets a gamepad drive: the first one whose layout is known, else the first one with a stick. */
 
 import { attempt } from "./browser.js";
-import { MAPPINGS, mappingOf, padVector } from "./inputs.js";
+import { MAPPINGS, mappingOf, padName, padVector } from "./inputs.js";
 import { reason } from "./reasons.js";
 
 /** @typedef {import("./inputs.js").Pad} Pad */
@@ -43,7 +43,7 @@ export class Pads {
     const { padArmed } = this.driver.inputs;
     return this.usable.flatMap(({ key, pad, far }) => {
       if (!far) return [];
-      const name = `Gamepad ${pad.index + 1} (${String(pad.id).split(" (")[0].slice(0, 24).trim()})`;
+      const name = `Gamepad ${pad.index + 1} (${padName(pad)})`;
       if (key !== this.key) return isKnown(pad) ? [reason("pad-other", `${name} is ignored: only the first one drives. Its STOP counts`)] : [];
       if (!document.hasFocus()) return [reason("pad-focus", `${name} is ignored: click this page first. Its STOP counts`)];
       return padArmed ? [] : [reason("pad-release", `${name} is ignored: let its stick go first`)];

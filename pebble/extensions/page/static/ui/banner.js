@@ -142,9 +142,23 @@ export function StopChip() {
   const first = [...new Set([...bad, ...refs])].slice(0, MOST_LISTED);
   const chip = html`<span class="chip stopped"><${Icon} name="stop" />${words}</span>`;
   return html`<${Drop} test="stopped" className="stops" summary=${chip}>
+    <${ResetAll} />
     ${first.map((ref) => html`<${StopBanner} key=${ref} at=${ref} />`)}
     ${refs.length > first.length && html`<p class="also">${refs.length - first.length} more</p>`}
   <//>`;
+}
+
+/** After a stop of several: those that this page may reset, by one hold. */
+function ResetAll() {
+  const { commands, connection, store } = usePage();
+  const named = (ref) => store.get(ref, "capabilities")?.value?.value?.named === true;
+  const refs = store.refs().filter((ref) => store.get(ref, STOP)?.value.latched && !resetReason(connection, named(ref)));
+  if (refs.length < 2) return null;
+  const reset = () => refs.forEach((ref) => commands.reset(ref, store.get(ref, STOP)?.value.owners));
+  return html`<div class="banner stopped">
+    <div class="banner-text"><b>Look at all: is everybody clear?</b></div>
+    <${HoldButton} key=${refs.join()} test="reset-all" onHeld=${reset}>Hold to reset all ${refs.length}<//>
+  </div>`;
 }
 
 const unconfirmed = (store) => store.refs().filter((ref) => progressOf(store, ref)?.kind === "bad").sort();
@@ -298,7 +312,7 @@ function PressBanner() {
   const known = stops(store).some(({ stop, latched }) => stop === pressed.stop || (latched && age > NO_ANSWER_MS));
   if (known && connection.isOpen) {
     const words = age < 10_000 && !unconfirmed(store).length && tally(estop, store);
-    return words && html`<${Banner} kind="warn" icon="stop"><p role="status">${words}</p><//>`;
+    return words && html`<${Banner} kind="ok" icon="stop"><p role="status">${words}</p><//>`;
   }
   const whom = pressed.ref ? nameIn(store, pressed.ref) : "all robots";
   if (age < NO_ANSWER_MS) {

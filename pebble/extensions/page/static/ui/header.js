@@ -7,7 +7,6 @@ import { nameIn } from "./parts/looks.js";
 import { Button, Charge, Face, Icon, RouteLink, Select, StopButton, useItself, useName } from "./parts/parts.js";
 import { driverName, kindOf, roughly, span, typeOf } from "./parts/words.js";
 
-const HELP = "Keys, and how stopping works";
 const LATE_MS = 300; // of the way to the server and back
 
 export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
@@ -25,7 +24,7 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     ${wide && at && html`<${AllButton} outlined /><span class="rule"></span>`}
     ${wide &&
     at &&
-    html`<${Button} className="quiet round-icon" test="open-help" label=${HELP} icon="help" onPress=${() => panels.toggle("help")} />`}
+    html`<${Button} className="quiet round-icon" test="open-help" label="Help" icon="help" onPress=${() => panels.toggle("help")} />`}
     <${Boundary} what="Notices"><${Notices} at=${at} wide=${wide || (layout === "portrait" && at !== "")} room=${wide} /><//>
     ${layout === "immersive" &&
     html`<${Button} className="round" test="drawer" label="Everything else" aria-expanded=${drawer} icon="menu" onPress=${onDrawer} />

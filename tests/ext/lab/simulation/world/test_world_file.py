@@ -49,6 +49,8 @@ def test_all_mistakes_are_reported_at_once_with_their_places() -> None:
         ({"robots": {"goob": GOOB | {"tag": 99}}},
          "robots.goob.tag: must be below 35, the number of tags in APRILTAG_25h9, not 99"),
         ({"walls": [{"x1": 1, "y1": 1, "x2": 1, "y2": 1}]}, "walls[0]: begins where it ends"),
+        ({"drawings": [{"x": 1, "y": 0, "z": 0.3, "width_m": 1, "height_m": 1, "shapes": []}]},
+         "drawings[0]: needs shapes of three points or more, each x and y"),
         ({"walls": [{"x1": 0.05, "y1": 1, "x2": 0.05, "y2": -1}]},
          "robots.goob: stands 0.05 m from a wall, its radius is 0.1"),
         ({"room": {"x_min": 1, "x_max": 0, "y_min": 0, "y_max": 1}},

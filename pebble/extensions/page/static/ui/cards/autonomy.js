@@ -3,15 +3,14 @@
 import { scriptName } from "../../core/reasons.js";
 import { useAnswer } from "../parts/asking.js";
 import { handDriven, whyNotStarted } from "./autonomy-model.js";
-import { filled, lastScript, moreWords, remember, remembered, scripts } from "./form-model.js";
+import { filled, moreWords, remember, remembered, scripts } from "./form-model.js";
 import { Form } from "./form.js";
 import { html, useEffect, useMetric, useOnline, useState, useValue } from "../parts/hooks.js";
 import { Nothing } from "../parts/nothing.js";
 import { Button, Icon, Why, useName } from "../parts/parts.js";
 import { refuses } from "../parts/typed.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
-import { plain } from "../parts/more-words.js";
-import { clockTime } from "../parts/words.js";
+import { plain, shortTime } from "../parts/more-words.js";
 import { useMemo } from "../../vendor/hooks.mjs";
 
 const LONGEST_CONFIG = 14_000; // characters of JSON: the server reads messages of 16 KB
@@ -24,7 +23,7 @@ export function Autonomy({ at }) {
   const listed = useMemo(() => scripts(payload), [payload]);
   const entry = useMetric(at, "autonomy-status");
   const status = entry?.value ?? {};
-  const [chosen, choose] = useState(() => status.file ?? lastScript(at));
+  const [chosen, choose] = useState("");
   const name = useName(at);
   const find = (file) => listed?.find((one) => one.file === file);
   const script = find(chosen);
@@ -59,26 +58,22 @@ function Row({ script, isOpen, onOpen, ...parts }) {
 }
 
 /** What a script does, as far as is known. */
-function how({ overridden }, past) {
-  if (overridden) return " waits: a person drives";
-  if (past) return " ran when it was last seen";
-  return " runs";
+function how({ overridden, since }, past) {
+  if (overridden) return ", waiting: a person drives";
+  if (past) return ", running when it was last seen";
+  return `, running${since > 0 ? ` since ${shortTime(1000 * since)}` : ""}`;
 }
 
 /** What runs, and the end of it. */
 function Running({ at, page, entry, status, running, find }) {
-  const script = find(status.file);
   const called = (file) => plain(find(file)?.label ?? file);
   const why = whyNotEnd(page);
-  const label = (key) => script?.fields.find((one) => one.key === key)?.label ?? key;
   const past = !useOnline(at);
-  const { dependencies = [] } = status;
-  const config = Object.entries(status.config ?? {});
+  const lacking = (status.dependencies ?? []).filter((one) => !one.running);
   return html`<div class="ask-row ask-now">
       <p role="status" data-test="script-state">
         ${status.running
-          ? html`<b>${past ? "○" : "●"} ${running}</b>
-              ${how(status, past)}${status.since > 0 && `, since ${clockTime(1000 * status.since)}`}`
+          ? html`<b>${past ? "○" : "●"} ${running}</b>${how(status, past)}`
           : html`<span class="dim">No script runs.</span>`}
       </p>
       ${(status.running || !entry) &&
@@ -89,30 +84,7 @@ function Running({ at, page, entry, status, running, find }) {
     (status.stopped
       ? html`<p class="dim" data-test="script-error">The stop has ended it. Start it again after the reset.</p>`
       : html`<p class="bad" data-test="script-error">✖ ${plain(status.error)}</p>`)}
-    ${dependencies.length > 0 &&
-    html`<ul class="dependencies" aria-label="Scripts that it needs">
-      ${dependencies.map(
-        ({ file, running }, index) => html`<li key=${index} class=${running ? "" : "bad"}>
-          ${running ? "●" : "✖"} ${called(file)} ${running ? "runs" : "does not run"}
-        </li>`,
-      )}
-    </ul>`}
-    ${config.length > 0 &&
-    html`<details class="effective">
-      <summary data-test="effective">Its settings (${config.length})</summary>
-      <dl class="values">
-        <div>
-          <dt>File</dt>
-          <dd>${plain(status.file)}</dd>
-        </div>
-        ${config.map(
-          ([key, value]) => html`<div key=${key}>
-            <dt>${plain(label(key))}</dt>
-            <dd>${plain(value)}</dd>
-          </div>`,
-        )}
-      </dl>
-    </details>`}`;
+    ${lacking.map(({ file }) => html`<p key=${file} class="bad">✖ ${called(file)}, which it needs, does not run</p>`)}`;
 }
 
 /** The form of one script, and its start. */
@@ -128,7 +100,7 @@ function Starter({ at, page, entry, status, running, script }) {
   const why = whyNotStarted(page, at);
   const { by, waits } = handDriven(page, at);
   const name = useName(at);
-  const note = by && waits ? `${by} driving: the script will wait` : meaning(name, waits);
+  const note = by && waits ? `${by} driving: the script will wait` : `${name} moves by itself${waits ? ". Drive it to interrupt" : ""}`;
   const restore = (event) => {
     event.currentTarget.closest("li").querySelector("button").focus(); // the button vanishes
     change(new Map(), version + 1);
@@ -172,9 +144,6 @@ function Starter({ at, page, entry, status, running, script }) {
     </div>
   </form>`;
 }
-
-/** What a start means. */
-const meaning = (name, waits) => `${name} may move by itself${waits ? ". Drive by hand to interrupt it" : ""}`;
 
 /** @param {import("../parts/asking.js").Progress} answer @param {string} name */
 function startedWords({ op, why }, name) {

@@ -65,8 +65,7 @@ export function hint({ type, min, max }) {
 /** @param {Field[]} fields @param {Texts} texts @returns {string} how many more there are, and how many were changed */
 export function moreWords(fields, texts) {
   const changed = fields.filter(({ key }) => texts.has(key)).length;
-  const none = fields.length === 1 ? "at its default" : "all at their defaults";
-  return `${fields.length} more, ${changed ? `${changed} changed` : none}`;
+  return `${fields.length} more ${fields.length === 1 ? "option" : "options"}${changed ? `, ${changed} changed` : ""}`;
 }
 
 /** @param {Field["type"]} type @param {string} value @returns {string} as people read it */
@@ -90,9 +89,6 @@ export function remember(ref, file, texts) {
   const others = forms().filter((one) => one[0] !== ref || one[1] !== file);
   write("forms", [[ref, file, [...texts]], ...others].slice(0, MOST_FORMS));
 }
-
-/** @param {string} ref @returns {string} the script whose form was used last; "" none */
-export const lastScript = (ref) => forms().find((one) => one[0] === ref)?.[1] ?? "";
 
 /** @returns {[string, string, [string, string][]][]} robot, script and texts, the newest first */
 function forms() {

@@ -93,7 +93,7 @@ function Switch({ field, text, onText, ...props }) {
 function Choice({ field, text, onText, ...props }) {
   const { options = ["true", "false"], required, type } = field;
   const listed = options.includes(usual(field));
-  const none = field.default !== null ? `default (${plain(field.default)})` : required ? "choose…" : "not set";
+  const none = field.default !== null ? `Default (${plain(field.default)})` : required ? "Choose…" : "Not set";
   const chosen = text ?? usual(field);
   return html`<select ...${props} onChange=${(event) => onText(event.currentTarget.value)}>
     ${!listed && html`<option value="">${none}</option>`}

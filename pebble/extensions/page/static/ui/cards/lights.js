@@ -64,7 +64,7 @@ export function Lights({ at }) {
       <${Period} page=${page} lights=${lights} why=${noFlash} />
     </div>
     ${why && html`<${Why} id="why-lights">${why}<//>`}
-    <p class="dim" data-test="lights-asked">${asked(lights)} ${useName(at)} does not report its lights.</p>
+    <p class="dim" data-test="lights-asked">${asked(lights, useName(at))}</p>
   </div>`;
 }
 
@@ -99,9 +99,9 @@ function Period({ page, lights, why }) {
   </label>`;
 }
 
-function asked({ mode, colour, period }) {
-  if (!mode) return "Nothing was asked from here yet.";
+function asked({ mode, colour, period }, robot) {
+  if (!mode) return `Lights unknown: ${robot} does not report them`;
   const name = Object.entries(COLOURS).find(([, value]) => value === colour)?.[0] ?? colour;
   const what = { solid: `${name}, solid`, flash: `${name}, flashing every ${period} s`, off: "off" };
-  return `Asked from here last: ${what[mode]}.`;
+  return `Asked last: ${what[mode]}`;
 }

@@ -16,7 +16,7 @@ const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], Arrow
 const ARROW_PX = 24;
 
 const LIMITS = { spanMs: 3_600_000, most: 4000, differs };
-const SOURCES = { "wheel-odometry": "by its wheels", "localization-pose": "in its map" };
+const SOURCES = { "wheel-odometry": "By its wheels", "localization-pose": "In its map" };
 const STEP_MS = 100; // between two drawings
 const WORDS_MS = 500;
 const ZOOM = { start: 120, least: 2, most: 1200 }; // pixels per metre

@@ -13,6 +13,7 @@ const uPlot = made;
 const STEP_MS = 100; // at most ten times a second
 const CALM_MS = 1000; // where people ask for less motion, and where a pixel is longer than that
 const HEIGHT = 132;
+const LEAST_MS = 20_000; // so much time is shown at least
 /** Colour alone does not tell lines apart; plots.css has the same dashes. */
 const DASHES = [[], [7, 4], [2, 3], [10, 3, 2, 3], [12, 6], [1, 5]];
 
@@ -83,13 +84,13 @@ class View {
         height: HEIGHT,
         legend: { show: false },
         cursor: { show: false },
-        padding: [6, 8, 0, 0],
+        padding: [6, 28, 0, 0], // half of a time
         scales: {
           x: { time: false, range: () => this.range },
           y: { range: (_plot, low, high) => spread(low, high, least) },
         },
         axes: [
-          { ...axis, size: 28, space: 90, incrs: [10, 30, 60, 120, 300], values: (_plot, at) => at.map((s) => clockTime(1000 * s)) },
+          { ...axis, size: 28, space: 90, incrs: [5, 10, 30, 60, 120, 300], values: (_plot, at) => at.map((s) => clockTime(1000 * s)) },
           { ...axis, size: 52, space: 28 },
         ],
         series: [{}, ...lines],
@@ -101,7 +102,8 @@ class View {
 
   /** @param {any} columns times in ms of the page's clock @param {number} from @param {number} to @param {number} offset to epoch */
   draw([times, ...values], from, to, offset) {
-    this.range = [(from + offset) / 1000, (to + offset) / 1000];
+    const first = Math.max(from, Math.min(times[0] ?? from, to - LEAST_MS)); // the axis begins with the data
+    this.range = [(first + offset) / 1000, (to + offset) / 1000];
     this.plot.setData([times.map((at) => (at + offset) / 1000), ...values]);
   }
 

@@ -37,7 +37,7 @@ export function Plots({ at }) {
     ${[...usual, ...whole].map((plot) => html`<${Figure} key=${plot.id} plot=${plot} at=${at} paused=${paused} />`)}
     <div class="plot-tools">
       ${(known.length > 0 || chosen) &&
-      html`<${Button} test="plots-pause" icon=${paused ? "play" : "halt"} onPress=${() => pause(!paused)}>
+      html`<${Button} test="plots-pause" icon=${paused ? "play" : "pause"} onPress=${() => pause(!paused)}>
         ${paused ? "Go on" : "Pause"}
       <//>`}
       ${more > 0 &&
@@ -61,7 +61,7 @@ function Figure({ at, plot, paused }) {
   const minutes = Math.round(limits.shownMs / 60_000);
   return html`<figure class="plot" data-test=${name} aria-label=${`${plot.title}, last ${minutes} minutes`}>
     <figcaption>
-      <b>${plot.title}</b> <small>${minutes} min</small>
+      <b>${plot.title}</b>
     </figcaption>
     <${Lines}
       key=${fields.join()}
@@ -98,6 +98,6 @@ function Choose({ at, metrics, chosen, onChoose }) {
   const having = metrics.filter((metric) => !metric.startsWith("web/") && numbers(store.get(at, metric)?.value));
   const listed = [...new Set([...having.sort().slice(0, MOST_METRICS), chosen])].filter(Boolean);
   if (!listed.length) return null;
-  const choices = [["", "choose…"], ...listed.map((metric) => [metric, metric])];
-  return html`<${Select} test="plots-of" title="All numbers of" value=${chosen} choices=${choices} onChoose=${onChoose} />`;
+  const choices = [["", "Choose…"], ...listed.map((metric) => [metric, metric])];
+  return html`<${Select} test="plots-of" title="Also plot" value=${chosen} choices=${choices} onChoose=${onChoose} />`;
 }

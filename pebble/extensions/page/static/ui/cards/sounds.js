@@ -8,37 +8,38 @@ import { plain } from "../parts/more-words.js";
 import { useMemo } from "../../vendor/hooks.mjs";
 
 const MOST = 60; // clips that are listed at a time
+const FEW = 8; // they need no filter
 
 export function Sounds({ at }) {
   const page = useReasons(at);
   const sounds = useModel(soundsOf(at));
   const why = whyNot(page, at, "soundboard");
-  const { last } = sounds;
-  const whyNotAgain = why || (last ? "" : "Play one sound first");
   return html`<div class="sounds">
-    <${NowPlaying} at=${at} page=${page} />
-    <div class="ask-row">
-      <${Button} test="repeat-last" why=${whyNotAgain} because="why-again" icon="play" onPress=${() => repeatLast(page, at)}>
-        Again <kbd aria-hidden="true">P</kbd>
-      <//>
-      <${Check} test="repeat" checked=${sounds.repeat} onChange=${(repeat) => sounds.set({ repeat })}>repeat until stopped<//>
-    </div>
-    ${whyNotAgain && html`<${Why} id="why-again">${whyNotAgain}<//>`}
     <${Clips} at=${at} page=${page} sounds=${sounds} why=${why} />
+    ${why && html`<${Why} id="why-again">${why}<//>`}
+    <div class="ask-row">
+      <${Check} test="repeat" checked=${sounds.repeat} onChange=${(repeat) => sounds.set({ repeat })}>Repeat until stopped<//>
+      ${sounds.last &&
+      html`<${Button} test="repeat-last" why=${why} because="why-again" icon="play" onPress=${() => repeatLast(page, at)}>
+        Again <kbd aria-hidden="true">P</kbd>
+      <//>`}
+    </div>
+    <${NowPlaying} at=${at} page=${page} />
   </div>`;
 }
 
+/** What plays, and its end; of a robot that does not report it only the end. */
 function NowPlaying({ at, page }) {
-  const { playing, file, error } = useValue(at, "soundboard-status") ?? {};
+  const status = useValue(at, "soundboard-status");
+  const { playing, file, error } = status ?? {};
   const why = whyNotEnd(page);
   const was = useOnline(at) ? "plays" : "played when it was last seen";
   return html`<div class="ask-row ask-now">
-      <p role="status" data-test="playing">
-        ${playing ? html`<b>♪ ${plain(file ?? "a clip")}</b> ${was}` : html`<span class="dim">Nothing ${was}.</span>`}
-      </p>
-      <${Button} test="stop-sound" why=${why} icon="halt" onPress=${() => page.commands.stopSound(at)}>Stop sound<//>
+      <p role="status" data-test="playing">${playing && html`<b>♪ ${plain(file ?? "a clip")}</b> ${was}`}</p>
+      ${(playing || !status) &&
+      html`<${Button} test="stop-sound" why=${why} icon="halt" onPress=${() => page.commands.stopSound(at)}>Stop sound<//>
+        ${why && html`<${Why} id="why-stop-sound">${why}<//>`}`}
     </div>
-    ${why && html`<${Why} id="why-stop-sound">${why}<//>`}
     ${error && html`<p class="bad" data-test="sound-error">✖ ${plain(error)}</p>`}`;
 }
 
@@ -50,15 +51,16 @@ function Clips({ at, page, sounds, why }) {
   const { playing, file: now } = useValue(at, "soundboard-status") ?? {};
   if (!files) return html`<p class="dim">No list of clips was received yet: is soundboard_handler enabled in its config?</p>`;
   if (!files.length) return html`<p class="dim">No clips: put sound files into ${name}'s folder of sounds.</p>`;
-  return html`<input
+  return html`${(files.length > FEW || filter) &&
+    html`<input
       type="search"
       class="wide"
       data-test="sound-filter"
       aria-label="Filter the clips"
-      placeholder=${`filter ${files.length} clips`}
+      placeholder=${`Filter ${files.length} clips`}
       value=${filter}
       onInput=${(event) => sounds.set({ filter: event.currentTarget.value })}
-    />
+    />`}
     <div class="clips" data-test="clips" role="group" aria-label="Clips" tabindex="0" data-arrows>
       ${shown.folders.map(
         ([folder, names]) => html`<section key=${folder} aria-label=${folder ? plain(folder) : "clips"}>

@@ -1,30 +1,39 @@
 // What the component reports of itself, in words and numbers.
 
-import { html, useMetric, useOnline, useTick, useValue } from "../parts/hooks.js";
-import { Live, useEnded } from "../parts/parts.js";
+import { html, useMetric, useOnline, useValue } from "../parts/hooks.js";
+import { Charge, Live, isGone, useEnded } from "../parts/parts.js";
 import { Board } from "./board.js";
-import { poseOf, poseWords } from "../../core/trail.js";
+import { charge, looksOf } from "../parts/looks.js";
 import { charging, plain } from "../parts/more-words.js";
-import { battery, inner, isObject, number, roughly, span, typeOf } from "../parts/words.js";
+import { battery, inner, isObject, number, typeOf } from "../parts/words.js";
 
 const STREAM_MS = 1000;
 const LEVEL_DEG = 3;
+const LOW_PERCENT = 20;
 
 export function Telemetry({ at }) {
   const online = useOnline(at);
-  return html`<dl class="values">
-    <${Row} at=${at} metric="charging-level" name="Battery" online=${online}>${battery}<//>
-    <${Row} at=${at} metric="charging-status" name="Charger" online=${online}>${charging}<//>
-    <${Heartbeat} at=${at} />
+  return html`<${Battery} at=${at} online=${online} />
+  <dl class="values">
     <${Neighbours} at=${at} />
     <${Row} at=${at} metric="sensors/imu" name="Tilt" online=${online} streams>${attitude}<//>
     <${Row} at=${at} metric="sensors/imu" name="Turn rate" online=${online} streams>${rate}<//>
     <${Row} at=${at} metric="sensors/imu" name="Acceleration" online=${online} streams>${acceleration}<//>
     <${Row} at=${at} metric="touch-sensors" name="Touch" online=${online} streams>${touch}<//>
-    <${Row} at=${at} metric="wheel-odometry" name="Odometry" online=${online} streams>${odometry}<//>
     <${Troubles} at=${at} online=${online} />
   </dl>
   <${Hint} at=${at} />`;
+}
+
+/** One large figure: in percent with its bar, where the cells are known. */
+function Battery({ at, online }) {
+  const level = useMetric(at, "charging-level");
+  const status = useValue(at, "charging-status");
+  const { cells } = looksOf(at, useValue(at, "capabilities"));
+  const percent = !level || isGone(level, online) ? null : charge(level.value, cells);
+  const more = [percent !== null && cells ? battery(level.value) : "", online ? charging(status) : ""].filter(Boolean).join(", ");
+  return html`<p class="figure">${level && html`<b><${Charge} at=${at} level=${level} online=${online} /></b> `}<span class="dim">${more}</span></p>
+    ${percent !== null && html`<i class=${`meter ${percent < LOW_PERCENT ? "low" : ""}`} aria-hidden="true"><i style=${{ width: `${percent}%` }}></i></i>`}`;
 }
 
 /** For the maker of a robot that does not say what it can do. */
@@ -55,33 +64,6 @@ function Row({ at, metric, name, online, streams = false, children: words }) {
   </div>`;
 }
 
-function Heartbeat({ at }) {
-  useTick(500);
-  const entry = useMetric(at, "web/liveness");
-  const liveness = entry?.value;
-  if (!liveness) return null;
-  const age = liveness.silent_s === null ? null : 1000 * liveness.silent_s + entry.age; // ms: at the server, and since
-  const ago = age < 1500 ? "within the last second" : `${roughly(age)} ago`;
-  const every = liveness.interval_ms ? `, every ${span(liveness.interval_ms)}` : "";
-  const seen = age === null ? "none since the server started" : `${ago}${every}`;
-  const average = liveness.average_latency_ms ?? null;
-  const late = liveness.whole_seconds
-    ? "unknown: its clock counts whole seconds"
-    : liveness.latency_ms === null
-      ? age === null
-        ? "–"
-        : "unknown: its clock is wrong"
-      : `late by ${span(liveness.latency_ms)}${average === null ? "" : `, on average ${span(average)}`}`;
-  return html`<div>
-      <dt>Heartbeat</dt>
-      <dd class=${liveness.online === false ? "bad" : ""}>${seen}</dd>
-    </div>
-    <div>
-      <dt>Latency</dt>
-      <dd>${late}</dd>
-    </div>`;
-}
-
 /** Which robots of its LAN it receives, and whose script drives it. */
 function Neighbours({ at }) {
   const { receives = {}, driven_by: driver } = useValue(at, "neighbours") ?? {};
@@ -99,12 +81,6 @@ function attitude(payload) {
 }
 
 const rate = (payload) => `${number(inner(payload)?.gyro_dps?.z, 1)} °/s`;
-
-/** Where it is; all else of it is in the list of all values. */
-function odometry(payload) {
-  const pose = poseOf(payload);
-  return pose ? poseWords(pose) : plain(inner(payload));
-}
 
 const acceleration = (payload) => `${number(inner(payload)?.accel_norm_g, 2)} g`;
 

@@ -3,7 +3,7 @@
 import { html, useMetric, useMetrics, useOnline, useState, useTick } from "../parts/hooks.js";
 import { isGone } from "../parts/parts.js";
 import { plain } from "../parts/more-words.js";
-import { roughly } from "../parts/words.js";
+import { roughly, span } from "../parts/words.js";
 
 const SHORT = 6; // lines that are always shown
 
@@ -12,7 +12,16 @@ export function Values({ at }) {
     .filter((metric) => !metric.startsWith("web/"))
     .sort();
   if (!metrics.length) return html`<p class="dim">Nothing was received yet.</p>`;
-  return html`<dl class="all-values">${metrics.map((metric) => html`<${Metric} key=${metric} at=${at} metric=${metric} />`)}</dl>`;
+  return html`<${Heartbeat} at=${at} /><dl class="all-values">${metrics.map((metric) => html`<${Metric} key=${metric} at=${at} metric=${metric} />`)}</dl>`;
+}
+
+/** How its heartbeats come, where that is known: for people they say only whether it is online. */
+function Heartbeat({ at }) {
+  const view = useMetric(at, "web/liveness")?.value;
+  if (!view?.interval_ms) return null;
+  const { interval_ms: interval, latency_ms: late, average_latency_ms: average, whole_seconds: coarse } = view;
+  const lateness = coarse || late === null ? "its clock does not tell how late" : `late by ${span(late)}, on average ${span(average ?? late)}`;
+  return html`<p class="dim" data-test="heartbeat">Heartbeats every ${span(interval)}, ${lateness}</p>`;
 }
 
 function Metric({ at, metric }) {

@@ -2,7 +2,6 @@
 
 import { ROOT } from "../../core/browser.js";
 import * as more from "../../core/browser-more.js";
-import { scriptName } from "../../core/reasons.js";
 import { doubtOf } from "./doubt.js";
 import { Bands, progressOf } from "../banner.js";
 import { Liveness } from "../header.js";
@@ -10,6 +9,7 @@ import {
   Boundary,
   html,
   useEffect,
+  useLater,
   useMetric,
   useModel,
   usePage,
@@ -26,14 +26,14 @@ import { Button, Charge, Check, Drawing, Drop, Icon, RouteLink, Select, StopButt
 import { RecordingsLink } from "./recordings-link.js";
 import { battery, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf } from "../parts/words.js";
 
-const THUMBNAIL_MS = 10_000;
-const LIVE_MS = 12_000; // a thumbnail that young is of now
+const STILL_MS = 5000; // between two of a camera that is on
+const LIVE_MS = 10_000; // a still that young is of now
 const DENSE = 13; // so many components are shown in small cards, and by what they need
 const MANY = 100; // beyond, cards have no pictures, and only those near the screen are drawn
 const NEEDS_MS = 10_000; // so long a card stays among those that need a look
 const LOW_PERCENT = 20;
 const isRobot = (ref) => typeOf(ref) === "robots";
-const SORTS = ["name", "type", "battery"];
+const SORTS = { name: "Name", type: "Type", battery: "Battery" };
 
 const kept = { filter: "" }; // while a robot is looked at
 
@@ -72,7 +72,7 @@ export function Fleet() {
         <h1>
         ${total === 0
           ? "Robots"
-          : `${robots.length} ${robots.length === 1 ? "robot" : "robots"}${connection.isOpen ? `, ${there.length} online` : ""}`}
+          : `${robots.length} ${robots.length === 1 ? "robot" : "robots"}${connection.isOpen && away.some(isRobot) ? `, ${there.length} online` : ""}`}
         ${others > 0 && html`<span class="dim"> and ${others} ${others === 1 ? "other" : "others"}</span>`}
         </h1>
         <${Bands} at="" />
@@ -165,13 +165,13 @@ function FleetTools({ filter, onFilter, many }) {
       onInput=${(event) => onFilter(event.currentTarget.value)}
     />
     <${RecordingsLink} />
-    <${Button} className="to-phone" test="phone" icon="phone" onPress=${() => panels.show("phone")}>Open on a phone<//>
     <${Drop} test="fleet-more" look="button" summary="More">
+        <${Button} test="phone" icon="phone" onPress=${() => panels.show("phone")}>Open on a phone<//>
         <${Select}
           test="sort"
           title="Sort by"
           value=${settings.sort}
-          choices=${SORTS.map((name) => [name, name])}
+          choices=${Object.entries(SORTS)}
           onChoose=${(name) => settings.set("sort", name)}
         />
         ${!WATCHES &&
@@ -197,11 +197,10 @@ function FirstTime({ refs }) {
   if (!drives) return null;
   const scripts = runs(drives) ? drives : robots.find(runs);
   const items = [
-    ["drive", `Drive ${drives.name}`, "Take control, then W A S D", { to: drives.ref }],
-    scripts && ["script", `Let ${scripts.name} drive itself`, "Scripts, Start", { to: scripts.ref }],
-    connection.you?.recordings && ["recordings", "Watch what just happened", "Recordings", { path: `${ROOT}replay` }],
+    ["drive", `Drive ${drives.name}`, { to: drives.ref }],
+    scripts && ["script", `Let ${scripts.name} drive itself`, { to: scripts.ref }],
+    connection.you?.recordings && ["recordings", "Watch what just happened", { path: `${ROOT}replay` }],
   ].filter(Boolean);
-  const code = more.isLoopback(location.hostname) && connection.you?.server === more.DEMO ? "make demo PHONE=1 shows a code" : "Scan one code";
   const number = (name, at) => html`<span class=${`step ${settings.begun.includes(name) ? "done" : ""}`}
     >${settings.begun.includes(name) ? html`<${Icon} name="check" />` : at}</span
   >`;
@@ -212,13 +211,13 @@ function FirstTime({ refs }) {
     </div>
     <ul>
       ${items.map(
-        ([name, title, how, target], at) => html`<li key=${name}>
-          <${RouteLink} ...${target} className="try">${number(name, at + 1)}<span><b>${title}</b><small>${how}</small></span><//>
+        ([name, title, target], at) => html`<li key=${name}>
+          <${RouteLink} ...${target} className="try">${number(name, at + 1)}<b>${title}</b><//>
         </li>`,
       )}
       <li>
         <${Button} className="try" onPress=${() => panels.show("phone")}>
-          ${number("phone", items.length + 1)}<span><b>Open it on your phone</b><small>${code}</small></span>
+          ${number("phone", items.length + 1)}<b>Open it on your phone</b>
         <//>
       </li>
     </ul>
@@ -308,7 +307,6 @@ function FleetCard({ at, plain }) {
         <${BatteryFact} at=${at} online=${connection.isOpen} />
         ${connection.isOpen && html`<${DoubtFact} at=${at} />`}
         <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} estop=${estop} pictured=${pictured} />
-        <${ScriptFact} at=${at} online=${connection.isOpen} />
         ${typeOf(at) !== "robots" ? html`<${StatusFact} at=${at} />` : html`<${ServiceFact} at=${at} />`}
       </ul>
       ${estop?.latched
@@ -355,23 +353,13 @@ function BatteryFact({ at, online }) {
 
 function DriverFact({ at, offers, online, estop, pictured }) {
   const view = useValue(at, "web/driver");
-  const doubt = doubtOf(useValue(at, "status")).text;
   const itself = useItself(at);
-  if (!offers.known && !offers.drives) return null;
-  if (!online && offers.drives) return html`<${Fact} icon="wheel">who drives is not known<//>`;
-  if (!offers.drives) return html`<${Fact} icon="wheel">does not drive<//>`;
+  if (!offers.drives) return null;
+  if (!online) return html`<${Fact} icon="wheel">who drives is not known<//>`;
   if (estop?.latched) return pictured && html`<${Fact} icon="stop">reset it to drive<//>`;
   if (itself) return html`<${Fact} icon="script" className=""><b title=${itself}>${itself}</b><//>`;
-  if (!view?.by) return doubt ? null : html`<${Fact} icon="wheel">nobody drives<//>`;
+  if (!view?.by) return null;
   return html`<${Fact} icon="wheel" className="">${view.you ? html`<b>driven by you</b>` : `driven by ${driverName(view)}`}<//>`;
-}
-
-/** What runs beside who drives. */
-function ScriptFact({ at, online }) {
-  const status = useValue(at, "autonomy-status");
-  const itself = useItself(at);
-  if (!status?.running || itself || !online) return null;
-  return html`<${Fact} icon="script">${scriptName(status)} ${status.overridden ? "waits" : "runs"}<//>`;
 }
 
 /** In a word or two, what a component reports that is no robot. */
@@ -381,33 +369,32 @@ function StatusFact({ at }) {
   return html`<${Fact}>${plain(Object.fromEntries(Object.entries(status).slice(0, 3)))}<//>`;
 }
 
-/**
- * The last picture, renewed while pictures flow anyway: this never starts a camera. Without one, the robot's face.
- * ``has``: it has a camera.
- */
+/** The last picture, renewed while the camera is on anyway: this never starts it. ``has``: there is one; else the robot's face. */
 function Thumbnail({ at, has, looks }) {
-  const flowing = useValue(at, "web/picture")?.state === "flowing";
-  const [count, setCount] = useState(0);
-  const [takenAt, setTakenAt] = useState(0); // 0: there is no picture
-  useTick(takenAt ? 1000 : 0);
+  const flows = useValue(at, "web/picture")?.state === "flowing";
+  const runs = useValue(at, "media-status")?.camera_publisher?.running === true;
+  const isOn = flows || runs;
+  const [{ src, takenAt }, take] = useState({ src: "", takenAt: 0 });
   useEffect(() => {
-    if (!flowing) return undefined;
-    setCount((n) => n + 1);
-    const timer = setInterval(() => document.hidden || setCount((n) => n + 1), THUMBNAIL_MS);
+    if (!has) return undefined;
+    const look = async () => {
+      const answer = document.hidden ? null : await fetch(`${ROOT}api/snapshot.jpg?ref=${encodeURIComponent(at)}`).catch(() => null);
+      if (answer?.status !== 200) return;
+      const age = 1000 * Number(answer.headers.get("age"));
+      take({ src: URL.createObjectURL(await answer.blob()), takenAt: performance.now() - age });
+    };
+    look();
+    const timer = setInterval(() => isOn && look(), STILL_MS);
     return () => clearInterval(timer);
-  }, [flowing]);
+  }, [at, has, isOn]);
+  useEffect(() => () => URL.revokeObjectURL(src), [src]);
   const age = performance.now() - takenAt;
-  const words = !has ? "no camera" : !takenAt ? "camera rests" : flowing && age < LIVE_MS ? "live" : `${roughly(age)} ago`;
-  return html`<div class=${`thumbnail ${takenAt ? "" : "faced"}`}>
-    ${count > 0 &&
-    html`<img
-      hidden=${!takenAt}
-      alt=${`What ${looks.name} sees`}
-      src=${`${ROOT}api/snapshot.jpg?ref=${encodeURIComponent(at)}&n=${count}`}
-      onLoad=${() => setTakenAt(performance.now())}
-    />`}
-    ${!takenAt && html`<${Drawing} picture=${looks.picture} />`}
-    <span class=${`tag ${words === "live" ? "live" : ""}`}>${words}</span>
+  const isLive = isOn && age < LIVE_MS;
+  useTick(src && !isLive ? 2000 : 0);
+  useLater(isLive ? LIVE_MS - age : Infinity);
+  return html`<div class=${`thumbnail ${src ? "" : "faced"}`}>
+    ${src ? html`<img alt=${`What ${looks.name} sees`} src=${src} />` : html`<${Drawing} picture=${looks.picture} />`}
+    ${src && html`<span class=${`tag ${isLive ? "live" : ""}`}>${isLive ? "live" : `${roughly(age)} ago`}</span>`}
     <${Stripe} at=${at} />
   </div>`;
 }

@@ -136,7 +136,7 @@ export function NoticeList({ onGo }) {
   const model = useNotices();
   const { list } = model.notices;
   useEffect(() => model.read(), [list]);
-  if (!list.length) return html`<div class="notices"><p class="dim">Nothing to tell since this page was opened.</p></div>`;
+  if (!list.length) return html`<div class="notices"><p class="dim">No notices yet</p></div>`;
   return html`<ul class="notices" data-test="notices">
     ${list.map((notice) => html`<${Row} key=${notice.ref} notice=${notice} onGo=${onGo} />`)}
   </ul>`;

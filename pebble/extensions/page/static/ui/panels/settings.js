@@ -4,20 +4,13 @@ import { html, useModel, usePage } from "../parts/hooks.js";
 import { lacks } from "../parts/lacks.js";
 import { NoticeList } from "../fleet/notices.js";
 import { Panel } from "./panel.js";
-import { Button, Check, Icon, useName } from "../parts/parts.js";
+import { Button, Check, Icon } from "../parts/parts.js";
 import { RecordingsLink } from "../fleet/recordings-link.js";
 
-const THEMES = { auto: "as the system", light: "light", dark: "dark" };
-const SIDES = { left: "on the left", right: "on the right" };
-const RIGHTS = {
-  drive: "drive",
-  reset: "reset stops",
-  take: "take over from others",
-  system: "restart and update robots",
-  people: "manage users",
-};
+const THEMES = { auto: "As the system", light: "Light", dark: "Dark" };
+const SIDES = { left: "On the left", right: "On the right" };
 const MORE = [
-  { name: "help", icon: "help", text: "Keys, and how stopping works" },
+  { name: "help", icon: "help", text: "Help" },
   { name: "phone", icon: "phone", text: "Open on a phone" },
 ];
 
@@ -25,7 +18,6 @@ export function SettingsPanel({ onClose }) {
   const { settings, driver, panels } = usePage();
   useModel(settings);
   useModel(driver);
-  const name = useName(driver.ref);
   const narrow = !document.querySelector(".bell"); // else the list is behind a button of its own
   return html`<${Panel} id="settings" title="Settings" onClose=${onClose}>
     <${WhoAmI} />
@@ -51,7 +43,7 @@ export function SettingsPanel({ onClose }) {
           driver.changed();
         }}
       >
-        I can see ${name}: drive with an old picture, too. In this tab
+        Allow driving with an old picture (this tab)
       <//>`}
     </fieldset>
     <div class="panel-links">
@@ -96,12 +88,11 @@ function WhoAmI() {
   useModel(connection);
   const { you } = connection;
   if (!you) return html`<p class="dim">Not connected yet.</p>`;
-  const rights = (you.rights ?? []).map((one) => RIGHTS[one] ?? one);
   return html`<section class="who" aria-label="Who I am">
     <span class="badge"><${Icon} name="person" /></span>
     <p>
       <b>${you.login ? you.user : "No login on this machine"}</b>
-      <span class="dim">${you.role} at ${you.server}. May ${["stop", ...rights].join(", ")}.</span>
+      <span class="dim">${you.role} at ${you.server}</span>
     </p>
     ${you.login
       ? html`<${Button} icon="out" onPress=${() => commands.logOut()}>Log out<//>`
@@ -129,6 +120,6 @@ function OwnName({ you }) {
         defaultValue=${settings.name}
         onChange=${(event) => change(event.currentTarget.value)}
     /></label>
-    <span class="why" id="own-name-why">Others see “${you.user}”. Nobody checks it: here is no login.</span>
+    <span class="why" id="own-name-why">Others see “${you.user}” (no login here)</span>
   </div>`;
 }

@@ -5,7 +5,7 @@ import { holding } from "../../core/replay/timeline.js";
 import { Bands } from "../banner.js";
 import { ROOT } from "../../core/browser.js";
 import { html, useEffect, usePage, useState } from "../parts/hooks.js";
-import { Button, Icon, RouteLink, Select } from "../parts/parts.js";
+import { Button, Icon, RouteLink, Select, Skeleton } from "../parts/parts.js";
 import { recordingsOf } from "../fleet/recordings-link.js";
 import { iconOf } from "../fleet/fleet.js";
 import { nameIn } from "../parts/looks.js";
@@ -41,6 +41,21 @@ function useDays() {
   return { days, problem, again: () => setAttempt(attempt + 1) };
 }
 
+/** The shape of a recording's page until it is here. @param {{name: string, problem?: string}} props */
+export const Opening = ({ name, problem }) => html`<div class="robot" aria-busy="true">
+  <h1 class="sr">${name}</h1>
+  <div class="bench connecting">
+    <div class="stage">
+      <div class="picture">
+        <div class="canvas"><canvas width="640" height="360" aria-hidden="true"></canvas></div>
+        <p class=${problem ? "cover" : "sr"} role="status">${problem || "Loading the recording…"}</p>
+      </div>
+      <div class="picture-bar"></div>
+    </div>
+    <section class="card"><${Skeleton} lines=${5} /></section>
+  </div>
+</div>`;
+
 const addressOf = (ref, day) => `${recordingsOf(ref)}?day=${day}`;
 
 const ALL_DAYS = `${ROOT}replay?days`;
@@ -56,14 +71,16 @@ export function Choose() {
     history.replaceState(null, "", recordingsOf(mostDriven(shown)));
     route.changed();
   }, [shown]);
+  if (shown || (!days && !problem)) {
+    return html`<div class="replay"><${Opening} name="Recordings" />
+      <section class="card player"><div class="player-marks loading"><i class="bone"></i></div></section></div>`;
+  }
   return html`<div class="replay-choose">
     <div class="screen-title"><h1>Recordings</h1><${Bands} at="" /></div>
     ${problem &&
     html`<p class="failed" role="alert">
       The recordings cannot be listed: ${problem} <${Button} onPress=${again}>Try again<//>
     </p>`}
-    ${(shown || (!days && !problem)) &&
-    html`<div class="loading bones" role="status"><span class="sr">Looking for recordings…</span><i></i><i></i><i></i></div>`}
     ${days &&
     !days.length &&
     html`<div class="empty">
@@ -72,7 +89,7 @@ export function Choose() {
       <p>Run <code>pebble record</code> at this server's broker: what it writes appears here while it runs.</p>
     </div>`}
     <ul class="replay-days">
-      ${(shown ? [] : (days ?? [])).map((one) => html`<${Day} key=${one.day} one=${one} />`)}
+      ${(days ?? []).map((one) => html`<${Day} key=${one.day} one=${one} />`)}
     </ul>
   </div>`;
 }

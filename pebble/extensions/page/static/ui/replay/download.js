@@ -59,13 +59,13 @@ export function Download({ replay }) {
       <span class="dim"> ${feed.seeks && span(lasts)}</span>
     </p>
     <div class="download-marks">
-      <${Button} test="mark-in" onPress=${() => replay.mark({ since: feed.position })}>Begin here<//>
+      <${Button} test="mark-in" onPress=${() => replay.mark({ since: feed.position })}>Start here<//>
       <${Button} test="mark-out" onPress=${() => replay.mark({ until: feed.position })}>End here<//>
       ${isMarked && html`<${Button} className="quiet" test="mark-clear" onPress=${() => replay.unmark()}>Clear<//>`}
     </div>
     <div class="download-marks">
       <${Select} test="download-as" label="Form of the download" value=${as} choices=${Object.entries(FORMS)} onChoose=${choose} />
-      <${Button} test="download" why=${off} icon="save" onPress=${() => begin(stretch, as)}>Make it<//>
+      <${Button} test="download" why=${off} icon="save" onPress=${() => begin(stretch, as)}>Prepare download<//>
     </div>
     ${off && html`<${Why} id="why-download">${off}<//>`}
     ${job && html`<${Job} job=${job} onEnd=${end} />`}

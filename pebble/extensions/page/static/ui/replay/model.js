@@ -101,6 +101,7 @@ export class Day extends Model {
     /** @type {import("../../core/replay/archive.js").Timeline | null} */
     this.timeline = null;
     this.indexing = -1; // share; -1: it is not
+    this.openedAt = 0; // of performance.now()
     this.problem = "";
     this.then = () => {}; // once the timeline is here
     this.abort = new AbortController();
@@ -111,7 +112,7 @@ export class Day extends Model {
     if (name === this.name && !this.problem) return;
     this.abort.abort();
     const { signal } = (this.abort = new AbortController());
-    Object.assign(this, { name, then, timeline: null, indexing: -1, problem: "" });
+    Object.assign(this, { name, then, timeline: null, indexing: -1, openedAt: performance.now(), problem: "" });
     this.changed();
     const index = (share) => {
       this.indexing = share;

@@ -9,6 +9,7 @@ import { clockTime, span } from "../parts/words.js";
 import { Elsewhere, Sessions } from "./choose.js";
 import { Download } from "./download.js";
 
+const PATIENCE_MS = 3000;
 const PANELS = { days: ["Days", "list"], download: ["Download", "save"] };
 
 export function PlayerBar({ at, replay }) {
@@ -111,12 +112,13 @@ function marksOf(timeline, seen) {
   ];
 }
 
-/** In place of the marks of a day that is not here. */
+/** In place of the marks of a day that is not here: its shape, and what is done once that takes long and goes on. */
 function NoDay({ replay }) {
   const { day } = replay;
-  const words = day.indexing < 0 ? "Loading the day…" : `This day is being indexed: ${Math.round(100 * day.indexing)} %`;
+  const words = day.indexing > 0 && performance.now() - day.openedAt > PATIENCE_MS ? `Reading the day: ${Math.round(100 * day.indexing)} %` : "";
   const again = () => (day.name ? day.open(day.name, day.then, true) : replay.start());
-  return html`<div class="player-scale" role="status">
+  return html`<div class="player-marks loading">${!day.problem && html`<i class="bone" aria-hidden="true"></i>`}</div>
+  <div class="player-scale" role="status">
     <span>${day.problem ? `✖ ${day.problem}` : words}</span>
     ${day.problem && html`<${Button} test="try-again" onPress=${again}>Try again<//>`}
   </div>`;

@@ -4,10 +4,11 @@ import { extentOf, firstOf } from "../../core/replay/timeline.js";
 import { Boundary, Page, html, useEffect, useMedia, useModel, usePage, useState, useTick } from "../parts/hooks.js";
 import { EXTRAS, VOICE } from "../cards/cards.js";
 import { exactTime } from "../parts/more-words.js";
+import { driverName, inner } from "../parts/words.js";
 import { Extra, Icon, Part, RouteLink, useName } from "../parts/parts.js";
 import { Robot } from "../robot/robot.js";
 import { Frame, SnapshotButton } from "../robot/video.js";
-import { Choose, timeWords } from "./choose.js";
+import { Choose, Opening, timeWords } from "./choose.js";
 import { Replay as Model } from "./model.js";
 import { PlayerBar } from "./player-bar.js";
 
@@ -81,9 +82,16 @@ function Shown({ at, replay }) {
             stage=${RecordedStage}
             watches
         /><//>`
-      : html`<div class="empty"><h1 class="sr">${name}</h1><p role="status">${replay.feed.problem || "Loading the recording…"}</p></div>`}
+      : html`<${Opening} name=${name} problem=${replay.feed.problem} />`}
     <${Boundary} what="What plays it"><${PlayerBar} at=${at} replay=${replay} /><//>
   </div>`;
+}
+
+/** Who had control then; "" it is not known, or nobody. @param {import("../../core/store.js").Store} store @param {string} ref */
+function driverThen(store, ref) {
+  const metric = store.metrics(ref).find((one) => one.startsWith("control/"));
+  const { by, device } = inner(store.get(ref, metric ?? "")?.value) ?? {};
+  return by ? driverName({ by, device }) : "";
 }
 
 /** What must not be overlooked: that this is the past. */
@@ -92,10 +100,12 @@ function Badge({ at, replay }) {
   useModel(replay);
   useTick(100);
   const { seeks, position } = replay.feed;
+  const by = driverThen(replay.store, at);
   return html`<div class="replay-badge" data-test="badge">
     <${Icon} name="recordings" />
     <p>
-      <b>Recording of ${seeks ? timeWords(position) : "…"}</b> <span>The past of ${name}: nothing here reaches the robot.</span>
+      <b>${seeks ? timeWords(position) : "…"}</b>${by && html`<em data-test="then">${by} drove</em>`}
+      <span>Recording: nothing here reaches ${name}</span>
     </p>
     <${RouteLink} to=${at} className="replay-live" label=${`Live page of ${name}`}>Live page<//>
   </div>`;

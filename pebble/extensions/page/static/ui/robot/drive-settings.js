@@ -1,6 +1,6 @@
 // Which keys drive, how the inputs are scaled, and the extra axis of a robot that has one.
 
-import { DOWN, UP } from "../../core/inputs.js";
+import { DOWN, UP, padName } from "../../core/inputs.js";
 import { html, useEffect, useModel, usePage } from "../parts/hooks.js";
 import { useExtraAxis, useKeyNames } from "../parts/keyboard.js";
 import { Button, Icon, Slider, held, set } from "../parts/parts.js";
@@ -23,14 +23,14 @@ export function KeyHints() {
       )}
     </div>
     <p aria-hidden="true">or arrows drive,<br /><b>Space</b> halts,<br /><b>Esc Esc</b> is STOP</p>
-    <${Button} className="quiet" test="help" label="All keys, and how stopping works" icon="help" onPress=${() => panels.show("help")} />
+    <${Button} className="quiet" test="help" label="Help" icon="help" onPress=${() => panels.show("help")} />
   </div>`;
 }
 
 /** ``open``: there is room for all of it. @param {{open?: boolean}} props */
 export function DriveSettings({ open = false }) {
   const { driver } = usePage();
-  const pad = driver.pads?.pad?.id;
+  const pad = driver.pads?.pad;
   const { turn, balance } = useModel(driver).sliders;
   const extra = useExtraAxis();
   const part = `${Math.round(100 * turn)} %`;
@@ -50,7 +50,7 @@ export function DriveSettings({ open = false }) {
           <summary data-test="fold-drive">Balance${extra && ", extra axis"}</summary>
           ${rest}
         </details>`}
-    ${pad && html`<p class="pad-name"><${Icon} name="pad" />${pad}</p>`}
+    ${pad && html`<p class="pad-name"><${Icon} name="pad" />${padName(pad)}</p>`}
   </div>`;
 }
 

@@ -52,7 +52,7 @@ function PictureFrom({ at, source, offers }) {
   const cameras = useCameras(at);
   const whyShown = why && html`<${Why} id="why-picture">${why}<//>`;
   if (!cameras.length) return whyShown;
-  const none = ["", offers.hasVideo ? "its own camera" : "nowhere"];
+  const none = ["", offers.hasVideo ? "Its own camera" : "Nowhere"];
   return html`<${Select}
       test="picture-from"
       title="Picture from"
