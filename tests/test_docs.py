@@ -140,7 +140,8 @@ def test_each_bound_has_a_comment_that_says_what_it_bounds() -> None:
 
 
 def test_each_file_of_the_samples_is_named_and_short() -> None:
-    named = re.findall(r"\(\.\./(examples/[^)]+)\)", (ROOT / "docs" / "your-robot.md").read_text())
+    pages = [(ROOT / "docs" / f"your-{name}.md").read_text() for name in ("robot", "operator")]
+    named = re.findall(r"\(\.\./(examples/your-[^)]+)\)", "".join(pages))
     files = {str(path.relative_to(ROOT)): path for path in ROOT.glob("examples/your-*/*.*")}
     assert sorted(named) == sorted(files)
     assert max(len(path.read_text().splitlines()) for path in files.values()) <= 120
