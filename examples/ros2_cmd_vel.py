@@ -1,7 +1,7 @@
 """Drives a robot by the Twists of ROS 2's topic /cmd_vel: python ros2_cmd_vel.py 127.0.0.1 1883 goob
 
-It needs `pip install cyclonedds`, which speaks ROS 2's DDS, and no ROS 2. A robot obeys each Twist for half a second; one
-that somebody else drives, or that is stopped, does not move.
+It needs `pip install cyclonedds`, which speaks ROS 2's DDS, and no ROS 2. A robot obeys each Twist for half a second;
+one that somebody else drives, or that is stopped, does not move.
 """
 
 import json
