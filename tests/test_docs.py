@@ -78,6 +78,12 @@ def test_classes_functions_and_variables_that_they_name_exist() -> None:
     assert {*names} - known - EXAMPLES == set()
 
 
+def test_pages_that_code_names_exist() -> None:
+    files = (path for folder in (*OURS, "configs", "examples") for path in (ROOT / folder).rglob("*.*"))
+    texts = [path.read_text() for path in files if path.suffix in {".py", ".js", ".json", ".service", ".cpp"}]
+    assert {page for page in re.findall(r"docs/[\w/-]+\.md", "".join(texts)) if not (ROOT / page).exists()} == set()
+
+
 def test_keys_of_a_config_that_they_name_exist() -> None:
     keys = re.findall(r"`((?:services|security|local_mqtt|web_interface)(?:\.[a-z_]+)+)`", ALL_TEXT)
     original = {"web_interface.mqtt_history"}
