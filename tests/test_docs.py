@@ -17,6 +17,7 @@ import pytest
 import typer
 
 from pebble.commands.app import application
+from pebble.config.schema import keys_text
 from pebble.extensions.checks.conform.checks import CHECKS, LAST
 from pebble.extensions.checks.conform.control import CONTROL, named
 from pebble.extensions.checks.conform.motion import MOVING
@@ -24,8 +25,9 @@ from tests.support import ROOT
 from tools.bounds import bounds
 
 DOCUMENTS = [
-    ROOT / "README.md",
-    ROOT / "CHANGELOG.md",
+    *sorted(ROOT.glob("*.md")),
+    *sorted((ROOT / ".github").rglob("*.md")),
+    ROOT / "firmware" / "README.md",
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 LINK = re.compile(r"\]\((?!https?:)([^)#]+)")
@@ -62,6 +64,34 @@ DECISIONS = sorted((ROOT / "docs" / "decisions").glob("*.md"))
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_files_it_names_exist(document: Path) -> None:
     assert [name for name in CODE.findall(document.read_text()) if not _exists(name)] == []
+
+
+ALL_TEXT = "\n".join(path.read_text() for path in DOCUMENTS)
+EXAMPLES = {"MyTransport"}  # a class of the reader
+
+
+def test_classes_functions_and_variables_that_they_name_exist() -> None:
+    kinds = {".py", ".js", ".mjs", ".json", ".cpp", ".h", ".service"}
+    files = (path for folder in (*OURS, "configs", "examples", "tests") for path in (ROOT / folder).rglob("*"))
+    known = {word for path in files if path.suffix in kinds for word in re.findall(r"\w+", path.read_text())}
+    names = re.findall(r"`((?:[A-Z][a-z]+){2,}|_?[a-z]+(?:_[a-z0-9]+)+)(?:\(\))?`", ALL_TEXT)
+    assert {*names} - known - EXAMPLES == set()
+
+
+def test_pages_that_code_names_exist() -> None:
+    files = (path for folder in (*OURS, "configs", "examples") for path in (ROOT / folder).rglob("*.*"))
+    texts = [path.read_text() for path in files if path.suffix in {".py", ".js", ".json", ".service", ".cpp"}]
+    assert {page for page in re.findall(r"docs/[\w/-]+\.md", "".join(texts)) if not (ROOT / page).exists()} == set()
+
+
+def test_keys_of_a_config_that_they_name_exist() -> None:
+    keys = re.findall(r"`((?:services|security|local_mqtt|web_interface)(?:\.[a-z_]+)+)`", ALL_TEXT)
+    original = {"web_interface.mqtt_history"}
+    assert {key for key in keys if f"`{key}`" not in keys_text()} - original == set()
+
+
+def test_no_page_is_longer_than_one_reads() -> None:
+    assert {path.name: words for path in DOCUMENTS if (words := len(path.read_text().split())) > 1600} == {}
 
 
 def test_every_page_can_be_found_from_the_index() -> None:
@@ -118,9 +148,6 @@ def test_a_command_line_is_one_that_exists(pebble: Any, line: str, monkeypatch: 
         assert "does not exist" in error.message  # noqa: PT017
 
 
-ALL_TEXT = "\n".join(path.read_text() for path in DOCUMENTS)
-
-
 def test_extras_targets_and_modules_are_ones_that_exist() -> None:
     extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
     rules = re.findall(r"^([a-z][a-z -]*):", (ROOT / "Makefile").read_text(), re.MULTILINE)
@@ -140,7 +167,8 @@ def test_each_bound_has_a_comment_that_says_what_it_bounds() -> None:
 
 
 def test_each_file_of_the_samples_is_named_and_short() -> None:
-    named = re.findall(r"\(\.\./(examples/[^)]+)\)", (ROOT / "docs" / "your-robot.md").read_text())
+    pages = [(ROOT / "docs" / f"your-{name}.md").read_text() for name in ("robot", "operator")]
+    named = re.findall(r"\(\.\./(examples/your-[^)]+)\)", "".join(pages))
     files = {str(path.relative_to(ROOT)): path for path in ROOT.glob("examples/your-*/*.*")}
     assert sorted(named) == sorted(files)
     assert max(len(path.read_text().splitlines()) for path in files.values()) <= 120

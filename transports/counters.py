@@ -1,4 +1,12 @@
-"""Named counters of a transport or service."""
+"""Named counters of a transport or service.
+
+Every transport counts ``sent``, ``refused`` (not accepted), ``parked`` (retained messages waiting for a connection),
+``received``, ``delivered`` (handler calls), ``handler_errors``, ``dropped`` (by a bounded queue), ``stale`` (T8),
+``connected`` (times) and ``forgotten`` (retained messages beyond what a transport stores to send them again). MQTT adds
+``echoes`` (own retained messages that came back), ``unconfirmed`` (accepted, and lost with the connection),
+``silences`` (T19), ``subscriptions_refused``, ``publications_refused``, ``malformed``, ``too_long``, ``too_large`` and
+``withheld``; Zenoh adds ``late`` (T19).
+"""
 
 import threading
 from collections import Counter

@@ -363,7 +363,7 @@ class ServiceState(Payload, frozen=True, kw_only=True):
 class Status(Payload, frozen=True, kw_only=True):
     """A robot's general state; robots carry ``services``, other components may put anything into ``value``.
 
-    Also ``mcu`` and ``driveable`` where there are serial lines and motors: docs/architecture.md.
+    Also ``mcu`` and ``driveable`` where there are serial lines and motors: docs/topics.md.
     """
 
     t: int | UnsetType = UNSET  # epoch milliseconds

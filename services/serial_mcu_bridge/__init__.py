@@ -4,6 +4,6 @@
 ``line/``              the open port, what waits to be sent, and the stop that is sent first and last
 ``text/``              the protocol goob_base_v1 of motor boards, and their bridge: motor_bridge.py
 ``imu/``               inertial sensors, those with lines of text (imu_mpu6050_v1) and those of self-describing MCUs
-``pebble_serial_v1/``  the protocol of MCUs that describe themselves, without I/O; docs/ext/boards.md describes it
+``pebble_serial_v1/``  the protocol of MCUs that describe themselves, without I/O; docs/ext/serial-protocol.md
 ``devices/``           such MCUs as parts of a robot, and their bridge: described_bridge.py
 """

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+from queue import SimpleQueue
 
+from examples.transport import Datagrams
 from pebble.transports import Message, MqttSettings, create
 from tests.ext.recordings.playing import Line, write
-from tests.support import ROOT, Broker, Child, until
+from tests.support import ROOT, Broker, Child, free_port, until
 
 GOOB = "pebble/robots/goob"
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 
 
 def example(name: str, *arguments: object) -> list[str]:
@@ -42,3 +47,37 @@ def test_recording_counts_messages_by_topic(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap", [Line(at, topic, b"{}") for at, topic in enumerate(topics)])
     done = subprocess.run(example("recording", tmp_path / "a.mcap"), capture_output=True, text=True, check=True)
     assert [line.split() for line in done.stdout.splitlines()] == [["3", topics[0]], ["1", topics[-1]]]
+
+
+def test_the_service_publishes_on_a_topic_of_its_own(broker: Broker, tmp_path: Path) -> None:
+    config = tmp_path / "goob.json"
+    config.write_text(json.dumps({"robot": {"id": "goob"}, "local_mqtt": {"host": "127.0.0.1", "port": broker.port}}))
+    received = SimpleQueue[Message]()
+    with create("mqtt", "operator", MqttSettings(host="127.0.0.1", port=broker.port)) as operator:
+        operator.subscribe(f"{GOOB}/outgoing/uptime", received.put)
+        with Child(example("service", config), env=ENVIRONMENT) as program:
+            assert json.loads(received.get(timeout=30).payload)["seconds"] > 0
+            program.terminate()
+            assert program.wait(10) == 0
+
+
+def test_the_extension_adds_a_section_a_line_and_a_check(tmp_path: Path) -> None:
+    shutil.copy(ROOT / "examples" / "extension.py", tmp_path)
+    raw = {"robot": {"id": "goob"}, "extensions": {"extension.py": {}}, "lamp": {"watts": 20}}
+    (tmp_path / "goob.json").write_text(json.dumps(raw))
+
+    def pebble(command: str) -> str:
+        line = [sys.executable, "-m", "pebble.cli", command, "goob.json"]
+        return subprocess.run(line, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=False).stdout
+
+    assert "takes 20 W" in pebble("check")
+    assert "it empties the battery in an hour" in pebble("doctor")
+
+
+def test_the_transport_carries_messages_between_two_clients() -> None:
+    here, received = ("239.1.2.3", free_port()), SimpleQueue[Message]()
+    with Datagrams("robot", here) as robot, Datagrams("operator", here) as operator:
+        operator.subscribe("pebble/+/+/outgoing/online", received.put)
+        assert robot.publish(f"{GOOB}/outgoing/online", b"{}")
+        message = received.get(timeout=10)
+        assert (message.topic, message.payload) == (f"{GOOB}/outgoing/online", b"{}")

@@ -11,5 +11,5 @@ EXTENSION = Extension(
             "pebble.extensions.foxglove.command:foxglove", "show robots live in the Foxglove app", "use", 60
         ),
     },
-    page="docs/ext/recordings.md",
+    page="docs/ext/foxglove.md",
 )

@@ -2,4 +2,4 @@
 
 from pebble.extension import Extension
 
-EXTENSION = Extension(name="pebble_serial_v1", page="docs/ext/boards.md")
+EXTENSION = Extension(name="pebble_serial_v1", page="docs/ext/serial-protocol.md")

@@ -1,6 +1,6 @@
 """The host's side of ``pebble_serial_v1``: requests the manifest of an MCU, decodes its readings and encodes commands.
 
-Pure: bytes and clock values in, events out; the bytes to send are events too. docs/ext/boards.md describes the wire.
+Pure: bytes and clock values in, events out; the bytes to send are events too. The wire: docs/ext/serial-protocol.md.
 """
 
 import logging

@@ -6,7 +6,7 @@ import struct
 from dataclasses import dataclass, replace
 from typing import Any
 
-#: The numbers in docs/ext/boards.md.
+#: The numbers in docs/ext/serial-protocol.md.
 HELLO, DESCRIBE_REQ, DESCRIBE = 0x01, 0x02, 0x03
 SAMPLE, STATE = 0x10, 0x11
 CMD, ACK, NACK = 0x20, 0x21, 0x22

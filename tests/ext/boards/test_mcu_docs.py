@@ -1,4 +1,4 @@
-"""docs/ext/boards.md: its example is a valid manifest, and its numbers agree with the code."""
+"""docs/ext/boards.md and serial-protocol.md: the example is a valid manifest, and the numbers agree with the code."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pebble.services.serial_mcu_bridge.devices.aliases import claims
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import frame, host, manifest
 from tests.support import ROOT
 
-DOCUMENT = (ROOT / "docs/ext/boards.md").read_text()
+DOCUMENT = "".join((ROOT / "docs/ext" / name).read_text() for name in ("boards.md", "serial-protocol.md"))
 
 
 def test_the_example_is_a_valid_manifest() -> None:

@@ -218,31 +218,32 @@ def test_every_role_and_every_command_of_the_contract_is_tried() -> None:
 
 #: The rows of docs/ext/fleet.md: what is sent, below the robot or the system; ``{by}`` is the sender at level `named`.
 ROWS = {
-    "emergency stop": ["incoming/{by}estop"],
-    "emergency stop, without a name": ["incoming/estop"],
-    "drive": ["incoming/{by}drive-values", "incoming/{by}control"],
+    "emergency stop, with or without a name": ["incoming/{by}estop", "incoming/estop"],
+    "drive, also by a will or a retained command": ["incoming/{by}drive-values", "incoming/{by}control"],
     "drive, without a name": ["incoming/drive-values", "incoming/control"],
-    "drive, under another's name": [f"incoming/by/nobody/{one}" for one in ("drive-values", "control", "estop-reset")],
-    "leave a drive command as a will": ["incoming/{by}drive-values"],
-    "leave a drive command retained": ["incoming/{by}drive-values"],
+    "scripts, lights, sounds, outlets, devices, voice; allow pictures and sound": [
+        f"incoming/{{by}}{one}"
+        for one in (
+            *("autonomy-command", "lights-solid", "lights-flash", "soundboard-command", "outlets/a/power"),
+            *("mcu/u1/led", "mip-raw", "audio", "audio-stream", "flags/mqtt-video", "flags/mqtt-audio"),
+        )
+    ],
     "take control over": ["incoming/{by}control/take"],
     "reset an emergency stop": ["incoming/{by}estop-reset"],
-    "start and end scripts": ["incoming/{by}autonomy-command"],
-    "lights": ["incoming/{by}lights-solid", "incoming/{by}lights-flash"],
-    "sounds, outlets, devices": [
-        f"incoming/{{by}}{one}" for one in ("soundboard-command", "outlets/a/power", "mcu/u1/led", "mip-raw")
-    ],
     "ask for pictures": ["incoming/{by}front-camera"],
-    "listen and speak": ["incoming/{by}audio", "incoming/{by}audio-stream"],
-    "allow and forbid pictures and sound": ["incoming/{by}flags/mqtt-video", "incoming/{by}flags/mqtt-audio"],
     "reboot, restart, update, mirror": [
         f"incoming/{{by}}flags/{one}" for one in ("reboot", "service-restart", "git-pull", "remote-mirror")
     ],
-    "commands and flags that the contract does not know": ["incoming/{by}junk", "incoming/{by}flags/junk"],
-    "pose as this robot": ["outgoing/online", "outgoing/control/serial", "outgoing/junk"],
-    "pose as another or a new robot": ["pebble/robots/new/outgoing/online", "pebble/robots/new/incoming/junk"],
+    "pose as this robot, or as others who command it; commands that the contract does not know": [
+        *(f"incoming/by/nobody/{one}" for one in ("drive-values", "control", "estop-reset")),
+        *("outgoing/online", "outgoing/control/serial", "outgoing/junk"),
+        *("incoming/{by}junk", "incoming/{by}flags/junk"),
+    ],
+    "pose as another or a new robot, or as a page server": [
+        *("pebble/robots/new/outgoing/online", "pebble/robots/new/incoming/junk"),
+        "pebble/servers/x1/outgoing/online",
+    ],
     "probe a broker as a page server": ["pebble/servers/x1/outgoing/bridge-probe"],
-    "pose as a page server otherwise": ["pebble/servers/x1/outgoing/online"],
 }
 SHOWN = {
     "see what the robot publishes, and its flags": ["outgoing/online", "incoming/flags/x"],
@@ -253,10 +254,8 @@ COLUMNS = {
     "driver": "otto",
     "maintainer": "mia",
     "safety": "sam",
-    "admin": "admin",
-    "page": "page-1",
+    "admin, page": "admin",
     "the robot": "goob",
-    "another robot": "fred",
 }
 
 
@@ -266,6 +265,8 @@ def test_the_table_of_the_documentation_is_what_the_brokers_do() -> None:
     assert head == list(COLUMNS)
     table = {what: dict(zip(COLUMNS, cells, strict=True)) for what, *cells in rows}
     assert table == {what: {one: _cell(what, name) for one, name in COLUMNS.items()} for what in (*ROWS, *SHOWN)}
+    assert {what: _cell(what, "page-1") for what in table} == {what: row["admin, page"] for what, row in table.items()}
+    assert {_cell(what, "fred") for what in table} == {"–"}
 
 
 def _cell(what: str, name: str) -> str:

@@ -109,7 +109,7 @@ def _none_of(wrong: Collection[str], fix: str, fine: str, what: str = "") -> Che
 def payloads(robot: Observer) -> CheckResult:
     wrong = {record.metric: record.wrong for record in robot.records if record.wrong}
     kinds = {record.metric for record in robot.records if record.channel}
-    return _none_of(wrong.values(), "docs/topics.md has each payload", f"{len(kinds)} kinds of messages")
+    return _none_of(wrong.values(), "see `pebble topic contract --json-schema`", f"{len(kinds)} kinds of messages")
 
 
 def numbers(robot: Observer) -> CheckResult:
@@ -162,7 +162,7 @@ def capabilities(robot: Observer) -> CheckResult:
     try:
         msgspec.convert(published[-1].value.value, CapabilitiesValue)
     except (msgspec.ValidationError, ValueError, AttributeError) as error:
-        return failed(str(published[-1].wrong or error), "docs/topics.md, CapabilitiesValue, has each field")
+        return failed(str(published[-1].wrong or error), "CapabilitiesValue in `pebble topic contract --json-schema`")
     return ok(some_of(sorted(available(robot.view.capabilities)), 20) or "nothing is offered")
 
 

@@ -10,7 +10,7 @@ from pebble.contract import CHANNELS, INCOMING, Channel
 from pebble.extensions.operator.contract.schemas import schemas
 
 _DESCRIPTION: Final = (
-    "What a component of type robots, or of any other type, sends and receives; docs/topics.md says who decides what, "
+    "What a component of type robots, or of any other type, sends and receives; docs/bridge.md says who decides what, "
     "and docs/your-robot.md how to build one. send and receive are the component's."
 )
 _LEVELS: Final = {

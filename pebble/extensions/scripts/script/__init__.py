@@ -1,4 +1,4 @@
-"""Programs that move a robot by themselves: `from pebble import Robot, run`. See docs/scripts.md."""
+"""Programs that move a robot by themselves: `from pebble import Robot, run`. See docs/ext/scripts.md."""
 
 from pebble.contract import Channel, Kind
 from pebble.extensions.scripts.script.neighbour import NotGrantedError
