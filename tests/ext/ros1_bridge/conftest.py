@@ -10,16 +10,13 @@ import pytest
 
 from tests.ext.ros1_bridge.world import DEBIAN, NEEDED, Husky, World
 
-_DEBIAN = pytest.param(
-    "debian",
-    marks=[
-        pytest.mark.skipif(not os.environ.get("PEBBLE_THOROUGH"), reason="make long PART=ros1"),
-        pytest.mark.skipif(not DEBIAN, reason=f"/usr/bin/python3 cannot import {NEEDED}"),
-    ],
-)
+DEBIAN_ONLY = [
+    pytest.mark.skipif(not os.environ.get("PEBBLE_THOROUGH"), reason="make long PART=ros1"),
+    pytest.mark.skipif(not DEBIAN, reason=f"/usr/bin/python3 cannot import {NEEDED}"),
+]
 
 
-@pytest.fixture(params=["scripted", _DEBIAN])
+@pytest.fixture(params=["scripted", pytest.param("debian", marks=DEBIAN_ONLY)])
 def ros(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[World]:
     """A master and a base."""
     world = World(tmp_path, request.param)

@@ -31,6 +31,7 @@ def base():
         note("cmd", f"{message.linear.x:.6f}", f"{message.angular.z:.6f}")
 
     rospy.init_node(sys.argv[2], disable_signals=True)
+    note("up", os.getpid())
     rospy.Subscriber("/cmd_vel", Twist, moved)
     rospy.Subscriber("/e_stop", Bool, lambda message: note("estop", message.data))
     rospy.Subscriber("/move_base/cancel", GoalID, lambda _: note("cancel"))
@@ -38,7 +39,6 @@ def base():
     diagnostics = rospy.Publisher("/diagnostics_agg", DiagnosticArray, queue_size=1)
     status = rospy.Publisher("/move_base/status", GoalStatusArray, queue_size=1)
     goal = rospy.Publisher("/move_base/current_goal", PoseStamped, queue_size=1, latch=True)
-    note("up", os.getpid())
     number = 0
     while True:
         time.sleep(0.02)

@@ -22,7 +22,7 @@ NEEDED = "rosmaster, rospy, nav_msgs.msg, diagnostic_msgs.msg, actionlib_msgs.ms
 DEBIAN = (
     subprocess.run(["/usr/bin/python3", "-c", f"import {NEEDED}"], capture_output=True, check=False).returncode == 0
 )
-ROSMASTER = "import sys, rosmaster; sys.argv = ['rosmaster', '--core', '-p', '{}']; rosmaster.rosmaster_main()"
+ROSMASTER = "import rosmaster; rosmaster.rosmaster_main(['rosmaster', '--core', '-p', '{}'])"
 
 Row = tuple[int, str, list[str]]  # nanoseconds, kind, words
 
@@ -31,7 +31,7 @@ class World:
     """A master at ``uri``, and bases that write what they hear into one log."""
 
     def __init__(self, folder: Path, partner: str) -> None:
-        self.partner, self.log, self._ends = partner, folder / "base.log", ExitStack()
+        self.partner, self.log, self.ends = partner, folder / "base.log", ExitStack()
         self.log.touch()
         self.port = free_port()
         self.uri = f"http://127.0.0.1:{self.port}"
@@ -43,8 +43,8 @@ class World:
         python = [sys.executable] if self.partner == "scripted" else ["/usr/bin/python3"]
         quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         process = self.processes[name] = Child([*python, *command], env=self.environment, **quiet)
-        self._ends.callback(process.wait)
-        self._ends.callback(process.kill)
+        self.ends.callback(process.wait)
+        self.ends.callback(process.kill)
         return process
 
     def start_master(self) -> None:
@@ -90,13 +90,13 @@ class World:
         return [words[0] for _, _, words in self.rows(since, "estop")]
 
     def close(self) -> None:
-        self._ends.close()
+        self.ends.close()
 
 
 class Husky:
     """A robot with the bridge, on a thread of this process; ``world`` is its operator."""
 
-    def __init__(self, ros: World, folder: Path, **section: Any) -> None:
+    def __init__(self, ros: World, folder: Path, /, **section: Any) -> None:
         self.ros, self.folder, self.section, self.hub = ros, folder, section, MemoryHub()
         self.world = Listener(MemoryTransport("operator", self.hub), "pebble/robots/husky")
         self.config = self.read()
