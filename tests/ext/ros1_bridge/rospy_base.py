@@ -24,10 +24,10 @@ def note(*words):
 
 
 def base():
-    state = {"speed": 0.0, "x": 0.0, "goal": 0, "quiet": False}
+    state = {"speed": 0.0, "turn": 0.0, "x": 0.0, "goal": 0, "quiet": False}
 
     def moved(message):
-        state["speed"] = message.linear.x
+        state["speed"], state["turn"] = message.linear.x, message.angular.z
         note("cmd", f"{message.linear.x:.6f}", f"{message.angular.z:.6f}")
 
     rospy.init_node(sys.argv[2], disable_signals=True)
@@ -60,6 +60,7 @@ def base():
             message.child_frame_id = "base_link"
             message.pose.pose.position.x, message.pose.pose.position.y = state["x"], 0.5
             message.pose.pose.orientation.w, message.twist.twist.linear.x = 1.0, state["speed"]
+            message.twist.twist.angular.z = state["turn"]
             odometry.publish(message)
         if number % 10 == 0:
             message = GoalStatusArray()

@@ -158,7 +158,7 @@ class Base:
         self.readers: dict[str, list[socket.socket]] = {topic: [] for topic in SAYS}
         self.connected: set[tuple[str, str]] = set()
         self.lock = threading.Lock()
-        self.speed, self.x, self.goal, self.quiet = 0.0, 0.0, 0, False
+        self.speed, self.turn, self.x, self.goal, self.quiet = 0.0, 0.0, 0.0, 0, False
         api = {"publisherUpdate": self.update, "requestTopic": self.request, "getPid": lambda _: [1, "", os.getpid()],
                "shutdown": lambda *_: os._exit(0)}  # fmt: skip
         for method, function in api.items():
@@ -221,7 +221,7 @@ class Base:
                     body = receive(sock)
                     if topic == "/cmd_vel":
                         linear, *_, angular = struct.unpack("<6d", body)
-                        self.speed = linear
+                        self.speed, self.turn = linear, angular
                         self.note("cmd", f"{linear:.6f}", f"{angular:.6f}")
                     elif topic == "/e_stop":
                         self.note("estop", body == b"\x01")
@@ -254,7 +254,13 @@ class Base:
 
     def odometry(self) -> bytes:
         pose = struct.pack("<7d", self.x, 0.5, 0.0, 0.0, 0.0, 0.0, 1.0) + bytes(288)
-        return stamped("odom") + text("base_link") + pose + struct.pack("<6d", self.speed, 0, 0, 0, 0, 0) + bytes(288)
+        return (
+            stamped("odom")
+            + text("base_link")
+            + pose
+            + struct.pack("<6d", self.speed, 0, 0, 0, 0, self.turn)
+            + bytes(288)
+        )
 
     def status(self) -> bytes:
         goal = bytes(8) + text("goal-1") + struct.pack("<B", self.goal) + text("on its way")
