@@ -58,7 +58,7 @@ class Node:
     def __init__(self, name: str, master: str, host: str, on_evicted: Callable[[str], object]) -> None:
         self.name, self.master = "/" + name.strip("/"), master
         self.registered, self.problem = False, "the ROS master has not answered yet"
-        self.others: list[str] = []  # nodes that publish what this one does
+        self.others: dict[str, list[str]] = {}  # nodes that publish what this one does, by topic
         self.counters = Counters()
         self._log = RateLimitedLog(log)
         self._on_evicted = on_evicted
@@ -68,6 +68,7 @@ class Node:
         self._missing: dict[tuple[str, str], float] = {}  # since when, by topic and node
         self._revived = 0
         self._ends = threading.Event()
+        self._threads: list[threading.Thread] = []
         self._calls: queue.Queue[Callable[[], None]] = queue.Queue(_MOST_CALLS_WAITING)
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # of the thread of sockets
         self._greetings: dict[Subscriber, float] = {}  # and when they began
@@ -96,7 +97,9 @@ class Node:
         self._select.register(self._listener, selectors.EVENT_READ, self._accept)
         self._select.register(self._wakes, selectors.EVENT_READ, lambda: self._wakes.recv(4096))
         for name, run in (("sockets", self._run_sockets), ("calls", self._run_calls), ("api", self._run_api)):
-            threading.Thread(target=run, name=f"ros-{name}", daemon=True).start()
+            thread = threading.Thread(target=run, name=f"ros-{name}", daemon=True)
+            self._threads.append(thread)
+            thread.start()
 
     def close(self) -> None:
         """Let what was sent arrive, then leave the master; bounded by the time of a call."""
@@ -111,6 +114,11 @@ class Node:
                 call(self.master, "unregisterSubscriber", self.name, topic, self.uri)
         self._api.shutdown()
         self._api.server_close()
+
+    @property
+    def alive(self) -> bool:
+        """False: a thread has ended by a mistake."""
+        return all(thread.is_alive() for thread in self._threads)
 
     def dropped(self) -> dict[str, int]:
         """Return what was dropped since the start because a bound was reached, by what it was."""
@@ -185,8 +193,7 @@ class Node:
         # The name alone may be that of an earlier life of this node, which was killed.
         if self._evicted or uri != self.uri or {*self._publications} - known or {*self._subscriptions} - read:
             self._register()
-        others = [node for topic, nodes in publishers if topic in self._publications for node in nodes]
-        self.others = sorted({*others} - {self.name})
+        self.others = {topic: sorted({*nodes} - {self.name}) for topic, nodes in publishers}
         self._revive(dict(publishers), dict(subscribers))
 
     def _register(self) -> None:
@@ -234,8 +241,8 @@ class Node:
         def attempt() -> None:
             try:
                 job()
-            except (RosError, OSError, ValueError, TypeError) as error:  # answers of others, which may be anything
-                log.debug("%s", error)
+            except Exception as error:  # noqa: BLE001 - answers of others may be anything, and this thread must not end
+                log.debug("%s: %s", type(error).__name__, error)
 
         try:
             self._calls.put_nowait(attempt)

@@ -52,6 +52,12 @@ class Ros1Reader(Service):
         self.node.start()
         self.on_stop(self.node.close)
 
+    @every(_CHECK_S)
+    def check_threads(self) -> None:
+        """Raise DeviceError, which restarts this process, if a thread of it has ended."""
+        if not self.node.alive:
+            raise DeviceError("a thread of the ROS node has ended")
+
     def hear(self) -> None:
         """Note that the base has sent odometry; called on the node's thread of sockets."""
 
@@ -141,8 +147,8 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
             return "absent", None, node.problem or f"nobody subscribes to {topic}"
         if self.cmd_vel.hangs:
             return "absent", None, f"its base has sent no odometry for {SILENT_S:g} s"
-        if node.others:
-            text = f"others publish {topic} as well: {', '.join(node.others)}"
+        if others := node.others.get("/" + topic.strip("/")):
+            text = f"others publish {topic} as well: {', '.join(others)}"
             self.log_limited.warning("others", "%s", text)
             return "ready", 0 if self.cmd_vel.heard else None, text
         if not self.cmd_vel.heard:

@@ -56,7 +56,7 @@ class _Handler(SimpleXMLRPCRequestHandler):
 
     def do_POST(self) -> None:  # noqa: N802 - the library's name
         length = self.headers.get("content-length", "")
-        if not length.isdecimal() or int(length) > MOST_HEADER:
+        if not length.isdecimal() or int(length) > MOST_HEADER or "content-encoding" in self.headers:
             self.send_error(413)
             return
         super().do_POST()

@@ -14,7 +14,7 @@ import pytest
 from pebble.contract.payloads import Drive
 from pebble.services.ros1_bridge.cmd_vel import CmdVel
 from pebble.services.ros1_bridge.config import Ros1
-from pebble.services.ros1_bridge.messages import TWIST
+from pebble.services.ros1_bridge.messages import GOAL_ID, TWIST
 from pebble.services.ros1_bridge.node import Node
 from pebble.services.ros1_bridge.xmlrpc_api import call, serve
 from tests.ext.ros1_bridge.world import Husky, World
@@ -261,6 +261,7 @@ def test_others_that_drive_the_base_are_named(husky: Husky) -> None:
     """Rule 9."""
     other = node_of(husky.ros, "teleop")
     other.advertise(TOPIC, TWIST, "")
+    other.advertise("/move_base/cancel", GOAL_ID, "")  # as each client of a planner does
     other.start()
     assert until(lambda: husky.bridge.assess()[2] == "others publish /cmd_vel as well: /teleop", 5)
     assert husky.bridge.assess()[:2] == ("ready", 0)
