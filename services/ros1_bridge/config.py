@@ -267,7 +267,7 @@ def programs(config: Config) -> list[Program]:
     if not section.enabled:
         return []
     name = "ros1_bridge" if section.drives else "ros1_reader"
-    return [Program(name, _MODULE, stage=Stage.DEVICE, preloaded=False)]
+    return [Program(name, _MODULE, stage=Stage.DEVICE, entry=f"{_MODULE}.service")]
 
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
