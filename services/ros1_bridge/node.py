@@ -50,9 +50,9 @@ class Subscription:
 class Node:
     """Call :meth:`advertise` and :meth:`subscribe`, then :meth:`start`.
 
-    One thread has the sockets, one serves the API of the node, one calls the master and other nodes: none of them waits
-    for another, and no message for a call. ``on_evicted(why)`` is called, on some thread, when another node takes over
-    the name: nothing may move from then on.
+    One thread has the sockets, one serves the API of the node, one calls the master and publishers, one lost
+    subscribers: none of them waits for another, and no message for a call. ``on_evicted(why)`` is called, on some
+    thread, when another node has the name: nothing may move from then on.
     """
 
     def __init__(self, name: str, master: str, host: str, on_evicted: Callable[[str], object]) -> None:
@@ -66,6 +66,8 @@ class Node:
         self._publications: dict[str, Publication] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._missing: dict[tuple[str, str], float] = {}  # since when, by topic and node
+        self._lost: dict[tuple[str, str], list[str]] = {}  # whom to tell, and the publishers
+        self._is_lost = threading.Event()
         self._revived = 0
         self._ends = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -96,8 +98,8 @@ class Node:
     def start(self) -> None:
         self._select.register(self._listener, selectors.EVENT_READ, self._accept)
         self._select.register(self._wakes, selectors.EVENT_READ, lambda: self._wakes.recv(4096))
-        for name, run in (("sockets", self._run_sockets), ("calls", self._run_calls), ("api", self._run_api)):
-            thread = threading.Thread(target=run, name=f"ros-{name}", daemon=True)
+        for run in (self._run_sockets, self._run_calls, self._run_lost, self._run_api):
+            thread = threading.Thread(target=run, name=f"ros{run.__name__}", daemon=True)
             self._threads.append(thread)
             thread.start()
 
@@ -106,6 +108,7 @@ class Node:
         for publication in self._publications.values():
             publication.finish()
         self._ends.set()
+        self._is_lost.set()
         self._wake()
         with suppress(RosError):  # if one call fails, the others wait in vain, too
             for topic in self._publications:
@@ -139,12 +142,16 @@ class Node:
 
     def evict(self, why: str) -> None:
         """Another node has this name now: move nothing, and wait until it has gone."""
-        self._evicted, self.registered = True, False
         self.problem = f"the ROS master has ended this node: {why}"
         log.error("%s", self.problem)
-        self._on_evicted(why)
+        self._rest()
+
+    def _rest(self) -> None:
+        """Let no subscriber hear this node until it is registered again."""
+        self._evicted, self.registered = True, False
+        self._on_evicted(self.problem)
         for publication in self._publications.values():
-            publication.remove_all("this node was ended")
+            publication.remove_all("another node has this name")
 
     def published(self) -> list[list[str]]:
         return [[topic, publication.form.kind] for topic, publication in self._publications.items()]
@@ -164,13 +171,14 @@ class Node:
                 self._check()
                 due = time.monotonic() + CHECK_S
             with suppress(queue.Empty):
-                self._calls.get(timeout=max(0.0, due - time.monotonic()))()
+                self._attempt_call(self._calls.get(timeout=max(0.0, due - time.monotonic())))
 
     def _check(self) -> None:
         """Register, or again: a master that restarts has forgotten everything."""
         try:
             self._look()
-            self.registered, self.problem = True, ""
+            self.registered = not self._evicted
+            self.problem = "" if self.registered else self.problem
         except RosError as error:
             if str(error) != self.problem:
                 log.warning("the ROS master: %s", error)
@@ -187,6 +195,8 @@ class Node:
         publishers, subscribers, _ = call(self.master, "getSystemState", self.name)
         uri = self._uri_of(self.name)
         if uri not in ("", self.uri) and lives(uri):
+            if not self._evicted:
+                self._rest()
             raise RosError(f"another node is called {self.name}: {uri}")  # to register would end it
         known = {topic for topic, nodes in publishers if self.name in nodes}
         read = {topic for topic, nodes in subscribers if self.name in nodes}
@@ -199,11 +209,15 @@ class Node:
     def _register(self) -> None:
         self._evicted = False
         for topic, publication in self._publications.items():
-            call(self.master, "registerPublisher", self.name, topic, publication.form.kind, self.uri)
+            self._register_as("registerPublisher", topic, publication.form)
         for topic, subscription in self._subscriptions.items():
-            form = subscription.form
-            self.publishers_are(topic, call(self.master, "registerSubscriber", self.name, topic, form.kind, self.uri))
+            self.publishers_are(topic, self._register_as("registerSubscriber", topic, subscription.form))
         log.info("registered at the ROS master %s", self.master)
+
+    def _register_as(self, method: str, topic: str, form: Form) -> Any:
+        if self._evicted:  # by another one that registers at the same time: to go on would end it
+            raise RosError(self.problem)
+        return call(self.master, method, self.name, topic, form.kind, self.uri)
 
     def _uri_of(self, node: str) -> str:
         try:
@@ -222,8 +236,19 @@ class Node:
         for (topic, node), since in missing.items():
             if now - since >= REVIVE_S:
                 missing[topic, node] = now
-                self._call_soon(lambda topic=topic, node=node: self._tell(topic, node, publishers.get(topic, [])))
+                self._lost[topic, node] = publishers.get(topic, [])
         self._missing = missing
+        self._is_lost.set()
+
+    def _run_lost(self) -> None:
+        while not self._ends.is_set():
+            self._is_lost.wait()
+            self._is_lost.clear()
+            while self._lost and not self._ends.is_set():
+                (topic, node), publishers = self._lost.popitem()
+                self._attempt_call(
+                    lambda topic=topic, node=node, publishers=publishers: self._tell(topic, node, publishers)
+                )
 
     def _tell(self, topic: str, node: str, publishers: list[str]) -> None:
         uri = self._uri_of(node)
@@ -238,18 +263,18 @@ class Node:
             source.asked = False
 
     def _call_soon(self, job: Callable[[], None]) -> bool:
-        def attempt() -> None:
-            try:
-                job()
-            except Exception as error:  # noqa: BLE001 - answers of others may be anything, and this thread must not end
-                log.debug("%s: %s", type(error).__name__, error)
-
         try:
-            self._calls.put_nowait(attempt)
+            self._calls.put_nowait(job)
         except queue.Full:
             self._refuse("waiting calls", "calls of other nodes that waited")
             return False
         return True
+
+    def _attempt_call(self, job: Callable[[], None]) -> None:
+        try:
+            job()
+        except Exception as error:  # noqa: BLE001 - answers of others may be anything, and this thread must not end
+            log.debug("%s: %s", type(error).__name__, error)
 
     def _connect(self, subscription: Subscription, source: Source) -> None:
         """Ask a publisher where it sends its topic, and connect to that."""

@@ -14,7 +14,7 @@ import pytest
 from pebble.contract.payloads import Drive
 from pebble.services.ros1_bridge.cmd_vel import CmdVel
 from pebble.services.ros1_bridge.config import Ros1
-from pebble.services.ros1_bridge.messages import GOAL_ID, TWIST
+from pebble.services.ros1_bridge.messages import GOAL_ID, GOAL_STATUS, TWIST
 from pebble.services.ros1_bridge.node import Node
 from pebble.services.ros1_bridge.xmlrpc_api import call, serve
 from tests.ext.ros1_bridge.world import Husky, World
@@ -216,14 +216,23 @@ def test_a_subscriber_that_is_not_connected_is_told_again(ros: World) -> None:
         def address_of(self, topic: str) -> None:
             return None
 
+    hung = socket.create_server(("127.0.0.1", 0))  # it answers no call, which must not keep others waiting
+    call(ros.uri, "registerSubscriber", "/hung", TOPIC, TWIST.kind, f"http://127.0.0.1:{hung.getsockname()[1]}/")
     deaf = serve(Deaf(), "127.0.0.1", lambda: None)  # type: ignore[arg-type]  # it is asked for nothing else
     threading.Thread(target=deaf.serve_forever, daemon=True).start()
     call(ros.uri, "registerSubscriber", "/deaf", TOPIC, TWIST.kind, f"http://127.0.0.1:{deaf.server_address[1]}/")
     node.advertise(TOPIC, TWIST, "")
+    heard = threading.Event()
+    node.subscribe("/move_base/status", GOAL_STATUS, lambda _body: heard.set())
     node.start()
     assert until(lambda: any(uri.startswith(node.uri) and uri != node.uri for uri in told), 8), told
+    ros.kill("base")
+    heard.clear()
+    ros.start_base()
+    assert heard.wait(5), "a publisher is connected to meanwhile"
     node.close()
     deaf.shutdown()
+    hung.close()
 
 
 def test_of_two_bridges_with_one_name_the_second_waits(husky: Husky) -> None:
