@@ -18,6 +18,7 @@ make long PART=looks      store anew how the page looks, for PART=page to compar
 make long PART=fleet      brokers and hubs that are killed, hung and cut off under driven robots and 300 boards, 16 minutes
 make long PART=brokers    install NATS, RabbitMQ and aedes where possible, test robots with them, judge them, seven minutes
 make long PART=gstreamer  install GStreamer and OpenCV, and have them read the original's local media, three minutes
+make long PART=ros1       install Debian's rosmaster, rospy and roscpp where possible, and test the bridge with them, four minutes
 make long PART=firmware   measure the firmware's use of each board's memory in the real MicroPython
 make long PART=life       install, update, damage and remove packages on machines with a real systemd; root, 15 minutes
 make long PART=lowest     core, films, Foxglove and the demo with the lowest versions that pyproject.toml admits, ten minutes
@@ -54,6 +55,13 @@ gstreamer)
         debian =gstreamer1.0-plugins-base =gstreamer1.0-plugins-bad
     /usr/bin/python3 -c "import cv2, paho.mqtt.client" 2>/dev/null || debian =python3-opencv =python3-paho-mqtt
     tests tests/examples/test_gstreamer_sockets.py
+    ;;
+ros1)
+    { [ -x /usr/lib/topic_tools/relay ] &&
+        /usr/bin/python3 -c "import rosmaster, rospy, nav_msgs, diagnostic_msgs, actionlib_msgs" 2>/dev/null; } ||
+        debian =topic-tools =python3-rosmaster =python3-rospy =python3-nav-msgs =python3-diagnostic-msgs \
+            =python3-actionlib-msgs
+    tests -ra tests/ext/ros1_bridge
     ;;
 firmware) tests --log-cli-level=INFO tests/firmware/test_heap.py ;;
 life)

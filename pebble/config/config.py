@@ -8,7 +8,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-import msgspec
 from msgspec import defstruct
 from msgspec.structs import asdict, fields, replace
 
@@ -22,9 +21,8 @@ from pebble.config.reader import Check, Reader, Rule
 from pebble.config.rules.between_keys import CHECKS
 from pebble.config.rules.exposure import warn_if_readable
 from pebble.config.tree import Root, SerialBridge, Services, tree_of
-from pebble.config.types import Section, Topic
+from pebble.config.types import Section
 from pebble.config.visible import is_text, shown
-from pebble.contract import DRIVE
 from pebble.contract.identity import Identity
 from pebble.contract.serial_protocols import OF_CORE, SERIAL_PROTOCOLS
 from pebble.errors import ConfigError
@@ -101,17 +99,6 @@ class Config(Root, frozen=True, kw_only=True):
         """Return the enabled serial lines that drive motors."""
         lines = self.serial_instances().items()
         return {name: line for name, line in lines if SERIAL_PROTOCOLS[line.protocol].drives}
-
-    @property
-    def zeros(self) -> tuple[str, ...]:
-        """The drive topics of what moves the robot and cannot latch: to it a stop is a zero."""
-        ros = self.services.ros1_bridge
-        if not ros.get("enabled") or not _object(ros, "drive").get("enabled", True):
-            return ()
-        try:
-            return (msgspec.convert(_object(ros, "topics").get("drive_values"), Topic),)
-        except msgspec.ValidationError:  # it names none, or one that no message may have
-            return (DRIVE.topic(self.base),)
 
     def on_demand_programs(self) -> tuple[str, ...]:
         """Return the programs that the bridge may request: they run while operators want their pictures or sound."""
@@ -330,9 +317,3 @@ def resolved(config: Config) -> dict[str, Any]:
             "serial_instances": list(config.serial_instances()),
         }
     }
-
-
-def _object(section: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """Return the object at ``key`` of a section that is not checked; empty where something else is."""
-    value = section.get(key)
-    return value if isinstance(value, dict) else {}

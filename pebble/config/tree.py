@@ -263,7 +263,6 @@ class Services(Section, frozen=True, kw_only=True):
     defaults: Annotated[Defaults, doc("Values for several services.")] = Defaults()
     launcher: Annotated[Launcher, doc("Starts the others.")] = Launcher()
     mqtt_bridge: Annotated[MqttBridge, doc("Connection to operators.")] = MqttBridge()
-    ros1_bridge: Annotated[dict[str, Any], doc("The original's connection to ROS 1: read, and not used.")] = EMPTY
     serial_mcu_bridge: Annotated[SerialBridge, doc("Serial line to the motor MCU.")] = SerialBridge()
 
 

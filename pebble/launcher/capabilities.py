@@ -76,14 +76,14 @@ def _motor(
 ) -> tuple[offers.DriveOffer, offers.EstopOffer, offers.LightsOffer, offers.TelemetryOffer]:
     """Return drive, stop, lights and telemetry of the serial line to the motor MCU, with its effective topics."""
     lines, owned = config.motor_lines(), bool(config.motor_owners)
-    present, moves = bool(lines), owned or bool(config.zeros)
+    present = bool(lines)
     name, line = next(iter(lines.items())) if lines else ("", config.services.serial_mcu_bridge)
     if name:
         addresses = Addresses(view_of(config, name))
     drive = offers.DriveOffer(
-        available=moves,
-        controls=moves,
-        topic=addresses[c.DRIVE].topic if owned or not config.zeros else config.zeros[0],
+        available=owned,
+        controls=owned,
+        topic=addresses[c.DRIVE].topic,
         arbitrates=owned or UNSET,
         axes=["x", "z"] if owned else UNSET,  # a line has speeds of two wheels
         control=(owned and "control" not in lacking) or UNSET,
@@ -118,7 +118,6 @@ def _estop(config: Config, owners: list[str]) -> offers.EstopOffer:
         reset_topic=c.ESTOP_RESET.topic(config.base),
         owners=owners,
         status_topics=[c.ESTOP_STATE.topic(config.base, owner=owner) for owner in owners],
-        zeros=list(config.zeros) or UNSET,
     )
 
 

@@ -85,6 +85,11 @@ class MotorOwner(Service, ABC):
         """Seconds for which a drive command is valid."""
         return 0.75
 
+    @property
+    def latched(self) -> bool:
+        """True while an emergency stop lasts, for hardware with a lock of its own; it changes in :meth:`judge`."""
+        return self._guard.latched
+
     @abstractmethod
     def move(self, drive: Drive, valid_s: float) -> None:
         """Move the motors: ``drive.x`` steers and ``drive.z`` is the throttle, both -1..1; for ``valid_s`` seconds."""

@@ -196,11 +196,6 @@ class TestOriginal:
         own = read({"robot": {"id": "goob"}}).services
         assert (own.av_daemon.sockets(), own.serial_mcu_bridge.odometry_shm) == ({}, None), "only where it is written"
 
-    def test_services_of_later_releases_are_skipped_with_a_warning_each(self) -> None:
-        enabled = {"services": {"ros1_bridge": {"enabled": True}}}
-        later = [line for line in read({"robot": {"id": "goob"}} | enabled).warnings if "later release" in line]
-        assert [line.partition(":")[0] for line in later] == ["services.ros1_bridge"]
-
     def test_its_page_for_other_machines_needs_a_certificate(self) -> None:
         config = load(ORIGINAL, env={})
         (warning,) = [line for line in config.warnings if line.startswith("web_interface")]
@@ -786,7 +781,7 @@ class TestPasswords:
         assert warning == "local_mqtt.password: is not sent: there is no username"
 
     def test_passwords_in_addresses_and_settings_are_hidden_too(self) -> None:
-        raw = at("services.ros1_bridge.uri", f"mongodb://me:{self.SECRET.split()[0]}@db.example/x")
+        raw = at("services.ros1_bridge.heartbeat.uri", f"mongodb://me:{self.SECRET.split()[0]}@db.example/x")
         raw["transport"] = {"kind": "other", "settings": {"api_token": "t0k3n", "list": [{"secret": "s3cret"}]}}
         shown = json.dumps(resolved(read(raw)))
         assert "mongodb://***@db.example/x" in shown

@@ -71,7 +71,7 @@ class TestOurs:
             target[name] = NEEDED.get(key, {}) | ({"enabled": True} if issubclass(part(place), ServiceSection) else {})
         config = parse(raw, folder=tmp_path, env={})
         names = [program.name for program in programs_of([extension], config)]
-        assert names == ([extension.program.name] if extension.program else [])
+        assert names == ([extension.program.name] if extension.program else [*extension.motors.values()])
 
 
 def test_to_declare_costs_a_robot_nothing() -> None:

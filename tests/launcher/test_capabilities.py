@@ -148,8 +148,7 @@ OFFERS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         {"serial_mcu_bridge": MOTOR},
         {**MOVES, "drive.arbitrates": True, "drive.control": True, "drive.axes": ["x", "z"], "estop.available": True,
          "estop.owners": ["serial"], "estop.status_topics": [f"{BASE}/outgoing/estop/serial"], "lights.solid": True,
-         "lights.flash": True, "telemetry.charging_status": True, "telemetry.touch_sensors": False,
-         "estop.zeros": None},
+         "lights.flash": True, "telemetry.charging_status": True, "telemetry.touch_sensors": False},
     ),
     "no control": ({"serial_mcu_bridge": MOTOR, "lacking": {"control"}}, {**MOVES, "drive.control": None}),
     "touch sensors, when they are published": (
@@ -169,22 +168,14 @@ OFFERS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         {**MOVES, "estop": {"available": False, "topic": f"{BASE}/incoming/estop", "owners": [], "status_topics": [],
                             "reset_topic": f"{BASE}/incoming/estop-reset"}},
     ),
-    "ROS": ({"ros1_bridge": OFF}, {"drive.available": False, "estop.zeros": None}),
-    "ROS that drives nothing": (
-        {"ros1_bridge": {"enabled": True, "drive": OFF}}, {"drive.available": False, "estop.zeros": None},
-    ),
+    "ROS": ({"ros1_bridge": OFF}, {"drive.available": False}),
+    "ROS that drives nothing": ({"ros1_bridge": {"enabled": True, "drive": OFF}}, {"drive.available": False}),
     "ROS that drives": (
         {"ros1_bridge": ON},
-        {**MOVES, "drive.arbitrates": None, "estop.owners": [], "estop.zeros": [f"{BASE}/incoming/drive-values"]},
+        {**MOVES, "drive.arbitrates": True, "drive.axes": ["x", "z"], "estop.owners": ["ros1"], "lights.solid": False,
+         "telemetry.wheel_odometry": True, "telemetry.charging_status": False},
     ),
-    "ROS that drives elsewhere": (
-        {"ros1_bridge": {"enabled": True, "topics": {"drive_values": "a/b"}}},
-        {**MOVES, "drive.topic": "a/b", "estop.zeros": ["a/b"]},
-    ),
-    "ROS beside a motor": (
-        {"serial_mcu_bridge": MOTOR, "ros1_bridge": ON},
-        {**MOVES, "estop.owners": ["serial"], "estop.zeros": [f"{BASE}/incoming/drive-values"]},
-    ),
+    "ROS beside a motor": ({"serial_mcu_bridge": MOTOR, "ros1_bridge": ON}, {"estop.owners": ["serial", "ros1"]}),
     "sounds": ({"soundboard_handler": ON}, {"soundboard.available": True, "soundboard.controls": True}),
     "scripts": ({"autonomy_manager": ON}, {"autonomy.available": True, "autonomy.controls": True}),
     "camera and microphone": (

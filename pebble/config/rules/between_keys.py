@@ -12,7 +12,7 @@ from pebble.config.rules.exposure import warn_if_readable, warn_of_known_id, war
 from pebble.config.rules.shared_topics import shared_topics
 from pebble.config.text_files import NotTextError, text_of
 from pebble.config.transport import Mqtt, RemoteMqtt, Tls, TransportSection
-from pebble.config.tree import MqttBridge, Root, SerialBridge, Services
+from pebble.config.tree import MqttBridge, Root, SerialBridge
 from pebble.config.types import Secret
 from pebble.contract.identity import GATEWAYS, SERVERS
 from pebble.errors import PebbleError
@@ -76,15 +76,6 @@ def _transport(reader: Reader, transport: TransportSection, path: Path) -> Trans
             "write the authority that signs the certificates of those who may",
         )
     return transport
-
-
-def _services(reader: Reader, services: Services, path: Path) -> Services:
-    if services.ros1_bridge.get("enabled"):
-        reader.notes.warning(
-            (*path, "ros1_bridge"),
-            "is enabled, but arrives in a later release; skipped, and a stop sends zeros to one that runs",
-        )
-    return services
 
 
 def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
@@ -240,7 +231,6 @@ def _contents(reader: Reader, file: FilePath, path: Path) -> str | None:
 CHECKS: tuple[Rule, ...] = (
     (Root, _root),
     (TransportSection, _transport),
-    (Services, _services),
     (MqttBridge, _bridge),
     (SerialBridge, _serial),
     (Tls, _tls),

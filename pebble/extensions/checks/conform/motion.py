@@ -32,25 +32,29 @@ from pebble.extensions.checks.observer import ANSWER_S, Observer
 RESTS_S = 0.75  # after the last command, at the latest
 LATE_S = 0.5  # until a report of it is here
 _SWING = 30  # of a hall sensor's value: less is noise
+_HALF_TRACK_M = 0.25  # of wheels that are known by odometry: only their signs are judged
 _OTHER_KEY, _OTHER_ACCOUNT = "0badf00d", "conform-other"
 _NOT_SHOWN = skipped(
     "nothing that it publishes shows whether it moves",
-    'publish {"value": {"wheels": [left, right]}} on outgoing/status whenever they change, or touch-sensors',
+    'publish {"value": {"wheels": [left, right]}} on outgoing/status whenever they change, touch-sensors or odometry',
 )
 
 
 def moves_until(robot: Observer, since: float) -> float | None:
     """Return when the last motion after ``since`` ended: infinite while it lasts, 0 without any, None if none is shown.
 
-    It is shown by ``wheels`` in the status, which is published on change, or by readings of hall sensors.
+    It is shown by ``wheels`` in the status, which is published on change, by readings of hall sensors, or by speeds of
+    odometry.
     """
     reports = _shown(robot)
     readings = [(record.at, record.value.value) for record in robot.of(c.TOUCH_SENSORS) if record.value]
-    if not reports and not readings:
+    travelled = _travelled(robot)
+    if not reports and not readings and not travelled:
         return None
     ends = [*(at for at, _ in reports[1:]), inf]  # a report holds until the next one
     turns = [end for (_, wheels), end in zip(reports, ends, strict=False) if any(wheels)]
-    return max((at for at in (*turns, *_swings(readings)) if at > since), default=0.0)
+    moved = (at for at, wheels in travelled if any(wheels))
+    return max((at for at in (*turns, *_swings(readings), *moved) if at > since), default=0.0)
 
 
 def _swings(readings: list[tuple[float, Any]]) -> Iterator[float]:
@@ -70,15 +74,28 @@ def _shown(robot: Observer) -> list[tuple[float, list[float]]]:
     return robot.eyes() or [(at, wheels) for at, wheels in reports if _are_wheels(wheels)]
 
 
+def _travelled(robot: Observer) -> list[tuple[float, list[float]]]:
+    """Return what its wheels did by its odometry, left and right, in metres a second."""
+    found = []
+    for record in robot.of(c.WHEEL_ODOMETRY):
+        value = record.value.value if record.value else {}
+        ahead, turn = value.get("linear_speed_mps"), value.get("angular_speed_radps")
+        if _are_wheels([ahead, turn]):
+            ahead, turn = round(ahead, 2), _HALF_TRACK_M * round(turn, 2)
+            found.append((record.at, [ahead - turn, ahead + turn]))
+    return found
+
+
 def _moves(robot: Observer, since: float) -> list[float] | None:
     """Return what its wheels do by commands since then; empty: nothing, None: it is not shown."""
 
     def moving() -> list[float]:
-        return next((wheels for at, wheels in reversed(_shown(robot)) if at >= since and any(wheels)), [])
+        shown = _shown(robot) or _travelled(robot)
+        return next((wheels for at, wheels in reversed(shown) if at >= since and any(wheels)), [])
 
     robot.wait(moving, ANSWER_S)
     robot.look(LATE_S)
-    return moving() if _shown(robot) else None
+    return moving() if _shown(robot) or _travelled(robot) else None
 
 
 def _are_wheels(value: Any) -> bool:
@@ -212,7 +229,7 @@ def _not_a_number(robot: Observer, _driver: Driver) -> CheckResult:
 
 def _clamped(robot: Observer, driver: Driver) -> CheckResult:
     wheels = _moves(robot, driver.drive(DRIVES_S / 2, z=9, x=-9)[0])
-    if wheels is None:
+    if wheels is None or not _shown(robot):
         return _NOT_SHOWN
     if not wheels:
         return failed("x -9, z 9 does not move it", "clamp both axes to -1..1, and obey")

@@ -1,0 +1,194 @@
+"""What the base is sent: the newest command again and again while it is valid, then zeros.
+
+While it is stopped: zeros and a lock. It has a deadline and a thread of its own: a service that hangs moves nothing.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.services.ros1_bridge import messages
+from pebble.services.ros1_bridge.node import Node
+
+log = logging.getLogger(__name__)
+
+ZERO = messages.twist(0.0, 0.0)
+ZEROS = 5  # after the last command; then silence, so that other programs of ROS may drive
+LATCHED_S = 0.1  # between two zeros while stopped
+SILENT_S = 1.0  # a base that sent odometry, and sends none for so long, hangs
+_PERIOD_S = 0.05  # between two repetitions, where the config says 0
+_CANCEL_S = 1.0  # between two cancellations of a navigation that goes on
+_END_S = 1.0  # longest wait for the thread at the end
+
+
+class CmdVel:
+    """Its methods may be called on any thread. ``save(owed)`` keeps whether the lock is still to be opened.
+
+    ``owed``: as an earlier life of this process saved it. One that never set the lock never opens it.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        period_s: float,
+        estop_topic: str | None,
+        cancel_topic: str | None,
+        *,
+        owed: bool = False,
+        save: Callable[[bool], object] = lambda _owed: None,
+    ) -> None:
+        definition = "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n"
+        self._out = node.advertise(topic, messages.TWIST, definition)
+        self._lock = node.advertise(estop_topic, messages.BOOL, "bool data\n") if estop_topic else None
+        self._goals = (
+            node.advertise(cancel_topic, messages.GOAL_ID, "time stamp\nstring id\n") if cancel_topic else None
+        )
+        self._period_s, self._save = period_s or _PERIOD_S, save
+        self._changed = threading.Condition()
+        self._body, self._until, self._zeros = ZERO, 0.0, ZEROS
+        self._latched, self._opens, self._owed = False, owed, owed
+        self._heard_at: float | None = None
+        self._cancelled_at = float("-inf")
+        self._ends = False
+        self._log = RateLimitedLog(log)
+        self.held_back = 0  # moves that a hung base did not get
+        self._out.first = lambda: ZERO
+        if self._lock is not None:
+            self._lock.first = self._first_lock
+        self._thread = threading.Thread(target=self._run, name="ros-cmd-vel", daemon=True)
+
+    def open(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        """Send a zero, and nothing after it."""
+        with self._changed:
+            self._ends = True
+            self._out.send(ZERO)
+            self._changed.notify()
+        self._thread.join(_END_S)
+
+    @property
+    def alive(self) -> bool:
+        """False: nothing is repeated any more."""
+        return self._thread.is_alive()
+
+    @property
+    def bases(self) -> set[str]:
+        """The nodes that listen."""
+        return self._out.names
+
+    @property
+    def heard(self) -> bool:
+        """True if the base has ever sent odometry."""
+        return self._heard_at is not None
+
+    @property
+    def hangs(self) -> bool:
+        """True if the base has sent odometry, and does not any more."""
+        return self._heard_at is not None and time.monotonic() - self._heard_at > SILENT_S
+
+    def hear(self) -> None:
+        """Note that the base has sent odometry."""
+        self._heard_at = time.monotonic()
+
+    def drive(self, linear: float, angular: float, valid_s: float) -> None:
+        """Move the base for ``valid_s`` seconds. A speed that is no finite number stops it."""
+        try:
+            body = messages.twist(linear, angular)
+        except ValueError:
+            self._log.warning("not finite", "a speed is no finite number: the base is stopped")
+            self.halt()
+            return
+        with self._changed:
+            if self._latched or self._ends:
+                return
+            self._body, self._until, self._zeros = body, time.monotonic() + valid_s, ZEROS
+            self._send()
+            self._changed.notify()
+
+    def halt(self) -> None:
+        """Stop the base now."""
+        with self._changed:
+            self._body, self._until, self._zeros = ZERO, 0.0, ZEROS
+            if not self._ends:
+                self._out.send(ZERO)
+            self._changed.notify()
+
+    def latch(self, latched: bool) -> None:
+        """Hold the base: the running command is over, others of ROS are locked out and their goals are cancelled."""
+        with self._changed:
+            if latched is self._latched:
+                return
+            self._latched = latched
+            self._body, self._until, self._zeros = ZERO, 0.0, ZEROS
+            self._out.send(ZERO)
+            self._opens = True
+            self._owe(True)
+            if latched:
+                self._cancel()
+            self._send_lock()
+            self._changed.notify()
+
+    def cancel_navigation(self) -> None:
+        """Cancel the goals of the planner, once a second at most."""
+        with self._changed:
+            if time.monotonic() - self._cancelled_at >= _CANCEL_S:
+                self._log.log("cancel", logging.INFO, "a person drives: the goals of the planner are cancelled")
+                self._cancel()
+
+    def _cancel(self) -> None:
+        self._cancelled_at = time.monotonic()
+        if self._goals is not None:
+            self._goals.send(messages.CANCEL_ALL)
+
+    def _owe(self, owed: bool) -> None:
+        if self._lock is not None and owed is not self._owed:
+            self._owed = owed
+            self._save(owed)
+
+    def _first_lock(self) -> bytes | None:
+        """Return what a new subscriber of the lock gets; called on the thread of sockets."""
+        if not self._opens:
+            return None
+        if not self._latched:
+            self._owe(False)
+        return messages.boolean(self._latched)
+
+    def _send_lock(self) -> None:
+        if self._lock is not None and self._lock.send(messages.boolean(self._latched)) and not self._latched:
+            self._owe(False)
+
+    def _send(self) -> None:
+        if self._body != ZERO and self.hangs:
+            self.held_back += 1
+            self._log.warning("hangs", "the base sends no odometry: it gets zeros instead of commands")
+            self._body, self._until = ZERO, 0.0
+        self._out.send(self._body)
+
+    def _run(self) -> None:
+        with self._changed:
+            while not self._ends:
+                self._changed.wait(self._wait_s(time.monotonic()))
+                if self._ends:
+                    return
+                if time.monotonic() < self._until:
+                    self._send()
+                elif self._latched or self._zeros > 0 or self._body != ZERO:
+                    self._body, self._zeros = ZERO, max(0, self._zeros - 1)
+                    self._out.send(ZERO)
+                    if self._latched:
+                        self._send_lock()
+
+    def _wait_s(self, now: float) -> float | None:
+        """Return how long nothing is to be sent; None: until something changes."""
+        if now < self._until:
+            return min(self._period_s, self._until - now)
+        if self._zeros > 0 or self._body != ZERO:
+            return self._period_s if self._body == ZERO else 0.0
+        return LATCHED_S if self._latched else None

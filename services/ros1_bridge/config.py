@@ -1,0 +1,302 @@
+"""The config section of a base with ROS 1, with the original's keys."""
+
+import os
+from collections.abc import Iterator
+from typing import Annotated, Any
+from urllib.parse import urlsplit
+
+from msgspec import UNSET, Meta
+from msgspec.structs import replace
+
+from pebble import contract as c
+from pebble.config import Config
+from pebble.config.hosts import is_loopback
+from pebble.config.problems import Notes, Path
+from pebble.config.reader import Reader, Rule
+from pebble.config.tree import Root
+from pebble.config.types import EMPTY, EXACT, Host, LogLevel, Section, Topic, doc
+from pebble.contract.capabilities import CapabilitiesValue, TelemetryOffer
+from pebble.contract.identity import Identity
+from pebble.extension import Facts, Program, Stage
+
+NONE = "none"
+_PATH: Path = ("services", "ros1_bridge")
+_MODULE = "pebble.services.ros1_bridge"
+
+RosName = Annotated[
+    str, Meta(pattern=r"^/?[A-Za-z]\w*(/[A-Za-z]\w*)*$(?!\n)", extra={"expected": "a name of ROS such as /cmd_vel"})
+]
+MasterUri = Annotated[
+    str,
+    Meta(
+        pattern=r"^http://[A-Za-z0-9._-]+:\d{1,5}/?$(?!\n)",
+        extra={"expected": 'the address of a ROS master such as "http://192.168.1.7:11311"'},
+    ),
+    EXACT,
+]
+Period = Annotated[float, Meta(ge=0.05, le=3600)]
+
+#: The channel of each metric, by the original's key.
+CHANNELS = {
+    "wheel_odometry": c.WHEEL_ODOMETRY,
+    "localization_pose": c.LOCALIZATION_POSE,
+    "navigation_status": c.NAVIGATION_STATUS,
+    "navigation_goal": c.NAVIGATION_GOAL,
+    "navigation_local_plan": c.NAVIGATION_LOCAL_PLAN,
+    "navigation_global_plan": c.NAVIGATION_GLOBAL_PLAN,
+    "diagnostics": c.DIAGNOSTICS,
+    "charging_level": c.CHARGING_LEVEL,
+    "charging_status": c.CHARGING_STATUS,
+}
+
+
+class Driving(Section, frozen=True, kw_only=True):
+    """Driving the base."""
+
+    enabled: Annotated[bool, doc("Drive it; false: only its telemetry is read, and nothing is sent.")] = True
+    cancels_navigation: Annotated[
+        bool, doc("A person who drives cancels the goals of a planner, which a multiplexer may prefer to people.")
+    ] = True
+
+
+class Ros(Section, frozen=True, kw_only=True):
+    """The node, and the names of its topics in ROS."""
+
+    master_uri: Annotated[
+        MasterUri | None, doc("Unset: `ROS_MASTER_URI` of the environment, else http://127.0.0.1:11311.")
+    ] = None
+    host: Annotated[
+        Host | None,
+        EXACT,
+        doc("Where other nodes reach this one; unset: `ROS_IP` or `ROS_HOSTNAME`, else this machine alone."),
+    ] = None
+    node_name: Annotated[RosName, doc("The name of the node.")] = "pebble_ros1_bridge"
+    cmd_vel_topic: Annotated[RosName, doc("What the base obeys.")] = "/cmd_vel"
+    cmd_vel_publish_interval_seconds: Annotated[
+        float, Meta(ge=0, le=1), doc("How often a command is repeated while it is valid; 0: every 0.05 s.")
+    ] = 0.05
+    estop_topic: Annotated[
+        RosName, doc('The lock of its multiplexer, a Bool: true while a stop lasts. "none": there is none.')
+    ] = "/e_stop"
+    cancel_topic: Annotated[RosName, doc('Where goals are cancelled; "none": nowhere.')] = "/move_base/cancel"
+    odometry_topic: Annotated[RosName, doc("Its odometry: without it the base is taken for hung.")] = (
+        "/odometry/filtered"
+    )
+    navigation_status_topic: Annotated[RosName, doc("What its planner does.")] = "/move_base/status"
+    navigation_goal_topic: Annotated[RosName, doc("Where its planner goes.")] = "/move_base/current_goal"
+    navigation_local_plan_topic: Annotated[RosName, doc("The next steps.")] = (
+        "/move_base/TrajectoryPlannerROS/local_plan"
+    )
+    navigation_global_plan_topic: Annotated[RosName, doc("The whole route.")] = "/move_base/NavfnROS/plan"
+    diagnostics_topic: Annotated[RosName, doc("Its diagnostics, and its battery.")] = "/diagnostics_agg"
+
+
+class Motion(Section, frozen=True, kw_only=True):
+    """What a stick at its end means."""
+
+    max_linear_speed_mps: Annotated[float, Meta(ge=0, le=20), doc("Metres a second ahead.")] = 0.6
+    max_angular_speed_radps: Annotated[float, Meta(ge=0, le=20), doc("Radians a second.")] = 1.2
+
+
+class Safety(Section, frozen=True, kw_only=True):
+    """When the base is stopped."""
+
+    drive_timeout_seconds: Annotated[
+        float,
+        Meta(gt=0, le=5),
+        doc("No drive command for this long: stop. A page of the original repeats every 0.5 s."),
+    ] = 0.75
+    ignore_retained_drive: Annotated[bool, doc("The original's; retained commands are always refused.")] = True
+    stop_on_shutdown: Annotated[bool, doc("The original's; a stop is always sent last.")] = True
+
+
+class Metric(Section, frozen=True, kw_only=True):
+    """One metric. The contract fixes QoS and retain flag."""
+
+    enabled: Annotated[bool, doc("Publish it.")] = True
+    qos: Annotated[int | None, doc("The original's; not used.")] = None
+    retain: Annotated[bool | None, doc("The original's; not used.")] = None
+
+
+class Sampled(Metric, frozen=True, kw_only=True):
+    """A metric that is published now and then."""
+
+    interval_seconds: Annotated[Period, doc("Seconds between two messages, at least.")] = 0.25
+
+
+class StatusMetric(Sampled, frozen=True, kw_only=True):
+    """What the planner does."""
+
+    interval_seconds: Annotated[Period, doc("Seconds between two messages, at least.")] = 0.5
+
+
+class LocalPlan(Sampled, frozen=True, kw_only=True):
+    """The next steps of the planner."""
+
+    enabled: Annotated[bool, doc("Publish it.")] = False
+    interval_seconds: Annotated[Period, doc("Seconds between two messages, at least.")] = 1.0
+    max_points: Annotated[int, Meta(ge=2, le=1000), doc("Points of it that are sent.")] = 40
+
+
+class GlobalPlan(LocalPlan, frozen=True, kw_only=True):
+    """The whole route of the planner."""
+
+    max_points: Annotated[int, Meta(ge=2, le=1000), doc("Points of it that are sent.")] = 60
+
+
+class DiagnosticsMetric(Sampled, frozen=True, kw_only=True):
+    """Diagnostics of the base."""
+
+    interval_seconds: Annotated[Period, doc("Seconds between two messages, at least.")] = 1.0
+    max_items: Annotated[int, Meta(ge=1, le=100), doc("Parts of the base that are told, the unhealthy ones first.")] = 8
+
+
+class LevelMetric(Metric, frozen=True, kw_only=True):
+    """The battery, as a value of the diagnostics."""
+
+    status_name: Annotated[str, doc("The part of the base.")] = "/Jackal Base/General/Battery"
+    key: Annotated[str, doc("Its value; with (V) or (%) it has that unit.")] = "Battery Voltage (V)"
+
+
+class StatusOfCharger(Metric, frozen=True, kw_only=True):
+    """Whether it charges, as a value of the diagnostics."""
+
+    enabled: Annotated[bool, doc("Publish it.")] = False
+    status_name: Annotated[str, doc("The part of the base.")] = ""
+    key: Annotated[str, doc("Its value.")] = ""
+    truthy_values: Annotated[tuple[str, ...], doc("These mean that it charges.")] = ("true", "charging", "yes", "1")
+    falsey_values: Annotated[tuple[str, ...], doc("These mean that it does not.")] = (
+        "false", "not charging", "no", "0",
+    )  # fmt: skip
+
+
+class Metrics(Section, frozen=True, kw_only=True):
+    """What is published of the base."""
+
+    wheel_odometry: Annotated[Sampled, doc("Position by its odometry, in millimetres.")] = Sampled()
+    localization_pose: Annotated[Sampled, doc("The same in metres, with its frame.")] = Sampled()
+    navigation_status: Annotated[StatusMetric, doc("What the planner does.")] = StatusMetric()
+    navigation_goal: Annotated[Metric, doc("Where the planner goes.")] = Metric()
+    navigation_local_plan: Annotated[LocalPlan, doc("Its next steps.")] = LocalPlan()
+    navigation_global_plan: Annotated[GlobalPlan, doc("Its whole route.")] = GlobalPlan()
+    diagnostics: Annotated[DiagnosticsMetric, doc("Its health.")] = DiagnosticsMetric()
+    charging_level: Annotated[LevelMetric, doc("Its battery.")] = LevelMetric()
+    charging_status: Annotated[StatusOfCharger, doc("Its charger.")] = StatusOfCharger()
+
+
+class Ros1(Section, frozen=True, kw_only=True):
+    """Drives a base with ROS 1 and reads its telemetry."""
+
+    enabled: Annotated[bool, doc("Start this service.")] = False
+    log_level: Annotated[LogLevel | None, doc("The original's; the one of the file is for all services.")] = None
+    drive: Annotated[Driving, doc("Driving.")] = Driving()
+    topics: Annotated[dict[str, Topic], doc("The original's; they are those of the contract.")] = EMPTY
+    heartbeat: Annotated[dict[str, Any], doc("The original's; `mqtt_bridge` sends the heartbeat.")] = EMPTY
+    ros: Annotated[Ros, doc("Node and topics.")] = Ros()
+    motion: Annotated[Motion, doc("Speeds.")] = Motion()
+    safety: Annotated[Safety, doc("When to stop.")] = Safety()
+    telemetry: Annotated[Metrics, doc("What is published.")] = Metrics()
+
+    @property
+    def drives(self) -> bool:
+        return self.enabled and self.drive.enabled
+
+    def master(self) -> str:
+        """Return the address of the master."""
+        return self.ros.master_uri or os.environ.get("ROS_MASTER_URI") or "http://127.0.0.1:11311"
+
+    def host(self) -> str:
+        """Return where the node listens, and what it tells others to connect to."""
+        return self.ros.host or os.environ.get("ROS_IP") or os.environ.get("ROS_HOSTNAME") or "127.0.0.1"
+
+
+def _check(reader: Reader, root: Root, _: Path) -> Root:
+    """Note what the original's keys ask for, and this bridge does otherwise."""
+    section: Ros1 = root.services.ros1_bridge  # type: ignore[attr-defined]  # of this extension
+    if not section.enabled:
+        return root
+    notes = reader.notes
+    robot = root.robot
+    if robot.id:
+        base = Identity(robot.system, robot.type, robot.id).base
+        known = {"drive_values": c.DRIVE, **CHANNELS}
+        for name, topic in section.topics.items():
+            if name not in known:
+                notes.problem((*_PATH, "topics", name), f"unknown key, the known ones are {', '.join(known)}")
+            elif topic != (own := known[name].topic(base)):
+                notes.problem((*_PATH, "topics", name), f"must be {own}, as the contract has it; leave it out")
+    _warn(notes, section)
+    if section.drives and section.ros.estop_topic == section.ros.cmd_vel_topic:
+        notes.problem(
+            (*_PATH, "ros", "estop_topic"), "is cmd_vel_topic, too: write the lock of the multiplexer, or none"
+        )
+    return root
+
+
+def _warn(notes: Notes, section: Ros1) -> None:
+    if section.heartbeat.get("enabled"):
+        notes.warning((*_PATH, "heartbeat"), "is not sent a second time: mqtt_bridge sends it")
+    if section.log_level not in (None, "INFO"):
+        notes.warning((*_PATH, "log_level"), "is not used: log_level at the top of the file is for all services")
+    if not section.safety.ignore_retained_drive:
+        notes.warning((*_PATH, "safety", "ignore_retained_drive"), "is not used: a retained command is always refused")
+    if not section.safety.stop_on_shutdown:
+        notes.warning((*_PATH, "safety", "stop_on_shutdown"), "is not used: a stop is always sent last")
+    for name, channel in CHANNELS.items():
+        metric: Metric = getattr(section.telemetry, name)
+        for key, fixed in (("qos", channel.default_qos), ("retain", channel.default_retain)):
+            if getattr(metric, key) not in (None, fixed):
+                notes.warning((*_PATH, "telemetry", name, key), f"is not used: the contract has {fixed!s}".lower())
+    if section.ros.master_uri and not is_loopback(urlsplit(section.ros.master_uri).hostname or ""):
+        why = "is another machine, and ROS has no passwords: whoever reaches it drives this base"
+        notes.warning((*_PATH, "ros", "master_uri"), why)
+        if not section.ros.host:
+            why = "is missing: nodes on other machines reach this one only by the address that it names"
+            notes.warning((*_PATH, "ros", "host"), why)
+    elif section.ros.host and not is_loopback(section.ros.host):
+        why = "is open to other machines, and ROS has no passwords: whoever reaches it drives this base"
+        notes.warning((*_PATH, "ros", "host"), why)
+
+
+RULES: tuple[Rule, ...] = ((Root, _check),)
+
+
+def programs(config: Config) -> list[Program]:
+    """Return the process; without driving it has another name, so that the robot has no motor owner."""
+    section = config.section(Ros1)
+    if not section.enabled:
+        return []
+    name = "ros1_bridge" if section.drives else "ros1_reader"
+    return [Program(name, _MODULE, stage=Stage.DEVICE, entry=f"{_MODULE}.service")]
+
+
+def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
+    """Return ``value`` with what is published of the base."""
+    section = config.section(Ros1)
+    if not section.enabled:
+        return value
+    known = TelemetryOffer() if value.telemetry is UNSET else value.telemetry
+    metrics = section.telemetry
+    charges = known.charging_status or metrics.charging_status.enabled
+    odometry = known.wheel_odometry or metrics.wheel_odometry.enabled
+    return replace(value, telemetry=replace(known, charging_status=charges, wheel_odometry=odometry))
+
+
+def facts(config: Config) -> Facts:
+    """Return a line about the base."""
+    section = config.section(Ros1)
+    if not section.enabled:
+        return Facts()
+    return Facts((("ros 1", " · ".join(_facts(section))),))
+
+
+def _facts(section: Ros1) -> Iterator[str]:
+    yield f"node {section.ros.node_name} at {section.master()}"
+    if not section.drives:
+        yield "reads only"
+        return
+    yield f"drives {section.ros.cmd_vel_topic} at {section.motion.max_linear_speed_mps:g} m/s"
+    if section.ros.estop_topic == NONE:
+        yield "no lock: other programs of ROS drive it while it is stopped"
+    else:
+        yield f"a stop locks {section.ros.estop_topic}"

@@ -1,0 +1,342 @@
+"""A base is driven, halted, latched and freed: what it hears, whatever happens to master, base and bridge."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.contract.payloads import Drive
+from pebble.services.ros1_bridge.cmd_vel import CmdVel
+from pebble.services.ros1_bridge.config import Ros1
+from pebble.services.ros1_bridge.messages import GOAL_ID, GOAL_STATUS, TWIST
+from pebble.services.ros1_bridge.node import Node
+from pebble.services.ros1_bridge.xmlrpc_api import call, serve
+from tests.ext.ros1_bridge.world import Husky, World
+from tests.support import until
+
+TOPIC = "/cmd_vel"
+
+
+def node_of(ros: World, name: str = "pebble_ros1_bridge") -> Node:
+    return Node(name, ros.uri, "127.0.0.1", lambda _why: None)
+
+
+def registered(node: Node) -> bool:
+    return until(lambda: node.registered, 5)
+
+
+def test_a_command_becomes_a_twist_and_ends_in_zeros_then_silence(husky: Husky) -> None:
+    """Rule 2, with x to the right; its odometry, diagnostics and planner are published."""
+    begin = time.monotonic_ns()
+    last = husky.send(x=0.5, z=1.0)
+    assert until(lambda: husky.ros.moves(begin), 2)
+    assert husky.ros.moves(begin)[0][2] == ["0.600000", "-0.600000"]
+    assert until(lambda: husky.ros.zeros(begin), 3)
+    first = (husky.ros.zeros(begin)[0][0] - last) / 1e9
+    assert 0.6 < first < 1.6, "0.75 s after the last command, on a machine that is not busy"
+    time.sleep(0.6)
+    assert husky.ros.moves(husky.ros.zeros(begin)[0][0]) == []
+    assert 5 <= len(husky.ros.zeros(begin)) <= 7
+    count = len(husky.ros.rows(begin))
+    time.sleep(0.4)
+    assert len(husky.ros.rows(begin)) == count, "other programs of ROS may drive"
+    assert husky.world.newest("wheel-odometry")["unit"] == "mm"
+    assert until(lambda: husky.world.newest("diagnostics").get("value", {}).get("label") == "OK", 3)
+    assert husky.world.newest("navigation-status")["value"]["label"] == "UNKNOWN"
+
+
+def test_its_sender_stops_the_base_although_the_service_hangs(ros: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rule 2: the first dead man. A speed that is no number is none."""
+    node = node_of(ros)
+    sender = CmdVel(node, TOPIC, 0.05, None, None)
+    node.start()
+    sender.open()
+    try:
+        assert until(lambda: sender.bases, 5)
+        begin = time.monotonic_ns()
+        sender.drive(0.4, 0.0, 0.3)
+        assert until(lambda: ros.zeros(begin) and ros.moves(begin), 2)
+        assert until(lambda: ros.zeros(ros.moves(begin)[-1][0]), 2)
+        assert (ros.zeros(ros.moves(begin)[-1][0])[0][0] - begin) / 1e9 < 1.0
+        begin = time.monotonic_ns()
+        sender.drive(0.4, 0.0, 5.0)
+        assert until(lambda: ros.moves(begin), 2)
+        sender.drive(float("nan"), 0.0, 5.0)
+        at = time.monotonic_ns()
+        time.sleep(0.4)
+        assert ros.moves(at + 50_000_000) == []
+    finally:
+        sender.close()
+        node.close()
+
+
+def test_the_service_stops_the_base_although_its_sender_hangs(
+    ros: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rule 2: the second dead man."""
+    monkeypatch.setattr(CmdVel, "open", lambda self: None)
+    monkeypatch.setattr(CmdVel, "close", lambda self: None)
+    monkeypatch.setattr(CmdVel, "alive", True)
+    husky = Husky(ros, tmp_path).ready()
+    begin = husky.send(z=0.5)
+    assert until(lambda: husky.ros.zeros(begin + 10_000_000), 3)
+    assert len(husky.ros.moves(begin)) <= 1
+    husky.end()
+
+
+def test_a_stopped_base_gets_zeros_the_lock_and_no_goal(husky: Husky) -> None:
+    """Rules 1 and 4: whatever is sent to it, until it is reset."""
+    assert husky.ros.locks() == [], "who has locked nothing opens nothing"
+    husky.drive(0.5)
+    begin = time.monotonic_ns()
+    husky.stop_it()
+    stopped = time.monotonic_ns()
+    husky.drive(1.0)
+    assert husky.ros.moves(stopped + 20_000_000) == []
+    assert len(husky.ros.zeros(stopped)) >= 5
+    assert set(husky.ros.locks(begin)) == {"True"}
+    assert len(husky.ros.locks(begin)) >= 5, "it is repeated"
+    assert husky.ros.rows(begin, "cancel")
+    reset = time.monotonic_ns()
+    husky.reset()
+    assert until(lambda: husky.ros.locks(reset)[-1:] == ["False"], 2)
+    time.sleep(0.6)
+    assert husky.ros.moves(stopped + 20_000_000) == []
+    husky.drive(0.3)
+    assert husky.ros.moves(reset)
+
+
+def test_a_new_base_hears_a_zero_first_and_a_lock_while_it_is_stopped(husky: Husky) -> None:
+    """Rule 3, while it is driven; then rule 4, with a bridge that is killed before the lock is open."""
+    done = threading.Event()
+    driver = threading.Thread(target=lambda: [husky.drive(0.2) for _ in range(100) if not done.is_set()])
+    driver.start()
+    try:
+        husky.ros.kill("base")
+        up = husky.ros.start_base()
+        assert until(lambda: husky.ros.moves(up), 5), "and then it is driven"
+        assert husky.ros.rows(up)[0] in husky.ros.zeros(up)
+    finally:
+        done.set()
+        driver.join()
+    husky.stop_it()
+    husky.ros.kill("base")
+    up = husky.ros.start_base()
+    assert until(lambda: husky.ros.locks(up), 5)
+    assert set(husky.ros.locks(up)) == {"True"}
+    husky.ros.kill("base")
+    assert until(lambda: husky.bridge.assess()[0] == "absent", 5)
+    husky.reset()
+    husky.end()
+    husky.start()
+    up = husky.ros.start_base()
+    assert until(lambda: husky.ros.locks(up), 5), "an earlier life has locked it"
+    assert set(husky.ros.locks(up)) == {"False"}
+    husky.end()
+    husky.ready()
+    time.sleep(0.3)
+    assert set(husky.ros.locks(up)) == {"False"}
+    count = len(husky.ros.locks(up))
+    husky.ros.kill("base")
+    up = husky.ros.start_base()
+    assert until(lambda: husky.ros.rows(up), 5)
+    time.sleep(0.3)
+    assert husky.ros.locks(up) == [], "who has locked nothing in this life opens nothing"
+    assert count
+
+
+def test_a_stop_is_kept_over_a_restart_and_locks_at_once(husky: Husky) -> None:
+    husky.stop_it()
+    husky.end()
+    begin = time.monotonic_ns()
+    husky.ready()
+    husky.drive(0.5)
+    assert husky.ros.moves(begin) == []
+    assert until(lambda: "True" in husky.ros.locks(begin), 3)
+    assert husky.ros.rows(begin)[0] in husky.ros.zeros(begin)
+
+
+@pytest.mark.parametrize(
+    ("section", "drive", "cancelled"),
+    [
+        ({}, {}, True),
+        ({"drive": {"cancels_navigation": False}}, {}, False),
+        ({}, {"source": "autonomy", "run": 1}, False),
+    ],
+)
+def test_a_person_who_drives_cancels_navigation(
+    ros: World, tmp_path: Path, section: dict[str, Any], drive: dict[str, Any], cancelled: bool
+) -> None:
+    """Rule 5: a multiplexer may prefer the planner."""
+    husky = Husky(ros, tmp_path, **section).ready()
+    ros.do("goal active")
+    assert until(lambda: husky.world.newest("navigation-status").get("value", {}).get("active"), 5)
+    assert husky.world.newest("navigation-goal")["value"]["x_m"] == 1.0
+    begin = time.monotonic_ns()
+    for _ in range(3):
+        husky.bridge.move(Drive(z=0.5, **drive), 0.2)
+    assert until(lambda: ros.rows(begin, "cancel"), 1) is cancelled
+    assert len(ros.rows(begin, "cancel")) <= 1, "once a second"
+    husky.end()
+
+
+def test_a_base_that_sends_no_odometry_any_more_gets_no_moves(husky: Husky) -> None:
+    """Rule 6: what it hears after it hung would be old."""
+    husky.drive(0.3)
+    husky.ros.do("quiet")
+    assert until(lambda: husky.bridge.assess()[0] == "absent", 3)
+    assert "no odometry" in husky.bridge.assess()[2]
+    begin = time.monotonic_ns()
+    husky.drive(0.5)
+    assert husky.ros.moves(begin) == []
+    assert husky.bridge.cmd_vel.held_back
+    husky.ros.do("loud")
+    assert until(lambda: husky.bridge.assess() == ("ready", 0, ""), 3)
+    begin = time.monotonic_ns()
+    husky.drive(0.3)
+    assert husky.ros.moves(begin)
+
+
+def test_a_subscriber_that_is_not_connected_is_told_again(ros: World) -> None:
+    """Rule 7: by another path, since rospy ignores an address to which it believes to be connected."""
+    node, told = node_of(ros), []
+
+    class Deaf:
+        master = ros.uri
+
+        def publishers_are(self, topic: str, uris: list[str]) -> None:
+            told.extend(uri for uri in uris if topic == TOPIC)
+
+        def address_of(self, topic: str) -> None:
+            return None
+
+    hung = socket.create_server(("127.0.0.1", 0))  # it answers no call, which must not keep others waiting
+    call(ros.uri, "registerSubscriber", "/hung", TOPIC, TWIST.kind, f"http://127.0.0.1:{hung.getsockname()[1]}/")
+    deaf = serve(Deaf(), "127.0.0.1", lambda: None)  # type: ignore[arg-type]  # it is asked for nothing else
+    threading.Thread(target=deaf.serve_forever, daemon=True).start()
+    call(ros.uri, "registerSubscriber", "/deaf", TOPIC, TWIST.kind, f"http://127.0.0.1:{deaf.server_address[1]}/")
+    node.advertise(TOPIC, TWIST, "")
+    heard = threading.Event()
+    node.subscribe("/move_base/status", GOAL_STATUS, lambda _body: heard.set())
+    node.start()
+    assert until(lambda: any(uri.startswith(node.uri) and uri != node.uri for uri in told), 8), told
+    ros.kill("base")
+    heard.clear()
+    ros.start_base()
+    assert heard.wait(5), "a publisher is connected to meanwhile"
+    node.close()
+    deaf.shutdown()
+    hung.close()
+
+
+def test_of_two_bridges_with_one_name_the_second_waits(husky: Husky) -> None:
+    """Rule 8: to register ends the other, which would register again, and so on."""
+    second = node_of(husky.ros)
+    CmdVel(second, TOPIC, 0.05, None, None)
+    second.start()
+    assert until(lambda: second.problem.startswith("another node is called"), 5)
+    begin = time.monotonic_ns()
+    husky.drive(2.5)
+    assert not second.registered
+    assert len(husky.ros.moves(begin)) > 20, "the first one drives on"
+    assert husky.ros.zeros(begin) == []
+    husky.end()
+    assert registered(second), "its name is free"
+    second.close()
+    husky.start()
+
+
+def test_a_node_that_is_ended_halts_and_returns_once_its_name_is_free(husky: Husky) -> None:
+    """Rule 8: another one that took the name may drive."""
+    husky.drive(0.3)
+    begin = husky.drive(0.2)
+    call(husky.bridge.node.uri, "shutdown", "/master", "new node registered with same name")
+    assert until(lambda: husky.ros.zeros(begin), 1)
+    state, _, why = husky.bridge.assess()
+    assert (state, "has ended this node" in why) == ("absent", True)
+    assert until(lambda: husky.bridge.assess()[0] == "ready", 6)
+    begin = time.monotonic_ns()
+    husky.drive(0.3)
+    assert husky.ros.moves(begin)
+
+
+def test_others_that_drive_the_base_are_named(husky: Husky) -> None:
+    """Rule 9."""
+    other = node_of(husky.ros, "teleop")
+    other.advertise(TOPIC, TWIST, "")
+    other.advertise("/move_base/cancel", GOAL_ID, "")  # as each client of a planner does
+    other.start()
+    assert until(lambda: husky.bridge.assess()[2] == "others publish /cmd_vel as well: /teleop", 5)
+    assert husky.bridge.assess()[:2] == ("ready", 0)
+    other.close()
+
+
+def test_a_master_that_is_killed_and_comes_back_is_registered_with_again(husky: Husky) -> None:
+    husky.ros.kill("master")
+    assert until(lambda: not husky.bridge.node.registered, 5)
+    begin = time.monotonic_ns()
+    husky.drive(0.4)
+    assert husky.ros.moves(begin), "open connections stay"
+    husky.ros.start_master()
+    assert until(lambda: husky.bridge.node.registered, 5)
+    husky.ros.kill("base")
+    up = husky.ros.start_base()
+    assert until(lambda: husky.ros.rows(up), 5)
+    assert husky.ros.rows(up)[0] in husky.ros.zeros(up)
+
+
+def test_a_base_that_hung_hears_few_old_moves_and_then_a_zero(husky: Husky) -> None:
+    husky.drive(0.5)
+    husky.ros.kill("base", signal.SIGSTOP)
+    husky.drive(2.5)
+    assert husky.bridge.assess()[0] == "absent"
+    begin = time.monotonic_ns()
+    husky.ros.kill("base", signal.SIGCONT)
+    assert until(lambda: husky.ros.zeros(begin), 3)
+    burst = [row for row in husky.ros.moves(begin) if row[0] < husky.ros.zeros(begin)[0][0]]
+    assert len(burst) < 70, "of the second before it was taken for hung"
+
+
+def test_strangers_are_bounded_and_keep_nobody_out(husky: Husky) -> None:
+    """Rule 10: connections that say nothing, calls that do not end, and what is of no known topic."""
+    node = husky.bridge.node
+    _, _, port = call(node.uri, "requestTopic", "/x", TOPIC, [["TCPROS"]])
+    silent = [socket.create_connection(("127.0.0.1", port)) for _ in range(40)]
+    api = int(node.uri.rsplit(":", 1)[1].strip("/"))
+    callers = [socket.create_connection(("127.0.0.1", api)) for _ in range(20)]
+    assert until(lambda: {"ros_greetings", "ros_calls"} <= node.dropped().keys(), 5), node.dropped()
+    begin = time.monotonic_ns()
+    husky.drive(0.3)
+    assert husky.ros.moves(begin), "who is connected is driven"
+    for sock in silent:
+        sock.settimeout(5)
+        assert sock.recv(1) == b""
+    for sock in callers:
+        sock.close()
+    assert until(lambda: registered(node) and call(node.uri, "getPid", "/x"), 5)
+    with socket.create_connection(("127.0.0.1", port)) as sock:
+        sock.settimeout(5)
+        sock.sendall(b"\x10\x00\x00\x00\x0c\x00\x00\x00topic=/other")
+        assert b"error=" in sock.recv(1000)
+    with socket.create_connection(("127.0.0.1", port)) as sock:
+        sock.settimeout(5)
+        sock.sendall(b"\xff\xff\xff\xff")
+        assert sock.recv(1) == b""
+
+
+def test_it_listens_on_this_machine_alone_unless_told_otherwise(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Rule 10."""
+    for name in ("ROS_IP", "ROS_HOSTNAME", "ROS_MASTER_URI"):
+        monkeypatch.delenv(name, raising=False)
+    assert (Ros1().host(), Ros1().master()) == ("127.0.0.1", "http://127.0.0.1:11311")
+    monkeypatch.setenv("ROS_HOSTNAME", "husky.lab")
+    monkeypatch.setenv("ROS_MASTER_URI", "http://base:11311")
+    assert (Ros1().host(), Ros1().master()) == ("husky.lab", "http://base:11311")
