@@ -17,7 +17,7 @@ import pytest
 import typer
 
 from pebble.commands.app import application
-from pebble.config.schema import keys_text
+from pebble.config.keys import keys_text
 from pebble.extensions.checks.conform.checks import CHECKS, LAST
 from pebble.extensions.checks.conform.control import CONTROL, named
 from pebble.extensions.checks.conform.motion import MOVING

@@ -10,8 +10,8 @@ import cv2
 import pytest
 
 from tests.commands.command_line import Run, config_file
+from tests.ext.media.test_cameras import HEIGHT, WIDTH, Filming
 from tests.support import Broker
-from tests.test_cameras import HEIGHT, WIDTH, Filming
 
 
 @pytest.fixture

@@ -19,8 +19,8 @@ from pebble.contract.payloads import Drive, WheelOdometry
 from pebble.errors import PebbleError
 from pebble.extensions.scripts.script import Robot, Stopped
 from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.ext.media.test_cameras import HEIGHT, WIDTH, Filming
 from tests.support import until
-from tests.test_cameras import HEIGHT, WIDTH, Filming
 
 BASE = "pebble/robots/goob"
 MOOD = Channel(metric="mood", kind=Kind.EVENT, payload=dict)
