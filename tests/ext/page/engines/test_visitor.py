@@ -69,6 +69,8 @@ def test_a_visitor_sees_drives_stops_and_starts_a_script(
         engine.evaluate(_ERRORS)
         visitor.sees("document.querySelectorAll('.fleet-card').length >= 4", START_S)
         visitor.did("all robots are there")
+        visitor.sees("document.querySelector('.thumbnail img')", 15)
+        visitor.did("one of them shows a picture")
         assert until(lambda: "the robots are yours" in demo.output, 120)
         visitor.presses(".fleet-card [href$='/goob']")
         visitor.arrives()
