@@ -20,7 +20,7 @@ import pytest
 
 from pebble.extensions.lab.rig.processes import free_port as free_port
 from pebble.extensions.lab.rig.processes import mosquitto_command
-from pebble.runtime.parent import tied_to_parent
+from pebble.extensions.media.child import tied_to_parent
 
 #: The checkout: tests that start programs of ours start them here.
 ROOT = Path(__file__).resolve().parent.parent

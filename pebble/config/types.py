@@ -73,11 +73,6 @@ Seconds = Annotated[float, Meta(ge=0, le=10_000_000)]
 Interval = Annotated[float, Meta(gt=0, le=10_000_000)]
 # A drive command that a silent connection delays for less is executed: the limit is that of drive_timeout_seconds.
 Silence = Annotated[float, Meta(gt=0, le=5)]
-Pixels = Annotated[int, Meta(ge=1, le=16384)]
-FramesPerSecond = Annotated[float, Meta(gt=0, le=1000)]
-Rotation = Annotated[Literal[0, 90, 180, 270], Meta(extra={"circle": 360, "unlike": 0})]
-SampleRate = Annotated[int, Meta(ge=4000, le=384_000)]
-AudioChannels = Annotated[int, Meta(ge=1, le=8)]
 #: A list of words, or one line that is split as a shell would; it is never run by a shell.
 Command = tuple[str, ...]
 #: Relative to the config file; ``~`` is the user's home.
@@ -152,11 +147,3 @@ class ServiceSection(Section, frozen=True, kw_only=True):
     }
 
     enabled: Annotated[bool, doc("Start this service.")] = False
-
-
-class HandlerTopics(Section, frozen=True, kw_only=True):
-    """Other names for a handler's three topics."""
-
-    command: Annotated[Topic | None, doc("Instead of the contract's incoming command topic.")] = None
-    files: Annotated[Topic | None, doc("Instead of the contract's list of files.")] = None
-    status: Annotated[Topic | None, doc("Instead of the contract's status.")] = None

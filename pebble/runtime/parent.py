@@ -1,21 +1,16 @@
 """The side of a process towards its launcher: it ends with it, notifies it, and logs in the format that it reads."""
 
 import ctypes
-import errno
 import logging
 import os
 import re
-import shutil
 import signal
 import sys
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from typing import NamedTuple
 
-from pebble.config import LAUNCHER_LOCK
 from pebble.config.secret_text import without_secrets
 from pebble.config.visible import shown
-from pebble.ownership import read_plain
 from pebble.runtime import notes
 
 #: A pipe to the launcher, for the notes of :class:`Notifier`.
@@ -75,29 +70,6 @@ def die_with_launcher() -> None:
 def end_with_parent(number: int | None = None) -> None:
     """Ask the kernel to send this process ``number``, else SIGKILL, when the thread that started it has ended."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL if number is None else number)
-
-
-def tied_to_parent(command: Sequence[str], number: signal.Signals | None = None) -> list[str]:
-    """Extend ``command`` so that the process gets ``number``, else SIGKILL, when the thread that starts it has ended.
-
-    This holds from some milliseconds after the start, when setpriv has asked the kernel for it. Raises
-    FileNotFoundError if there is no such program. Not by ``preexec_fn``: between fork and exec, Python 3.11.2 may wait
-    for ever for a lock that a thread of Zenoh held.
-    """
-    if shutil.which(command[0]) is None:
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), command[0])
-    name = (signal.SIGKILL if number is None else number).name.removeprefix("SIG")
-    return ["setpriv", "--pdeathsig", name, "--", *command]
-
-
-def launcher_runs(run_dir: Path) -> bool:
-    """True if the newest launcher of the robot with this run directory is still a running process."""
-    try:
-        pid = int(read_plain(run_dir / LAUNCHER_LOCK).partition(b"\n")[0])
-        os.kill(pid, 0)
-    except (OSError, ValueError, OverflowError):
-        return False
-    return True
 
 
 class ProgramRequest(NamedTuple):

@@ -7,19 +7,8 @@ from msgspec import field
 
 from pebble.config import problems
 from pebble.config.reader import Reader, Rule
-from pebble.config.types import (
-    ONE_VALUE,
-    UNIT,
-    AudioChannels,
-    File,
-    FramesPerSecond,
-    Pixels,
-    Rotation,
-    SampleRate,
-    Section,
-    ServiceSection,
-    doc,
-)
+from pebble.config.types import ONE_VALUE, UNIT, File, Section, ServiceSection, doc
+from pebble.extensions.media.config import AudioChannels, FramesPerSecond, Pixels, Rotation, SampleRate
 from pebble.ownership import others_in
 from pebble.transports.socket_paths import fits_socket
 

@@ -5,9 +5,10 @@ from typing import Annotated, ClassVar
 from msgspec.structs import replace
 
 from pebble.config import Config
-from pebble.config.types import COMMAND, ONE_VALUE, Command, File, HandlerTopics, Section, ServiceSection, doc
+from pebble.config.types import COMMAND, ONE_VALUE, Command, File, Section, ServiceSection, doc
 from pebble.contract import SOUNDBOARD_COMMAND, SOUNDBOARD_FILES, SOUNDBOARD_STATUS
 from pebble.contract.capabilities import CapabilitiesValue
+from pebble.extensions.media.config import HandlerTopics
 
 
 class Playback(Section, frozen=True, kw_only=True):

@@ -78,26 +78,3 @@ def test_an_output_that_is_full_or_gone_ends_a_command_in_order(config: Path, wo
     assert done.returncode in (0, 1, 2)
     assert b"Traceback" not in done.stderr
     assert b"Exception ignored" not in done.stderr
-
-
-def test_process_1_collects_what_others_leave_to_it(config: Path) -> None:
-    """Each round of this script leaves a process that ends later, whose parent is then process 1."""
-    space = ["unshare", "--pid", "--fork", "--mount-proc", "--kill-child"]
-    if subprocess.run([*space, "true"], capture_output=True).returncode:
-        pytest.skip("no pid namespace can be made here")
-    script = config.parent / "leave.py"
-    script.write_text(
-        "import os, subprocess, time\n"
-        "from pebble.launcher.launcher import reap\n"
-        "subprocess.run(['sh', '-c', 'for i in 1 2 3; do (sleep 0.2 &); done'])\n"
-        "own = subprocess.Popen(['true'])\n"
-        "end, collected = time.monotonic() + 10, 0\n"
-        "while collected < 3 and time.monotonic() < end:\n"
-        "    collected += reap({own.pid})\n"
-        "    time.sleep(0.05)\n"
-        "print(os.getpid(), collected, own.wait())\n"
-    )
-    done = subprocess.run(
-        [*space, sys.executable, script], env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
-    )
-    assert done.stdout.split() == ["1", "3", "0"], done.stderr

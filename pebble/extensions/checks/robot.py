@@ -23,10 +23,10 @@ from pebble.extensions.fleet import certificates
 from pebble.extensions.fleet.folder import FLEET, Fleet, FleetError, load
 from pebble.extensions.fleet.roles import ProgramRole, Right, rights
 from pebble.extensions.operator.client.page_packages import require_packages
+from pebble.extensions.operator.running import launcher_runs
 from pebble.extensions.page.config import WebHandler, WebInterface
 from pebble.extensions.page.setting import settings_of
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
-from pebble.runtime.parent import launcher_runs
 
 #: By the config section of each broker that the robot uses.
 _BROKERS = {"local_mqtt": "local broker", "mqtt_mirror": "mirror's broker", "remote_mqtt": "remote broker"}

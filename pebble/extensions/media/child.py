@@ -1,6 +1,8 @@
 """A program that a service starts: in a group of its own, and ended with the service, however that ends."""
 
+import errno
 import os
+import shutil
 import signal
 import subprocess
 import threading
@@ -9,8 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
-
-from pebble.runtime.parent import tied_to_parent
 
 _POLL_S = 0.01
 
@@ -90,3 +90,16 @@ class Child:
 def how_ended(code: int) -> str:
     """Return an exit code in words: ``exit code 1`` or ``signal 9``."""
     return f"exit code {code}" if code >= 0 else f"signal {-code}"
+
+
+def tied_to_parent(command: Sequence[str], number: signal.Signals | None = None) -> list[str]:
+    """Extend ``command`` so that the process gets ``number``, else SIGKILL, when the thread that starts it has ended.
+
+    This holds from some milliseconds after the start, when setpriv has asked the kernel for it. Raises
+    FileNotFoundError if there is no such program. Not by ``preexec_fn``: between fork and exec, Python 3.11.2 may wait
+    for ever for a lock that a thread of Zenoh held.
+    """
+    if shutil.which(command[0]) is None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), command[0])
+    name = (signal.SIGKILL if number is None else number).name.removeprefix("SIG")
+    return ["setpriv", "--pdeathsig", name, "--", *command]

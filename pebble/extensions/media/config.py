@@ -1,24 +1,25 @@
-"""The config sections of pictures and sound towards operators, which the bridge asks for."""
+"""The config sections of pictures and sound towards operators, and kinds of values that media services share."""
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 from msgspec import Meta
 
 from pebble.config.types import (
     BY_CONTRACT,
     ONE_VALUE,
-    AudioChannels,
     Command,
     Count,
-    FramesPerSecond,
-    Pixels,
-    Rotation,
-    SampleRate,
     Section,
     Topic,
     doc,
 )
 from pebble.contract.encodings import SoundEncoding, VideoEncoding
+
+Pixels = Annotated[int, Meta(ge=1, le=16384)]
+FramesPerSecond = Annotated[float, Meta(gt=0, le=1000)]
+Rotation = Annotated[Literal[0, 90, 180, 270], Meta(extra={"circle": 360, "unlike": 0})]
+SampleRate = Annotated[int, Meta(ge=4000, le=384_000)]
+AudioChannels = Annotated[int, Meta(ge=1, le=8)]
 
 _FRAMES = "pictures and sound use the robot's own shared memory, found by transport.run_dir"
 _SOURCE = "every frame has its own size and format"
@@ -101,3 +102,11 @@ class Media(Section, frozen=True, kw_only=True):
     video_publisher: Annotated[VideoPublisher, doc("Pictures out.")] = VideoPublisher()
     audio_publisher: Annotated[AudioPublisher, doc("Sound out.")] = AudioPublisher()
     audio_receiver: Annotated[AudioReceiver, doc("Sound in.")] = AudioReceiver()
+
+
+class HandlerTopics(Section, frozen=True, kw_only=True):
+    """Other names for a handler's three topics."""
+
+    command: Annotated[Topic | None, doc("Instead of the contract's incoming command topic.")] = None
+    files: Annotated[Topic | None, doc("Instead of the contract's list of files.")] = None
+    status: Annotated[Topic | None, doc("Instead of the contract's status.")] = None

@@ -2,18 +2,8 @@
 
 from typing import Annotated, Any, ClassVar, Literal
 
-from pebble.config.types import (
-    EMPTY,
-    ONE_VALUE,
-    UNIT,
-    File,
-    HandlerTopics,
-    Seconds,
-    Section,
-    ServiceSection,
-    Variables,
-    doc,
-)
+from pebble.config.types import EMPTY, ONE_VALUE, UNIT, File, Seconds, Section, ServiceSection, Variables, doc
+from pebble.extensions.media.config import HandlerTopics
 
 
 class ScriptArgument(Section, frozen=True, kw_only=True):

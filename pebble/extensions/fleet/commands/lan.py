@@ -133,7 +133,7 @@ def _commands(place: Path) -> dict[str, list[str]]:
 
 @contextmanager
 def _running(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
-    from pebble.runtime.parent import tied_to_parent
+    from pebble.extensions.media.child import tied_to_parent
 
     process = subprocess.Popen(tied_to_parent(command, signal.SIGTERM), start_new_session=True)
     try:

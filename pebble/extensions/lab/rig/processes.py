@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
 
 from pebble.errors import PebbleError
+from pebble.extensions.media.child import tied_to_parent
 from pebble.extensions.operator.places import mosquitto_path
-from pebble.runtime.parent import tied_to_parent
 
 #: In this order they end: robots while the brokers to which they report it still run, MCUs after what they move.
 OPERATORS, ROBOTS, MCUS, BROKERS = range(4)

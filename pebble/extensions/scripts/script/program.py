@@ -14,12 +14,13 @@ import msgspec
 from pebble.config import Config, load
 from pebble.contract.payloads import LAST_RUN, LONGEST_SUMMARY, MOST_MAIN
 from pebble.errors import ConfigError, PebbleError, TransportError
+from pebble.extensions.operator.running import launcher_runs
 from pebble.extensions.scripts.runs import CONFIG, RUN, LocalScripts, next_run
 from pebble.extensions.scripts.script.guard import END_S, Guard
 from pebble.extensions.scripts.script.options import OneLineParser, form, parse
 from pebble.extensions.scripts.script.robot import EXIT_ENDED, Robot
 from pebble.runtime.connections import local_transport
-from pebble.runtime.parent import launcher_runs, set_up_logging
+from pebble.runtime.parent import set_up_logging
 from pebble.transports import State, Transport
 
 _CONNECT_S = 2.0

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from pebble.runtime.parent import tied_to_parent
+from pebble.extensions.media.child import tied_to_parent
 from tests.support import ROOT, gone, until
 
 PARENT = """
 import signal, subprocess, sys, time
-from pebble.runtime.parent import tied_to_parent
+from pebble.extensions.media.child import tied_to_parent
 child = subprocess.Popen(tied_to_parent([sys.executable, "-c", "import time; time.sleep(100)"], signal.SIGTERM))
 print(child.pid, flush=True)
 time.sleep(100)
