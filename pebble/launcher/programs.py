@@ -33,9 +33,9 @@ def _core(config: Config) -> Iterator[tuple[bool, Program]]:
     yield config.transport.kind == "zenoh", _hub(config)
     yield True, _announcer(config)
     yield from ((True, _serial_line(config, *line)) for line in config.serial_instances().items())
-    places = (place for one in config.installed for place in (one.observer, one.step, *one.requests) if place)
-    seams = tuple(place.partition(":")[0] for place in places)
-    yield bridge.enabled, _service(config, "mqtt_bridge", may_request=True, shares=seams)
+    seams = ((one.observer, one.step, one.private, *one.requests) for one in config.installed)
+    shares = tuple(place.partition(":")[0] for places in seams for place in places if place)
+    yield bridge.enabled, _service(config, "mqtt_bridge", may_request=True, shares=shares)
     yield mirror is not None, _service(config, "mqtt_mirror")
 
 

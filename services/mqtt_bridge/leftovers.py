@@ -11,23 +11,25 @@ from pebble.forwarding.subjects import Subjects
 from pebble.transports import Message, Subscription, Transport
 
 _TOPICS = 10_000  # noted of each side; with more nothing is removed
-_NOT_HERE = (ONLINE, MCU_DESCRIBE)  # the bridge's own, and one that MCU_VALUE covers
+_EXCEPTED = (ONLINE, MCU_DESCRIBE)  # the bridge's own, and one that MCU_VALUE covers
 
 
 class Leftovers:
     """Topics that robot and broker retain. Transports call :meth:`note_local` on their threads."""
 
-    def __init__(self, base: str, subjects: Subjects, remote: Transport, *own: Channel, sparing: bool = False) -> None:
-        """Store the arguments; ``own`` are further channels that the bridge itself publishes on the remote side.
+    def __init__(
+        self, base: str, subjects: Subjects, remote: Transport, *channels: Channel, sparing: bool = False
+    ) -> None:
+        """Store the arguments; ``channels`` are further channels that the bridge itself publishes on the remote side.
 
         ``sparing``: topics that the robot has are not asked for: the answers would only hold up messages to it.
         """
         self._remote, self._sparing = remote, sparing
-        self._here: set[str] | None = set()  # topics that the robot retains; None: the search is over
-        self._there: set[str] = set()
+        self._on_robot: set[str] | None = set()  # topics that the robot retains; None: the search is over
+        self._at_remote: set[str] = set()
         self._subscriptions: list[Subscription] = []
         states = [channel for channel in CHANNELS if channel.kind is Kind.STATE and channel.direction == OUTGOING]
-        wanted = [state for state in states if state not in (*_NOT_HERE, *own) and state.synonym_of is None]
+        wanted = [state for state in states if state not in (*_EXCEPTED, *channels) and state.synonym_of is None]
         patterns = [state.filter(base) for state in wanted if state.is_pattern]
         named = subjects.topics(*(state for state in wanted if not state.is_pattern))
         self._filters = [MCU_VALUE.filter(base), *patterns, *named]
@@ -35,23 +37,23 @@ class Leftovers:
 
     @property
     def done(self) -> bool:
-        return self._here is None
+        return self._on_robot is None
 
     def note_local(self, message: Message) -> None:
-        here = self._here
-        if here is not None and len(here) <= _TOPICS:
-            (here.add if message.payload else here.discard)(message.topic)
+        on_robot = self._on_robot
+        if on_robot is not None and len(on_robot) <= _TOPICS:
+            (on_robot.add if message.payload else on_robot.discard)(message.topic)
 
     def begin(self) -> None:
         """Begin again, because a connection was lost."""
         self._close()
         self._next = 0
-        self._there.clear()
+        self._at_remote.clear()
 
     def ask_next(self) -> bool:
         """Ask the broker for some of the topics; False if all were asked for. Waits for its answer."""
-        here = self._here or set()
-        while self._sparing and self._next < len(self._filters) and self._filters[self._next] in here:
+        on_robot = self._on_robot or set()
+        while self._sparing and self._next < len(self._filters) and self._filters[self._next] in on_robot:
             self._next += 1
         if self._next == len(self._filters):
             return False
@@ -69,13 +71,13 @@ class Leftovers:
         ``remove(topic, unless=…)`` removes one, unless there is a reason not to, and returns whether it did.
         """
         self._close()
-        gone = [topic for topic in sorted(self._there) if remove(topic, unless=self._stays)]
-        self._here = None
+        gone = [topic for topic in sorted(self._at_remote) if remove(topic, unless=self._stays)]
+        self._on_robot = None
         return gone
 
     def _stays(self, topic: str) -> bool:
-        here = self._here or set()
-        return topic in here or max(len(here), len(self._there)) > _TOPICS
+        on_robot = self._on_robot or set()
+        return topic in on_robot or max(len(on_robot), len(self._at_remote)) > _TOPICS
 
     def _close(self) -> None:
         subscriptions, self._subscriptions = self._subscriptions, []
@@ -83,5 +85,5 @@ class Leftovers:
             subscription.close()
 
     def _note_remote(self, message: Message) -> None:
-        if message.retain and message.payload and len(self._there) <= _TOPICS:
-            self._there.add(message.topic)
+        if message.retain and message.payload and len(self._at_remote) <= _TOPICS:
+            self._at_remote.add(message.topic)

@@ -27,6 +27,7 @@ from pebble.extension import ours, part
 from pebble.forwarding.forwarder import Routed, barrier
 from pebble.forwarding.names import Names
 from pebble.forwarding.observer import ROBOT, Observers, Step, steps_of
+from pebble.forwarding.private_topics import PrivateTopics
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
 from pebble.forwarding.service import CHECK_SOON_S, ForwardingService
@@ -42,7 +43,6 @@ from pebble.services.mqtt_bridge.leftovers import Leftovers
 from pebble.services.mqtt_bridge.motor_owners import CHECK_S, MotorOwners
 from pebble.services.mqtt_bridge.own_requests import OwnRequests
 from pebble.services.mqtt_bridge.passed_stops import REPEAT_S, PassedStops, named
-from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.same_broker import SameBrokerProbe, now_ms
 from pebble.services.mqtt_bridge.uplink import POLL_S, uplink_of
 from pebble.services.mqtt_bridge.vouching import PERIOD_S, Vouching
@@ -90,7 +90,8 @@ class MqttBridge(ForwardingService):
         self._observers = Observers(self.config, self.clock)
         decides = min(self.config.motor_owners, default="")
         self._control_topic = CONTROL_STATE.topic(self.config.base, owner=decides) if decides else ""
-        self._private = PrivateTopics(self.config.base)
+        private = next((extension.private for extension in self.config.installed if extension.private), "")
+        self._private = (part(private) if private else PrivateTopics)(self.config.base)
         self._is_thin = section.link.profile != "wide"  # or may become so
         self._uplink = uplink_of(self.config, self.addresses, self.remote, self.forwarder, self.clock)
         self._requests = OwnRequests(self, self.forwarder.mirroring, self._uplink.note_drive)

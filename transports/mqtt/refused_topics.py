@@ -65,7 +65,7 @@ class RefusedTopics:
     def _is_due(self, topic: str, now: float) -> bool:
         return now >= max(self.withheld[topic].tried_at, self._quiet_at)
 
-    def due(self, own: Mapping[str, Message], where: str, now: float) -> Iterator[Message]:
+    def due(self, messages: Mapping[str, Message], where: str, now: float) -> Iterator[Message]:
         """End a trial that has succeeded, and yield the retained message of the topic that is tried next."""
         if self._trial is not None:
             if now < self._trial.ends_at:
@@ -75,9 +75,9 @@ class RefusedTopics:
             if self.not_taken.pop(topic, None) is not None:
                 log.info("%s: %s accepts messages on %s again", self._client_id, where, topic)
         for topic in self.withheld:
-            if topic in own and self._is_due(topic, now):
+            if topic in messages and self._is_due(topic, now):
                 self._trial = Trial(topic, now + WINDOW_S)
-                yield own[topic]
+                yield messages[topic]
                 return
 
     def note_loss(self, where: str, written: Mapping[str, int] | None, now: float) -> None:

@@ -313,14 +313,16 @@ class MqttTransport(Transport):
         """
         self.went_back = False
         with self._publishing:
-            own = {topic: message for topic, message in self._own.items() if topic not in self._own.pending}
+            messages = {topic: message for topic, message in self._own.items() if topic not in self._own.pending}
             unsure = self._own.shared | {
-                topic for topic, message in own.items() if not self._accepts(connection, message)
+                topic for topic, message in messages.items() if not self._accepts(connection, message)
             }
-        retained = self._find(connection, list(own), stopping)
+        retained = self._find(connection, list(messages), stopping)
         if self.will is not None and retained.get(self.will.topic) == self.will.payload:
             del retained[self.will.topic]  # our own will, published although we were running
-        older = {topic for topic, payload in retained.items() if topic not in unsure and payload != own[topic].payload}
+        older = {
+            topic for topic, payload in retained.items() if topic not in unsure and payload != messages[topic].payload
+        }
         self.went_back = bool(older)
         return retained.keys() - older
 

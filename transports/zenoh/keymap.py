@@ -32,7 +32,7 @@ def filter_to_key(filter_: str) -> str:
 def key_to_topic(key: str) -> str:
     """Return the topic that ``topic_to_key`` made ``key`` from."""
     chunks = ("" if chunk == _EMPTY else chunk for chunk in key.removeprefix("@").split("/"))
-    return "/".join(_ESCAPE.sub(lambda found: chr(int(found.group(1), 16)), chunk) for chunk in chunks)
+    return "/".join(_ESCAPE.sub(lambda match: chr(int(match.group(1), 16)), chunk) for chunk in chunks)
 
 
 def _join(levels: list[str]) -> str:
@@ -44,5 +44,5 @@ def _join(levels: list[str]) -> str:
 def _level(level: str) -> str:
     if not level:
         return _EMPTY
-    escaped = _FORBIDDEN.sub(lambda found: f"%{ord(found.group()):02X}", level)
+    escaped = _FORBIDDEN.sub(lambda match: f"%{ord(match.group()):02X}", level)
     return "%40" + escaped[1:] if escaped.startswith("@") else escaped

@@ -155,8 +155,8 @@ def _tls(tls: TlsSettings | None) -> dict[str, Any]:
     if tls.ca_cert is not None:
         link["root_ca_certificate"] = str(tls.ca_cert)
     if tls.client_cert is not None and tls.client_key is not None:
-        own = {"certificate": str(tls.client_cert), "private_key": str(tls.client_key)}
-        link |= {f"{side}_{what}": path for side in ("listen", "connect") for what, path in own.items()}
+        certificate = {"certificate": str(tls.client_cert), "private_key": str(tls.client_key)}
+        link |= {f"{side}_{what}": path for side in ("listen", "connect") for what, path in certificate.items()}
         link["enable_mtls"] = tls.ca_cert is not None
     return {"tls": link}
 

@@ -67,14 +67,14 @@ class Access(NamedTuple):
 def read_access(file: Path) -> Access:
     """Read what ``pebble fleet zenoh`` wrote. Raises TransportError."""
     try:
-        found = msgspec.json.decode(file.read_bytes(), type=_File)
+        content = msgspec.json.decode(file.read_bytes(), type=_File)
     except OSError as error:
         raise TransportError(f"transport.access: {file}: {error.strerror}; `pebble fleet zenoh` makes it") from None
     except msgspec.MsgspecError as error:
         raise TransportError(f"transport.access: {file}: {error}; `pebble fleet zenoh` makes it") from None
-    if found.access_control.get("enabled") is not True or found.access_control.get("default_permission") != "deny":
+    if content.access_control.get("enabled") is not True or content.access_control.get("default_permission") != "deny":
         raise TransportError(f"transport.access: {file} lets everybody in; `pebble fleet zenoh` makes it anew")
-    return Access(found.access_control, found.metadata.pebble, found.qos)
+    return Access(content.access_control, content.metadata.pebble, content.qos)
 
 
 def written(access: Access) -> bytes:
@@ -93,9 +93,9 @@ def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dic
     subjects: list[Mapping[str, Any]] = []
     policies: list[dict[str, Any]] = []
     for subject, grants in [(LOCAL, EVERYTHING), *((_named(names), grants) for names, grants in rows if names)]:
-        own = [rules.setdefault(grant, _rule(len(rules), grant)) for grant in grants if grant.keys]
+        granted = [rules.setdefault(grant, _rule(len(rules), grant)) for grant in grants if grant.keys]
         subjects.append(subject)
-        policies.append({"rules": [rule["id"] for rule in own], "subjects": [subject["id"]]})
+        policies.append({"rules": [rule["id"] for rule in granted], "subjects": [subject["id"]]})
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -113,8 +113,8 @@ def first(commands: Sequence[str], stops: Sequence[str]) -> dict[str, Any]:
     commands.
     """
     rows = (("commands", commands, _COMMANDS), ("stops", stops, _STOPS))
-    here = {"messages": ["put"], "flows": [*IN], "link_protocols": OTHER_MACHINES}
-    network = [{"id": name, "key_exprs": [*keys], "overwrite": changes, **here} for name, keys, changes in rows]
+    fields = {"messages": ["put"], "flows": [*IN], "link_protocols": OTHER_MACHINES}
+    network = [{"id": name, "key_exprs": [*keys], "overwrite": changes, **fields} for name, keys, changes in rows]
     return {"network": network}
 
 

@@ -40,7 +40,9 @@ class CheckedNames(Names):
         self._below = f"{base}/{INCOMING}/{BY}/"
         self._subjects = subjects
         rights = () if strangers == "refuse" else (Right.LOOK, Right.DRIVE)
-        self._strangers = frozenset(one.suffix for right in rights for one in WRITES[right] if isinstance(one, Channel))
+        self._strangers = frozenset(
+            channel.suffix for right in rights for channel in WRITES[right] if isinstance(channel, Channel)
+        )
 
     def __missing__(self, topic: str) -> Sender:
         if len(self) >= _REMEMBERED:
@@ -51,13 +53,13 @@ class CheckedNames(Names):
     def _find(self, topic: str) -> Sender:
         if not topic.startswith(self._below):
             return Sender(NO_ACCOUNT, topic, self._subjects[topic])
-        found = without_name(topic)
-        if found is None:
+        bare = without_name(topic)
+        if bare is None:
             plain = stop_topic(topic)
             if plain is not None:
                 return Sender(NO_ACCOUNT, plain, self._subjects[plain])
             return Sender(NO_ACCOUNT, topic, None, Drop.MISNAMED)
-        return Sender(found.account, found.topic, self._subjects[found.topic])
+        return Sender(bare.account, bare.topic, self._subjects[bare.topic])
 
     def sign(self, sender: Sender, message: Message) -> Signed | Drop:
         """Return ``message`` with its sender in the payload, or why it does not pass. Hot.
@@ -75,19 +77,19 @@ class CheckedNames(Names):
                 return Drop.UNNAMED
         elif (message.retain or message.retain_requested) and form is not EstopCommand:
             return Drop.STALE
-        found, by = _object(payload), account
-        if found is None:
+        fields, by = _object(payload), account
+        if fields is None:
             if channel is not None and form not in _BARE:
                 return Drop.UNREADABLE
         else:
-            body = _body(found)
+            body = _body(fields)
             claim = body.get("by")
             if account != NO_ACCOUNT and isinstance(claim, str) and claim:
                 by = _with_person(account, claim[:_LONGEST])
             if form not in _UNSIGNED:
-                found.pop("by", None)
+                fields.pop("by", None)
                 body["by"] = by
-                payload = _encoder.encode(found)
+                payload = _encoder.encode(fields)
         return Signed(_moved(message, sender.topic, payload), by)
 
 
@@ -97,13 +99,13 @@ def _moved(message: Message, topic: str, payload: bytes) -> Message:
 
 def _doubted(payload: bytes) -> bytes:
     """Mark who a stop without a name claims to be from. What cannot be read names no sender to its readers."""
-    found = _object(payload)
-    body = {} if found is None else _body(found)
+    fields = _object(payload)
+    body = {} if fields is None else _body(fields)
     claim = body.get("by")
     if not isinstance(claim, str) or not claim:
         return payload
     body["by"] = unchecked(claim)
-    return _encoder.encode(found)
+    return _encoder.encode(fields)
 
 
 def _body(command: dict[str, Any]) -> dict[str, Any]:
@@ -123,12 +125,12 @@ def _object(payload: bytes) -> dict[str, Any] | None:
     try:
         usual = payload[:1] == b"{" and payload[-1:] == b"}" and len(payload) <= _USUAL_BYTES
         if usual and payload.isascii() and b"\0" not in payload:  # else there may be something around it
-            found = _decoder.decode(payload)
+            fields = _decoder.decode(payload)
         else:
-            found = codec.plain(DRIVE, payload)
+            fields = codec.plain(DRIVE, payload)
     except (PayloadError, msgspec.DecodeError):
         return None
-    return found if isinstance(found, dict) else None
+    return fields if isinstance(fields, dict) else None
 
 
 @lru_cache(maxsize=256)

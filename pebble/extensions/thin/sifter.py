@@ -22,12 +22,12 @@ class Sifter:
     def use(self, sieve: Sieve | None) -> None:
         """Pass messages through ``sieve``, whose owner calls :meth:`send_waiting`; None: pass them at once."""
         with self._lock:
-            before, self._sieve = self._sieve, sieve
+            former, self._sieve = self._sieve, sieve
             self._forwarder.pass_on = self._forwarder.pass_now if sieve is None else self._sift
             events = self._sides[Side.REMOTE].events
             events.has_room = None if sieve is None else sieve.takes_event
-            if before is not None and sieve is None:
-                self._send(before.empty())
+            if former is not None and sieve is None:
+                self._send(former.empty())
                 events.resume()
 
     def send_waiting(self) -> None:
@@ -39,16 +39,16 @@ class Sifter:
                 self._send(self._sieve.due(Rank.STREAM))
 
     def _send(self, waiting: Iterable[Waiting]) -> None:
-        here = self._sides[Side.LOCAL]
+        robot = self._sides[Side.LOCAL]
         for entry in waiting:
-            if isinstance(self._forwarder.pass_now(here, entry.subject, entry.message, entry.forward), Forward):
-                here.count_forwarded()
+            if isinstance(self._forwarder.pass_now(robot, entry.subject, entry.message, entry.forward), Forward):
+                robot.count_forwarded()
 
-    def _sift(self, here: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
-        if here.side is not Side.LOCAL or subject.prompt:
-            return self._forwarder.pass_now(here, subject, message, forward)
+    def _sift(self, source: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
+        if source.side is not Side.LOCAL or subject.prompt:
+            return self._forwarder.pass_now(source, subject, message, forward)
         with self._lock:
             sieve = self._sieve
             if sieve is not None and self._sides.gate is Gate.OPEN and sieve.keeps(subject, message, forward):
                 return Drop.NO_ROOM
-            return self._forwarder.pass_now(here, subject, message, forward)
+            return self._forwarder.pass_now(source, subject, message, forward)

@@ -11,5 +11,6 @@ EXTENSION = Extension(
             "pebble.services.serial_mcu_bridge.devices.described_bridge:DescribedBridge", describes_itself=True
         )
     },
+    private="pebble.services.serial_mcu_bridge.devices.private_topics:LocalOnly",
     page="docs/ext/boards.md",
 )

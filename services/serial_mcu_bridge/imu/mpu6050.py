@@ -64,10 +64,10 @@ def _summary(fields: dict[bytes, bytes]) -> Summary | None:
 
 
 def _integers(fields: dict[bytes, bytes], names: dict[bytes, str]) -> dict[str, int] | None:
-    found = {name: fields.get(key, b"") for key, name in names.items()}
-    return {name: int(raw) for name, raw in found.items()} if all(map(_INTEGER.match, found.values())) else None
+    texts = {name: fields.get(key, b"") for key, name in names.items()}
+    return {name: int(raw) for name, raw in texts.items()} if all(map(_INTEGER.match, texts.values())) else None
 
 
 def _decimals(fields: dict[bytes, bytes], names: dict[bytes, str]) -> dict[str, float] | None:
-    found = {name: fields.get(key, b"") for key, name in names.items()}
-    return {name: float(raw) for name, raw in found.items()} if all(map(_DECIMAL.match, found.values())) else None
+    texts = {name: fields.get(key, b"") for key, name in names.items()}
+    return {name: float(raw) for name, raw in texts.items()} if all(map(_DECIMAL.match, texts.values())) else None

@@ -11,9 +11,9 @@ from pebble.config import SerialBridge
 from pebble.contract import DRIVE, MCU_DESCRIBE, codec
 from pebble.contract.payloads import McuManifest
 from pebble.extension import ours
-from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.serial_mcu_bridge.devices.aliases import claims
 from pebble.services.serial_mcu_bridge.devices.peers import CONFIRM_S, PeerDevices
+from pebble.services.serial_mcu_bridge.devices.private_topics import LocalOnly
 from pebble.services.serial_mcu_bridge.imu.reports import ImuWatchdog
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from pebble.transports import Message
@@ -122,7 +122,7 @@ def test_no_manifest_of_another_device_raises_anything(interfaces: list[dict[str
             "device_uid": "u", "firmware_version": "", "model": "", "interfaces": interfaces}  # fmt: skip
     raw = msgspec.json.encode(body)
     claims(codec.decode(MCU_DESCRIBE, raw))
-    topics = PrivateTopics("pebble/robots/rover")
+    topics = LocalOnly("pebble/robots/rover")
     topics.admit(Message(MCU_DESCRIBE.topic("pebble/robots/rover", uid="u"), raw, retain_requested=True))
     topics.admit(Message("pebble/robots/rover/outgoing/sensors/imu", b'{"device_uid": "u"}'))
 

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from pebble.forwarding.side import Gate
-from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.service import MqttBridge
+from pebble.services.serial_mcu_bridge.devices.private_topics import LocalOnly
 from pebble.transports import Message, MqttSettings, create
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.boards.mcu_wire import F, I, M
@@ -136,7 +136,7 @@ HISTORIES: dict[str, list[tuple[Message, bool | list[str]]]] = {
 
 @pytest.mark.parametrize("history", HISTORIES.values(), ids=HISTORIES)
 def test_what_passes(history: list[tuple[Message, bool | list[str]]]) -> None:
-    topics = PrivateTopics(BASE)
+    topics = LocalOnly(BASE)
     for message, passes in history:
         expected = [message.topic.removeprefix(f"{OUT}/")] if passes is True else passes or []
         assert [admitted.topic.removeprefix(f"{OUT}/") for admitted in topics.admit(message)] == expected, message
@@ -144,7 +144,7 @@ def test_what_passes(history: list[tuple[Message, bool | list[str]]]) -> None:
 
 def test_which_commands_stay() -> None:
     """Requests for a manifest do not leave the robot, nor commands to an MCU without a list."""
-    topics = PrivateTopics(BASE)
+    topics = LocalOnly(BASE)
     incoming = [f"{BASE}/incoming/{metric}" for metric in ("mcu/spy-1/describe", "mcu/spy-1/tune", "mcu/spy-1/set")]
     aliases = [f"{BASE}/incoming/{metric}" for metric in ("lab/tune", "lab/set", "estop", "drive-values")]
     assert [topics.stays(topic) for topic in (*incoming, *aliases)] == [True] * 3 + [False] * 4
@@ -153,7 +153,7 @@ def test_which_commands_stay() -> None:
 
 
 def test_memory_is_bounded() -> None:
-    topics = PrivateTopics(BASE)
+    topics = LocalOnly(BASE)
     for number in range(300):
         assert topics.admit(value(f"lab/slow-{number}", "slow", retain=True)) == []
     assert len(topics.admit(KNOWN)) == 256, "waiting values"

@@ -1,4 +1,4 @@
-"""Keeps topics on the robot that a self-describing MCU marks ``local_only``: serial bridges publish a list for each.
+"""Topics that a self-describing MCU marks ``local_only``: serial bridges publish a list for each.
 
 The order of two topics is undefined: on Zenoh, and behind a full queue of a broker, a value may arrive before the list,
 and at a bridge that starts late it nearly always does. So nothing of an MCU passes before its list.
@@ -10,6 +10,7 @@ from typing import Any
 from pebble.contract import MCU_COMMAND, MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, codec, is_reserved
 from pebble.contract.payloads import McuLocalOnly
 from pebble.errors import PayloadError
+from pebble.forwarding.private_topics import PrivateTopics
 from pebble.transports import Message
 
 _DEVICES = 256  # remembered; a robot has a handful
@@ -18,11 +19,11 @@ _QUESTION, _LIST = ("/" + channel.metric.rpartition("/")[2] for channel in (MCU_
 _MARK = b'"device_uid"'  # in every value under an alias: the MCU it belongs to
 
 
-class PrivateTopics:
-    """The lists of all MCUs; used on the transports' threads."""
+class LocalOnly(PrivateTopics):
+    """The lists of all MCUs."""
 
     def __init__(self, base: str) -> None:
-        self._base = base
+        super().__init__(base)
         self._lock = threading.Lock()
         self._private: dict[str, frozenset[str]] = {}  # topics by uid; also of an MCU that has gone
         self._listed: set[str] = set()  # the uids whose list is valid now
@@ -31,7 +32,7 @@ class PrivateTopics:
         self._commands = f"{base}/{MCU_COMMAND.suffix.partition('{')[0]}"
 
     def stays(self, topic: str) -> bool:
-        """True for a topic on a list, for a command to an MCU without one, and for requests for a manifest."""
+        """True if a topic is on a list, or of a command to an MCU without one, or of a request for a manifest."""
         if topic.startswith(self._commands):
             uid = topic.removeprefix(self._commands).partition("/")[0]
             if uid not in self._listed or topic.endswith(_QUESTION):
@@ -39,7 +40,7 @@ class PrivateTopics:
         return bool(self._private) and any(topic in topics for topics in list(self._private.values()))
 
     def admit(self, message: Message) -> list[Message]:
-        """Return the messages that may pass now: ``message`` or none; with a list, the values that waited for it."""
+        """Return ``message`` or none; with a list, the values that waited for it."""
         with self._lock:
             if not message.payload:
                 self._waiting.pop(message.topic, None)  # removed: nothing to forward any more
@@ -59,7 +60,7 @@ class PrivateTopics:
         if uid in self._private or len(self._private) < _DEVICES:
             metrics = {topic: topic.partition("/")[2] for topic in listed.topics}
             usable = (topic for topic, metric in metrics.items() if not is_reserved(metric))  # a stop must pass
-            self._private[uid] = frozenset(f"{self._base}/{topic}" for topic in usable)
+            self._private[uid] = frozenset(f"{self.base}/{topic}" for topic in usable)
             self._listed.add(uid)
 
     def _judge(self, message: Message) -> list[Message]:
