@@ -29,6 +29,7 @@ from pebble.extensions.lab.simulation.world import program
 from pebble.extensions.operator.places import Places
 from pebble.extensions.page.commands.people import opened
 from pebble.launcher.launcher import Launcher
+from pebble.ownership import owner_of
 from pebble.runtime.as_owner import as_before, as_owner, require_own
 from pebble.services.autonomy_manager.catalogue import Catalogue
 from pebble.services.autonomy_manager.script import Script
@@ -91,6 +92,8 @@ def test_what_it_writes_is_theirs_and_a_link_is_no_folder(place: Path) -> None:
         assert os.geteuid() == NOBODY, "a link of root's is followed"
         assert 0 not in (os.getegid(), *os.getgroups()), "the group of a folder may be that of the one above"
     assert os.geteuid() == 0
+    with os.popen("true") as pipe:
+        assert owner_of(Path(f"/dev/fd/{pipe.fileno()}"), there=True).uid == 0, "pebble check <(jq … robot.json)"
 
 
 def test_a_number_in_a_folder_of_others_aims_no_signal(place: Path) -> None:
