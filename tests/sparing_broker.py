@@ -1,4 +1,4 @@
-"""Stands before a real broker, and hands out its messages late, for exact names only, or none after a long one."""
+"""Stands before a real broker, and hands out retained messages for exact names only, or none after a long one."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _NO_BRIDGE_MODE = b"\x20\x02\x00\x01"
 
 
 class SparingBroker:
-    """``late_s``: how long after it was asked for a retained message comes; ``by_name``: not for wildcards.
+    """``by_name``: what is retained comes for exact names, not for wildcards.
 
     ``longest``: bytes of a packet; a longer one, and what comes after it on its connection, never arrives.
     ``segment``: bytes of TCP that the newest client takes at once.
     """
 
-    def __init__(self, to: int, *, late_s: float = 0.0, by_name: bool = False, longest: int = 1 << 28) -> None:
-        self.port, self._to, self._late_s, self._by_name = free_port(), to, late_s, by_name
+    def __init__(self, to: int, *, by_name: bool = False, longest: int = 1 << 28) -> None:
+        self.port, self._to, self._by_name = free_port(), to, by_name
         self._longest, self.stalled, self.segment = longest, 0, 0
         self._loop = asyncio.new_event_loop()
         self._loop.run_until_complete(asyncio.start_server(self._serve, "127.0.0.1", self.port))
@@ -59,10 +59,8 @@ class SparingBroker:
                     self.stalled += 1
                     await reader.read(-1)
                 named = any(body[: 2 + int.from_bytes(body[:2], "big")] in one for one in asked)
-                if first & 0xF1 != _PUBLISH | 1:
+                if named or not self._by_name or first & 0xF1 != _PUBLISH | 1:
                     writer.write(packet)
-                elif named or not self._by_name:
-                    self._loop.call_later(self._late_s, writer.write, packet)
 
 
 async def packet_of(reader: asyncio.StreamReader) -> tuple[int, bytes, bytes]:

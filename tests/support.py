@@ -78,6 +78,15 @@ def until(condition: Callable[[], object], timeout: float = 10.0, *, step: float
     return bool(condition())
 
 
+class Clock:
+    """One that stands still between two changes of ``now``."""
+
+    now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
 def quarters(values: Sequence[float]) -> list[float]:
     """The medians of the quarters of a run. The first one warms up: caches fill, and the heap finds its size."""
     size = max(1, len(values) // 4)

@@ -199,17 +199,13 @@ class ForbiddingProxy(TcpProxy):
 
     def __init__(self, target: int) -> None:
         self.forbidden: set[str] = set()
-        self.hung_up = 0
         super().__init__(target)
 
     def passes(self, data: bytes) -> bool:
         """Whether ``data``, which a client sent together, has none of them."""
         if not any(b"\0" + bytes((len(topic),)) + topic.encode() in data for topic in self.forbidden):
             return True
-        if 0x30 not in {data[at] & 0xF0 for at in _packets(data)}:
-            return True  # a SUBSCRIBE
-        self.hung_up += 1
-        return False
+        return 0x30 not in {data[at] & 0xF0 for at in _packets(data)}  # a SUBSCRIBE
 
 
 class Hole(TcpProxy):

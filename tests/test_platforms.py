@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.commands.conftest import broker as broker
 from tests.kit.played_robot import RecordingRobot
 from tests.support import ROOT, THOROUGH, Broker, Child, free_port, until
 
@@ -32,13 +33,6 @@ MODULES = (
     ),
     *("pebble.extensions.foxglove.command", "pebble.extensions.foxglove.run"),
 )
-
-
-@pytest.fixture(scope="module")
-def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
-    broker = Broker(tmp_path_factory.mktemp("b"))
-    yield broker
-    broker.stop()
 
 
 @pytest.fixture

@@ -12,9 +12,10 @@ from pebble.forwarding.routing import Side
 from pebble.forwarding.subjects import Subjects
 from pebble.services.mqtt_bridge.requests.actions import Action
 from pebble.transports import Message, QoS
-from tests.forwarding.test_forwarding import Clock, grows_no_more
+from tests.forwarding.test_forwarding import grows_no_more
 from tests.forwarding.virtual import Connection, Running, World
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client, make_config
+from tests.support import Clock
 
 LOCAL, REMOTE = Side.LOCAL, Side.REMOTE
 DRIVE, ESTOP, FLAG = "incoming/drive-values", "incoming/estop", "incoming/flags/mqtt-video"

@@ -27,16 +27,9 @@ from pebble.transports import Message, QoS, State, clock
 from pebble.transports.counters import Counters
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.services.mqtt_bridge.bridge_rig import BASE, is_probe, make_config
+from tests.support import Clock
 
 LOCAL, REMOTE = Side.LOCAL, Side.REMOTE
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 def grows_no_more(fill: Callable[[int], None], number: int) -> bool:

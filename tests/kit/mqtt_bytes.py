@@ -27,20 +27,17 @@ def connect(
     *,
     level: int = 4,
     will: tuple[str, str] | None = None,
-    will_retain: bool = False,
     client_id: str | None = None,
 ) -> bytes:
     flags = 2 | (0x80 if user is not None else 0) | (0x40 if password is not None else 0)
-    flags |= (4 if will else 0) | (0x20 if will_retain else 0)
+    flags |= 4 if will else 0
     properties = b"\x00" if level == 5 else b""
     texts = [text(f"t{next(_names)}" if client_id is None else client_id)]
     texts += [text(each) for each in (*(will or ()), user, password) if each is not None]
     return packet(0x10, text("MQTT") + bytes((level, flags, 0, 15)) + properties + b"".join(texts))
 
 
-def publish(
-    topic: str, payload: str | bytes, qos: int = 0, number: int = 1, *, retain: bool = False, dup: bool = False
-) -> bytes:
+def publish(topic: str, payload: str | bytes, qos: int = 0, number: int = 1, *, retain: bool = False) -> bytes:
     raw = payload.encode() if isinstance(payload, str) else payload
-    head = 0x30 | qos << 1 | int(retain) | (8 if dup else 0)
+    head = 0x30 | qos << 1 | int(retain)
     return packet(head, text(topic) + (number.to_bytes(2, "big") if qos else b"") + raw)

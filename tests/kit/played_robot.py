@@ -24,8 +24,8 @@ class RecordingRobot:
     """Publishes heartbeats and capabilities, and records what arrives; it also takes stops.
 
     ``keeps``: it keeps control itself, as ``keeping`` does. ``named``: it takes commands with names, as a bridge gives
-    them to a robot, and drive commands of strangers; ``wire`` has the topics as they arrived. ``pace``: of the clock by
-    which it keeps control. ``deaf``: it answers no stop and no reset; ``late_s``: so late it does.
+    them to a robot, and drive commands of strangers; ``wire`` has the topics as they arrived. ``deaf``: it
+    answers no stop and no reset; ``late_s``: so late it does.
     """
 
     def __init__(
@@ -36,12 +36,11 @@ class RecordingRobot:
         capabilities: dict[str, Any] | None = None,
         keeps: bool = False,
         named: bool = False,
-        pace: float = 1.0,
         persisted: bool | None = True,
         heartbeats: bool = True,
         **login: Any,
     ) -> None:
-        self.base, self.named, self._pace = base, named, pace
+        self.base, self.named = base, named
         self.id = base.rpartition("/")[2]
         self.wire: set[str] = set()
         self.received: list[tuple[float, str, Any]] = []
@@ -136,7 +135,7 @@ class RecordingRobot:
     def answer(self, messages: list[Message]) -> None:
         """Handle requests for control, or only time."""
         with self._answering:
-            self._publish_all(self.keeping.take(messages, self._pace * time.monotonic()) if self.keeping else [])
+            self._publish_all(self.keeping.take(messages, time.monotonic()) if self.keeping else [])
 
     def command(self, metric: str, body: object) -> None:
         """Publish a command to it, as another client does."""

@@ -18,17 +18,10 @@ from pebble.extensions.fleet.database import DatabaseError
 from pebble.extensions.fleet.people import SESSION_S, People, PeopleError, TooManyTriesError, User, has_user
 from pebble.extensions.fleet.roles import Role, page_rights
 from pebble.extensions.fleet.tries import TRIES, WINDOW_S, network_of
+from tests.support import Clock
 
 PASSWORD = "correct horse"
 HERE = "192.0.2.7"
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 @pytest.fixture

@@ -386,24 +386,9 @@ def storm(seed: int, count: int) -> JitterBuffer:
         assert chunk is None or (chunk.samples.dtype == np.int16 and chunk.samples.shape[1] == chunk.channels)
         assert chunk is None or 0 < chunk.seconds <= 1
     honest = [(now + 0.02 * index, packet(index, ms=2**63)) for index in range(200)]
-    played = _continue(buffer, honest)
+    played = play(buffer, honest)
     assert played.real[-150:] == list(range(50, 200))
     return buffer
-
-
-def _continue(buffer: JitterBuffer, arrivals: list[tuple[float, bytes]]) -> Played:
-    chunks = []
-    for at, raw in arrivals:
-        buffer.put(raw, at)
-        for step in range(4):
-            chunk = buffer.take(at + step * 0.005)
-            if chunk is not None:
-                chunks.append((at, chunk))
-    for step in range(200):
-        chunk = buffer.take(arrivals[-1][0] + 0.02 * step)
-        if chunk is not None:
-            chunks.append((0.0, chunk))
-    return Played(chunks)
 
 
 def test_hostile_packets() -> None:

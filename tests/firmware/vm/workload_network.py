@@ -34,7 +34,6 @@ class Workload:
         self._bad = [net.publish(topic, payload, 2) for payload in _BAD]
         self._next = 0
         self._count = 0
-        self._joined = 0
         self._part = "booting"
 
     def between(self, robot):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -11,7 +11,9 @@ import pytest
 
 from pebble.forwarding import side as side_module
 from pebble.services.mqtt_bridge.requests.media import Media
-from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Rig, Side, ZenohEnd
+from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Side, ZenohEnd
+from tests.forwarding.links.test_other_ways import Make
+from tests.forwarding.links.test_other_ways import make as make
 from tests.support import some, until
 
 FLAG, STATUS = "incoming/flags/mqtt-audio", "outgoing/autonomy-status"
@@ -35,23 +37,6 @@ HISTORIES = [
 ]
 #: How long the side is away; ``longer``: than an outage in which an operator could choose an earlier value again.
 WHEN = ("briefly", "longer", "while the robot is off")
-Make = Callable[..., Rig]
-
-
-@pytest.fixture
-def make(tmp_path: Path) -> Iterator[Make]:
-    """Makes rigs, and closes them with their ends."""
-    made: list[Rig] = []
-
-    def make(service: str, local: End, remote: End) -> Rig:
-        made.append(Rig(service, local, remote))
-        return made[-1]
-
-    yield make
-    for rig in made:
-        rig.close()
-        for end in rig.ends.values():
-            end.close()
 
 
 @pytest.mark.parametrize(("link", "when", "history"), some(product(LINKS, WHEN, HISTORIES), 23))

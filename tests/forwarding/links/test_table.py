@@ -303,32 +303,6 @@ def storm(*voices: tuple[Client, str, list[bytes]], seconds: float, retain: bool
         time.sleep(max(0.0, began + number * seconds / len(rounds) - time.monotonic()))
 
 
-@each_link
-def test_a_storm_from_both_sides_comes_through_once_each_in_order_and_nothing_circulates(rig: TableRig) -> None:
-    rig.start()
-    rig.local.publish(MIRROR_FLAG, TRUE, retain=True)
-    assert until(lambda: rig.remote.on(MIRROR_FLAG))
-    flags = [TRUE, FALSE] * 150
-    drives = [b'{"x": 0, "z": 0, "valid_ms": 0}', b'{"x": 0, "z": 0}'] * 150
-    presses = [b'{"stop": "%016x"}' % (number // 2) for number in range(300)]
-    voices = {
-        LOCAL: {VIDEO_FLAG: flags, DRIVE: drives, STOP: presses, "incoming/flags/party": [TRUE] * 300},
-        REMOTE: {AUDIO_FLAG: flags, DRIVE: drives, STOP: presses, "incoming/flags/party": [FALSE] * 300},
-    }
-    every = [(rig.clients[side], suffix, sent) for side in Side for suffix, sent in voices[side].items()]
-    storm(*every, seconds=1.0, retain=True)
-    for side, sent in voices.items():
-        listener = rig.clients[side.other]
-        for suffix, payloads in sent.items():
-            assert until(lambda: len(listener.on(suffix)) >= len(payloads))  # noqa: B023
-    Quiet(rig.local, rig.remote).wait(0.3)
-    for side, sent in voices.items():
-        assert {suffix: rig.clients[side.other].payloads(suffix) for suffix in sent} == sent
-        assert not any(message.retain for message in rig.clients[side].on(STOP))
-    assert not rig.local.on(VIDEO_FLAG)
-    assert not rig.remote.on(AUDIO_FLAG)
-
-
 @contextmanager
 def slow(rig: Rig, delay_s: float) -> Iterator[None]:
     """The way to the operators' broker is so meanwhile."""

@@ -17,16 +17,10 @@ from pebble.errors import DeviceError
 from pebble.extensions.install.flash import verify
 from pebble.extensions.install.flash.boards import FIRMWARE
 from pebble.extensions.install.flash.verify import at_broker, on_serial_port
+from tests.commands.conftest import broker as broker
 from tests.support import Broker, free_port
 
 TOPIC = "pebble/robots/lamp/outgoing/online"
-
-
-@pytest.fixture(scope="module")
-def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
-    broker = Broker(tmp_path_factory.mktemp("broker"))
-    yield broker
-    broker.stop()
 
 
 def config(port: int) -> Config:

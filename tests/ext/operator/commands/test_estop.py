@@ -161,20 +161,6 @@ def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printe
     assert robot.latched
 
 
-def test_an_old_robot_gets_zeros(robot_on: Make, url: str) -> None:
-    robot = robot_on(estop={})
-    with running("estop", robot.id, url) as process:
-        assert until(lambda: robot.count("drive-values") >= 3, 30)
-        process.send_signal(signal.SIGTERM)
-        out, _ = process.communicate(timeout=30)
-    assert out.endswith(
-        f"{robot.id}: old firmware: zeros are sent, it cannot be latched\n"
-        f"{robot.id}: old firmware: NOT LATCHED, zeros are no longer sent\n"
-    )
-    assert (process.returncode, robot.count("autonomy-command")) == (1, 1)
-    assert robot.count("estop") <= 2, "only before its capabilities had arrived"
-
-
 def test_all_robots_are_stopped_and_others_spared(run: Run, robot_on: Make, url: str) -> None:
     robots = [robot_on("serial"), robot_on("mcu", "arm")]
     outlet = robot_on(estop=None, drive={"available": False})

@@ -18,7 +18,7 @@ from pebble.services.autonomy_manager.script import Script
 from pebble.services.autonomy_manager.service import AutonomyManager
 from pebble.transports import Message, QoS
 from tests.kit.robot import BASE, Listener, LocalNetwork, Running
-from tests.support import until
+from tests.support import Clock, until
 
 MOTORS = {"enabled": True, "serial": {"port": "/dev/null"}}
 
@@ -60,14 +60,6 @@ class FakeProcesses:
     def files(self) -> list[str]:
         """Those alive, in the order of their start."""
         return [child.launch.file for child in self.all if child.running]
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 class Bench:
