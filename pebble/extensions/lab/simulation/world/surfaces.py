@@ -112,7 +112,7 @@ def _drawn(drawing: Drawing) -> Surface:
     picture = np.full((_DRAWING_PX, _DRAWING_PX, 3), _bgr(drawing.shapes[0].colour), np.uint8)
     mask = np.zeros((_DRAWING_PX, _DRAWING_PX), np.uint8)
     for shape in drawing.shapes:
-        points = np.round(np.array(shape.points).reshape(1, -1, 2) * _DRAWING_PX).astype(np.int32)
+        points = [np.round(np.array(shape.points).reshape(-1, 2) * _DRAWING_PX).astype(np.int32)]
         cv2.fillPoly(picture, points, _bgr(shape.colour))
         cv2.fillPoly(mask, points, 255)
     edges = _edges(drawing.x, drawing.y, drawing.width_m / 2, math.radians(drawing.yaw_deg))

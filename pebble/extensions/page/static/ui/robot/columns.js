@@ -1,4 +1,4 @@
-// Balanced columns: each card goes once to the shortest column; later only what is below it in that column moves.
+// Balanced columns: once all cards are here, each goes to the shortest column; later only what is below it in that column moves.
 
 import * as more from "../../core/browser-more.js";
 import { useLayoutEffect, useRef } from "../parts/hooks.js";
@@ -47,6 +47,7 @@ class Columns {
     this.grid = grid;
     this.homes = new Map();
     this.count = 0;
+    this.settled = false; // every card is as high as it is
     this.seen = new Set();
     this.observer = more.sizes(() => this.place());
     this.follow(grid);
@@ -65,7 +66,8 @@ class Columns {
     cards.forEach((card) => this.follow(card));
     const hasSide = cards.some((card) => card.dataset.at === "side" && card.offsetHeight > 0);
     const count = columnsOf(grid.clientWidth, hasSide);
-    if (count !== this.count) {
+    if (count !== this.count || !this.settled) {
+      this.settled = !grid.querySelector(".loading");
       homes.clear();
       const side = hasSide && count > 1 ? ` ${SIDE}px` : "";
       grid.style.gridTemplateColumns = `repeat(${side ? count - 1 : count}, minmax(0, 1fr))${side}`;
