@@ -84,7 +84,14 @@ def _link(origin: Path, page: Path, pages: dict[Path, Path], link: re.Match[str]
     if file not in pages:
         return link[2] if file.exists() else link[0]
     to = pages[file]
-    return f"{link[1]}[{link[2]}]({_relative(to, page.parent)}{link[4] or ''})"
+    words = _title(file) if link[2] == file.name and file.suffix == ".md" else link[2]
+    return f"{link[1]}[{words}]({_relative(to, page.parent)}{link[4] or ''})"
+
+
+def _title(page: Path) -> str:
+    """Return the heading of a page, up to a colon, for links that show the name of its file."""
+    heading, _, _ = page.read_text().removeprefix("# ").partition("\n")
+    return heading.partition(":")[0]
 
 
 def _relative(to: Path, folder: Path) -> str:

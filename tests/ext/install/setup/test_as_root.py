@@ -125,6 +125,7 @@ CALLS = {
     "database": 4,
     "folder": 1,
     "lan": 1,
+    "new_file": 2,
     "own_broker": 1,
     "people": 1,
     "robot_audit": 2,

@@ -214,7 +214,7 @@ def test_a_snapshot_is_what_is_on_the_canvas_under_its_time(show: Show) -> None:
 
 def test_a_snapshot_that_would_be_noise_is_not_saved(show: Show) -> None:
     """As Firefox reads canvases where it resists fingerprinting."""
-    noise = """OffscreenCanvasRenderingContext2D.prototype.getImageData = (x, y, width, height) =>
+    noise = """CanvasRenderingContext2D.prototype.getImageData = (x, y, width, height) =>
       new ImageData(crypto.getRandomValues(new Uint8ClampedArray(4 * width * height)), width, height)"""
     with show(STATES["driving"], script=noise) as opened:
         opened.test("snapshot").click()

@@ -118,7 +118,7 @@ export async function snapshot(video, store, source) {
 
 /** Whether what is drawn is read back as it was: browsers that resist fingerprinting give noise. */
 function readsPixels() {
-  const context = new OffscreenCanvas(8, 8).getContext("2d");
+  const context = Object.assign(document.createElement("canvas"), { width: 8, height: 8 }).getContext("2d");
   context.fillStyle = "rgb(40 90 200)";
   context.fillRect(0, 0, 8, 8);
   const { data } = context.getImageData(0, 0, 8, 8);
