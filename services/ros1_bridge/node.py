@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from pebble.runtime.rate_limit import RateLimitedLog
@@ -227,7 +228,8 @@ class Node:
 
     def _revive(self, publishers: Mapping[str, list[str]], subscribers: Mapping[str, list[str]]) -> None:
         """Tell subscribers that are not connected who publishes: without it one that was cut off waits for minutes."""
-        now, missing = time.monotonic(), {}
+        now = time.monotonic()
+        missing: dict[tuple[str, str], float] = {}
         for topic, publication in self._publications.items():
             connected = publication.names
             for node in subscribers.get(topic, [])[:MOST_PEERS]:
@@ -245,10 +247,8 @@ class Node:
             self._is_lost.wait()
             self._is_lost.clear()
             while self._lost and not self._ends.is_set():
-                (topic, node), publishers = self._lost.popitem()
-                self._attempt_call(
-                    lambda topic=topic, node=node, publishers=publishers: self._tell(topic, node, publishers)
-                )
+                topic, node = first = next(iter(tuple(self._lost)))  # each in turn: who hangs comes last
+                self._attempt_call(partial(self._tell, topic, node, self._lost.pop(first)))
 
     def _tell(self, topic: str, node: str, publishers: list[str]) -> None:
         uri = self._uri_of(node)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from pebble.config import Config
 from pebble.contract import Channel
@@ -29,7 +29,7 @@ class Ros1Reader(Service):
     """Publishes what a base says, and sends it nothing."""
 
     name = "ros1_reader"
-    publishes = PUBLISHES
+    publishes: ClassVar[tuple[Channel, ...]] = PUBLISHES
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -68,7 +68,10 @@ class Ros1Reader(Service):
         return {**super().dropped(), **self.node.dropped()}
 
     def _publish_soon(self, channel: Channel, payload: dict[str, Any]) -> None:
-        self.post(lambda: self.publish(channel, payload), newest_of=channel.metric)
+        def publish() -> None:
+            self.publish(channel, payload)
+
+        self.post(publish, newest_of=channel.metric)
 
 
 class Ros1Bridge(Ros1Reader, MotorOwner):

@@ -131,7 +131,7 @@ def serve(node: Answers, host: str, on_refused: Callable[[], object]) -> ApiServ
         node.evict(str(why))
         return [1, "", 0]
 
-    for name, function in {
+    api: dict[str, Any] = {
         "publisherUpdate": publisher_update,
         "requestTopic": request_topic,
         "shutdown": shutdown,
@@ -142,6 +142,7 @@ def serve(node: Answers, host: str, on_refused: Callable[[], object]) -> ApiServ
         "getBusStats": lambda _caller: [1, "", [[], [], []]],
         "getBusInfo": lambda _caller: [1, "", []],
         "paramUpdate": lambda _caller, _key, _value: [1, "", 0],
-    }.items():
+    }
+    for name, function in api.items():
         server.register_function(function, name)
     return server

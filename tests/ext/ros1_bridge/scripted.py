@@ -192,8 +192,7 @@ class Base:
         self.goal = {"goal active": 1, "goal done": 3}.get(line, self.goal)
         self.quiet = {"quiet": True, "loud": False}.get(line, self.quiet)
         if line == "goal active":
-            place = struct.pack("<7d", 1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-            self.send("/move_base/current_goal", stamped("map") + place)
+            self.send("/move_base/current_goal", self.place())
         self.do.unlink(missing_ok=True)
 
     def note(self, *words: object) -> None:
@@ -244,6 +243,8 @@ class Base:
             kind, md5 = FORMS[topic]
             sock.sendall(header(callerid=self.name, topic=topic, md5sum=md5, type=kind))
             self.readers[topic].append(sock)
+            if topic == "/move_base/current_goal" and self.goal == 1:
+                sock.sendall(block(self.place()))
 
     def send(self, topic: str, body: bytes) -> None:
         for sock in list(self.readers[topic]):
@@ -251,6 +252,9 @@ class Base:
                 sock.sendall(block(body))
             except OSError:
                 self.readers[topic].remove(sock)
+
+    def place(self) -> bytes:
+        return stamped("map") + struct.pack("<7d", 1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
     def odometry(self) -> bytes:
         pose = struct.pack("<7d", self.x, 0.5, 0.0, 0.0, 0.0, 0.0, 1.0) + bytes(288)

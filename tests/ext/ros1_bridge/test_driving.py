@@ -47,11 +47,12 @@ def test_a_command_becomes_a_twist_and_ends_in_zeros_then_silence(husky: Husky) 
     time.sleep(0.4)
     assert len(husky.ros.rows(begin)) == count, "other programs of ROS may drive"
     assert husky.world.newest("wheel-odometry")["unit"] == "mm"
-    assert until(lambda: husky.world.newest("diagnostics").get("value", {}).get("label") == "OK", 3)
-    assert husky.world.newest("navigation-status")["value"]["label"] == "UNKNOWN"
+    newest = husky.world.newest
+    assert until(lambda: newest("diagnostics").get("value", {}).get("label") == "OK", 5)
+    assert until(lambda: newest("navigation-status").get("value", {}).get("label") == "UNKNOWN", 5)
 
 
-def test_its_sender_stops_the_base_although_the_service_hangs(ros: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_its_sender_stops_the_base_although_the_service_hangs(ros: World) -> None:
     """Rule 2: the first dead man. A speed that is no number is none."""
     node = node_of(ros)
     sender = CmdVel(node, TOPIC, 0.05, None, None)
@@ -68,9 +69,9 @@ def test_its_sender_stops_the_base_although_the_service_hangs(ros: World, monkey
         sender.drive(0.4, 0.0, 5.0)
         assert until(lambda: ros.moves(begin), 2)
         sender.drive(float("nan"), 0.0, 5.0)
-        at = time.monotonic_ns()
+        assert until(lambda: ros.zeros(begin), 2)
         time.sleep(0.4)
-        assert ros.moves(at + 50_000_000) == []
+        assert ros.moves(ros.zeros(begin)[0][0]) == []
     finally:
         sender.close()
         node.close()
@@ -96,9 +97,9 @@ def test_a_stopped_base_gets_zeros_the_lock_and_no_goal(husky: Husky) -> None:
     husky.drive(0.5)
     begin = time.monotonic_ns()
     husky.stop_it()
-    stopped = time.monotonic_ns()
     husky.drive(1.0)
-    assert husky.ros.moves(stopped + 20_000_000) == []
+    stopped = husky.ros.zeros(begin)[0][0]
+    assert husky.ros.moves(stopped) == []
     assert len(husky.ros.zeros(stopped)) >= 5
     assert set(husky.ros.locks(begin)) == {"True"}
     assert len(husky.ros.locks(begin)) >= 5, "it is repeated"
@@ -107,7 +108,7 @@ def test_a_stopped_base_gets_zeros_the_lock_and_no_goal(husky: Husky) -> None:
     husky.reset()
     assert until(lambda: husky.ros.locks(reset)[-1:] == ["False"], 2)
     time.sleep(0.6)
-    assert husky.ros.moves(stopped + 20_000_000) == []
+    assert husky.ros.moves(stopped) == []
     husky.drive(0.3)
     assert husky.ros.moves(reset)
 
@@ -177,7 +178,7 @@ def test_a_person_who_drives_cancels_navigation(
     husky = Husky(ros, tmp_path, **section).ready()
     ros.do("goal active")
     assert until(lambda: husky.world.newest("navigation-status").get("value", {}).get("active"), 5)
-    assert husky.world.newest("navigation-goal")["value"]["x_m"] == 1.0
+    assert until(lambda: husky.world.newest("navigation-goal").get("value", {}).get("x_m") == 1.0, 5)
     begin = time.monotonic_ns()
     for _ in range(3):
         husky.bridge.move(Drive(z=0.5, **drive), 0.2)

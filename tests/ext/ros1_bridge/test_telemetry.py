@@ -7,13 +7,17 @@ import socket
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pebble import contract as c
 from pebble.config import parse
+from pebble.contract.payloads import WheelOdometry
+from pebble.extensions.checks.conform.motion import moves_until
 from pebble.services.ros1_bridge import messages, publication
 from pebble.services.ros1_bridge.config import Ros1
 from pebble.services.ros1_bridge.messages import Form
@@ -221,3 +225,15 @@ def test_what_a_subscriber_cannot_take_is_dropped_and_one_that_takes_nothing_is_
     assert blocks.feed(received)[:2] == [bytes(48), body], "first the first one, and whole messages"
     for sock in (listener, theirs, ours):
         sock.close()
+
+
+def test_conform_sees_by_odometry_whether_a_base_moves() -> None:
+    def seen(*speeds: tuple[float, float]) -> Any:
+        values = [{"linear_speed_mps": ahead, "angular_speed_radps": turn} for ahead, turn in speeds]
+        payloads = [WheelOdometry(value=value, timestamp=0.0) for value in values]
+        records = [SimpleNamespace(at=at + 1.0, value=payload) for at, payload in enumerate(payloads)]
+        return SimpleNamespace(of=lambda channel: records if channel is c.WHEEL_ODOMETRY else [], eyes=list)
+
+    driven = seen((0.0, 0.0), (0.3, 0.0), (0.0, -0.5), (0.001, 0.001))
+    assert [moves_until(driven, since) for since in (0.0, 3.5)] == [3.0, 0.0]
+    assert moves_until(seen(), 0.0) is None

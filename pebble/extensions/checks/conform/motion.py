@@ -78,11 +78,12 @@ def _travelled(robot: Observer) -> list[tuple[float, list[float]]]:
     """Return what its wheels did by its odometry, left and right, in metres a second."""
     found = []
     for record in robot.of(c.WHEEL_ODOMETRY):
-        value = record.value.value if record.value else {}
-        ahead, turn = value.get("linear_speed_mps"), value.get("angular_speed_radps")
+        value: dict[str, Any] = record.value.value if record.value else {}
+        ahead: Any = value.get("linear_speed_mps")
+        turn: Any = value.get("angular_speed_radps")
         if _are_wheels([ahead, turn]):
-            ahead, turn = round(ahead, 2), _HALF_TRACK_M * round(turn, 2)
-            found.append((record.at, [ahead - turn, ahead + turn]))
+            metres, swing = round(float(ahead), 2), _HALF_TRACK_M * round(float(turn), 2)
+            found.append((record.at, [metres - swing, metres + swing]))
     return found
 
 
