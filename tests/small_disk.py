@@ -18,7 +18,15 @@ class SmallDisk:
 
     def mount(self, *options: str) -> None:
         """An empty one; over the one that is there, which is hidden."""
-        words = ["mount", "-t", "tmpfs", "-o", ",".join((f"size={self._size}m", *options)), "none", str(self.root)]
+        words = [
+            "mount",
+            "-t",
+            "tmpfs",
+            "-o",
+            ",".join((f"size={self._size}m", "mode=755", *options)),
+            "none",
+            str(self.root),
+        ]
         subprocess.run(words, check=True)
         self._mounts += 1
 

@@ -37,7 +37,7 @@ def problems(level: str, *changes: dict[str, Any]) -> list[str]:
     for change in changes:
         raw = deep_merge(raw, change)
     try:
-        parse(raw, folder=Path("/nowhere"), env={})
+        parse(raw, folder=Path("/"), env={})
     except ConfigError as error:
         return [one.partition(": ")[0] for one in error.problems]
     return []

@@ -14,7 +14,7 @@ import pytest
 
 from pebble.commands import app
 from pebble.config import load, parse
-from pebble.config.types import Section, ServiceSection
+from pebble.config.types import Section
 from pebble.errors import ConfigError
 from pebble.extension import OURS, Command, Extension, Stage, lacking_packages, ours, part, programs_of
 from pebble.launcher.capabilities import capabilities
@@ -68,7 +68,9 @@ class TestOurs:
         for key, place in extension.sections.items():
             *outer, name = key.split(".")
             target = reduce(lambda section, step: section.setdefault(step, {}), outer, raw)
-            target[name] = NEEDED.get(key, {}) | ({"enabled": True} if issubclass(part(place), ServiceSection) else {})
+            target[name] = NEEDED.get(key, {}) | (
+                {"enabled": True} if "enabled" in part(place).__struct_fields__ else {}
+            )
         config = parse(raw, folder=tmp_path, env={})
         names = [program.name for program in programs_of([extension], config)]
         assert names == ([extension.program.name] if extension.program else [*extension.motors.values()])

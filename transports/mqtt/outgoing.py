@@ -3,12 +3,10 @@
 Neither class is locked: their connection is.
 """
 
-import fcntl
 import itertools
 import socket
 import struct
 import sys
-import termios
 import threading
 from collections import deque
 from collections.abc import Sequence
@@ -16,6 +14,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from pebble.transports.base import Message, QoS
+
+try:
+    import fcntl
+    import termios
+except ImportError:  # Windows has neither
+    _can_measure = False
+else:
+    _can_measure = True
 
 BACKLOG_MESSAGES = 64  # that are not retained
 BACKLOG_BYTES = 256 * 1024  # of their payloads; one message may always wait, whatever its size
@@ -277,19 +283,24 @@ def _note(table: dict[str, tuple[float, int]], topic: str, at: float, size: int)
 
 
 def unconfirmed_bytes(sock: socket.socket) -> int:
-    """Return bytes the kernel has accepted and the other side's TCP has not acknowledged, sent or not (SIOCOUTQ)."""
-    return _kernel_bytes(sock, termios.TIOCOUTQ)
+    """Return bytes the kernel has accepted and the other side's TCP has not acknowledged, sent or not (SIOCOUTQ).
+
+    0 where the system does not say.
+    """
+    return _kernel_bytes(sock, "TIOCOUTQ")
 
 
 def readable_bytes(sock: socket.socket | None) -> int:
-    """Return bytes that the kernel has received and we have not read (FIONREAD)."""
-    return 0 if sock is None else _kernel_bytes(sock, termios.FIONREAD)
+    """Return bytes that the kernel has received and we have not read (FIONREAD); 0 where the system does not say."""
+    return 0 if sock is None else _kernel_bytes(sock, "FIONREAD")
 
 
-def _kernel_bytes(sock: socket.socket, request: int) -> int:
+def _kernel_bytes(sock: socket.socket, request: str) -> int:
     size = bytearray(4)
+    if not _can_measure:
+        return 0
     with suppress(OSError, ValueError):  # closed, or no TCP
-        fcntl.ioctl(sock.fileno(), request, size)
+        fcntl.ioctl(sock.fileno(), getattr(termios, request), size)
     return int.from_bytes(size, sys.byteorder)
 
 
