@@ -16,27 +16,38 @@ class SocketPoll:
         self._wakeup = WakeupPipe()
         self.registered = False
         self._sock, self._wake, self._write = -1, self._wakeup.fileno(), False
-        self._poll = select.poll()
+        self._poll = select.poll() if hasattr(select, "poll") else None  # Windows has none
 
     def register(self, sock: socket.socket) -> None:
         self.registered, self._sock = True, sock.fileno()
-        self._poll.register(self._sock, select.POLLIN)
-        self._poll.register(self._wake, select.POLLIN)
+        if self._poll is not None:
+            self._poll.register(self._sock, select.POLLIN)
+            self._poll.register(self._wake, select.POLLIN)
 
     def wait(self, seconds: float, *, write: bool) -> tuple[bool, bool, bool]:
         """Return which of the three holds: readable, writable, woken."""
-        if write is not self._write:
-            self._write = write
-            self._poll.modify(self._sock, select.POLLIN | (select.POLLOUT if write else 0))
-        readable = writable = woken = False
-        for descriptor, seen in self._poll.poll(ceil(seconds * 1000)):
-            if descriptor == self._wake:
-                woken = True
-            else:
-                readable, writable = bool(seen & ~select.POLLOUT), bool(seen & select.POLLOUT)
+        if self._poll is None:
+            readable, writable, woken = self._select(seconds, write=write)
+        else:
+            if write is not self._write:
+                self._write = write
+                self._poll.modify(self._sock, select.POLLIN | (select.POLLOUT if write else 0))
+            readable = writable = woken = False
+            for descriptor, seen in self._poll.poll(ceil(seconds * 1000)):
+                if descriptor == self._wake:
+                    woken = True
+                else:
+                    readable, writable = bool(seen & ~select.POLLOUT), bool(seen & select.POLLOUT)
         if woken:
             self._wakeup.clear()
         return readable, writable, woken
+
+    def _select(self, seconds: float, *, write: bool) -> tuple[bool, bool, bool]:
+        try:
+            ready = select.select([self._sock, self._wake], [self._sock] if write else [], [self._sock], seconds)
+        except (OSError, ValueError):  # closed meanwhile: reading it says so
+            return True, False, False
+        return self._sock in ready[0] + ready[2], bool(ready[1]), self._wake in ready[0]
 
     def wake(self) -> None:
         """Make `wait` return; other threads call it."""

@@ -19,14 +19,13 @@ class Stage(Testbed):
     """Brokers and the named robots (none: all four), and the page's server; no operator drives them.
 
     ``robots``, by name, are traced: ``entries()`` is what each MCU received and did, with time.monotonic_ns().
-    ``room``: Goob sees its room, in pictures as old as the room's state; else a scene that is drawn when due.
     ``settings`` are fields of WebSettings. ``url`` of the page ends with a slash. Raises PebbleError.
     """
 
     keep = False
 
-    def __init__(self, *names: str, room: bool = True, **settings: Any) -> None:
-        super().__init__(threading.Event(), names or ROBOTS, room=room)
+    def __init__(self, *names: str, **settings: Any) -> None:
+        super().__init__(threading.Event(), names or ROBOTS)
         self._settings = settings
 
     def start(self) -> None:

@@ -78,7 +78,7 @@ Drive = Callable[..., Terminal]
 
 @pytest.fixture(scope="module")
 def stage() -> Iterator[Stage]:
-    with Stage("minilamp", room=False) as running:
+    with Stage("minilamp") as running:
         yield running
 
 

@@ -79,7 +79,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def goob() -> Iterator[Stage]:
-    with Stage("goob", room=False) as running:
+    with Stage("goob") as running:
         yield running
 
 

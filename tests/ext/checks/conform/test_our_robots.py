@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.alone, pytest.mark.thorough]
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_robot_of_ours_passes(name: str) -> None:
     with (
-        Stage(name, room=False) as stage,
+        Stage(name) as stage,
         observed(Target(url=f"mqtt://127.0.0.1:{stage.broker_port}", robot=name), 4.0) as robot,
     ):
         robot.eyes = lambda: [(ns / 1e9, [*wheels]) for ns, wheels in stage.motors(name)]

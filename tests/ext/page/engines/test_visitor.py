@@ -79,7 +79,7 @@ def test_a_visitor_sees_drives_stops_and_starts_a_script(
         visitor.presses("[data-test=take]")
         visitor.sees("document.querySelector('[data-test=release]')")
         visitor.did("it is the visitor's")
-        since_ns, trace = time.monotonic_ns(), trace_path(demo.folders()[0] / "goob", "goob")
+        since_ns, trace = time.monotonic_ns(), trace_path(demo.folders()[0] / "world", "goob")
         for _ in range(20):
             engine.hold("w", 700)
             if any(any(seen.motors or ()) for seen in read_trace(trace) if seen.ns > since_ns):

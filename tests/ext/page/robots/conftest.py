@@ -20,7 +20,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture(scope="package")
 def stage() -> Iterator[Stage]:
-    with Stage("minilamp", "benjr", room=False) as running:
+    with Stage("minilamp", "benjr") as running:
         yield running
 
 

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.page  # deadlines are checked
 @pytest.fixture(scope="module")
 def stage() -> Iterator[Stage]:
     """The demo's four robots."""
-    with Stage(room=False) as running:
+    with Stage() as running:
         yield running
 
 
