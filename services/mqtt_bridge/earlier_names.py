@@ -1,35 +1,157 @@
-"""Notices that a robot has another name than before: brokers go on retaining what it published under the old one."""
+"""Removes what brokers retain under the names that this robot had before: its identity in the config was changed.
 
+Nothing else ever would, and operators would see a robot that is off for ever.
+"""
+
+import json
 import logging
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TypeAlias
 
 from pebble.config import Config
 from pebble.config.config import file_name
-from pebble.errors import PebbleError
+from pebble.contract import ONLINE
+from pebble.contract.identity import Identity
+from pebble.contract.levels import LEVELS
+from pebble.errors import ConfigError, PebbleError, TransportError
+from pebble.runtime.timers import Timer
 from pebble.runtime.whole_file import make_folder, write
+from pebble.transports import Message, QoS, State, Subscription, Transport
 
 log = logging.getLogger(__name__)
 
-_LONGEST = 1000  # bytes of a name
+CallIn: TypeAlias = Callable[[float, Callable[[], None]], Timer]  # calls later, on the service's thread
+
+WATCH_S = LEVELS["thin"].silent_s + 1.0  # in which another robot of that name would send a heartbeat
+_ARRIVE_S = 2.0  # for what a broker retains
+_OFFLINE = re.compile(rb'"online"\s*:\s*false')
+_NAMES = 16  # that are remembered
+_TOPICS = 1000  # that are removed of one name
 
 
-def note_name(config: Config) -> None:
-    """Remember the robot's name beside its state, and warn if it was another one at the last start."""
-    if config.path is None:  # several robots may share a state directory, but not a config
-        return
-    folder = config.state_dir()
-    if folder.name == file_name(config.base):  # by default each name has a folder of its own
-        folder = folder.parent
-    file = folder / f"name-{file_name(str(config.path.resolve()))}"
-    name = config.base.encode()
-    try:
-        earlier = file.read_bytes()[:_LONGEST] if file.is_file() else b""
-        if earlier == name:
+class EarlierNames:
+    """The names that were used with the same config file."""
+
+    def __init__(self, config: Config, sides: list[Transport], call_in: CallIn) -> None:
+        self._base, self._sides, self._call_in = config.base, sides, call_in
+        self._file: Path | None = None
+        if config.path is not None:  # several robots may share a state directory, but not a config
+            folder = config.state_dir()
+            if folder.name == file_name(config.base):  # by default each name has one of its own
+                folder = folder.parent
+            self._file = folder / f"names-{file_name(str(config.path.resolve()))}.json"
+        self._names: list[str] = []
+        self._begun = False
+
+    def begin(self) -> None:
+        """Remember the robot's name, and look for what is left of earlier ones; once both sides are connected."""
+        if self._begun or self._file is None:
             return
-        make_folder(folder)
-        write(file, name, 0o600, PebbleError)
-    except (PebbleError, OSError) as error:
-        log.warning("its name cannot be remembered: %s", error)
-        return
-    if earlier:
-        text = "its name was %s before: what brokers retain under that stays: see `pebble doctor --running`"
-        log.warning(text, earlier.decode(errors="replace"))
+        self._begun = True
+        try:
+            names = json.loads(self._file.read_bytes())
+            self._names = [Identity(*name.split("/")).base for name in names][-_NAMES:]
+        except (
+            OSError,
+            ValueError,
+            TypeError,
+            AttributeError,
+            RecursionError,
+            ConfigError,
+        ):  # or it is the first start
+            self._names = []
+        earlier = [name for name in self._names if name != self._base]
+        self._save([*earlier, self._base])
+        for name in earlier:
+            log.info("its name was %s before: what a broker retains under it is removed unless a robot has it", name)
+            _Removal(name, self._sides, self._call_in, partial(self._forget, name)).begin()
+
+    def _forget(self, name: str) -> None:
+        self._save([other for other in self._names if other != name])
+
+    def _save(self, names: list[str]) -> None:
+        if names == self._names or self._file is None:
+            return
+        self._names = names
+        try:
+            make_folder(self._file.parent)
+            write(self._file, json.dumps(names).encode(), 0o600, PebbleError)
+        except (PebbleError, OSError) as error:
+            log.warning("its name cannot be remembered: %s", error)
+
+
+class _Removal:
+    """Watches for a robot of one name; if there is none, removes what brokers retain, and checks that it has gone."""
+
+    def __init__(self, name: str, sides: list[Transport], call_in: CallIn, done: Callable[[], None]) -> None:
+        self._name, self._sides, self._call_in, self._done = name, sides, call_in, done
+        self._subscriptions: list[Subscription] = []
+        self._found: list[set[str]] = []  # on each side: heartbeats, then topics
+        self._removed = 0
+
+    def begin(self) -> None:
+        self._ask(ONLINE.topic(self._name), _note_heartbeat, WATCH_S, self._look)
+
+    def _look(self) -> None:
+        if any(len(heartbeats) > 1 for heartbeats in self._found):  # one may be retained
+            log.info("%s is another robot now: what is retained under this name is its own", self._name)
+            self._end()
+            self._done()
+        elif all(transport.state is State.CONNECTED for transport in self._sides):  # else at the next start
+            self._ask(f"{self._name}/#", _note_retained, _ARRIVE_S, self._remove)
+        else:
+            self._end()
+
+    def _remove(self) -> None:
+        self._removed = sum(map(len, self._found))
+        for transport, topics in zip(self._sides, self._found, strict=True):
+            for topic in sorted(topics):
+                transport.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
+        again = partial(self._ask, f"{self._name}/#", _note_retained, _ARRIVE_S, self._check)
+        self._call_in(_ARRIVE_S, again)
+
+    def _check(self) -> None:
+        left = [topic for topics in self._found for topic in topics]
+        left += [one.filter for one in self._subscriptions if one.refused]
+        self._end()
+        if left:
+            text = "%s, its earlier name, stays at a broker: this account may not remove %s and %d more topics"
+            log.warning(text, self._name, min(left), len(left) - 1)
+        elif self._removed:  # the next start looks again: a broker may publish a will later
+            log.info("removed %d retained messages of its earlier name %s", self._removed, self._name)
+        else:
+            self._done()
+
+    def _ask(
+        self, filter_: str, note: Callable[[set[str], Message], None], wait_s: float, then: Callable[[], None]
+    ) -> None:
+        """Subscribe on all sides, and go on once what they have has arrived; nothing of this ends the bridge."""
+        self._end()
+        self._found = [set() for _ in self._sides]
+        try:
+            for transport, found in zip(self._sides, self._found, strict=True):
+                received = partial(note, found)
+                self._subscriptions.append(transport.subscribe(filter_, received, echo=False, direct=True))
+        except TransportError as error:
+            log.warning("what is left of its earlier name %s stays: %s", self._name, error)
+            self._end()
+            return
+        self._call_in(wait_s, then)
+
+    def _end(self) -> None:
+        subscriptions, self._subscriptions = self._subscriptions, []
+        for subscription in subscriptions:
+            subscription.close()
+
+
+def _note_heartbeat(found: set[str], message: Message) -> None:
+    if len(found) < _TOPICS and _OFFLINE.search(message.payload) is None:
+        found.add(message.payload.hex())
+
+
+def _note_retained(found: set[str], message: Message) -> None:
+    if message.retain and message.payload and len(found) < _TOPICS:
+        found.add(message.topic)

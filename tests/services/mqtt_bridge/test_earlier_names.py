@@ -1,35 +1,137 @@
-"""A robot that has another name than at its last start says so."""
+"""What is retained under a name that a robot had before goes, unless the name is another robot's now."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from pebble.config import load
-from pebble.services.mqtt_bridge.earlier_names import note_name
+from pebble.services.mqtt_bridge.earlier_names import EarlierNames
+from pebble.transports import MqttSettings, Transport, create
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.services.mqtt_bridge.bridge_rig import Client
+from tests.support import Broker, until
+
+OLD = "pebble/robots/rover"
+_ARRIVES_S = 0.1  # what a hub of memory distributes
+LEFT = ("outgoing/online", "outgoing/capabilities", "outgoing/mcu/x/value", "incoming/flags/mqtt-audio")
 
 
-@pytest.mark.parametrize(
-    ("names", "warnings"),
-    [(["a"], 0), (["a", "a"], 0), (["a", "b", "b"], 1), (["a", "b", "a"], 2), (["a", "", "b"], 1)],
-)
-@pytest.mark.parametrize("folder", [None, "state"], ids=["default", "shared"])
-def test_a_new_name_is_warned_of_once(
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-    names: list[str],
-    warnings: int,
-    folder: str | None,
-) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
-    path = tmp_path / "robot.json"
-    for name in filter(None, names):
-        transport = {"kind": "zenoh"} if folder is None else {"kind": "zenoh", "state_dir": str(tmp_path / folder)}
-        path.write_text(json.dumps({"robot": {"id": name}, "transport": transport}))
-        note_name(load(path))
-    before = [line for line in caplog.messages if "its name was pebble/robots/" in line]
-    assert len(before) == len(caplog.messages) == warnings
+class Named:
+    """A robot that is started again and again under names, at one broker."""
+
+    def __init__(self, folder: Path, make: Callable[[str], Transport]) -> None:
+        self.make, self.config = make, folder / "robot.json"
+        self.state = folder / "state"
+        self.client = Client(make("operator"), OLD, listen=False)
+
+    def start(self, name: str, meanwhile: Callable[[], None] = lambda: None, *, connected: bool = True) -> None:
+        """``meanwhile`` happens after it has begun to watch."""
+        transport = {"kind": "zenoh", "state_dir": str(self.state)}
+        self.config.write_text(json.dumps({"robot": {"id": name}, "transport": transport}))
+        robots_own = MemoryHub()
+        if not connected:
+            robots_own.stop()
+        sides = [self.make(name), MemoryTransport(f"{name}-local", robots_own)]
+        for side in sides:
+            side.open(5 if connected else 0.5)
+        jobs: list[Callable[[], None]] = [meanwhile]
+        names = EarlierNames(load(self.config), sides, lambda _seconds, job: jobs.append(job))  # type: ignore[arg-type]
+        names.begin()
+        while jobs:
+            jobs.pop(0)()
+            until(lambda: False, _ARRIVES_S)
+        for side in sides:
+            side.close()
+
+    def leave(self) -> None:
+        for suffix in LEFT:
+            self.client.publish(suffix, b'{"online": false}', retain=True)
+
+    @property
+    def left(self) -> list[str]:
+        looker = Client(self.make("looker"), OLD)
+        until(lambda: False, _ARRIVES_S)
+        found = sorted(message.topic.removeprefix(f"{OLD}/") for message in looker.seen)
+        looker.transport.close()
+        return found
+
+    @property
+    def known(self) -> list[str]:
+        (file,) = self.state.iterdir()
+        return [name.rpartition("/")[2] for name in json.loads(file.read_text())]
+
+
+@pytest.fixture(params=["memory", "mqtt"])
+def robot(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Named]:
+    if request.param == "memory":
+        hub = MemoryHub()
+        yield Named(tmp_path, lambda name: MemoryTransport(name, hub))
+        return
+    broker = Broker(tmp_path)
+
+    def make(name: str) -> Transport:  # a bridge's connection tells its own messages from others, and what is retained
+        return create(
+            "mqtt", name, MqttSettings(host="127.0.0.1", port=broker.port, as_published=name.startswith("rover"))
+        )
+
+    yield Named(tmp_path, make)
+    broker.stop()
+
+
+def test_what_was_retained_under_an_earlier_name_is_removed(robot: Named) -> None:
+    robot.start("rover")
+    robot.leave()
+    robot.start("rover")
+    assert robot.left == sorted(LEFT)
+    robot.start("rover-two")
+    assert robot.left == []
+    robot.client.publish("outgoing/online", b'{"online": false}', retain=True)  # a late will
+    robot.start("rover-two")
+    assert (robot.left, robot.known) == ([], ["rover", "rover-two"])
+    robot.start("rover-two")
+    assert robot.known == ["rover-two"]
+
+
+def test_what_another_robot_retains_stays(robot: Named) -> None:
+    robot.start("rover")
+    robot.leave()
+    beats = iter(range(1_000_000))
+
+    def beat() -> None:
+        for _ in range(2):
+            robot.client.publish("outgoing/online", b'{"t": %d}' % next(beats), retain=True)
+
+    robot.start("rover-two", beat)
+    assert (robot.left, robot.known) == (sorted(LEFT), ["rover-two"])
+
+
+def test_without_a_connection_it_is_tried_at_the_next_start(robot: Named) -> None:
+    robot.start("rover")
+    robot.leave()
+    robot.start("rover-two", connected=False)
+    assert (robot.left, robot.known) == (sorted(LEFT), ["rover", "rover-two"])
+    robot.start("rover-two")
+    assert robot.left == []
+
+
+@pytest.mark.parametrize("text", ['["+/+/+"]', '["pebble/#/x"]', "[7]", "{", '["pebble/robots"]'])
+def test_a_damaged_file_removes_nothing(robot: Named, text: str) -> None:
+    robot.start("rover")
+    robot.leave()
+    (file,) = robot.state.iterdir()
+    file.write_text(text)
+    robot.start("rover-two")
+    assert (robot.left, robot.known) == (sorted(LEFT), ["rover-two"])
+
+
+def test_a_name_that_comes_back_is_the_robots_own(robot: Named) -> None:
+    for name in ("rover", "rover-two", "rover"):
+        robot.start(name)
+    robot.leave()
+    robot.start("rover")
+    assert robot.left == sorted(LEFT)
+    assert robot.known[-1] == "rover"
