@@ -184,7 +184,8 @@ def report(theirs: Path, secret: Path) -> object:
 
 def container(theirs: Path, _: Path) -> object:
     os.chown(theirs, 100_999, 100_999)  # of no user, but of one in a container
-    return require_own(theirs)
+    require_own(theirs)
+    return "root goes on"
 
 
 def everybody(theirs: Path, _: Path) -> object:
@@ -205,7 +206,8 @@ def holes(theirs: Path, _: Path) -> object:
 
 
 def lines(theirs: Path, _: Path) -> object:
-    return applying.make(theirs / "x\nuser root", Fleet(level="login", brokers=(Server(host="127.0.0.1"),)))
+    applying.make(theirs / "x\nuser root", Fleet(level="login", brokers=(Server(host="127.0.0.1"),)))
+    return "made"
 
 
 def copy(theirs: Path, _: Path) -> object:
@@ -244,7 +246,7 @@ def test_what_a_user_names_root_neither_reads_nor_runs(
 def test_who_asks_as_a_user_has_no_variables_of_roots(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[dict[str, Any]] = []
     monkeypatch.setenv("TOKEN_OF_ROOT", "x")
-    monkeypatch.setattr("pebble.extensions.checks.report.report.output_of", lambda *_, **how: asked.append(how) or "")
+    monkeypatch.setattr("pebble.extensions.checks.report.report.output_of", lambda *_, **how: asked.append(how))
     (place / "theirs").mkdir()
     os.chown(place / "theirs", NOBODY, NOBODY)
     text = json.dumps({"robot": {"id": "goob"}, "transport": {"kind": "mqtt", "run_dir": str(place / "theirs")}})
