@@ -28,6 +28,8 @@ from pebble.extensions.install.setup.answers import read_file
 from pebble.extensions.lab.simulation.world import program
 from pebble.extensions.operator.places import Places
 from pebble.extensions.page.commands.people import opened
+from pebble.extensions.recordings.commands.files import mend
+from pebble.extensions.recordings.files.writer import RecordingWriter
 from pebble.launcher.launcher import Launcher
 from pebble.ownership import owner_of
 from pebble.runtime.as_owner import as_before, as_owner, require_own
@@ -182,7 +184,8 @@ def report(theirs: Path, secret: Path) -> object:
 
 def container(theirs: Path, _: Path) -> object:
     os.chown(theirs, 100_999, 100_999)  # of no user, but of one in a container
-    return require_own(theirs)
+    require_own(theirs)
+    return "root goes on"
 
 
 def everybody(theirs: Path, _: Path) -> object:
@@ -196,7 +199,30 @@ def world(theirs: Path, _: Path) -> object:
     return program.run(program.ROOM)
 
 
-@pytest.mark.parametrize("act", [password, answers, robot, script, report, container, everybody, world])
+def holes(theirs: Path, _: Path) -> object:
+    (theirs / "fleet.json").touch()
+    os.truncate(theirs / "fleet.json", 1 << 40)
+    return load_fleet(theirs)
+
+
+def lines(theirs: Path, _: Path) -> object:
+    applying.make(theirs / "x\nuser root", Fleet(level="login", brokers=(Server(host="127.0.0.1"),)))
+    return "made"
+
+
+def copy(theirs: Path, _: Path) -> object:
+    with (theirs / "a.mcap").open("wb", buffering=0) as file:
+        RecordingWriter(file).finish()
+    config(theirs)
+    mend(theirs / "a.mcap", theirs / "b.mcap")
+    owner = (theirs / "b.mcap").stat().st_uid
+    return f"belongs to user {owner}" if owner else "a link in its place would lead root"
+
+
+ACTS = [password, answers, robot, script, report, container, everybody, world, holes, lines, copy]
+
+
+@pytest.mark.parametrize("act", ACTS)
 def test_what_a_user_names_root_neither_reads_nor_runs(
     act: Callable[[Path, Path], object], place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -212,7 +238,7 @@ def test_what_a_user_names_root_neither_reads_nor_runs(
         told = str(act(theirs, secret))
     except PebbleError as error:
         told = str(error)
-    assert re.search("denied|belongs to (user|all)", told)
+    assert re.search("denied|belongs to (user|all)|too large|cannot stand", told)
     assert "of root" not in told
     assert os.geteuid() == 0
 
@@ -220,7 +246,7 @@ def test_what_a_user_names_root_neither_reads_nor_runs(
 def test_who_asks_as_a_user_has_no_variables_of_roots(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[dict[str, Any]] = []
     monkeypatch.setenv("TOKEN_OF_ROOT", "x")
-    monkeypatch.setattr("pebble.extensions.checks.report.report.output_of", lambda *_, **how: asked.append(how) or "")
+    monkeypatch.setattr("pebble.extensions.checks.report.report.output_of", lambda *_, **how: asked.append(how))
     (place / "theirs").mkdir()
     os.chown(place / "theirs", NOBODY, NOBODY)
     text = json.dumps({"robot": {"id": "goob"}, "transport": {"kind": "mqtt", "run_dir": str(place / "theirs")}})

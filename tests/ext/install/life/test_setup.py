@@ -77,7 +77,8 @@ def test_package_and_setup_make_a_robot_with_heartbeats_and_let_its_user_in(mach
         assert "All is so already." in again
         before = machine.sh(OWNERS)
         machine.sh(BLANK)
-        shown.append(machine.run("pebble", "setup", "--from", "/srv/goob.tar", timeout=300))
+        restored = ("pebble", "setup", "--from", "/srv/goob.tar")
+        shown.append(machine.run(*restored, timeout=300, given="y\n"))  # its board is in /run, which is asked for
         assert machine.succeeds(*receives), "the backup is the same robot"
         assert machine.sh(OWNERS) == before
         machine.run("env", "PLANTED=in-an-environment", "sleep", "1.5")
