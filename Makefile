@@ -53,6 +53,7 @@ test: .venv/.ready-dev
 check: .venv/.ready-dev
 	@$(VENV) -m ruff check
 	@$(VENV) -m ruff format --check
+	@$(VENV) tools/docstrings.py
 	@.venv/bin/lint-imports --no-logo
 	@$(VENV) -m mypy
 	@$(VENV) -m tests.firmware.types

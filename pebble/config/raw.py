@@ -1,4 +1,4 @@
-"""Reads a config file into plain data: JSON without comments, the keys that serial lines share copied to each."""
+"""The plain data of a config file: JSON without comments, the keys that serial lines share copied to each."""
 
 import json
 import math

@@ -90,7 +90,7 @@ class EstopCommand(Payload, frozen=True, kw_only=True):
 
 
 class EstopReset(Payload, frozen=True, kw_only=True):
-    """Ends the emergency stop of one motor owner, if both are those of its state now."""
+    """The end of the emergency stop of one motor owner, if ``boot`` and ``count`` are those of its state now."""
 
     boot: str
     count: int

@@ -1,4 +1,4 @@
-"""Runs a program of this machine to its own end."""
+"""A run of a program of this machine to its own end."""
 
 import os
 import subprocess
