@@ -24,7 +24,7 @@ from pebble.transports.segments import SHM
 
 
 def picture(size: tuple[int, int], frame: Frame) -> bytes:
-    """Return rows of BGR, each padded to a multiple of four bytes, as everywhere in GStreamer."""
+    """Return rows of BGR, each of which ends at a multiple of four bytes, as everywhere in GStreamer."""
     pixels = frame.picture()
     if (sent := pixels.shape[1::-1]) != size:
         sys.exit(f"the camera sends pictures of {sent}, and the config says {size}")

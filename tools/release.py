@@ -61,7 +61,7 @@ def copied(source: Path, into: Path) -> None:
 
 
 def normal(sdist: Path, epoch: int) -> None:
-    """Rewrite an sdist without the times and owners of its build, which setuptools leaves in it."""
+    """Write an sdist again, because setuptools leaves times and owners of its build in it."""
     with tarfile.open(sdist) as archive:
         members = [(member, archive.extractfile(member)) for member in archive.getmembers()]
         tar = io.BytesIO()

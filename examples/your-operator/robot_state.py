@@ -1,4 +1,4 @@
-"""A robot's state as an operator knows it by the messages that it publishes."""
+"""The state of a robot as an operator knows it, by the messages that it publishes."""
 
 import json
 import math

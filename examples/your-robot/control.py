@@ -1,4 +1,4 @@
-"""Control of a robot: one program has it until it ends, is released or is taken; others who ask are shown.
+"""The control of a robot: it ends, is released or is taken; a request meanwhile is shown.
 
 Times are milliseconds of a clock that is never set.
 """

@@ -1,4 +1,4 @@
-"""A robot's duties to those who drive it, see docs/your-robot.md: on a computer, and unchanged on a board."""
+"""The duties of a robot towards its drivers, see docs/your-robot.md: on a computer, and unchanged on a board."""
 
 from control import Control
 from emergency_stop import EmergencyStop

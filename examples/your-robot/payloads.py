@@ -1,4 +1,4 @@
-"""Readers of payloads, which may be anything: they return JSON objects, numbers and short texts, or nothing."""
+"""Readers of payloads, which may be anything: they become JSON objects, numbers and short texts, or nothing."""
 
 import binascii
 import json

@@ -1,4 +1,4 @@
-"""BenJr's wiring on its LOLIN (WEMOS) D1 mini: GPIO numbers, and 0 for the only analogue input."""
+"""The wiring of BenJr's LOLIN (WEMOS) D1 mini: GPIO numbers, and 0 for the only analogue input."""
 
 SCL = 5  # D1
 SDA = 4  # D2

@@ -1,4 +1,4 @@
-"""Arbitration of the motors: the latch, control, people before scripts. Pure; boards share it with Linux.
+"""Who moves the motors: none while latched, who has control, people before scripts. Pure; boards share it with Linux.
 
 A drive command with all axes 0 is a zero. A person's zero is always judged. Commands of a script carry the number of
 its run, which grows with each start; a run that is barred never moves anything again. The numbers have no end: after

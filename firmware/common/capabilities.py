@@ -1,4 +1,4 @@
-"""The capabilities that a robot on Wi-Fi announces (paper A.8.6). Pure."""
+"""The capabilities of a robot on Wi-Fi (paper A.8.6). Pure."""
 
 import json
 

@@ -124,14 +124,14 @@ def is_name(name: object) -> bool:
 
 
 def stop_of(body: object) -> tuple[str, str, str]:
-    """Return ``(name, by, why)`` of a parsed stop, of whatever shape; the name is "" if it has none."""
+    """``(name, by, why)`` of a parsed stop, of whatever shape; the name is "" if it has none."""
     found = fields(body)
     name = found.get("stop")
     return str(name) if is_name(name) else "", _text(found.get("by"), 32), _text(found.get("why"), 40)
 
 
 def reset_of(body: object) -> tuple[str, int] | None:
-    """Return ``(boot, count)`` of a parsed reset; None if it is none."""
+    """``(boot, count)`` of a parsed reset; None if it is none."""
     found = fields(body)
     boot = found.get("boot")
     count = found.get("count")
@@ -149,7 +149,7 @@ def fields(body: object) -> dict:
 
 
 def _text(value: object, limit: int) -> str:
-    """Return printable ASCII, without what JSON would have to escape."""
+    """Printable ASCII, without what JSON would have to escape."""
     if not isinstance(value, str):
         return ""
     return "".join([char if " " <= char <= "~" and char not in '"\\' else "?" for char in value[:limit]])

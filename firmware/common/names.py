@@ -1,4 +1,4 @@
-"""Senders of commands, where the broker checks names: loaded there only, for it takes memory. Pure.
+"""The senders of commands at a broker that checks names. Loaded only there, because it takes memory. Pure.
 
 Each topic is subscribed to a second time there, with the account of its sender: ``by/{account}/{topic}``.
 """

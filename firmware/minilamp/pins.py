@@ -1,4 +1,4 @@
-"""MiniLAMP's wiring on its Seeed XIAO ESP32C6: GPIO numbers.
+"""The wiring of MiniLAMP's Seeed XIAO ESP32C6: GPIO numbers.
 
 D0..D10 are GPIO 0, 1, 2, 21, 22, 23, 16, 17, 19, 20, 18 (espressif/arduino-esp32, variants/XIAO_ESP32C6). Only D0..D2
 have an ADC. D6 and D7 are unused: the boot loader sends on GPIO 16 and pulls GPIO 17 up, so motors would twitch.

@@ -1,4 +1,4 @@
-"""A meter of messages: how many come per second, how many bits, and how old they are. Pure: times are passed in."""
+"""A meter of messages and bits per second, and of their age. Pure: times are passed in."""
 
 import statistics
 from collections import deque

@@ -1,4 +1,4 @@
-"""A catalogue of what recordings hold, by their summaries where they have some."""
+"""The contents of recordings, read from their summaries where they have them."""
 
 import json
 from collections import Counter
@@ -109,7 +109,7 @@ def events(paths: Iterable[Path]) -> Iterator[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """The conditions of wanted messages; without any, all of robots, brokers and the recorder."""
+    """A choice of messages; without any condition all of robots, brokers and the recorder."""
 
     robot: str | None = None  # system/type/id
     topics: tuple[str, ...] = ()  # filters; one without the robot's identity begins at any robot's

@@ -1,4 +1,4 @@
-"""A payload's own stamp, and the answer to whether it is media. Pure.
+"""What a payload says about itself: its own stamp, and whether it is media. Pure.
 
 Stamps of JSON are ``t`` in milliseconds or ``timestamp`` in seconds (paper A.4.2); media have theirs in the header
 (``pebble.contract.packets``).
@@ -74,7 +74,7 @@ def is_keyframe(payload: bytes) -> bool:
 
 
 def _media_header(payload: bytes) -> Picture | Sound | None:
-    """Return None if it is neither, or cut off."""
+    """None if it is neither, or cut off."""
     try:
         return Sound.unpack(payload) if payload[:4] == PBAT else Picture.unpack(payload)
     except PayloadError:
@@ -82,7 +82,7 @@ def _media_header(payload: bytes) -> Picture | Sound | None:
 
 
 def _in_ns(stamp: float | None, unit: int = 0) -> int:
-    """Return nanoseconds, exact to a microsecond; 0 for what is no stamp. ``unit``: nanoseconds; 0: by its size."""
+    """Exact to a microsecond. ``unit``: nanoseconds; 0: by its size. Returns 0 for what is no stamp."""
     if stamp is None or not 0 < stamp < _LATEST_NS:
         return 0
     ns = round(stamp * (unit or _unit(stamp)) / 1000) * 1000

@@ -42,7 +42,7 @@ class Route:
 
 
 class Device:
-    """A device. ``payload`` is the manifest to publish: as the MCU sent it, with channels renamed as in the config."""
+    """``payload`` is the manifest to publish: as the MCU sent it, with channels renamed as in the robot's config."""
 
     def __init__(self, manifest: Manifest, addresses: Addresses, reports: imu.ImuReports) -> None:
         self._addresses, self._reports = addresses, reports
@@ -51,7 +51,7 @@ class Device:
         interfaces = tuple(map(self._renamed, manifest.interfaces))
         self.payload: McuManifest = Manifest(manifest.hello, interfaces).payload()
         self.claims: Claims = claims(self.payload, self._robots_channel)
-        self.routes = {interface.id: self._route(interface) for interface in interfaces}
+        self.routes = {one.id: self._route(one) for one in interfaces}
 
     @property
     def has_motion(self) -> bool:
@@ -60,7 +60,7 @@ class Device:
 
     @property
     def local_only(self) -> McuLocalOnly:
-        """The topics of its interfaces that stay on the robot."""
+        """Return the topics of its interfaces that stay on the robot."""
         routes = [route for route in self.routes.values() if route.interface.local_only]
         aliases = [route.alias.claim for route in routes if route.alias is not None]
         return McuLocalOnly(topics=[*(route.generic.suffix for route in routes), *aliases])
@@ -103,14 +103,14 @@ class Device:
         channel = self._robots_channel(claim)
         if channel in (c.IMU_FAST, c.IMU):
             return Alias(claim, channel, interface.profile)
-        raw = _channel(interface.channel, interface.kind, payload, retain=interface.retain)
+        own = _channel(interface.channel, interface.kind, payload, retain=interface.retain)
         # a payload that must stay on the robot names its device, so that the MQTT bridge recognises it
         profiled = interface.profile in (imu.MOTION, imu.SUMMARY) and not interface.local_only
         fits = profiled and imu.fits(interface.profile, {field.name for field in interface.fields})
-        return Alias(claim, raw, interface.profile if fits else "")
+        return Alias(claim, own, interface.profile if fits else "")
 
     def _renamed(self, interface: Interface) -> Interface:
-        """Return the interface with the channel's effective name, if the config sets one that is valid as a channel."""
+        """Return it with the channel's effective name, if the config sets one and the name is valid as a channel."""
         if interface.direction is Direction.IN:
             return interface
         channel = c.channel_of(f"{c.OUTGOING}/{interface.channel}")

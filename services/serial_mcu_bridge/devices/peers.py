@@ -16,7 +16,7 @@ class _PeerDevice:
 
 
 class PeerDevices:
-    """The claims of other devices. A retained manifest counts too, until its confirmation times out."""
+    """Claims by device. A retained manifest counts too, until its confirmation times out."""
 
     def __init__(self) -> None:
         self._of: dict[str, _PeerDevice] = {}
@@ -35,12 +35,12 @@ class PeerDevices:
 
     @property
     def due(self) -> float | None:
-        """The time at which the next confirmation times out; None if none is pending."""
-        return min((peer.confirm_by for peer in self._of.values() if peer.confirm_by is not None), default=None)
+        """When the next confirmation times out; None if none is pending."""
+        return min((one.confirm_by for one in self._of.values() if one.confirm_by is not None), default=None)
 
     def left_over(self, now: float) -> list[str]:
         """Remove the devices that were not confirmed in time, and return their uids."""
-        gone = [uid for uid, peer in self._of.items() if peer.confirm_by is not None and peer.confirm_by <= now]
+        gone = [uid for uid, one in self._of.items() if one.confirm_by is not None and one.confirm_by <= now]
         for uid in gone:
             del self._of[uid]
         return gone

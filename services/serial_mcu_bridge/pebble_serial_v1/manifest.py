@@ -1,4 +1,4 @@
-"""A parser of the two messages in which an MCU describes itself: HELLO and DESCRIBE."""
+"""Parses and checks the two messages in which an MCU describes itself: HELLO and DESCRIBE."""
 
 import math
 import re
@@ -28,7 +28,7 @@ _level = re.compile(LEVEL).search
 
 
 class Direction(IntEnum):
-    """The direction of an interface, seen from the robot as in its topics."""
+    """Seen from the robot, as in its topics."""
 
     IN = 1
     OUT = 2
@@ -125,7 +125,7 @@ def parse_describe(payload: bytes, base: str = "") -> Manifest:
 
 
 class _Reader:
-    """A reader of little-endian values from the front of a payload."""
+    """Takes little-endian values off the front of a payload."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._at = data, 0

@@ -1,4 +1,4 @@
-"""A table of what robots need of a broker: each probe, and what it costs them where the broker lacks it."""
+"""The needs of robots at a broker, as a table: each probe, and the loss if the broker fails it."""
 
 from __future__ import annotations
 

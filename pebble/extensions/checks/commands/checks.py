@@ -1,4 +1,4 @@
-"""Printing of checks by commands: each result with what ends a failure, or all of them as JSON."""
+"""The output of checks by commands: each result with the fix of a failure, or all as JSON."""
 
 from __future__ import annotations
 

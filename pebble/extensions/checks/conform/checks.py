@@ -1,4 +1,4 @@
-"""A table of what a robot owes all who watch and stop it: each check, and why. Nothing here turns a wheel."""
+"""The duties of a robot towards all who watch and stop it, as a table: each check, and why. No wheel turns here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A table of what a robot owes those who drive it by turns: control, and names where they are checked."""
+"""The duties of a robot towards drivers in turn, as a table: control, and names where they are checked."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ _WRITE_S = 600.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlashOptions:
-    """The choices of an installation: what, on which port, and from where."""
+    """The firmware to install, the port, and its sources."""
 
     firmware: Firmware
     port: str

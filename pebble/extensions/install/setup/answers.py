@@ -30,7 +30,7 @@ class AnswersError(PebbleError):
 
 
 class Answers(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The user's answers; None is not answered yet.
+    """The user's answers; None: not answered yet.
 
     ``port`` and ``camera`` may be ``none``, ``broker`` ``here`` (on the robot) or ``none`` (yet).
     """

@@ -1,4 +1,4 @@
-"""Detection of what is at this machine: boards, only by listening, cameras, and what a robot lacks."""
+"""What is at this machine: boards, which are listened to and never written to, cameras, and what a robot lacks."""
 
 import re
 import shutil

@@ -1,4 +1,4 @@
-"""The steps that make a robot of a machine, in order. Each is looked at first, and done only if it is not so yet."""
+"""The steps that make a robot of a machine, in order. Each is checked first, and done only if it is necessary."""
 
 import json
 import os
@@ -234,7 +234,7 @@ class Job:
         return [step for step in self.steps() if not step.is_done()]
 
     def do(self, steps: list[Step]) -> bool:
-        """Do the steps, then restart the services that read what was written.
+        """Do the steps, then restart the services that read the written files.
 
         Returns True if the robot was started. Raises SetupError at the first failure.
         """

@@ -1,1 +1,1 @@
-"""Signed releases: they make a newer version safe to take."""
+"""Signed releases, which make a newer version safe to install."""

@@ -42,7 +42,7 @@ class Turn(NamedTuple):
 
 
 class Arrived(NamedTuple):
-    """The messages that arrived in several turns."""
+    """The arrivals of several turns."""
 
     commands: Mapping[Wheels, int]  # when each reached the MCU
     reports: Sequence[tuple[int, int | None]]  # of the MCU: when each was sent, and received; None: it was not
@@ -138,7 +138,7 @@ class DrivenRobot(StockClient):
 
 
 class StandIn(Robot):
-    """A stand-in for Pebble: what a user would have without us."""
+    """A robot as a user would build it without us."""
 
     def launch(self) -> None:
         rest = (*self.broker_ports[::-1], self.base, self.port, *(["--reports"] if self.reports else []))

@@ -1,4 +1,4 @@
-"""Operators made of stock paho clients: some drive robots, one watches a robot start and stream."""
+"""Stock paho clients, of which operators are made: some drive robots, one watches a robot start and stream."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.contract.payloads import Drive
 from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.lab.rig.robot import BASE, MEDIA, Robot, one_robot
-from pebble.extensions.lab.rig.scripted_operator import ScriptedOperator
 from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.extensions.operator.client.scripted_operator import ScriptedOperator
 from pebble.transports import Message
 
 _AHEAD: Final = 0.5
@@ -59,7 +59,7 @@ class StockClient:
             self.paho.on_socket_open = _send_at_once
 
     def open(self, port: int) -> Self:
-        """Connect and start the network thread; returns before anything was subscribed."""
+        """Connects and starts the network thread; returns before anything was subscribed."""
         self.paho.connect("127.0.0.1", port)
         self.paho.loop_start()
         return self
@@ -80,14 +80,14 @@ class StockClient:
         self.paho.loop_stop()
 
     def send(self, channel: contract.Channel, base: str, body: Any) -> MQTTMessageInfo:
-        """Publish ``body`` as JSON, with the QoS and the retain flag of the channel."""
+        """Publishes ``body`` as JSON, with the QoS and the retain flag of the channel."""
         return self.paho.publish(channel.topic(base), json.dumps(body), channel.default_qos, channel.default_retain)
 
     def publish(self, message: Message) -> None:
         self.paho.publish(message.topic, message.payload, message.qos, message.retain)
 
     def driver(self, base: str, wait: Callable[[float], object] = time.sleep) -> ScriptedOperator:
-        """Return an operator who knows nothing of its robot, as the original page: without control."""
+        """Return an operator of a robot of which it knows nothing, as the original page: without control."""
         return ScriptedOperator(RobotView(base), self.publish, by="bench", wait=wait)
 
     def request_media(self, base: str, *encodings: str) -> None:

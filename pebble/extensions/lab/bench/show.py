@@ -1,4 +1,4 @@
-"""The output of a comparison: tables on the terminal, notes, and the files that it leaves."""
+"""The output of a comparison: tables on the terminal, notes, and files."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ _FIGURES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The times for which the robots stand idle, and are used."""
+    """The times in which the robots stand idle, and are used."""
 
     idle_s: float = 40.0
     session_s: float = 80.0

@@ -29,7 +29,7 @@ class CountedMedia(MediaReceiver):
         self.counted: Counter[str] = Counter()
 
     def missing(self) -> list[str]:
-        """Return the encodings that never arrived."""
+        """Return the encodings in which nothing arrived."""
         return [name for name in (*ALL_VIDEO, *ALL_SOUND) if not self.counted[name]]
 
     def on_picture(self, picture: Decoded) -> None:

@@ -1,4 +1,4 @@
-"""Judgement of a step: did the robot move when driven and stand when let go, by the trace of its motors? Pure."""
+"""A judgement of the trace of a robot's motors: did it move when driven, and stand when released? Pure."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Driven(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """A robot's behaviour in one step; ``wrong`` is empty if it did what it was commanded to do."""
+    """A robot's motion in one step; ``wrong`` is empty if it was the commanded one."""
 
     robot: str
     step: str

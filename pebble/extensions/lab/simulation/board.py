@@ -22,7 +22,7 @@ _DEADLINES_S = 2.0  # simulated part of a longer pause: all deadlines of the fir
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """A board's timing: ``turn_s`` is the period of its firmware's loop, ``tick_s`` that of calling ``tick``."""
+    """The timing of a board: ``turn_s`` is the period of its firmware's loop, ``tick_s`` of calls of ``tick``."""
 
     turn_s: float
     tick_s: float

@@ -19,7 +19,7 @@ class Pose:
 
 
 class Ground(Protocol):
-    """The ground under a robot."""
+    """The ground below a robot."""
 
     def move(self, start: Pose, end: Pose) -> Pose:
         """Return where a robot is that drives from ``start`` to ``end``: less far, if something is in its way."""

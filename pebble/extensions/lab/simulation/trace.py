@@ -39,7 +39,7 @@ class Entry:
 
     @property
     def late_s(self) -> float:
-        """The time for which the MCU did not look at its port until now; 0 for any other entry."""
+        """The time for which the MCU did not read its port until now; 0 for any other entry."""
         return float(self.line) if self.event == "late" else 0.0
 
 

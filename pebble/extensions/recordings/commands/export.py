@@ -30,7 +30,7 @@ from pebble.extensions.recordings.library import Damages, files, merged, problem
 
 
 class Form(StrEnum):
-    """A form to which recordings can be exported."""
+    """The forms of exports."""
 
     LINES = "lines"
     FOXGLOVE = "foxglove"

@@ -31,7 +31,7 @@ _BITRATE: Final = 64_000  # bits per second of each channel
 
 @dataclass(frozen=True, slots=True)
 class FilmResult:
-    """The parts of a film."""
+    """What a film is made of."""
 
     seconds: float
     pictures: int
@@ -120,7 +120,7 @@ def _media(messages: Iterable[Recorded], robot: str, on_time: Progress) -> Itera
 
 
 def _sound_packets(av: Any, path: Path, out: Any, codec: str) -> Iterator[Any]:
-    """Yield packets, made while they are read, so that no more than a part of the sound is in memory."""
+    """Made while they are read, so that no more than a part of the sound is in memory."""
     with av.open(str(path), format="wav") as source:
         wav = source.streams.audio[0]
         layout = "mono" if wav.channels == 1 else "stereo"  # wav has no names for them
@@ -159,7 +159,7 @@ class _Pictures:
             yield from _lasting(stream.encode(None))
 
     def _opened(self, height: int, width: int) -> Any:
-        """Open the film's file. Colour is stored for two by two pixels."""
+        """Colour is stored for two by two pixels."""
         stream = self._out.add_stream("libx264", rate=_NOMINAL_FPS, options=_OPTIONS)
         stream.width, stream.height = width & ~1, height & ~1
         stream.pix_fmt = "yuv420p"

@@ -20,7 +20,7 @@ _WAV_BYTES: Final = (1 << 32) - (1 << 16)  # the format's lengths have 32 bits
 
 @dataclass(slots=True)
 class SoundResult:
-    """The parts of a film's sound."""
+    """The contents of a film's sound."""
 
     seconds: float = 0.0
     silence_s: float = 0.0  # of these: no sound was received

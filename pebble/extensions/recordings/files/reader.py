@@ -67,7 +67,7 @@ Chooses = Callable[[Channel], bool]
 
 
 class Chunk(NamedTuple):
-    """A chunk's place and contents; ``channels`` empty: not known, so it may hold any."""
+    """The place and contents of a chunk; ``channels`` empty: not known, so it may hold any."""
 
     start_ns: int
     end_ns: int
@@ -114,7 +114,7 @@ class RecordingFile:
 
     @property
     def first_ns(self) -> int:
-        """The time at which the first message was received; 0: there is none."""
+        """The time of the first message; 0: there is none."""
         return min((chunk.start_ns for chunk in self.chunks if chunk.start_ns), default=0)
 
     @property
@@ -132,7 +132,7 @@ class RecordingFile:
 
     @property
     def problem(self) -> str:
-        """The part that could not be read, in words; "" if all was, as far as that is known."""
+        """The parts that could not be read, in words; "" if all was, as far as that is known."""
         return self.damage.report(active=self.path.name.endswith(ACTIVE))
 
     def reaches_into(self, since_ns: int, until_ns: int) -> bool:

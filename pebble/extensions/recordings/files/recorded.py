@@ -1,4 +1,4 @@
-"""A recording's contents: messages of channels, and its damage."""
+"""The contents of a recording: messages of channels, and damage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recorder's work beside writing: it makes files durable, and finishes them."""
+"""The recorder's work beside writing: it makes files durable, and finishes them."""
 
 import logging
 import os

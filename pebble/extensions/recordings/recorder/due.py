@@ -1,10 +1,10 @@
-"""Timers of tasks that are done again after some time. Pure."""
+"""Tasks that are repeated after some time. Pure."""
 
 from collections.abc import Callable
 
 
 class Due:
-    """Timers of tasks that are done again after some time."""
+    """The tasks that are repeated after some time."""
 
     def __init__(self, boot_ns: Callable[[], int]) -> None:
         self._boot_ns = boot_ns

@@ -1,4 +1,4 @@
-"""Messages that wait to be written into files."""
+"""The queue of items to write into files."""
 
 import json
 import threading
@@ -25,7 +25,7 @@ _MOST_ROBOTS: Final = 1000  # whose newest message is remembered
 
 
 class Clocks(NamedTuple):
-    """The clocks, in nanoseconds."""
+    """The clocks of a recorder, in nanoseconds."""
 
     wall_ns: Callable[[], int] = time.time_ns
     boot_ns: Callable[[], int] = lambda: time.clock_gettime_ns(time.CLOCK_BOOTTIME)  # a clock that only Linux has
@@ -33,7 +33,7 @@ class Clocks(NamedTuple):
 
 
 class Intake:
-    """Messages that wait to be written: bounded; media are never in the way of state. Any thread may add to it."""
+    """A bounded queue of items to write; pictures and sound never displace state. Any thread may add to it."""
 
     def __init__(self, limit: int, clocks: Clocks, clock: RecordingClock, counters: Counter[str]) -> None:
         self.robots: dict[str, float] = {}  # when each was received last, seconds since 1970

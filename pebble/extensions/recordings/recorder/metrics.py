@@ -1,4 +1,4 @@
-"""A recorder's numbers in a file: for ``pebble doctor``, and for programs that watch machines."""
+"""The recorder's numbers in a file, for ``pebble doctor`` and for programs that watch machines."""
 
 import json
 import os

@@ -33,7 +33,7 @@ class RetainedValues:
             self._values.pop(key, None)
 
     def forget(self, source: str) -> None:
-        """Forget the retained values of a connection: they are fetched again."""
+        """Forget the values of a connection: they are fetched again."""
         for key in [key for key in self._values if key.startswith(f"{source} ")]:
             del self._values[key]
 

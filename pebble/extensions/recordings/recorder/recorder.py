@@ -95,7 +95,7 @@ class Recorder:
 
     @property
     def blocked(self) -> str:
-        """The reason why nothing is written at present; empty if something is."""
+        """The reason why nothing is written now; empty while it is."""
         return self._writing.blocked
 
     @property
@@ -108,7 +108,7 @@ class Recorder:
 
     @property
     def robots(self) -> dict[str, float]:
-        """The times at which each robot was received last, in seconds since 1970."""
+        """The time of each robot's last message, in seconds since 1970."""
         return dict(self._intake.robots)
 
     # -- the writer's thread

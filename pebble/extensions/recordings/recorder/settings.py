@@ -1,4 +1,4 @@
-"""Options of a recorder: what it records, and how."""
+"""The options of a recorder."""
 
 from typing import Final
 

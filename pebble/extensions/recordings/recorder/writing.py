@@ -1,4 +1,4 @@
-"""The work of the recorder's writer thread: messages into files, room for them, and losses when there is none."""
+"""The work of the recorder's writer thread: messages into files, room for them, and the lack of room."""
 
 import errno
 import logging
@@ -34,7 +34,7 @@ _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 
 
 class _Blocked(NamedTuple):
-    """The reason why nothing is written, and since when."""
+    """A time in which nothing is written, and its reason."""
 
     why: str
     since_ns: int
@@ -43,7 +43,7 @@ class _Blocked(NamedTuple):
 
 
 class Context(NamedTuple):
-    """The things that the parts of one recorder share."""
+    """The values that the parts of a recorder share."""
 
     folder: Folder
     options: Options

@@ -19,7 +19,7 @@ _LATE_S: Final = 0.5
 
 
 class Source(Protocol):
-    """A source of a player's messages."""
+    """The source of a player."""
 
     def messages(self, since_ns: int, until_ns: int) -> Iterator[Recorded]:
         """Yield those of a period by the time at which they were received."""
@@ -31,7 +31,7 @@ class Source(Protocol):
 
 
 class Output(Protocol):
-    """A target of a player's messages."""
+    """The output of a player."""
 
     sent: int
     skipped: int
@@ -87,7 +87,7 @@ class BusOutput:
 
 
 class Reading:
-    """The place of a replay in its recording, among what is published; ``skipped`` counts the messages between."""
+    """The position of a replay in its recording, by published messages; ``skipped`` counts the others between."""
 
     def __init__(self, source: Source, publishes: Chooses, until_ns: int) -> None:
         self.next: Recorded | None = None

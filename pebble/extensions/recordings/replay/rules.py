@@ -1,4 +1,4 @@
-"""Rules for what of a recording is published again, and how: harmless unless asked for more. Pure.
+"""The rules by which a recording may be published again: harmless unless asked for more. Pure.
 
 The rules in their order: nothing of a broker's own; another base; nothing that is an order to a robot, but mild ones
 if asked for; nothing retained. Names of topics decide by the contract, so an unknown name counts as the worst of its
@@ -41,7 +41,7 @@ class ReplayError(PebbleError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """The user's choices."""
+    """The options of `pebble replay`."""
 
     system: str = SYSTEM
     incoming: bool = False  # commands that end by themselves
@@ -56,7 +56,7 @@ class Outgoing(NamedTuple):
 
 
 class _Address(NamedTuple):
-    """The address to which the messages of one recorded channel go."""
+    """The target of the messages of one recorded channel."""
 
     recorded: Identity
     base: str

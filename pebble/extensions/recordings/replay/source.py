@@ -1,4 +1,4 @@
-"""A replay's source: the messages of recordings from any time on, and the state at that time."""
+"""The source of a replay: the messages of recordings from any time on, and the state at that time."""
 
 from __future__ import annotations
 

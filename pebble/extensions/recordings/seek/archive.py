@@ -29,7 +29,7 @@ _NAME: Final = re.compile(r"(?P<stamp>\d{8}T\d{6}Z)-\d{6,}\.(?P<lane>.+?)\.mcap(
 
 
 class _Named(NamedTuple):
-    """The facts that a file's name says; of other programs' files none."""
+    """The facts in a file's name; files of other programs have none."""
 
     path: Path
     lane: str  # "": any
@@ -124,7 +124,7 @@ class Archive:
         return []
 
     def next_ns(self, robot: str, at_ns: int) -> int | None:
-        """Return when the robot's next message from ``at_ns`` on was received; None if there is none."""
+        """Return the time of the robot's next message from ``at_ns`` on; None if there is none."""
         found: int | None = None
         for file in sorted(self.files(robot, at_ns, 1 << 63), key=lambda file_: file_.first_ns):
             if found is not None and file.first_ns >= found:

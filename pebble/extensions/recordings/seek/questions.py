@@ -1,4 +1,4 @@
-"""Questions that a process asks another one about recordings: functions that take and return plain data.
+"""The questions of a process to another about recordings: functions that take and return plain data.
 
 The process that answers (:class:`pebble.extensions.page.recordings.archive_process.ArchiveProcess`) has one archive;
 unpacking files would otherwise delay the loop that passes on drive commands.

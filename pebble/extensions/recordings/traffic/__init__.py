@@ -1,1 +1,1 @@
-"""Traffic of robots and networks by recordings: index, analysis, report."""
+"""The analysis of robots and networks by recordings: index, analysis, report."""

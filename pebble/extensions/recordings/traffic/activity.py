@@ -1,4 +1,4 @@
-"""A robot's activity as a message shows it: it is driven, watched, plays a sound, runs a script. Pure."""
+"""The use of a robot that a message shows: it is driven, watched, plays a sound, runs a script. Pure."""
 
 import re
 from collections.abc import Callable

@@ -27,7 +27,7 @@ _EVENTS: Final = """
 
 
 class RecorderEvents(Struct):
-    """The notes of recorders about themselves."""
+    """The events that recorders noted about themselves."""
 
     gaps: list[Gap]
     starts: list[int]  # ns; what was before is not known

@@ -78,7 +78,7 @@ _COPY: Final = """
 
 
 class About(Struct):
-    """An index's facts about its recording."""
+    """What an index says of its recording."""
 
     recording: str  # its name
     size: int  # of the file, when it was indexed
@@ -92,7 +92,7 @@ def index_path(recording: Path) -> Path:
 
 
 def about(index: Path, connection: DuckDBPyConnection) -> About | None:
-    """Return None for a file that is no index. Raises RecordingError if it cannot be read."""
+    """None for a file that is no index. Raises RecordingError if it cannot be read."""
     found = dict(connection.execute(f"SELECT key, value FROM parquet_kv_metadata({quoted(index)})").fetchall())
     try:
         texts = {key.decode(): value.decode() for key, value in found.items()}
@@ -142,7 +142,7 @@ class _Rows:
         self._heartbeats: set[int] = set()
 
     def read(self, recording: Path, advance: Advance) -> tuple[int, str]:
-        """Return how many messages are missing, and what could not be read. Raises RecordingError."""
+        """Returns how many messages are missing, and what could not be read. Raises RecordingError."""
         with RecordingFile(recording) as file:
             damage, expected = file.damage, 0 if file.statistics is None else file.statistics.message_count
             for message in file.read():

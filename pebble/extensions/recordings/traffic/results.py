@@ -1,4 +1,4 @@
-"""Results of robots' traffic: bandwidth, sessions, heartbeats, outages, latency (paper, section 4.1).
+"""The figures of robots' traffic: bandwidth, sessions, heartbeats, outages, latency (paper, section 4.1).
 
 Definitions, all of payload bytes and of the time of receiving, without retained messages:
 

@@ -25,7 +25,7 @@ FROZEN_S = 1.0  # a picture shown for longer counts as frozen
 
 
 class Plan(msgspec.Struct, kw_only=True):
-    """The operator's part of each trial. An encoding of None leaves the choice to the robot."""
+    """The operator's actions in each trial. An encoding of None leaves the choice to the robot."""
 
     video: str | None
     audio: str | None
@@ -37,7 +37,7 @@ class Plan(msgspec.Struct, kw_only=True):
 
 
 class Arrival(NamedTuple):
-    """A message as received; ``sent_ns`` is when it was sent, or when a picture or the first sample was captured."""
+    """A received message; ``sent_ns``: when it was sent, or when a picture or the first sample was captured."""
 
     sent_ns: int
     arrived_ns: int

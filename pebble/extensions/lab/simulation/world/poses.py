@@ -1,4 +1,4 @@
-"""A robot's poses during the last second, and at any moment in between."""
+"""The poses of a robot during the last second, and at any moment in between."""
 
 import math
 from bisect import bisect_right

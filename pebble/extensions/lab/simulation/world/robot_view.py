@@ -1,4 +1,4 @@
-"""A camera's view from a robot in a simulated world, whose program shares where the robots are."""
+"""The view of a camera on a robot in a simulated world, whose program shares the poses of the robots."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STALE_S = 1.0  # a world that has written nothing for so long does not run
 
 
 class RobotView:
-    """A view of the present from the robot that ``device`` (``world.json#goob``) names.
+    """The view from the robot that ``device`` (``world.json#goob``) names.
 
     Raises DeviceError for a file or robot that is wrong, NotRunningError while the world does not run.
     """

@@ -98,7 +98,7 @@ class SimulatedRobot(Robot):
 
     @property
     def body(self) -> LockstepRobot:
-        """The robot as it really is: its place, and its motor board."""
+        """Its true pose, and its motor board."""
         return self._body
 
     def receive(self, channel: Channel, value: Any) -> None:

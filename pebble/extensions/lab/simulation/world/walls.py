@@ -17,7 +17,7 @@ _ROUNDING_MM = 1e-6
 
 
 class Floor:
-    """A world's walls and the places of its robots. Safe from any thread, as each robot's motion has its own."""
+    """The poses of all robots of a world. Safe from any thread, as each robot's motion has its own."""
 
     def __init__(self, world: World) -> None:
         self._lock = threading.Lock()
