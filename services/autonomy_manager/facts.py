@@ -36,9 +36,9 @@ def facts(config: Config) -> Facts:
         from pebble.services.autonomy_manager.catalogue import Catalogue  # few checks need it
     except ModuleNotFoundError:  # a system without fcntl runs no robots
         return Facts()
-    scans: list[dict[str, Script]] = []
-    Catalogue(config, asks=False).scan(scans.append)
-    return Facts(table=tuple(("script", name, _fitness(script)) for name, script in scans[-1].items()))
+    found: list[dict[str, Script]] = []
+    Catalogue(config, asks=False).scan(found.append)
+    return Facts(table=tuple(("script", name, _fitness(script)) for name, script in found[-1].items()))
 
 
 def _fitness(script: Script) -> str:

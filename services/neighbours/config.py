@@ -80,10 +80,10 @@ def _check_hub(reader: Reader, root: Root, _: Path) -> Root:
     endpoints = list(zenoh_endpoints(root))
     meets = {place_of_endpoint(endpoint): endpoint for path, endpoint in endpoints if path[:3] == _LAN}
     for path, endpoint in endpoints:
-        hub = meets.get(place_of_endpoint(endpoint))
-        if hub is not None and path[:3] != _LAN:
+        mine = meets.get(place_of_endpoint(endpoint))
+        if mine is not None and path[:3] != _LAN:
             why = f"is also {'.'.join(map(str, path))}: what is shared would come twice, or without end"
-            reader.notes.problem((*_LAN, "connect"), f"{hub} {why}; take another hub")
+            reader.notes.problem((*_LAN, "connect"), f"{mine} {why}; take another hub")
     return root
 
 

@@ -21,7 +21,7 @@ class VideoStream(ServiceSection, frozen=True, kw_only=True):
 
 
 def _check(reader: Reader, stream: VideoStream, path: Path) -> VideoStream:
-    """Check the section, and leave a login out of the address, which every operator receives."""
+    """Check the address, which every operator receives: a login in it would be no secret."""
     if stream.enabled and not stream.command:
         reader.notes.doubt((*path, "command"), "is missing, write the program that streams the video")
     if stream.webrtc_url is None:

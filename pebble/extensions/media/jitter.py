@@ -26,7 +26,7 @@ _DELAY_LIMIT_S: Final = 0.2  # a caller that takes this late does not have to ca
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """The piece of sound to play next: (samples, channels)."""
+    """The samples to play next: (samples, channels)."""
 
     samples: Samples
     rate: int

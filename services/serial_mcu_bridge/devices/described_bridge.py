@@ -54,7 +54,7 @@ _UID_QUERY = Channel(
 
 
 class DescribedBridge(SerialService):
-    """The bridge of one MCU: it publishes its topics while connected, and clears what is retained when it goes."""
+    """The service of one MCU: it publishes its topics while it is connected, and clears them when it has gone."""
 
     publishes = (MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, IMU_FAST, IMU)
     end = END

@@ -29,9 +29,9 @@ from pebble.forwarding.routing import GATEWAY, Side
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.transports import Handler, Message, Subscription, Transport, clock
 
-LARGEST = 1024 * 1024  # bytes of a message; the brokers of `pebble fleet` take no more
 #: What the robot sends of each medium, by what allows and what requests it.
 _MEDIA = ((CAMERA, MQTT_VIDEO, VIDEO_CONTROL), (AUDIO, MQTT_AUDIO, AUDIO_CONTROL))
+LARGEST = 1024 * 1024  # bytes of a message; the brokers of `pebble fleet` take no more
 
 
 class NamedSubjects(Subjects):
