@@ -1,7 +1,8 @@
-"""Compressed sound files as samples, a piece at a time, by PyAV."""
+"""Compressed sound files as samples, a piece at a time, by PyAV; and a writer of wav files."""
 
 from __future__ import annotations
 
+import wave
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
@@ -42,7 +43,7 @@ class SoundFile:
         self._container.close()
 
     def chunks(self) -> Iterator[bytes]:
-        """Yield interleaved s16le until the end. Raises PebbleError where it cannot be decoded."""
+        """Interleaved s16le until the end. Raises PebbleError where it cannot be decoded."""
         layout = "mono" if self.channels == 1 else "stereo"
         try:
             resampler = self._av.AudioResampler(format="s16", layout=layout, rate=self.rate)
@@ -54,3 +55,12 @@ class SoundFile:
 
     def _undecodable(self, error: Exception) -> PebbleError:
         return PebbleError(f"{self._name} cannot be decoded: {getattr(error, 'strerror', None) or error}")
+
+
+def write_wav(path: Path, samples: bytes, rate: int) -> None:
+    """Write one channel of s16le as a wav file."""
+    with wave.open(str(path), "wb") as file:
+        file.setnchannels(1)
+        file.setsampwidth(2)
+        file.setframerate(rate)
+        file.writeframes(samples)

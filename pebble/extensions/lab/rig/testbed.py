@@ -6,7 +6,6 @@ import json
 import struct
 import threading
 import time
-import wave
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -20,6 +19,7 @@ from pebble.extensions.lab.rig.page import Ready
 from pebble.extensions.lab.rig.processes import HOST, OPERATORS, Processes, Program, python
 from pebble.extensions.lab.rig.robot import MEDIA, START_S, Config, Robot, SimulatedRobot
 from pebble.extensions.lab.simulation.world.program import port_path, trace_path
+from pebble.extensions.media.sound_file import write_wav
 from pebble.extensions.operator.client.discovery import ALL_OUTGOING, Discovery
 from pebble.extensions.operator.client.page_packages import require_packages
 from pebble.transports import MqttSettings, create
@@ -46,16 +46,16 @@ class LinuxRobot(Robot):
     has_media = True
 
     def __init__(self, running: Testbed, name: str) -> None:
-        config = _config(name)
+        own = _config(name)
         remote, folder = (HOST, running.broker_port), running.folder / name
-        super().__init__(running, config["transport"]["kind"], remote, name=name, folder=folder)
+        super().__init__(running, own["transport"]["kind"], remote, name=name, folder=folder)
         self.local_port = running.local_broker.port
         self.voice = folder / "voice"  # where its loudspeaker records what it plays of operators' voices
         self._imu = folder / "imu"  # a serial port
         self.instances: dict[str, Config] = {}
         if name == "goob":
             self.instances["imu"] = {"protocol": "pebble_serial_v1", "serial": {"port": str(self._imu)}}
-        self._own = config | {"services": config["services"] | {"av_daemon": {}}}
+        self._own = own | {"services": own["services"] | {"av_daemon": {}}}
         raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
         self._services = {
             "mqtt_bridge": {
@@ -98,7 +98,7 @@ class RoomRobot(LinuxRobot):
         sounds = self.folder / "sounds"
         (sounds / "signals").mkdir(parents=True)
         for clip, seconds in {CLIP: 1.0, "signals/beep.wav": 0.15, "signals/long.wav": 0.6}.items():
-            _write_wav(sounds / clip, HORN[: 2 * round(seconds * _RATE)])
+            write_wav(sounds / clip, HORN[: 2 * round(seconds * _RATE)], _RATE)
         playback = {"directory": str(sounds), "player_command": _loudspeaker(self.played)}
         self._services |= {
             "av_daemon": deep_merge(MEDIA["av_daemon"], {"video": {"device": f"{self.room}#{name}"}}),
@@ -111,15 +111,6 @@ class RoomRobot(LinuxRobot):
 
 def _config(name: str) -> Any:
     return json.loads((files("pebble") / "configs" / f"{name}.json").read_text())
-
-
-def _write_wav(path: Path, samples: bytes) -> None:
-    """Write one channel of s16le."""
-    with wave.open(str(path), "wb") as file:
-        file.setnchannels(1)
-        file.setsampwidth(2)
-        file.setframerate(_RATE)
-        file.writeframes(samples)
 
 
 def _loudspeaker(record: Path) -> list[str]:
@@ -194,13 +185,13 @@ class Testbed(Processes):
         return self.server
 
     def start_recorder(self, into: Path, *options: object) -> Program:
-        """Start ``pebble record`` of everything at the operators' broker, which is starting; ``options`` are added."""
+        """``pebble record`` of everything at the operators' broker, which is starting; ``options`` are further ones."""
         url = f"mqtt://{HOST}:{self.broker_port}"
         command = python("pebble.cli", "record", "--url", url, "--into", into, *options)
         return self.add(Program("pebble record", command, self.folder / "record.log"), OPERATORS)
 
     def start_robots(self) -> None:
-        """Start the robots. Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""
+        """Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""
         for robot in self.robots.values():
             robot.bring_up(self._ending)
 
@@ -208,7 +199,7 @@ class Testbed(Processes):
         """Wait until all robots can be driven. Raises PebbleError after that time, or if a process ends."""
         discovery, end = Discovery(), time.monotonic() + timeout
         with create("mqtt", "testbed", MqttSettings(host=HOST, port=self.broker_port)) as transport:
-            transport.subscribe(ALL_OUTGOING, lambda message: discovery.receive(message, time.monotonic(), time.time()))
+            transport.subscribe(ALL_OUTGOING, lambda one: discovery.receive(one, time.monotonic(), time.time()))
             while sum(robot.ready(time.monotonic()) for robot in discovery.all_robots()) < len(self.robots):
                 if (problems := self.unexpected_exits()) or time.monotonic() > end:
                     raise PebbleError("; ".join(problems) or "the robots did not become ready to drive")
