@@ -19,8 +19,8 @@ from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.contract.payloads import Drive
 from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.lab.rig.robot import BASE, MEDIA, Robot, one_robot
+from pebble.extensions.lab.rig.scripted_operator import ScriptedOperator
 from pebble.extensions.operator.client.robot_view import RobotView
-from pebble.extensions.operator.client.scripted_operator import ScriptedOperator
 from pebble.transports import Message
 
 _AHEAD: Final = 0.5
