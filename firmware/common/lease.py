@@ -1,4 +1,4 @@
-"""Control of one motor owner: a lease that it gives, renews and ends. Pure; boards and Linux robots share it.
+"""Who has control of one motor owner: a lease that it gives, renews and ends. Pure; boards and Linux robots share it.
 
 Control orders people; it is no safety function. A stop and a zero need none. A drive command names the control under
 which it is sent by a key, which is new whenever another client gets control: so earlier commands have no effect.
@@ -123,6 +123,6 @@ def request_of(fields: dict) -> tuple[str, str, str, int] | None:
 
 
 def shown(text: str, limit: int) -> str:
-    """Return ``text`` in the letters of names; "/" separates a server and its person."""
+    """``text`` in the letters of names; "/" separates a server and its person."""
     letters = "abcdefghijklmnopqrstuvwxyz0123456789_-/"
     return "".join([char if char in letters else "_" for char in text.lower()[:limit]])

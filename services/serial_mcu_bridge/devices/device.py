@@ -51,7 +51,7 @@ class Device:
         interfaces = tuple(map(self._renamed, manifest.interfaces))
         self.payload: McuManifest = Manifest(manifest.hello, interfaces).payload()
         self.claims: Claims = claims(self.payload, self._robots_channel)
-        self.routes = {interface.id: self._route(interface) for interface in interfaces}
+        self.routes = {one.id: self._route(one) for one in interfaces}
 
     @property
     def has_motion(self) -> bool:
@@ -60,7 +60,7 @@ class Device:
 
     @property
     def local_only(self) -> McuLocalOnly:
-        """The topics of its interfaces that stay on the robot."""
+        """Return the topics of its interfaces that stay on the robot."""
         routes = [route for route in self.routes.values() if route.interface.local_only]
         aliases = [route.alias.claim for route in routes if route.alias is not None]
         return McuLocalOnly(topics=[*(route.generic.suffix for route in routes), *aliases])
