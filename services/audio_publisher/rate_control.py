@@ -4,9 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from pebble.extensions.media.in_flight import InFlight
 from pebble.extensions.media.opus import BUNDLE_LIMIT
 from pebble.extensions.media.rests import Rests
-from pebble.runtime.rate import InFlight
 from pebble.transports.base import Outgoing
 
 LEAST_BITRATE: Final = 16_000  # of Opus: below it speech gets hard to follow

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from pebble.runtime.rate import InFlight
+from pebble.extensions.media.in_flight import InFlight
 
 #: The other side's TCP may delay an acknowledgement by 40 ms: this much says nothing about the connection.
 SLACK_S = 0.05

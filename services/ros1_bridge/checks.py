@@ -1,4 +1,4 @@
-"""What `pebble doctor` checks of a base with ROS 1."""
+"""The checks of `pebble doctor` for a base with ROS 1."""
 
 from collections.abc import Iterator
 

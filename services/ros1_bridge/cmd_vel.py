@@ -1,4 +1,4 @@
-"""What the base is sent: the newest command again and again while it is valid, then zeros.
+"""The commands to the base: the newest one repeatedly while it is valid, then zeros.
 
 While it is stopped: zeros and a lock. It has a deadline and a thread of its own: a service that hangs moves nothing.
 """

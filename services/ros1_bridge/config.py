@@ -92,14 +92,14 @@ class Ros(Section, frozen=True, kw_only=True):
 
 
 class Motion(Section, frozen=True, kw_only=True):
-    """What a stick at its end means."""
+    """The speeds of a stick at its end."""
 
     max_linear_speed_mps: Annotated[float, Meta(ge=0, le=20), doc("Metres a second ahead.")] = 0.6
     max_angular_speed_radps: Annotated[float, Meta(ge=0, le=20), doc("Radians a second.")] = 1.2
 
 
 class Safety(Section, frozen=True, kw_only=True):
-    """When the base is stopped."""
+    """Limits after which the base is stopped."""
 
     drive_timeout_seconds: Annotated[
         float,
@@ -125,7 +125,7 @@ class Sampled(Metric, frozen=True, kw_only=True):
 
 
 class StatusMetric(Sampled, frozen=True, kw_only=True):
-    """What the planner does."""
+    """The state of the planner."""
 
     interval_seconds: Annotated[Period, doc("Seconds between two messages, at least.")] = 0.5
 
@@ -159,7 +159,7 @@ class LevelMetric(Metric, frozen=True, kw_only=True):
 
 
 class StatusOfCharger(Metric, frozen=True, kw_only=True):
-    """Whether it charges, as a value of the diagnostics."""
+    """The state of the charger, as a value of the diagnostics."""
 
     enabled: Annotated[bool, doc("Publish it.")] = False
     status_name: Annotated[str, doc("The part of the base.")] = ""
@@ -171,7 +171,7 @@ class StatusOfCharger(Metric, frozen=True, kw_only=True):
 
 
 class Metrics(Section, frozen=True, kw_only=True):
-    """What is published of the base."""
+    """The published values of the base."""
 
     wheel_odometry: Annotated[Sampled, doc("Position by its odometry, in millimetres.")] = Sampled()
     localization_pose: Annotated[Sampled, doc("The same in metres, with its frame.")] = Sampled()

@@ -31,14 +31,14 @@ Numbers = tuple[float, ...]
 
 
 class Header(NamedTuple):
-    """When and where a message was measured; ``stamp``: seconds, 0 where the sender has none."""
+    """The time and frame of a measurement; ``stamp``: seconds, 0 if the sender has none."""
 
     stamp: float
     frame: str
 
 
 class Odometry(NamedTuple):
-    """Where the base is and how fast; ``quaternion``: x, y, z, w."""
+    """The pose and speed of the base; ``quaternion``: x, y, z, w."""
 
     header: Header
     child_frame: str
@@ -64,7 +64,7 @@ class Route(NamedTuple):
 
 
 class Goal(NamedTuple):
-    """What has become of one goal."""
+    """The outcome of a goal."""
 
     id: str
     code: int

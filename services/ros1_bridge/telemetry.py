@@ -1,4 +1,4 @@
-"""What is published of a base: its odometry, planner, diagnostics and battery, as the original's bridge has them."""
+"""Telemetry of a base: its odometry, planner, diagnostics and battery, as the original's bridge has them."""
 
 from __future__ import annotations
 

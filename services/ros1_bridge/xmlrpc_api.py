@@ -102,7 +102,7 @@ class ApiServer(ThreadingMixIn, SimpleXMLRPCServer):
 
 
 class Answers(Protocol):
-    """What the API of a node asks it."""
+    """The questions of a node's API to the node."""
 
     master: str
 

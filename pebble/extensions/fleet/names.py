@@ -14,8 +14,8 @@ from pebble.config.security import Strangers
 from pebble.contract import DRIVE, INCOMING, Channel, codec
 from pebble.contract.names import BY, NO_ACCOUNT, stop_topic, unchecked, without_name
 from pebble.contract.payloads import AutonomyCommand, Drive, EstopCommand, MediaRequest, SoundboardCommand
-from pebble.contract.rights import WRITES, Right
 from pebble.errors import PayloadError
+from pebble.extensions.fleet.rights import WRITES, Right
 from pebble.forwarding.names import Names, Sender, Signed
 from pebble.forwarding.routing import Drop
 from pebble.forwarding.subjects import Subjects

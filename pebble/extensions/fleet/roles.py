@@ -1,4 +1,4 @@
-"""The one table of who may do what: roles, and the rights of each (pebble/contract/rights.py has their channels).
+"""The one table of who may do what: roles, and the rights of each (rights.py has their channels).
 
 Rules for brokers, the rights of people on the operator page, and the tables of docs/ext/fleet.md are made from it.
 """
@@ -17,8 +17,8 @@ from pebble.contract import channels as c
 from pebble.contract.identity import GATEWAYS as GATEWAYS
 from pebble.contract.identity import SERVERS
 from pebble.contract.names import BY
-from pebble.contract.rights import WRITES as WRITES
-from pebble.contract.rights import Right as Right
+from pebble.extensions.fleet.rights import WRITES as WRITES
+from pebble.extensions.fleet.rights import Right as Right
 
 _ANY = "+/+/+"  # any component
 

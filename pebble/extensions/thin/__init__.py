@@ -2,4 +2,6 @@
 
 from pebble.extension import Extension
 
-EXTENSION = Extension(name="thin", uplink="pebble.extensions.thin.uplink:ThinUplink", page="docs/thin-links.md")
+EXTENSION = Extension(
+    name="thin", needs=("media",), uplink="pebble.extensions.thin.uplink:ThinUplink", page="docs/thin-links.md"
+)

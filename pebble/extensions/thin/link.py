@@ -8,8 +8,8 @@ from collections import deque
 from msgspec import Struct
 
 from pebble.contract.payloads import LinkLevel
+from pebble.extensions.media.in_flight import InFlight
 from pebble.extensions.thin.sieve import Rank
-from pebble.runtime.rate import InFlight
 from pebble.transports import Answer
 
 _ORDER: tuple[LinkLevel, ...] = ("wide", "narrow", "thin")
@@ -31,7 +31,7 @@ _RUN_S = 1.0  # late commands that are further apart are no run
 
 
 class _Rule(Struct, frozen=True):
-    """When a level ends: ``worse_s`` of queue in two of three answers, or no queue for ``rise_s``."""
+    """The end of a level: ``worse_s`` of queue in two of three answers, or no queue for ``rise_s``."""
 
     worse_s: float
     rise_s: float

@@ -35,7 +35,7 @@ class PeerDevices:
 
     @property
     def due(self) -> float | None:
-        """When the next confirmation times out; None if none is pending."""
+        """The time at which the next confirmation times out; None if none is pending."""
         return min((peer.confirm_by for peer in self._of.values() if peer.confirm_by is not None), default=None)
 
     def left_over(self, now: float) -> list[str]:

@@ -7,8 +7,8 @@ import json
 import pytest
 
 from pebble.contract import CHANNELS, CONTROL, DRIVE, ESTOP, INCOMING, Channel, codec
-from pebble.contract.rights import WRITES, Right
 from pebble.extensions.fleet.names import CheckedNames
+from pebble.extensions.fleet.rights import WRITES, Right
 from pebble.forwarding.names import Signed
 from pebble.forwarding.routing import Drop, Side
 from pebble.forwarding.subjects import Subjects

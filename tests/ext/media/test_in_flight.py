@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pebble.runtime.rate import InFlight
+from pebble.extensions.media.in_flight import InFlight
 
 
 def test_messages_are_acknowledged_in_order() -> None:
