@@ -37,7 +37,6 @@ from pebble.runtime.connections import remote_transport, stops_transport
 from pebble.runtime.parent import Notifier
 from pebble.runtime.service import every
 from pebble.runtime.timers import Timer
-from pebble.services.mqtt_bridge.earlier_names import EarlierNames
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
 from pebble.services.mqtt_bridge.leftovers import Leftovers
 from pebble.services.mqtt_bridge.motor_owners import CHECK_S, MotorOwners
@@ -99,9 +98,6 @@ class MqttBridge(ForwardingService):
             self.config.base, self.subjects, self.remote, *self._uplink.channels, sparing=self._is_thin
         )
         self._leftover_timer: Timer | None = None
-        self._earlier_names = EarlierNames(
-            self.config, [self.remote, self.transport], lambda seconds, job: self.call_at(self.clock() + seconds, job)
-        )
         asks = section.remote is None or section.remote.kind == "mqtt"
         self._vouching = Vouching(self.remote, self.clock(), None if asks else self._silence_s)
         self._local_changes = 0  # of the connection
@@ -284,7 +280,6 @@ class MqttBridge(ForwardingService):
             self.forwarder.subscribed(Side.LOCAL)
         self.subscribe_remote()
         self.log.info("forwarding between the robot and its remote side")
-        self._earlier_names.begin()
 
     def found_one_broker(self) -> None:
         self.forward_nothing(CHECK_SOON_S)

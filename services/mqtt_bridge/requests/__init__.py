@@ -1,4 +1,4 @@
-"""Requests to the bridge itself: system actions, and programs for pictures and sound."""
+"""What the bridge does besides forwarding: system actions, programs for pictures and sound, earlier names."""
 
 from pebble.extension import Extension
 
@@ -7,6 +7,7 @@ EXTENSION = Extension(
     requests=(
         "pebble.services.mqtt_bridge.requests.actions:SystemActions",
         "pebble.services.mqtt_bridge.requests.media:MediaRequests",
+        "pebble.services.mqtt_bridge.requests.earlier_names:Renaming",
     ),
     page="docs/bridge.md",
 )

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from pebble.config import load
-from pebble.services.mqtt_bridge.earlier_names import EarlierNames
+from pebble.services.mqtt_bridge.requests.earlier_names import EarlierNames
 from pebble.transports import MqttSettings, Transport, create
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.services.mqtt_bridge.bridge_rig import Client
+from tests.services.mqtt_bridge.bridge_rig import Client, MemoryRig
 from tests.support import Broker, until
 
 OLD = "pebble/robots/rover"
@@ -135,3 +135,15 @@ def test_a_name_that_comes_back_is_the_robots_own(robot: Named) -> None:
     robot.start("rover")
     assert robot.left == sorted(LEFT)
     assert robot.known[-1] == "rover"
+
+
+def test_a_bridge_looks_for_them_once_it_forwards(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    begun: list[EarlierNames] = []
+    monkeypatch.setattr(EarlierNames, "begin", lambda names: begun.append(names))
+    rig = MemoryRig(monkeypatch)
+    rig.bridge()
+    assert until(lambda: begun, 5)
+    rig.close()
+    assert "failed at the bridge" not in caplog.text

@@ -9,16 +9,20 @@ import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from pebble.config import Config
 from pebble.config.config import file_name
-from pebble.contract import ONLINE
+from pebble.contract import ONLINE, Channel
 from pebble.contract.identity import Identity
 from pebble.contract.levels import LEVELS
 from pebble.errors import ConfigError, PebbleError, TransportError
+from pebble.forwarding.service import ForwardingService
+from pebble.forwarding.side import Gate
+from pebble.runtime.service import Service
 from pebble.runtime.timers import Timer
 from pebble.runtime.whole_file import make_folder, write
+from pebble.services.mqtt_bridge.own_requests import Requests
 from pebble.transports import Message, QoS, State, Subscription, Transport
 
 log = logging.getLogger(__name__)
@@ -81,6 +85,30 @@ class EarlierNames:
             write(self._file, json.dumps(names).encode(), 0o600, PebbleError)
         except (PebbleError, OSError) as error:
             log.warning("its name cannot be remembered: %s", error)
+
+
+class Renaming(Requests):
+    """Has earlier names looked for once the bridge forwards; nobody requests it."""
+
+    channels = ()
+
+    def __init__(self, service: Service) -> None:
+        super().__init__(service)
+        if not isinstance(service, ForwardingService):
+            raise TypeError("earlier names are looked for by a bridge")
+        self._forwarder = service.forwarder
+        self._names = EarlierNames(
+            service.config,
+            [service.remote, service.transport],
+            lambda seconds, job: service.call_at(service.clock() + seconds, job),
+        )
+
+    def take(self, channel: Channel, value: Any) -> None:
+        """Take nothing: it has no channels."""
+
+    def repeat(self) -> None:
+        if self._forwarder.gate is Gate.OPEN:
+            self._names.begin()
 
 
 class _Removal:
