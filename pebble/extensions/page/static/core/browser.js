@@ -96,6 +96,5 @@ export const webSocket = (path) =>
 export const find = (name) => attempt(() => globalThis[name], undefined);
 
 // uPlot writes numbers in the browser's language, which some systems call "C" or "en-US@posix": no browser knows these.
-if (!attempt(() => new Intl.NumberFormat(navigator.language), null)) {
-  attempt(() => Object.defineProperty(navigator, "language", { value: "en" }), null);
-}
+const takesLanguage = attempt(() => Boolean(new Intl.NumberFormat(navigator.language)), false);
+if (!takesLanguage) attempt(() => Object.defineProperty(navigator, "language", { value: "en" }), null);

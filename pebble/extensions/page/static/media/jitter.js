@@ -196,7 +196,8 @@ export class JitterBuffer {
     const excess = this.depth.excess(this.waitingS, now);
     if (sound && excess > secondsOf(sound) - ROUNDING_S) sound = this.leaveOut(sound, excess);
     if (!sound) return this.conceal(this.budget);
-    const samples = this.concealed && this.last ? fadedIn(sound) : sound.samples;
+    const fadesIn = this.concealed && this.last;
+    const samples = fadesIn ? mixed(sound, (sample, _, weight) => sample * weight) : sound.samples;
     this.last = sound;
     this.concealed = 0;
     return { ...sound, samples, concealed: false };
@@ -244,11 +245,6 @@ export class JitterBuffer {
     this.concealed += size;
     return { ...last, samples: made, concealed: true };
   }
-}
-
-/** @param {Samples} sound @returns {Int16Array} */
-function fadedIn(sound) {
-  return mixed(sound, (sample, _, weight) => sample * weight);
 }
 
 /** @param {Samples} old @param {Samples} sound @returns {Samples} ``sound``, beginning as ``old`` does */

@@ -1,7 +1,7 @@
 // The log lines of a robot's services as they come, filtered.
 
 import { LEVELS } from "../../core/logs.js";
-import { html, useEffect, useModel, usePage, useRef, useState, useValue } from "../parts/hooks.js";
+import { html, useEffect, useModel, usePage, useRef, useValue } from "../parts/hooks.js";
 import { logViewOf } from "../parts/log-view.js";
 import { Button, Check, Select } from "../parts/parts.js";
 import { exactTime } from "../parts/more-words.js";

@@ -191,7 +191,7 @@ export class Replay extends Model {
     this.feed.close();
     this.pictures.stop();
     this.sound.leave();
-    this.sound.context?.close();
+    this.sound.speaker.context?.close();
     this.store.clear();
     this.video.canvas.remove();
     this.video.canvas.width = this.video.canvas.height = 0; // gives its memory back at once

@@ -2,7 +2,7 @@
 
 import * as more from "../../core/browser-more.js";
 import { MIXED, refusal } from "../../core/stream.js";
-import { html, useEffect, useMetrics, useModel, usePage, useRef, useValue } from "../parts/hooks.js";
+import { html, useEffect, useMetrics, useModel, usePage, useRef } from "../parts/hooks.js";
 import { read, write } from "../parts/models.js";
 import { Button, Check, Why, useName, useStream } from "../parts/parts.js";
 import { NewestOverlays, STALE_MS, contained, drawOverlays } from "../../media/overlays.js";
@@ -121,8 +121,7 @@ function readsPixels() {
   const context = Object.assign(document.createElement("canvas"), { width: 8, height: 8 }).getContext("2d");
   context.fillStyle = "rgb(40 90 200)";
   context.fillRect(0, 0, 8, 8);
-  const { data } = context.getImageData(0, 0, 8, 8);
-  return data.every((value, at) => Math.abs(value - [40, 90, 200, 255][at % 4]) < 9);
+  return context.getImageData(0, 0, 8, 8).data.every((value, at) => Math.abs(value - [40, 90, 200, 255][at % 4]) < 9);
 }
 
 /** @param {string} source @param {number} ms epoch @returns {string} goob-2026-05-01T12-03-41.png, in local time */

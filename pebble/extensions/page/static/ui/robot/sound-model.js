@@ -96,15 +96,7 @@ export class Sound extends Model {
       this.problem = "";
       this.leave();
     });
-    connection.onChange(() => this.worker && connection.isOpen && connection.you.user !== this.link.name && this.leave());
-  }
-
-  get worker() {
-    return this.link.worker;
-  }
-
-  get context() {
-    return this.speaker.context;
+    connection.onChange(() => this.link.worker && connection.isOpen && connection.you.user !== this.link.name && this.leave());
   }
 
   get talking() {
@@ -177,7 +169,7 @@ export class Sound extends Model {
     const { voice } = this;
     const context = this.speaker.start();
     this.adjust();
-    if (!this.worker) this.connect(ref, null);
+    if (!this.link.worker) this.connect(ref, null);
     clearInterval(voice.timer);
     voice.timer = setInterval(() => this.step(), STEP_MS);
     this.changed();
@@ -225,7 +217,7 @@ export class Sound extends Model {
     this.voice.microphone?.close();
     this.listening = false;
     this.link.close();
-    this.context?.suspend();
+    this.speaker.context?.suspend();
     this.changed();
   }
 
@@ -237,7 +229,7 @@ export class Sound extends Model {
   /** @param {string} ref @param {MessagePort|null} port where sound is played; null: this is only for talking */
   connect(ref, port) {
     const name = this.connection.you?.user ?? "";
-    const of = { ref, name, port, rate: this.context?.sampleRate };
+    const of = { ref, name, port, rate: this.speaker.context?.sampleRate };
     this.link.open(of, (message) => this.take(message), (why) => {
       this.leave();
       this.problem = `Sound has failed: ${why}. Try again`;
