@@ -85,7 +85,7 @@ class SenderClocks(Generic[K]):
                 clock = self._clocks[key] = self._begin(key, _Clock(sent, now))
             else:
                 clock.receive(sent, now)
-                clock = self._believed(key, clock, sent, now, late_s)
+                clock = self._clock_to_use(key, clock, sent, now, late_s)
             if waited_s <= late_s:
                 clock.proved = max(clock.proved, now - sent - waited_s)
             age = now - sent - min(clock.least, clock.proved)
@@ -113,21 +113,22 @@ class SenderClocks(Generic[K]):
             del clocks[replaced]
         return clock
 
-    def _believed(self, key: K, clock: _Clock, sent: float, now: float, late_s: float) -> _Clock:
+    def _clock_to_use(self, key: K, clock: _Clock, sent: float, now: float, late_s: float) -> _Clock:
         """Return the sender's clock as it is, or as changed once all its messages have seemed late for long enough."""
         if now - sent - clock.least <= late_s:
-            clock.other = None
+            clock.other = None  # on time: the clock holds
             return clock
-        other, patience = clock.other, self._patience
+        candidate, patience = clock.other, self._patience
         patience_s = patience.set_back_s if sent < clock.newest - _JUMP_S else patience.believed_s
-        if other is None or now - other.received_at > patience.gap_s or patience_s < other.patience_s:
+        # begin with a new candidate: there is none, or after a pause, or less patience is due now
+        if candidate is None or now - candidate.received_at > patience.gap_s or patience_s < candidate.patience_s:
             clock.other = _Clock(sent, now, patience_s)
             return clock
-        other.receive(sent, now)
-        if now - other.began <= other.patience_s:
+        candidate.receive(sent, now)
+        if now - candidate.began <= candidate.patience_s:
             return clock
-        self._clocks[key] = other
-        return other
+        self._clocks[key] = candidate  # late for long enough
+        return candidate
 
 
 class MessageAges:

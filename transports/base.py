@@ -300,7 +300,10 @@ class Transport(ABC):
         self.is_thin = thin
 
     def renew_connection(self, why: str) -> None:  # noqa: B027 - where no other end keeps messages, nothing is to be done
-        """Replace the connection by another: messages that wait for the old one at the other end are dropped there."""
+        """Close the connection and open a new one. What the broker has queued for the old one is dropped.
+
+        ``why`` is for the log.
+        """
 
     def on_state(self, watcher: Watcher) -> None:
         """Call ``watcher`` on every change of state, in order, on a thread of the transport: it must return at once."""

@@ -27,7 +27,10 @@ _RESERVED = "?#;"  # these separate the parts of a Zenoh endpoint
 
 
 def prepare_run_dir(run_dir: Path) -> None:
-    """Make a folder of sockets private. Raises TransportError, also if it cannot contain one."""
+    """Create the folder for sockets, private to this user.
+
+    Raises TransportError, also if its path is too long for a socket or has a reserved character.
+    """
     check_socket_path(run_dir / f"{new_name()}.sock")
     if any(character in str(run_dir) for character in _RESERVED):
         raise TransportError(f"transport.run_dir {run_dir} must not contain any of {_RESERVED}")

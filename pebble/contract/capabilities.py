@@ -98,7 +98,7 @@ class DriveOffer(Offer, frozen=True, kw_only=True):
 
 
 class EstopOffer(Payload, frozen=True, kw_only=True):
-    """An emergency stop that stays. Without it a stop is a zero, and the page says that it does not stay."""
+    """A latching emergency stop. Without it, a stop is only a zero drive command, and pages say so."""
 
     available: bool = False
     topic: str | UnsetType = UNSET

@@ -206,19 +206,19 @@ class Forwarder:
     def _receive_named(self, source: SideState, names: Names, message: Message) -> Routed:
         """Pass a message whose sender is checked, on the topic without the name and with the sender in the payload."""
         sender = names[message.topic]
-        subject, by = sender.subject, sender.account
+        subject, by = sender.subject, sender.account  # sign() adds the person for whom an account acts
         outcome = self._admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
         if subject is None:
             outcome = sender.foreign
         elif isinstance(outcome, Forward):
             match names.sign(sender, message):
-                case Signed(message, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:
-                    outcome = self.retained.change(subject, message)
-                case Signed(message, by):
-                    outcome = self.pass_now(source, subject, message, outcome, sender.account)
+                case Signed(signed, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:
+                    outcome = self.retained.change(subject, signed)
+                case Signed(signed, by):
+                    outcome = self.pass_now(source, subject, signed, outcome, sender.account)
                 case Drop.UNNAMED if outcome.retain:  # it may be a retained message of the robot itself
                     outcome = self.retained.receive(source, subject, message, outcome, old=True)
-                case drop:
+                case Drop() as drop:
                     outcome = drop
         if isinstance(outcome, Drop) and outcome in _NAMES:
             self._warn(outcome, message.topic[:_LOGGED])

@@ -45,7 +45,10 @@ class LoopbackFilter:
                 self._tidy(topic)
 
     def is_echo(self, topic: str, payload: bytes) -> bool:
-        """True if this message is ours. A broker keeps the order of a topic, so earlier ones will not come back."""
+        """True if we sent this message; forgets that message and all earlier ones of its topic.
+
+        A broker keeps the order of a topic, so the earlier ones will not come back.
+        """
         with self._lock:
             out = self._out.get(topic)
             if not out:

@@ -29,9 +29,9 @@ def become(
 ) -> NoReturn:
     """Run ``program`` with these descriptors and no others, and exit with its code. Call right after the fork.
 
-    The program gets ``config`` as it is: its file may have changed since. All signals must be blocked. It never returns
-    or raises: the frames below belong to the launcher. They must stay as well, because closing one of their objects
-    would close a descriptor that by then belongs to another object.
+    The program gets ``config`` as it is: its file may have changed since. All signals must be blocked. Never return or
+    raise: the frames of the callers belong to the launcher, and unwinding them would close descriptors that by then
+    belong to other objects.
     """
     code = 1
 
@@ -44,8 +44,8 @@ def become(
         _run(program)
 
     try:
-        code = _exit_code(begin)
-        _exit_code(_finish)
+        code = _run_to_exit_code(begin)
+        _run_to_exit_code(_finish)
     finally:
         os._exit(code)
 
@@ -102,7 +102,7 @@ def _finish() -> None:
     sys.stderr.flush()
 
 
-def _exit_code(job: Callable[[], None]) -> int:
+def _run_to_exit_code(job: Callable[[], None]) -> int:
     try:
         job()
     except SystemExit as end:

@@ -36,9 +36,10 @@ class Control:
         show_turn: Callable[[], object] = lambda: None,
         bridged: bool = False,
     ) -> None:
-        """Store the arguments; ``owners``: all of the robot; ``show_turn()`` is to send :meth:`turn` to the others.
+        """Store the arguments; ``owners``: all motor owners of the robot.
 
-        ``bridged``: silence counts only while :meth:`vouch` says so.
+        ``show_turn()`` must send the result of :meth:`turn` to the other owners. ``bridged``: the silence of a client
+        counts only as far as the bridge vouches (:meth:`vouch`) that it would have passed on messages.
         """
         self.boot = secrets.token_hex(4)  # of this life of the motor owner
         self._named = security.named

@@ -72,7 +72,10 @@ class BrokerFilters:
         return wanted, sorted(merged - {wanted})
 
     def prune(self, unwanted: str, wanted: Iterable[str]) -> list[str]:
-        """Remove and return the filters that overlap ``unwanted``, which was wanted, and none of ``wanted``."""
+        """Remove and return the subscribed filters that overlap ``unwanted`` but none of ``wanted``.
+
+        ``unwanted`` is a filter that is no longer needed.
+        """
         needs = list(wanted)
         idle = [
             existing

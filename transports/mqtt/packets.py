@@ -368,7 +368,7 @@ def _read_variable(data: bytes, at: int) -> tuple[int, int]:
 
 
 def properties(data: bytes) -> dict[int, int]:
-    """Return MQTT 5's properties with numbers as values, by their own numbers. ``data`` begins with their length."""
+    """Return the numeric MQTT 5 properties, by property identifier. ``data`` begins with the properties' length."""
     values = dict[int, int]()
     if not data:
         return values

@@ -38,7 +38,11 @@ class Trial(NamedTuple):
 
 
 class RefusedTopics:
-    """Topics that are withheld; ``vital``: filters of those that are so for their size only. Publishing locks it."""
+    """A table of topics that are not sent, because the broker closes the connection for them.
+
+    Topics that match ``vital`` are withheld only if the messages are large. The transport's lock for publishing guards
+    ``withheld`` and the trial.
+    """
 
     def __init__(self, client_id: str, vital: tuple[str, ...]) -> None:
         self._client_id, self._vital = client_id, vital

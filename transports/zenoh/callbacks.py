@@ -42,13 +42,13 @@ ensure_state = ctypes.pythonapi.PyGILState_Ensure
 
 
 class Calls:
-    """The callbacks that one thread has begun and ended, by number, and those that the guard has seen."""
+    """Counters of one thread: callbacks begun, callbacks ended, and the number begun that the guard saw last."""
 
     __slots__ = ("begun", "ended", "known", "ran")
 
     def __init__(self) -> None:
         self.begun = self.ended = self.known = 0
-        self.ran = False
+        self.ran = False  # when the guard looked last, a callback was running
 
 
 class Guard:

@@ -84,7 +84,7 @@ class Audit(Observer):
             if says is not None:
                 command = codec.decode(channel, payload)
                 row, who = says(command), _sender(by, command)
-                if row and not self._is_repeated(row.get("stop", ""), who):
+                if row and not self._noted_before(row.get("stop", ""), who):
                     self.note(who=who, **_place(by), **row)
             else:
                 on = bool(payload) and bool(codec.decode(channel, payload))
@@ -112,8 +112,11 @@ class Audit(Observer):
     def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
         self.note("stop-not-confirmed", owner=owner, stop=str(stop.stop))
 
-    def _is_repeated(self, stop: str, who: str) -> bool:
-        """True if a stop of this name and sender has been noted; it may come with a checked name and without one."""
+    def _noted_before(self, stop: str, who: str) -> bool:
+        """True if this sender's stop was noted before; remembers the stop.
+
+        A stop may arrive twice, with a checked sender and without: the two count as different senders.
+        """
         repeated = (stop, who) in self._stops
         if stop and not repeated:
             self._stops.append((stop, who))

@@ -27,7 +27,7 @@ Body = Callable[[McuSample], Payload | None]
 
 @dataclass(frozen=True, slots=True)
 class Alias:
-    """A channel of an interface's own, and the claim that no other device may make."""
+    """An extra channel for one interface. While two devices have the same ``claim``, neither uses it."""
 
     claim: str
     channel: c.Channel

@@ -49,7 +49,7 @@ class RobotEstop:
 
     @property
     def states(self) -> dict[str, EstopState]:
-        """The states by owner; with capabilities only of the owners that these list: others are no longer there."""
+        """The stop states by motor owner. Once capabilities are known, only of the owners that they list."""
         if not self.has_capabilities:
             return dict(self._states)
         return {owner: self._states[owner] for owner in self.owners if owner in self._states}

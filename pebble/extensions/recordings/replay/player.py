@@ -42,7 +42,7 @@ class Output(Protocol):
         ...
 
     def send(self, message: Recorded, position_ns: int) -> bool:
-        """Return whether it is done; else it is tried again."""
+        """Send the message; False: not sent now, and the caller tries again later."""
         ...
 
     def halt(self) -> None:

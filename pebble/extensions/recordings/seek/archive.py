@@ -108,7 +108,7 @@ class Archive:
         return sorted(found[:LOG_LINES], key=lambda message: message.log_ns)
 
     def pictures(self, robot: str, at_ns: int) -> list[Recorded]:
-        """Return the last picture before ``at_ns``, and before it all from its key frame on; empty if there is none."""
+        """Return the last picture before ``at_ns`` and those it needs, from its key frame on, oldest first; or none."""
         chain: list[Recorded] = []
         size = 0
         for message in self._pictures_before(robot, at_ns):
