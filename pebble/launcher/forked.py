@@ -51,7 +51,7 @@ def become(
 
 
 def _arrange_descriptors(stdin: int, output: int, notes: int) -> None:
-    """Close all other descriptors: this child would hold the launcher's lock, for one, as long as it lives."""
+    """Set the child's descriptors, and close all others, such as the launcher's lock, which the child would keep."""
     wanted = (stdin, output, output, notes)
     clear = [fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, len(wanted)) for descriptor in wanted]
     for number, descriptor in enumerate(clear):
@@ -66,7 +66,7 @@ def _arrange_descriptors(stdin: int, output: int, notes: int) -> None:
 
 
 def _reset_signals() -> None:
-    """Set signals as in a fresh interpreter. What was ignored (nohup) stays ignored."""
+    """Set signals as in a fresh interpreter. Ignored signals (nohup) stay ignored."""
     signal.set_wakeup_fd(-1)
     for number in _SIGNALS:
         if callable(signal.getsignal(number)):
@@ -75,7 +75,7 @@ def _reset_signals() -> None:
 
 
 def _forget_launcher(environment: Mapping[str, str]) -> None:
-    """Remove the launcher's handlers and variables. Change only what differs: a written page is no longer shared."""
+    """Remove the launcher's handlers and variables. Change only what differs, as a written page is no longer shared."""
     atexit._clear()
     logging.getLogger().handlers.clear()
     for name in os.environ.keys() - environment.keys():
