@@ -169,7 +169,7 @@ class Launcher:
             log.error("%s", error)
 
     def _stop(self) -> None:
-        """Stop stage by stage, each within its share of the timeout, so a hung process takes no time from later stages."""
+        """Stop stage by stage, each within its share of the timeout, which a hung process cannot exceed."""
         log.info("stopping")
         self._status.stopping()
         end = self._reactor.now() + self._config.services.launcher.shutdown_timeout_seconds

@@ -116,7 +116,7 @@ class OwnMessageFilter:
         self._repeats.update(topic for topic in seen if overlap(topic, filter_))
 
     def is_echo(self, message: Message) -> bool:
-        """True if this is our own retained message, sent back to us; else forgets ours: another client has published."""
+        """True if this is our own retained message, sent back to us; else forgets ours, which is outdated."""
         if message.topic not in self._own:
             return False
         if self._own.get(message.topic) == _digest(message):
