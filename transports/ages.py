@@ -1,7 +1,7 @@
 """Ages of messages when they arrive, by the clocks of their senders (T19).
 
-A sender's clock may show any time. Its fastest recent message is taken to have needed no time on its way: one that
-seems to have needed longer has waited somewhere.
+A sender's clock may show any time. The fastest recent message of a sender is taken to have needed no time on its way: a
+message that seems to have needed longer has waited somewhere.
 """
 
 import threading
@@ -61,8 +61,8 @@ class _Clock:
 class SenderClocks(Generic[K]):
     """The clocks of at most ``most`` senders, each known by a key.
 
-    Where there is no room, a silent one gives way, or else the one that was received for the shortest time: a flood of
-    invented keys does not displace a sender that goes on.
+    Where there is no room, a silent sender gives way, or else the sender that was received for the shortest time, so
+    that a flood of invented keys does not displace a sender that goes on.
     """
 
     def __init__(self, most: int, patience: Patience) -> None:
@@ -74,10 +74,11 @@ class SenderClocks(Generic[K]):
         return len(self._clocks)
 
     def age_s(self, key: K, sent: float, waited_s: float, now: float, late_s: float) -> float:
-        """Return how many seconds a message stamped ``sent`` has waited at ``now``; more than ``late_s`` is late.
+        """Return for how many seconds a message stamped ``sent`` has waited at ``now``; learns the sender's clock.
 
-        ``waited_s`` is the longest time that it can have waited, as far as is known without the stamp. It counts, too,
-        until the clock is two seconds old, and until one of the sender's messages was not late by it.
+        A message that has waited for more than ``late_s`` is late. ``waited_s`` is the longest time that it can have
+        waited, as far as is known without the stamp. This time counts, too, until the clock is two seconds old, and
+        until one of the sender's messages was not late by it.
         """
         with self._lock:
             clock = self._clocks.get(key)
@@ -132,7 +133,7 @@ class SenderClocks(Generic[K]):
 
 
 class MessageAges:
-    """Ages of messages of other processes; one older than ``late_s`` is late. Thread-safe.
+    """Ages of messages of other processes; a message older than ``late_s`` is late. Thread-safe.
 
     All processes of a boot share a clock that counts since that boot. A sender can claim any boot, and so make all
     messages from that machine seem late: so a clock counts for one topic only, on which few may send. A machine whose
