@@ -190,7 +190,7 @@ class MqttBridge(ForwardingService):
             self._publish_heartbeat()
 
     def _look_later(self) -> None:
-        """Wait again until all messages that the robot retains are known; then look for those that only brokers retain."""
+        """Wait until all messages that the robot retains are known; then look for those only at the remote side."""
         if self._leftovers.done:
             return
         if self._leftover_timer is not None:
