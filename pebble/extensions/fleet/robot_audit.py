@@ -76,7 +76,7 @@ class Audit(Observer):
         self._writer.add({"t": round(time.time(), 3), "what": what, "who": who, **more})
 
     def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
-        """Note what it says, without parameters and keys."""
+        """Note the content of a message that has passed, without parameters and keys."""
         says = _COMMANDS.get(channel.suffix)
         if says is None and channel.kind not in (Kind.FLAG, Kind.ACTION):
             return
@@ -93,7 +93,7 @@ class Audit(Observer):
                     self.note(channel.kind.name.lower(), _sender(by), **_place(by), name=name, on=on)
 
     def refused(self, drop: Drop, channel: Channel | None, by: str | None) -> None:
-        """Note it, so many at most of strangers."""
+        """Note a message that was refused, only a limited number of strangers."""
         if drop in _REFUSED:
             name, who = "" if channel is None else channel.metric, _sender(by)
             row = {"t": round(time.time(), 3), "what": "refused", "who": who, **_place(by), "name": name}

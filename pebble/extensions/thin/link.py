@@ -130,7 +130,7 @@ class LinkMeter:
             self._decide(now)
 
     def lost(self) -> None:
-        """Note that the connection is lost: the next measurements are of another one."""
+        """Note that the connection is lost; the next measurements are of another connection."""
         self._answers = 0
         self._crowd = Crowd()
         self._forget()
@@ -222,5 +222,5 @@ class LateRun:
         self.count, self._newest_at = self.count + 1, now
 
     def seconds(self, now: float) -> float:
-        """Return how long all of them were late."""
+        """Return for how long commands have been late without a break; 0 if none was."""
         return now - self._since if self.count else 0.0

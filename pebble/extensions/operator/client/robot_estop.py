@@ -82,7 +82,7 @@ class RobotEstop:
 
     @property
     def old(self) -> bool:
-        """True if it is known to have no emergency stop; one that announces it, but cannot receive it, is not old."""
+        """True if the robot is known to have no emergency stop; a robot that cannot receive its own is not old."""
         return self.has_capabilities and not self.announces
 
     def subscribe(self, transport: Transport) -> None:

@@ -71,7 +71,7 @@ class Liveness:
         return None if self.received_at is None else now - self.received_at
 
     def online(self, now: float, at_least_s: float = 0.0) -> bool | None:
-        """True if it is there; None while there are too few heartbeats. A silence below ``at_least_s`` is none."""
+        """True if the robot is there; None while heartbeats are too few. A silence below ``at_least_s`` is none."""
         if self.reported_offline:
             return False
         interval = self.interval_s
@@ -199,7 +199,7 @@ class RobotView:
         return "assumed" in self.capabilities
 
     def assume(self, axes: Collection[str], name: str = "") -> bool:
-        """Take a silent board for one that drives by these axes, or by none; return whether that is new."""
+        """Assume that a silent board drives by these axes, or by none; return True if that is new."""
         before = self.capabilities
         if self.silent:
             self.capabilities = assumed.assumed(self.base, axes, name)
@@ -233,18 +233,18 @@ class RobotView:
 
     @property
     def drives(self) -> bool:
-        """True if it offers driving; without capabilities nothing is assumed (paper A.8.6)."""
+        """True if the robot offers driving; without capabilities nothing is assumed (paper A.8.6)."""
         drive = section_of(self.capabilities, "drive")
         return drive.get("available") is True and drive.get("controls") is not False
 
     @property
     def arbitrates(self) -> bool:
-        """True if it decides itself between a script and a person."""
+        """True if the robot itself decides between a script and a person."""
         return section_of(self.capabilities, "drive").get("arbitrates") is True
 
     @property
     def controlled(self) -> bool:
-        """True if it decides itself which person drives it."""
+        """True if the robot itself decides which person drives it."""
         return section_of(self.capabilities, "drive").get("control") is True
 
     @property
@@ -258,12 +258,12 @@ class RobotView:
 
     @property
     def named(self) -> bool:
-        """True if it takes commands only with the name of their sender in the topic."""
+        """True if the robot takes commands only with the name of their sender in the topic."""
         return self.estop.named
 
     @property
     def slow_s(self) -> float | None:
-        """The seconds that commands take over its thin link; None: it has reported none, or is gone."""
+        """The seconds that commands take over the robot's thin link; None if there is none, or the robot is gone."""
         link = self.link
         return None if link is None or link.level == "wide" or self.liveness.reported_offline else way_s(link)
 
@@ -273,7 +273,7 @@ class RobotView:
         return pace_of(self.link)
 
     def topic(self, channel: c.Channel) -> str | None:
-        """Return the topic that its capabilities name for ``channel``; None: none, or none of its own."""
+        """Return the topic that the robot's capabilities name for ``channel``; None for none, or a foreign topic."""
         return named_topic(self.base, self.capabilities, channel)
 
     def offers(self, section: str) -> bool:
@@ -281,7 +281,7 @@ class RobotView:
         return section_of(self.capabilities, section).get("controls") is True
 
     def ready(self, now: float) -> bool:
-        """True if it is online, with a known drive topic."""
+        """True if the robot is online, with a known drive topic."""
         return self.topic(c.DRIVE) is not None and self.liveness.online(now) is True
 
     def online(self, now: float) -> bool | None:

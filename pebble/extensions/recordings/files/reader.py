@@ -136,7 +136,7 @@ class RecordingFile:
         return self.damage.report(active=self.path.name.endswith(ACTIVE))
 
     def reaches_into(self, since_ns: int, until_ns: int) -> bool:
-        """True if it may hold messages of a period: one that is not finished has no end."""
+        """True if the file may hold messages of a period; an unfinished file has no end."""
         ends = self.damage.finished and self.last_ns < since_ns
         return bool(self.chunks) and self.first_ns < until_ns and not ends
 
@@ -170,7 +170,7 @@ class RecordingFile:
             yield from messages
 
     def messages(self, chunk: Chunk, chooses: Chooses = lambda _channel: True) -> list[Recorded]:
-        """Return those of one chunk in the order of time; none if it is damaged."""
+        """Return the messages of one chunk in the order of time; none if the chunk is damaged."""
         return self._unpacked(chunk, chooses)[0]
 
     def metadata(self) -> dict[str, dict[str, str]]:
@@ -215,7 +215,7 @@ class RecordingFile:
             self._look_through()
 
     def _summary(self) -> Summary | None:
-        """Return the summary; None: it is not finished, its end is damaged, or it has none."""
+        """Return the summary; None if the file is not finished, its end is damaged, or it has no summary."""
         tail = FOOTER.size + len(MAGIC)
         file_size = self.size
         footer = self._read(max(0, file_size - tail), tail)

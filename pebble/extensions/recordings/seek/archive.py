@@ -135,7 +135,7 @@ class Archive:
         return found
 
     def files(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[SeekableFile]:
-        """Return those that may hold messages of a robot in a period, opened, in the order of time."""
+        """Return the files that may hold messages of a robot in a period, opened, in the order of time."""
         lane = lane_of(f"{robot}/", is_media=True)
         found = []
         for named in self._list():
@@ -172,7 +172,7 @@ class Archive:
         return self._named
 
     def _opened(self, path: Path) -> SeekableFile | None:
-        """Return None for one that has gone meanwhile, or is no recording."""
+        """Return a file, opened; None if it has gone meanwhile, or is no recording."""
         file = self._open.pop(path, None)
         try:
             if file is not None and file.is_replaced():
