@@ -347,9 +347,9 @@ def motors_of(extensions: Iterable[Extension], config: Any) -> dict[str, str]:
 
 
 def programs_of(extensions: Iterable[Extension], config: Any, core: Iterable[str] = ()) -> list[Program]:
-    """Return the processes that extensions add to a robot; ``core``: names that are taken.
+    """Return the processes that extensions add to a robot; ``core``: names of Pebble's own processes.
 
-    One that owns motors belongs to the stage of devices. Raises ConfigError if a name is taken.
+    A process that owns motors is started with the devices. Raises ConfigError if a name is taken.
     """
     owners = dict.fromkeys(core, "the core")
     programs = []
@@ -384,7 +384,11 @@ def items(extension: Extension, hook: str, kind: type[T], *arguments: Any) -> li
 def call(
     extension: Extension, hook: str, kind: Any, *arguments: Any, finish: Callable[[Any], Any] = lambda value: value
 ) -> Any:
-    """Return the result of an extension's function. Raises ConfigError, which names both, if it fails."""
+    """Call function ``hook`` of an extension and return its result.
+
+    ``finish`` converts the result within the same guard. Raises ConfigError with the extension and the hook if the
+    call fails or returns no ``kind``.
+    """
     try:
         value = finish(part(getattr(extension, hook))(*arguments))
     except PebbleError:

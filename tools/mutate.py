@@ -60,7 +60,10 @@ Mutant = tuple[dict[str, Any], set[tuple[str, int]], bytes]  # a record, the lin
 
 
 def mutants(file: str, text: bytes) -> Iterator[Mutant]:
-    """Yield the mutants of a file. Their names stay when lines move: the n-th of an operator in a function."""
+    """Yield the mutants of a file.
+
+    A name holds the function, the operator and a running number, not the line: it stays when lines move.
+    """
     starts = [0, *itertools.accumulate(map(len, text.splitlines(keepends=True)))]
     numbers: Counter[str] = Counter()
 
@@ -68,20 +71,21 @@ def mutants(file: str, text: bytes) -> Iterator[Mutant]:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             function = f"{function}.{node.name}".lstrip(".")
         statement = node.lineno if isinstance(node, ast.stmt) else statement
-        operator = ""
+        is_log = False
         for operator, part, new in replacements(node):
+            is_log = is_log or operator == "log"
             name = f"{file}:{function or '<module>'}:{operator}"
             numbers[name] += 1
             start, end = starts[part.lineno - 1] + part.col_offset, starts[part.end_lineno - 1] + part.end_col_offset
             newlines = text.count(b"\n", start, end) * "\n"  # so that what follows stays on its lines
-            words = ast.unparse(new) + newlines
-            words = words if isinstance(new, ast.Constant | ast.Pass) else f"({words})"
+            replacement = ast.unparse(new) + newlines
+            replacement = replacement if isinstance(new, ast.Constant | ast.Pass) else f"({replacement})"
             change = " ".join(f"{text[start:end].decode()} -> {ast.unparse(new)}".split())
             record = {"name": f"{name}:{numbers[name]}", "file": file, "line": part.lineno, "change": change}
             reached_by = {(file, line) for line in (statement, *range(part.lineno, part.end_lineno + 1))}
-            yield record, reached_by, text[:start] + words.encode() + text[end:]
-        vars(node).update(annotation=None, returns=None, decorator_list=[])  # these are not changed
-        if operator != "log" and not isinstance(node, ast.JoinedStr):
+            yield record, reached_by, text[:start] + replacement.encode() + text[end:]
+        vars(node).update(annotation=None, returns=None, decorator_list=[])  # they are not mutated
+        if not is_log and not isinstance(node, ast.JoinedStr):
             for child in ast.iter_child_nodes(node):
                 yield from walk(child, function, statement)
 
@@ -307,7 +311,7 @@ class Trial:
         return swaps if possible else []
 
     def run_swapped(self, swaps: list[tuple[FunctionType, CodeType]], names: list[str]) -> bool:
-        """Run rows with changed functions; True if all pass."""
+        """Run the tests ``names`` with the changed code of ``swaps``; True if all pass."""
         for function, code in swaps:
             function.__code__ = code
         return len(self.run_rows(names, stop=not self.options.matrix)) == len(names)

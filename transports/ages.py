@@ -1,7 +1,7 @@
 """Ages of messages when they arrive, by the clocks of their senders (T19).
 
-A sender's clock may show any time. Its fastest recent message is taken to have needed no time on its way: one that
-seems to have needed longer has waited somewhere.
+A sender's clock may show any time. The fastest recent message of a sender is taken to have needed no time on its way: a
+message that seems to have needed longer has waited somewhere.
 """
 
 import threading
@@ -61,8 +61,8 @@ class _Clock:
 class SenderClocks(Generic[K]):
     """The clocks of at most ``most`` senders, each known by a key.
 
-    Where there is no room, a silent one gives way, or else the one that was received for the shortest time: a flood of
-    invented keys does not displace a sender that goes on.
+    Where there is no room, a silent sender gives way, or else the sender that was received for the shortest time, so
+    that a flood of invented keys does not displace a sender that goes on.
     """
 
     def __init__(self, most: int, patience: Patience) -> None:
@@ -74,10 +74,11 @@ class SenderClocks(Generic[K]):
         return len(self._clocks)
 
     def age_s(self, key: K, sent: float, waited_s: float, now: float, late_s: float) -> float:
-        """Return how many seconds a message stamped ``sent`` has waited at ``now``; more than ``late_s`` is late.
+        """Return for how many seconds a message stamped ``sent`` has waited at ``now``; learns the sender's clock.
 
-        ``waited_s`` is the longest time that it can have waited, as far as is known without the stamp. It counts, too,
-        until the clock is two seconds old, and until one of the sender's messages was not late by it.
+        A message that has waited for more than ``late_s`` is late. ``waited_s`` is the longest time that it can have
+        waited, as far as is known without the stamp. This time counts, too, until the clock is two seconds old, and
+        until one of the sender's messages was not late by it.
         """
         with self._lock:
             clock = self._clocks.get(key)
@@ -85,7 +86,7 @@ class SenderClocks(Generic[K]):
                 clock = self._clocks[key] = self._begin(key, _Clock(sent, now))
             else:
                 clock.receive(sent, now)
-                clock = self._believed(key, clock, sent, now, late_s)
+                clock = self._clock_to_use(key, clock, sent, now, late_s)
             if waited_s <= late_s:
                 clock.proved = max(clock.proved, now - sent - waited_s)
             age = now - sent - min(clock.least, clock.proved)
@@ -113,25 +114,26 @@ class SenderClocks(Generic[K]):
             del clocks[replaced]
         return clock
 
-    def _believed(self, key: K, clock: _Clock, sent: float, now: float, late_s: float) -> _Clock:
+    def _clock_to_use(self, key: K, clock: _Clock, sent: float, now: float, late_s: float) -> _Clock:
         """Return the sender's clock as it is, or as changed once all its messages have seemed late for long enough."""
         if now - sent - clock.least <= late_s:
-            clock.other = None
+            clock.other = None  # on time: the clock holds
             return clock
-        other, patience = clock.other, self._patience
+        candidate, patience = clock.other, self._patience
         patience_s = patience.set_back_s if sent < clock.newest - _JUMP_S else patience.believed_s
-        if other is None or now - other.received_at > patience.gap_s or patience_s < other.patience_s:
+        # begin with a new candidate: there is none, or after a pause, or less patience is due now
+        if candidate is None or now - candidate.received_at > patience.gap_s or patience_s < candidate.patience_s:
             clock.other = _Clock(sent, now, patience_s)
             return clock
-        other.receive(sent, now)
-        if now - other.began <= other.patience_s:
+        candidate.receive(sent, now)
+        if now - candidate.began <= candidate.patience_s:
             return clock
-        self._clocks[key] = other
-        return other
+        self._clocks[key] = candidate  # late for long enough
+        return candidate
 
 
 class MessageAges:
-    """Ages of messages of other processes; one older than ``late_s`` is late. Thread-safe.
+    """Ages of messages of other processes; a message older than ``late_s`` is late. Thread-safe.
 
     All processes of a boot share a clock that counts since that boot. A sender can claim any boot, and so make all
     messages from that machine seem late: so a clock counts for one topic only, on which few may send. A machine whose

@@ -164,7 +164,7 @@ class Subscription:
 
 
 class Subscriptions:
-    """The subscriptions of one transport; any thread may use it, and ask which of them match a topic."""
+    """The subscriptions of one transport, thread-safe, with a search for those that match a topic."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -182,7 +182,7 @@ class Subscriptions:
             self.matched.clear()
 
     def remove(self, subscription: Subscription) -> bool:
-        """Remove a subscription; return True if it was one of them."""
+        """Remove a subscription; return True if it was there."""
         with self.lock:
             if subscription not in self._all:
                 return False
@@ -199,7 +199,7 @@ class Subscriptions:
     def matching(self, topic: str) -> tuple[Subscription, ...]:
         """Return the subscriptions that match ``topic``.
 
-        They are remembered by topic: matching takes longer than everything else that happens to a message here.
+        The result is remembered by topic, because matching takes longer than all other steps of a message here.
         """
         with self.lock:
             matching = self.matched.get(topic)
@@ -290,20 +290,23 @@ class Transport(ABC):
 
     @property
     def not_received(self) -> str:
-        """One line about subscriptions that the other end refuses; empty: none."""
+        """One line about the subscriptions that the other end refuses; empty if it refuses none."""
         refused = [subscription.filter for subscription in self._subscriptions if subscription.refused]
         more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""
         return f"it refuses to deliver {', '.join(refused[:_NAMED])}{more}" if refused else ""
 
     def suit_link(self, *, thin: bool) -> None:
-        """Set `is_thin`, from now on."""
+        """Set whether the link to the other end is thin (`is_thin`), from now on."""
         self.is_thin = thin
 
     def renew_connection(self, why: str) -> None:  # noqa: B027 - where no other end keeps messages, nothing is to be done
-        """Replace the connection by another: messages that wait for the old one at the other end are dropped there."""
+        """Close the connection and open a new one. What the broker has queued for the old one is dropped.
+
+        ``why`` is for the log.
+        """
 
     def on_state(self, watcher: Watcher) -> None:
-        """Call ``watcher`` on every change of state, in order, on a thread of the transport: it must return at once."""
+        """Call ``watcher`` on every change of state, in order, on a thread of the transport. It must not wait."""
         self._changes.watch(watcher)
 
     def open(self, timeout: float = 5.0) -> Self:
@@ -436,7 +439,7 @@ class Transport(ABC):
     def ask(self, topics: Collection[str]) -> None:
         """Have the retained messages of ``topics`` delivered to the subscriptions that match; waits, bounded.
 
-        Some brokers send them only to subscriptions of exact names; a backend whose network has none does nothing.
+        Some brokers send retained messages only to subscriptions of exact names; other backends do nothing here.
         """
         del topics
 
@@ -470,7 +473,7 @@ class Transport(ABC):
             self._own.send_again(known, lambda message: self._send(message, False))
 
     def _initial_sync(self, known: Collection[str]) -> None:
-        """Finish a new connection that has its subscriptions: send the retained messages it lacks, and be connected.
+        """Finish a new connection that has its subscriptions: send the retained messages it lacks, and set CONNECTED.
 
         Until then the ``_send`` of a backend that calls this accepts messages only while ``_own.syncing``: retained
         ones that are published meanwhile are pending, and sent last.
@@ -496,7 +499,7 @@ class Transport(ABC):
         """Send one message within a bounded time; False if it cannot be sent now."""
 
     def _declare_all(self, subscriptions: Sequence[Subscription]) -> None:
-        """Declare each; a backend may wait once for all."""
+        """Declare each subscription; a backend may wait once for all."""
         for subscription in subscriptions:
             self._declare(subscription)
 

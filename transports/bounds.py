@@ -9,7 +9,7 @@ V = TypeVar("V")
 
 
 class BoundedQueue(Generic[V]):
-    """Items in order. The oldest make room for a new one, which is never refused, however large it is."""
+    """Items in order. The oldest make room for a new item, which is never refused, however large it is."""
 
     def __init__(self, items: int, size: int) -> None:
         self._max_items, self._max_size = items, size
@@ -39,9 +39,9 @@ class BoundedQueue(Generic[V]):
 
 
 class BoundedTable(MutableMapping[str, V]):
-    """Values by topic, in the order in which they were set. The oldest are forgotten to make room for a new one.
+    """Values by topic, in the order in which they were set. The oldest are forgotten to make room for a new value.
 
-    A value that is too large for the table is not stored, and removes the older one of its topic. May be changed by
+    A value that is too large for the table is not stored, and removes the older value of its topic. May be changed by
     several threads.
     """
 

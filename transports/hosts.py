@@ -1,4 +1,4 @@
-"""Addresses of a host: each gets its turn, in whatever way the one before has failed."""
+"""Addresses of a host. Each gets its turn, in whatever way the address before has failed."""
 
 import socket
 from collections.abc import Callable
@@ -79,7 +79,7 @@ class AddressRound:
         self._slow: set[Address] = set()  # addresses where TLS took long, or was not there in time
 
     def address(self) -> Address:
-        """Return the address whose turn it is; may wait for a resolver. Raises OSError, ValueError."""
+        """Return the address whose turn it is; may wait for a name server. Raises OSError, ValueError."""
         if not self._left:
             addresses = self._resolve(*self.host_port)
             if not addresses:
@@ -107,11 +107,11 @@ class AddressRound:
         return HANDSHAKE_S if self._left and self._left[0] in self._slow else CONNECT_TIMEOUT_S
 
     def opened(self, seconds: float) -> None:
-        """Note how long TCP and TLS took there; addresses that had not answered in time were dead, then, not slow."""
+        """Note how long TCP and TLS took; addresses that had not answered in time before were dead, not slow."""
         self._slow = {self._left[0]} if seconds > CONNECT_TIMEOUT_S else set()
 
     def was_slow(self) -> None:
-        """Note that TLS was silent for too long: it gets longer the next time."""
+        """Note that TLS was silent for too long; the next attempt may be silent for longer."""
         self._slow.add(self._left[0])
 
     def succeeded(self) -> str:

@@ -13,12 +13,12 @@ class OwnFile:
 
     @property
     def in_place(self) -> bool:
-        """True if others that open its path still reach this process."""
+        """True if this process's file is still at its path."""
         return self._made is not None and identity(self._path) == self._made
 
     @property
     def replaced(self) -> bool:
-        """True if another file is at its path."""
+        """True if another file has taken the place of this file."""
         return identity(self._path) not in (None, self._made)
 
 

@@ -21,9 +21,9 @@ class OwnRetained(BoundedTable[Message]):
         self._counters = counters
 
     def remember(self, message: Message, *, sent: bool, shared: bool | None = None) -> bool:
-        """Store a message, to send it again. False if there is no room; then no older one is sent again either.
+        """Store a message, to send it again. False if there is no room; an older message is not sent again then either.
 
-        ``shared`` None: as the older one.
+        ``shared`` None: as for the older message of the topic.
         """
         shared = message.topic in self.shared if shared is None else shared
         self.pending.pop(message.topic, None)
@@ -41,7 +41,7 @@ class OwnRetained(BoundedTable[Message]):
         return True
 
     def send_again(self, known: Collection[str], send: Callable[[Message], bool]) -> None:
-        """Send the pending ones, then the others that are not in ``known``."""
+        """Send the pending messages, then the others whose topics are not in ``known``."""
         changed = [self[topic] for topic in self.pending]
         others = [m for topic, m in self.items() if topic not in self.pending and topic not in known]
         self.syncing = True

@@ -1,7 +1,7 @@
 """The processes running in a run directory: one locked file each, so that an exit needs no message and no timeout.
 
 A process holds a lock on its ``<name>.seat`` as long as it runs; the kernel releases it however the process ends. A
-process that finds an unlocked one removes the files of its former owner. The owner writes its name into the file when
+process that finds an unlocked file removes the files of its former owner. The owner writes its name into the file when
 it listens, and is ready from then on: a newcomer waits for all that are ready, and those that become ready later wait
 for the newcomer, so that of any two at least one waits for the other.
 """
@@ -27,7 +27,10 @@ _RESERVED = "?#;"  # these separate the parts of a Zenoh endpoint
 
 
 def prepare_run_dir(run_dir: Path) -> None:
-    """Make a folder of sockets private. Raises TransportError, also if it cannot contain one."""
+    """Create the folder for sockets, private to this user.
+
+    Raises TransportError, also if its path is too long for a socket or has a reserved character.
+    """
     check_socket_path(run_dir / f"{new_name()}.sock")
     if any(character in str(run_dir) for character in _RESERVED):
         raise TransportError(f"transport.run_dir {run_dir} must not contain any of {_RESERVED}")
@@ -35,10 +38,10 @@ def prepare_run_dir(run_dir: Path) -> None:
 
 
 def make_private(run_dir: Path, *, close: bool = False) -> None:
-    """Make ``run_dir`` for this user alone, if it is missing; ``close`` takes an existing one away from others.
+    """Create ``run_dir`` for this user alone, if it is missing; ``close`` takes access from others if it exists.
 
-    Raises TransportError for a folder in which others may write: that is control over the robot, or over what its
-    programs see, and in /tmp another user may have created these names first.
+    Raises TransportError for a folder in which others may write, because who writes there controls the robot, or what
+    its programs see. In /tmp another user may have created these names first.
     """
     try:
         run_dir.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -68,7 +71,7 @@ def make_private(run_dir: Path, *, close: bool = False) -> None:
 class FileLock:
     """An exclusive lock on a file. The kernel releases it when the process ends.
 
-    Taking one raises TransportError if there can be no such file.
+    Taking a lock raises TransportError if the file cannot be created.
     """
 
     def __init__(self, path: Path, descriptor: int) -> None:
@@ -77,7 +80,7 @@ class FileLock:
 
     @classmethod
     def take(cls, path: Path) -> FileLock | None:
-        """Lock ``path``, made if it is missing; None if another process has locked it."""
+        """Lock ``path``, which is created if missing; None if another process has locked it."""
         try:
             return cls._get(path, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -85,7 +88,7 @@ class FileLock:
 
     @classmethod
     def wait(cls, path: Path) -> FileLock:
-        """Lock a path with a new name: another process locks it only for the moment of checking its owner."""
+        """Lock a path with a new name, which another process locks only for the moment of checking its owner."""
         return cls._get(path, fcntl.LOCK_EX)
 
     @classmethod
@@ -134,7 +137,7 @@ class PresenceLock:
         self._released = False
 
     def ready(self) -> None:
-        """Mark the process as reachable: from now on newcomers wait for its answer."""
+        """Mark the process as reachable, so that newcomers wait for its answer from now on."""
         with self._changing:
             if not self._released:
                 self._lock.write(self._owner.encode() or b"?")
@@ -199,7 +202,7 @@ def _no_lock(path: Path, error: OSError, remedy: str = "") -> TransportError:
 
 
 def _owner_if_running(path: Path) -> str | None:
-    """Return the text in a lock file; None if its owner does not run any more: its files are removed then."""
+    """Return the text in a lock file; if its owner has ended, remove the owner's files and return None."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError:  # removed meanwhile, or no lock file

@@ -10,7 +10,7 @@ YOUNG_S = 1.0  # a segment is locked within a second after its creation
 
 
 def sweep(folder: Path = SHM) -> int:
-    """Remove the segments of this user that no process uses any more; return how many there were."""
+    """Remove the segments of this user that no process uses any more; return how many were removed."""
     return sum(map(_remove_if_unused, folder.glob("*.zenoh")))
 
 
@@ -24,7 +24,7 @@ def has_room(size: int, folder: Path = SHM) -> bool:
 
 
 def mappings() -> list[tuple[int, int, str]]:
-    """Return the mapped segments of this process: first address, the one after the last, and the file."""
+    """Return the mapped segments of this process: first address, the address after the last, and the file."""
     found = []
     for line in Path("/proc/self/maps").read_text(encoding="utf-8").splitlines():
         place, *_, path = line.split(maxsplit=5)

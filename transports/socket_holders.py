@@ -1,4 +1,4 @@
-"""Processes that hold a socket, as far as this user may look: into those of the same user, as root into all."""
+"""Processes that hold a socket, as far as this user may see: the user's own processes, or all for root."""
 
 import errno
 from collections.abc import Collection, Iterator
@@ -10,7 +10,7 @@ _LISTENS = "0A"  # in /proc/net/tcp
 
 
 def _processes_with(inodes: Collection[str]) -> Iterator[tuple[Path, set[str]]]:
-    """Yield each process that holds some of these sockets: its folder in /proc, and those that it holds."""
+    """Yield each process that holds some of these sockets: its folder in /proc, and the sockets that it holds."""
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             links = []
@@ -31,7 +31,7 @@ def _command_of(process: int) -> str:
 
 
 def why_not(error: OSError, port: int) -> str:
-    """Return why this TCP port could not be listened at; for one that is taken by which process, if that is found."""
+    """Return why this TCP port could not be listened at; for a port in use with its process, if that is found."""
     return f"{error.strerror}{port_holder(port)}" if error.errno == errno.EADDRINUSE else str(error.strerror)
 
 

@@ -2,8 +2,9 @@
 
     python robot.py ID HOST PORT STOP_FILE [USER PASSWORD_FILE CA_FILE]
 
-It needs the modules beside it as well.
-With a user it is at level named, see docs/ext/fleet.md: commands count only under the account of their sender.
+The program needs the modules beside it as well.
+With USER it runs at security level `named` (docs/ext/fleet.md): it obeys only commands that carry the account of their
+sender.
 """
 
 import json

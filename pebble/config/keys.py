@@ -18,28 +18,33 @@ def keys_text() -> str:
 
 
 def _chapters(kind: type[Section], path: str, places: dict[type[Section], str]) -> Iterator[str]:
-    """Yield one table per section, depth first; a class of section has its table at the first place of use."""
+    """Yield one table per section, depth first; a section class used in several places is described at the first."""
     places[kind] = path
-    inner: list[tuple[type[Section], str]] = []
+    to_describe: list[tuple[type[Section], str]] = []
     rows = []
     for field in sorted(fields(kind), key=lambda field: not field.required):
         section, key = _section_of(field), f"{path}.{field.encode_name}".removeprefix(".")
         if section is None:
             rows.append(f"| `{key}` | {_default(field)} | {_meaning(field)}{_allowed(field)} |\n")
             continue
-        place = key + {dict: ".<name>", tuple: "[]"}.get(get_origin(unwrap(field.type)[0]), "")
-        like = f"keys as in `{places[section]}`" if section in places else "keys below"
-        rows.append(f"| `{key}` | | {_meaning(field)} ({like}) |\n")
+        place = key + _suffix_of(field)
+        where_described = f"keys as in `{places[section]}`" if section in places else "keys below"
+        rows.append(f"| `{key}` | | {_meaning(field)} ({where_described}) |\n")
         if section not in places:
             places[section] = place
-            inner.append((section, place))
+            to_describe.append((section, place))
     yield f"## {f'`{path}`' if path else 'The whole file'}\n\n"
     yield f"{kind.__doc__}\n\n| key | default | meaning |\n|---|---|---|\n{''.join(rows)}\n"
     for text in dict.fromkeys(kind.all_retired().values()):
         keys = ", ".join(f"`{key}`" for key, replacement in kind.all_retired().items() if replacement == text)
         yield f"No longer used: {keys}; {text}.\n\n"
-    for section, place in inner:
+    for section, place in to_describe:
         yield from _chapters(section, place, places)
+
+
+def _suffix_of(field: FieldInfo) -> str:
+    """Return the text that marks a field of several sections: by name, or in a list."""
+    return {dict: ".<name>", tuple: "[]"}.get(get_origin(unwrap(field.type)[0]), "")
 
 
 def _section_of(field: FieldInfo) -> type[Section] | None:

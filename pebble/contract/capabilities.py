@@ -54,7 +54,7 @@ class VideoOffer(Offer, frozen=True, kw_only=True):
 
 
 class AudioOffer(Offer, frozen=True, kw_only=True):
-    """A microphone, and a loudspeaker where there is an ``uplink_topic``. Without it nothing is heard or spoken."""
+    """A microphone, and a loudspeaker if there is an ``uplink_topic``. Without this section there is no sound."""
 
     topic: str | UnsetType = UNSET  # of its sound
     uplink_topic: str | UnsetType = UNSET  # of voices to it
@@ -67,7 +67,7 @@ class AudioOffer(Offer, frozen=True, kw_only=True):
 
 
 class FilesOffer(Offer, frozen=True, kw_only=True):
-    """Sounds that it plays, or scripts that it runs. Without it their card is there once it publishes a list."""
+    """Sounds or scripts of a robot. Without this section their card is shown once the robot publishes a list."""
 
     command_topic: str | UnsetType = UNSET
     files_topic: str | UnsetType = UNSET
@@ -89,7 +89,7 @@ class SystemOffer(Payload, frozen=True, kw_only=True):
 
 
 class DriveOffer(Offer, frozen=True, kw_only=True):
-    """Wheels, or whatever moves it. Without it there is no card to drive."""
+    """Wheels, or anything else that moves the robot. Without this section there is no card to drive."""
 
     topic: str | UnsetType = UNSET  # of drive commands
     axes: list[Literal["x", "y", "z"]] | UnsetType = UNSET  # that move anything; without it all of them
@@ -98,7 +98,7 @@ class DriveOffer(Offer, frozen=True, kw_only=True):
 
 
 class EstopOffer(Payload, frozen=True, kw_only=True):
-    """An emergency stop that stays. Without it a stop is a zero, and the page says that it does not stay."""
+    """A latching emergency stop. Without it, a stop is only a zero drive command, and pages say so."""
 
     available: bool = False
     topic: str | UnsetType = UNSET
@@ -109,7 +109,7 @@ class EstopOffer(Payload, frozen=True, kw_only=True):
 
 
 class LightsOffer(Payload, frozen=True, kw_only=True):
-    """Lights. Without it there is no card for them."""
+    """Lights. Without this section there is no card for lights."""
 
     solid: bool = False  # a steady colour
     flash: bool = False  # one that fades in and out
@@ -118,7 +118,7 @@ class LightsOffer(Payload, frozen=True, kw_only=True):
 
 
 class TelemetryOffer(Payload, frozen=True, kw_only=True):
-    """Measurements. One that is not listed is shown from its first message on."""
+    """Measurements. A measurement that is not listed is shown from its first message on."""
 
     touch_sensors: bool = False
     charging_status: bool = False
@@ -141,7 +141,7 @@ class OutletOffer(Payload, frozen=True, kw_only=True):
 
 
 class OutletsOffer(Offer, frozen=True, kw_only=True):
-    """Switched outlets. Without it an outlet is shown from its first status on."""
+    """Switched outlets. Without this section an outlet is shown from its first status on."""
 
     outlets: list[OutletOffer] | UnsetType = UNSET
 

@@ -43,11 +43,12 @@ class Kind(Enum):
 class Channel(Struct, frozen=True, kw_only=True, dict=True):
     """A topic, or a family of topics: its name, payload and delivery.
 
-    ``metric`` may hold ``{names}``, one level each. With ``remote=False`` it never leaves the robot. With
-    ``bridged=False`` its own process is connected to the remote broker. With ``newest``, only the newest of several
-    waiting messages is handled. A one-shot message that has waited for longer than ``waits_s`` in a process or at a
-    broker (``thin_waits_s`` over a link that may be thin) is stale, unless it ends something. A ``prompt`` message
-    never waits for room on a thin link.
+    ``metric`` may hold placeholders ``{name}``, each for one topic level. With ``remote=False`` messages never leave
+    the robot. With ``bridged=False`` the publishing process has a remote connection of its own: the bridge does not
+    forward the topic. With ``newest``, only the newest of several waiting messages is handled. A one-shot message that
+    has waited for longer than ``waits_s`` in a process or at a broker (``thin_waits_s`` over a link that may be thin)
+    is stale and ignored, except if it ends something (a zero, a release). A ``prompt`` message never waits for room on
+    a thin link.
     """
 
     metric: str

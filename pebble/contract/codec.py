@@ -115,7 +115,7 @@ def trim(raw: bytes) -> bytes:
 
 
 def _stop(channel: Channel, raw: bytes) -> EstopCommand:
-    """Return a stop; one that cannot be read has no name. An empty payload, of a removed message, is no stop."""
+    """Return a stop; a stop that cannot be read has no name. An empty payload, of a removed message, is no stop."""
     if not raw:
         raise PayloadError(f"{channel.metric}: empty")
     try:

@@ -101,7 +101,7 @@ def untypeable(name: str) -> str:
 
 
 def meant(names: Iterable[str], typed: str) -> str:
-    """Return the name that was typed, or one that looks the same; ``typed`` itself if there is none."""
+    """Return the name that was typed, or a name that looks the same; ``typed`` itself if there is none."""
     if typed.isascii():
         return typed
     alike = [name for name in names if composed(name) == composed(typed)]

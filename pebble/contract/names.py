@@ -34,13 +34,13 @@ def with_name(topic: str, account: str) -> str:
 
 
 def without_name(topic: str) -> Named | None:
-    """Return the account and the topic without it; None: there is no account, several, or an invalid one."""
+    """Return the topic without the account, and the account; None for no account, several, or an invalid one."""
     match = _NAMED.fullmatch(topic)
     return None if match is None else Named(match[2], match[1] + match[3])
 
 
 def stop_topic(topic: str) -> str | None:
-    """Return the topic of stops if ``topic`` is that with any accounts in it, also invalid ones; else None."""
+    """Return the topic of stops if ``topic`` is that topic with any accounts in it, even invalid ones; else None."""
     match = _STOP.fullmatch(topic)
     return None if match is None else match[1] + match[2]
 

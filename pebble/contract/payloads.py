@@ -24,7 +24,7 @@ class Payload(Struct, frozen=True, kw_only=True, omit_defaults=False):
                 raise ValueError(f"{name} is not a finite number")
 
     def ends(self) -> bool:
-        """True if it can only end something: a zero, and the end of a script, a sound or a picture."""
+        """True if the message can only end something: a zero, or the end of a script, a sound or a picture."""
         return False
 
 
@@ -76,7 +76,7 @@ class Drive(Payload, frozen=True, kw_only=True):
 
     @property
     def signed(self) -> bool:
-        """True if it is a script's."""
+        """True if a script has sent this command."""
         return self.source == SCRIPT
 
 

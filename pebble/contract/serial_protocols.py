@@ -26,7 +26,7 @@ class SerialProtocol(Struct, frozen=True):
         return self.service.partition(":")[0]
 
     def has_imu(self, instance: str) -> bool:
-        """True if a line of this name has an inertial sensor, as far as is known before the device is connected."""
+        """True if a line of this name has an inertial sensor, by the config alone, before the device is connected."""
         return self.is_imu or (self.describes_itself and instance == _IMU_INSTANCE)
 
 

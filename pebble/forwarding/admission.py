@@ -33,7 +33,8 @@ class Admission:
     def refuse(self, side: Side, subject: Subject, message: Message, topic: str, *, named: bool = True) -> Drop | None:
         """Return why this message may not pass to ``topic``; None if it may. Hot.
 
-        ``named`` False: it has no name where others have one; such messages are counted apart.
+        Counts the message if its kind is bounded, and remembers an unknown flag. ``named`` False: the message has no
+        sender where others have one; such messages are counted apart.
         """
         if side is Side.REMOTE and len(message.payload) > MAX_COMMAND_BYTES and _is_bounded(subject):
             return Drop.TOO_LARGE

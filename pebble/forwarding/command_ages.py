@@ -21,10 +21,10 @@ _PATIENCE = Patience(believed_s=60.0, set_back_s=2.0, silent_s=60.0)
 
 
 class CommandAges:
-    """Ages of drive commands and requests for control that tell them; thread-safe.
+    """Ages of drive commands and requests for control that carry a time stamp; thread-safe.
 
-    :attr:`keys` are the keys of control now: others count for nothing, as at the motor owner. None: no motor owner
-    gives keys, and every sender has one of its own.
+    :attr:`keys` are the present keys of control: a command with another key has no age here, as at the motor owner.
+    None: no motor owner gives keys, and every sender has a key of its own.
     """
 
     def __init__(self) -> None:
@@ -33,9 +33,9 @@ class CommandAges:
         self._asking = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
 
     def waited_s(self, subject: Subject, message: Message, account: str) -> float:
-        """Return seconds for which a message with a STAMP has waited: by the stamp, if it counts.
+        """Return seconds for which a message with a time stamp has waited; remembers the sender's clock.
 
-        A key, or an id, counts for the ``account`` that uses it.
+        The stamp counts if the message has a valid key or id. A key, or an id, belongs to the ``account`` that uses it.
         """
         waited_s = message.waited_s
         assert subject.channel is not None  # noqa: S101 - else it is not stamped
@@ -57,7 +57,7 @@ class CommandAges:
         return clocks.age_s((account, key), command.t / 1000, waited_s, clock.since_boot(), subject.waits_s)
 
     def _key(self, command: Drive) -> str:
-        """Return the key by which its sender is known; empty: none that counts."""
+        """Return the key by which the sender of a command is known; empty if no valid key is given."""
         text, keys = command.key, self.keys
         if not isinstance(text, str) or len(text) > _LONGEST:
             return ""

@@ -86,7 +86,8 @@ class Cycles:
     def examine(self, side: Side, subject: Subject, message: Message) -> Finding:
         """Return a finding about a message from ``side`` that may be forwarded. Hot.
 
-        One that runs something may pass while its topic circulates: the caller recognises it when it comes back.
+        Counts the message, and notes an answered probe. A message that runs something may pass while its topic
+        circulates: the caller recognises the message when it comes back.
         """
         topic, payload = message.topic, message.payload
         if subject.is_stop:
@@ -109,7 +110,7 @@ class Cycles:
             return Finding.SUSPECT if suspicious and due else Finding.PASS
 
     def _repeats_stop(self, side: Side, topic: str, payload: bytes) -> bool:
-        """True if an emergency stop returns too fast for its sender. Stops are not probed: any payload is one."""
+        """True if an emergency stop returns too fast for its sender; counts the stop. Stops are not probed."""
         with self._lock:
             now, key = self._clock(), (side, payload)
             often = self._way(side, topic).count(payload, now) > SUSPICIOUS
@@ -119,7 +120,7 @@ class Cycles:
             return False
 
     def probe(self, side: Side, topic: str) -> bytes:
-        """Return the white space of a new probe about ``topic`` from ``side``, to be published on the other one."""
+        """Note a new probe about ``topic`` from ``side``; return its white space, to be published on the other side."""
         number = bytes(_DIGITS[byte % len(_DIGITS)] for byte in secrets.token_bytes(_LENGTH))
         with self._lock:
             way = self._way(side, topic)
@@ -129,7 +130,7 @@ class Cycles:
         return number
 
     def poll(self) -> list[tuple[Side, str]]:
-        """Return the topics that need a new probe; open those that circulate no more. Call it once a second."""
+        """Open the topics that circulate no more; return those that need a new probe. Call this once a second."""
         with self._lock:
             now, due = self._clock(), []
             for key in [key for key in self.closed_ways if now - self._ways[key].probed_at >= PROBE_PERIOD_S / 2]:
@@ -184,7 +185,7 @@ class Cycles:
 
 
 def _usual_count(subject: Subject) -> int:
-    """Return how many equal messages within 2 s are not suspicious; of those that run something, the first only.
+    """Return how many equal messages within 2 s are not suspicious.
 
     Actions are probed at once. Programs of others need to know of probes on those topics already; on topics of other
     commands they see one only after a repetition.

@@ -61,7 +61,7 @@ class EventBuffer:
                 self._drain()  # Zenoh accepts messages while the hub is away
 
     def flush(self) -> None:
-        """Begin with a new connection: send events that may have been lost with the last one, then the waiting ones."""
+        """Begin with a new connection: send events perhaps lost with the last connection, then those waiting."""
         with self._lock:
             if self._lost_at is not None:
                 recent = [event for event in self._recent if 0 <= self._lost_at - event.sent_at <= RESEND_S]

@@ -69,7 +69,7 @@ class Mirroring:
         self.on, self._was_refused = on, on and self._was_refused
 
     def is_possible(self) -> bool:
-        """True if the broker does not send our own commands back: it would repeat each later, also after the stop."""
+        """True if the broker does not send our own commands back, which would repeat each later, even after a stop."""
         if all(state.transport.exact_echo for state in self._sides.values()):
             return True
         if not self._was_refused:
@@ -136,7 +136,7 @@ class Forwarder:
         return self.sides.gate
 
     def dropped(self) -> dict[str, int]:
-        """Return how many messages did not pass because of a bound, here or in a transport; by reason: ``too_many``."""
+        """Return how many messages did not pass because of a bound, here or in a transport, by reason."""
         counts = Counter(bounds_reached(*(state.transport.counters for state in self.sides.values())))
         for drop, side in itertools.product(_BOUNDS, Side):
             counts[drop.name.lower()] += self.counters[f"{side.value}: {drop.value}"]
@@ -175,7 +175,7 @@ class Forwarder:
     # -- the receiving threads
 
     def skips_retained(self, side: Side, topic: bytes) -> bool:
-        """True if no retained message of ``topic`` passes; for TopicPolicy.skips_retained."""
+        """True if no retained message of ``topic`` passes; counts and logs the message then. For TopicPolicy."""
         kind = self._subjects.invented(topic)
         if self._names is not None and topic.endswith(_STOP) and self._is_stop(topic.decode(errors="replace")):
             return False  # it may be a live one
@@ -206,19 +206,19 @@ class Forwarder:
     def _receive_named(self, source: SideState, names: Names, message: Message) -> Routed:
         """Pass a message whose sender is checked, on the topic without the name and with the sender in the payload."""
         sender = names[message.topic]
-        subject, by = sender.subject, sender.account
+        subject, by = sender.subject, sender.account  # sign() adds the person for whom an account acts
         outcome = self._admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
         if subject is None:
             outcome = sender.foreign
         elif isinstance(outcome, Forward):
             match names.sign(sender, message):
-                case Signed(message, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:
-                    outcome = self.retained.change(subject, message)
-                case Signed(message, by):
-                    outcome = self.pass_now(source, subject, message, outcome, sender.account)
+                case Signed(signed, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:
+                    outcome = self.retained.change(subject, signed)
+                case Signed(signed, by):
+                    outcome = self.pass_now(source, subject, signed, outcome, sender.account)
                 case Drop.UNNAMED if outcome.retain:  # it may be a retained message of the robot itself
                     outcome = self.retained.receive(source, subject, message, outcome, old=True)
-                case drop:
+                case Drop() as drop:
                     outcome = drop
         if isinstance(outcome, Drop) and outcome in _NAMES:
             self._warn(outcome, message.topic[:_LOGGED])
@@ -227,9 +227,9 @@ class Forwarder:
     def _admit(
         self, source: SideState, subject: Subject | None, message: Message, topic: str, named: bool
     ) -> Forward | Drop:
-        """Return how to forward it, or why not: no subject, no route, or the first of `_ADMISSION` that holds. Hot.
+        """Return how to forward ``message``, or why not: no subject, no route, or a reason of `_ADMISSION`. Hot.
 
-        ``topic`` is the one on which it passes, and would be retained.
+        ``topic`` is the topic on which the message passes, and would be retained.
         """
         if subject is None or not subject.is_stop:
             if message.retain:  # while such messages arrive, a stop among them is an old one
@@ -297,7 +297,7 @@ class Forwarder:
     ) -> Forward | Drop:
         """Publish an admitted message on the other side, or return why not. Hot.
 
-        ``account`` is that of its sender, where names are checked.
+        ``account`` is the account of the sender, where names are checked.
         """
         if subject.kind.one_shot and self._is_late(subject, message, forward, account):
             return Drop.LATE
@@ -321,7 +321,7 @@ class Forwarder:
         return late
 
     def _without_script(self, source: SideState, message: Message) -> Message | None:
-        """Return a drive command as it may pass: a script's only if it ends motion; None: it does not pass."""
+        """Return a drive command as it may pass; None for a script's command that does not end motion."""
         passing = unsigned(message.payload)
         if passing is message.payload:
             return message
@@ -381,10 +381,10 @@ class Forwarder:
 
 
 def barrier(transport: Transport, filter_: str) -> None:
-    """Wait, bounded, until the other end has handled all that we sent, and its retained messages are here.
+    """Wait, bounded, until the other end has handled all our messages, and its retained messages have arrived.
 
-    A subscription is acknowledged after everything before it. ``filter_`` should be within one that is subscribed to
-    anyway: a broker may forbid others. A narrow one brings few retained messages.
+    A subscription is acknowledged after everything before it. ``filter_`` should be within a filter that is subscribed
+    to anyway, because a broker may forbid others. A narrow filter brings few retained messages.
     """
     transport.subscribe(filter_, _ignore, echo=False, direct=True, limit=1).close()
 

@@ -26,7 +26,7 @@ class LoopbackFilter:
         return len(self._out)
 
     def expect(self, topic: str, payload: bytes) -> None:
-        """Expect a message to come back; call it before publishing, as the echo may be faster than that call."""
+        """Expect a message to come back; call this before publishing, because the echo may be faster than that call."""
         with self._lock:
             out = self._out.setdefault(topic, deque())
             out.append((self._clock(), _digest(payload)))
@@ -37,7 +37,7 @@ class LoopbackFilter:
                 self._messages -= len(self._out.pop(next(iter(self._out))))
 
     def forget(self, topic: str) -> None:
-        """Forget the newest message on ``topic``: it was not sent after all."""
+        """Forget the newest message on ``topic``, which was not sent after all."""
         with self._lock:
             if self._out.get(topic):
                 self._out[topic].pop()
@@ -45,7 +45,10 @@ class LoopbackFilter:
                 self._tidy(topic)
 
     def is_echo(self, topic: str, payload: bytes) -> bool:
-        """True if this message is ours. A broker keeps the order of a topic, so earlier ones will not come back."""
+        """True if we sent this message; forgets that message and all earlier ones of its topic.
+
+        A broker keeps the order of a topic, so the earlier ones will not come back.
+        """
         with self._lock:
             out = self._out.get(topic)
             if not out:

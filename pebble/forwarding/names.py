@@ -1,7 +1,7 @@
 """Senders of messages at the level ``named``, where the broker vouches for the account in a message's topic. Pure.
 
-On the robot itself the topic is without the account, and the sender stands in the payload. What has none is from a
-program of the robot. An extension reads and writes the names.
+On the robot itself the topic is without the account, and the sender stands in the payload. A message without a sender
+is from a program of the robot. An extension reads and writes the names.
 """
 
 from abc import ABC, abstractmethod
@@ -14,10 +14,10 @@ from pebble.transports import Message
 
 
 class Sender(Struct, frozen=True):
-    """The sender of a message, as far as its topic tells: the account, or NO_ACCOUNT.
+    """The sender of a message by its topic: the account, or NO_ACCOUNT.
 
-    ``topic`` is the one without the name, and ``subject`` its meaning; None: it means nothing to this robot, because
-    of ``foreign``.
+    ``topic`` is the topic without the name, and ``subject`` the meaning of that topic; None if it means nothing to
+    this robot, for the reason ``foreign``.
     """
 
     account: str
@@ -38,4 +38,4 @@ class Names(dict[str, Sender], ABC):
 
     @abstractmethod
     def sign(self, sender: Sender, message: Message) -> Signed | Drop:
-        """Return ``message`` with its sender in the payload, and without in the topic, or why it does not pass."""
+        """Return ``message`` with its sender in the payload instead of the topic, or why the message does not pass."""

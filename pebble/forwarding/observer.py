@@ -32,10 +32,10 @@ class Observer:
     """
 
     def start(self) -> None:
-        """Begin; on the service's thread, as :meth:`close`, :meth:`control` and :meth:`unconfirmed`."""
+        """Begin to observe; on the service's thread, as :meth:`close`, :meth:`control` and :meth:`unconfirmed`."""
 
     def close(self) -> None:
-        """End; keep the observations until now."""
+        """End observing; keep the observations until now."""
 
     def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
         """Note a command or a changed flag."""
@@ -47,11 +47,11 @@ class Observer:
         """Note the state of control, from the motor owner that decides."""
 
     def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
-        """Note a stop that a motor owner has not confirmed, and that is given up."""
+        """Note a stop that a motor owner has not confirmed, and that is not repeated any more."""
 
 
 class Observers(Observer):
-    """The observers of all extensions. An error of one is logged, and costs the others nothing."""
+    """The observers of all extensions. An error of one observer is logged, and the others are called all the same."""
 
     def __init__(self, config: Config, clock: Callable[[], float]) -> None:
         self._observers: list[Observer] = []
@@ -85,7 +85,7 @@ class Observers(Observer):
 
 
 def steps_of(config: Config) -> dict[str, Step]:
-    """Return the steps that extensions add, by their names; one that cannot be made is logged, and left out."""
+    """Return the steps that extensions add, by extension; a step that cannot be made is logged, and left out."""
     steps: dict[str, Step] = {}
     for extension in config.installed:
         if extension.step:

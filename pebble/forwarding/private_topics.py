@@ -14,5 +14,5 @@ class PrivateTopics:
         return False
 
     def admit(self, message: Message) -> list[Message]:
-        """Return the messages of the robot that may pass now: ``message``, none, or others that waited as well."""
+        """Return the messages of the robot that may pass now: ``message``, none, or earlier ones as well."""
         return [message]

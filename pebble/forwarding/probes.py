@@ -30,7 +30,7 @@ def new_probe(now_ms: int, nonce_bytes: int = 8) -> bytes:
 class Probes:
     """Probes that the bridge has announced and probes received from a broker, compared in either order.
 
-    Each counts once: a copy that a client keeps sending, or has retained, proves nothing.
+    Each probe counts once, because a client may keep sending a copy, or retain one.
     """
 
     def __init__(self) -> None:
@@ -52,7 +52,7 @@ class Probes:
 
 
 def _match(payload: bytes, counterparts: deque[bytes], waiting: deque[bytes]) -> bool:
-    """Return True if ``payload`` has a counterpart, which then counts no more; else let it wait for one."""
+    """Return True, and remove the counterpart, if ``payload`` has one; else let ``payload`` wait for a counterpart."""
     if payload in counterparts:
         counterparts.remove(payload)
         return True

@@ -15,7 +15,7 @@ from pebble.transports.counters import Counters
 
 
 class Publisher:
-    """A publisher of messages, and of probes for cycles; ``both_ways`` are the kinds that pass in both directions."""
+    """A publisher of messages, and of probes for cycles; ``both_ways``: kinds that pass in both directions."""
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class Publisher:
             self._sides[origin].returns.expect(message.topic, message.payload)
 
     def is_echo(self, source: SideState, subject: Subject, message: Message) -> bool:
-        """True if ``message`` is one of ours that came back."""
+        """True if we sent ``message`` and it came back; forgets it and all earlier messages of its topic."""
         topic, payload = message.topic, message.payload
         if (source.side, topic) in self._cycles.closed_ways and source.returns.is_echo(topic, payload):
             return True
@@ -79,7 +79,7 @@ class Publisher:
             self.probe(side, topic, b"")
 
     def probe_again(self, sides: tuple[Side, ...], value: Callable[[str], bytes | None]) -> None:
-        """Probe topics that circulated, and then also commands from ``sides``; call it once a second.
+        """Probe topics that circulated, and then also commands from ``sides``; call this once a second.
 
         ``value`` returns the newest value of a topic. Commands were probed when a connection began, but the other way
         may be younger.

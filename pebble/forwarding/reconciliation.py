@@ -114,7 +114,7 @@ class Reconciliation:
         return None if last is None else last.payload
 
     def begin(self, side: Side) -> None:
-        """Begin again with ``side``, whose connection was lost or is new: its retained messages will arrive again."""
+        """Begin again with ``side`` after its connection was lost: its retained messages will arrive again."""
         self._received[side].clear()
         if side is self._winner:
             self._offered.clear()
@@ -164,7 +164,7 @@ class Reconciliation:
         self._published[side][topic] = payload
 
     def synchronize(self, side: Side) -> list[tuple[Side, str, bytes]]:
-        """Note that all retained messages of ``side`` have arrived; return sides, topics and payloads to publish."""
+        """Note that all retained messages of ``side`` have arrived; return the values to publish, by side and topic."""
         self._synchronized[side] = True
         due: list[tuple[Side, str, bytes]] = []
         if side is self._winner:
@@ -198,7 +198,7 @@ class Reconciliation:
         )
 
     def _may_come_late(self, topic: str) -> bool:
-        """True if the winner may still have an old value: silence does not mean that it has none."""
+        """True if the winner may still have an old value that has not arrived."""
         return self._synchronized[self._winner] and topic not in self._received[self._winner]
 
     def _is_missing(self, side: Side, topic: str, last: LastValue) -> bool:

@@ -39,7 +39,7 @@ class RetainedTopics:
     def receive(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, *, old: bool = False
     ) -> Forward | Drop:
-        """Forward ``message``, which will be retained, or return why not. ``old``: only one that is an old one."""
+        """Forward ``message``, which will be retained, or return why not. ``old``: only an old message."""
         with self._lock:
             self._begin_restarted()
             if subject.kind in self._both_ways:

@@ -32,7 +32,7 @@ class RetainedWindow:
         return self._clock() - self._newest_at < QUIET_S
 
     def subscribing(self) -> None:
-        """Note that its retained messages arrive from now on."""
+        """Note that the transport subscribes: its retained messages arrive from now on."""
         self._newest_at = float("-inf")
         self._until = self._stops_until = float("inf")
 
@@ -43,7 +43,7 @@ class RetainedWindow:
         self._stops_until = max(self._until, self._newest_at + INITIAL_SYNC_S)
 
     def note(self) -> None:
-        """Note a message with the retain flag: while such come, a stop may be an old one."""
+        """Note a message with the retain flag: while such messages come, a stop may be an old one."""
         now, until = self._clock(), self._stops_until
         if now >= until:
             return
@@ -56,5 +56,5 @@ class RetainedWindow:
         return message.retain and (not self._transport.as_published or self._clock() < self._stops_until)
 
     def may_be_old(self, message: Message) -> bool:
-        """True if ``message``, if it is the first of its topic, is an old one, where live ones have the flag, too."""
+        """True if ``message`` may be an old retained one: it has the flag, and such messages may still arrive."""
         return message.retain and self._clock() < self._until

@@ -70,7 +70,7 @@ class Forward(Struct, frozen=True):
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """A routing table: the kinds that leave each side, and those that follow only while mirroring is on."""
+    """A routing table: the kinds of messages forwarded from each side, and the kinds that need mirroring to be on."""
 
     passes: Mapping[Side, frozenset[Kind]]
     mirrored: Mapping[Side, frozenset[Kind]] = field(default_factory=dict)

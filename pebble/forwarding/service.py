@@ -118,7 +118,7 @@ class ForwardingService(Service, ABC):
 
     @abstractmethod
     def await_retained(self) -> None:
-        """Wait, bounded, until the retained messages of the remote side have arrived."""
+        """Wait, for a limited time, until the retained messages of the remote side have arrived."""
 
     @abstractmethod
     def check_again(self, epoch: int) -> None:
@@ -126,11 +126,11 @@ class ForwardingService(Service, ABC):
 
     @abstractmethod
     def receive_local(self, message: Message) -> None:
-        """Take a message of the local side, on its thread."""
+        """Handle a message of the local side, on its thread."""
 
     @abstractmethod
     def receive_remote(self, epoch: int, message: Message) -> None:
-        """Take a message of the remote side, on its thread; ``epoch`` is that of its connection."""
+        """Handle a message of the remote side, on its thread; ``epoch`` is the number of its connection."""
 
     # -- the life of the service
 
@@ -158,7 +158,7 @@ class ForwardingService(Service, ABC):
     def subscribe_remote(self) -> None:
         """Subscribe for a new connection, after the transport has sent the robot's changes during the outage.
 
-        So no retained message of the remote side is older than a change by the robot.
+        Because of this order, no retained message of the remote side is older than a change by the robot.
         """
         self.unsubscribe(Side.REMOTE)
         self.forwarder.sides[Side.REMOTE].subscribing()
@@ -199,7 +199,7 @@ class ForwardingService(Service, ABC):
         self.forward_nothing()
 
     def forward_nothing(self, seconds: float = CHECK_AGAIN_S) -> None:
-        """Forward nothing until the next check: at a reconnect, or in so many seconds."""
+        """Forward nothing until the next check, which comes at a reconnect or after a fixed time."""
         self.forwarder.shut()  # again: it may just have been opened
         self.unsubscribe(Side.REMOTE)
         self.check_later(seconds)

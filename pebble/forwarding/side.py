@@ -25,7 +25,7 @@ class Gate(Enum):
 class SideState:
     """One side: its transport, messages that wait for it or may come back, and the age of its retained messages.
 
-    ``wins``: its retained messages count where those of the two sides differ.
+    ``wins``: the retained messages of this side count where those of the two sides differ.
     """
 
     def __init__(
@@ -72,7 +72,10 @@ class SideState:
         return self._was_brief or self.transport.was_ended
 
     def arrived(self) -> None:
-        """Note that its retained messages have arrived: an earlier value that comes later was chosen again."""
+        """Note that the retained messages of this side have arrived.
+
+        An earlier value that comes from now on was chosen again.
+        """
         self._went_back = False
 
     @property

@@ -15,7 +15,7 @@ _SCRIPT, _BACKSLASH = SCRIPT.encode(), 0x5C
 
 
 def unsigned(payload: bytes) -> bytes | None:
-    """Return the drive command ``payload`` as it may pass; None: it may not. Hot: a person's is hardly looked at.
+    """Return the drive command ``payload`` as it may pass; None if it may not. Hot: a person's is hardly looked at.
 
     JSON writes the letters as they are or with backslashes. A payload with either of them that cannot be read does not
     pass: the parser of a board may be more lenient.

@@ -38,12 +38,12 @@ class Subject:
 
     @cached_property
     def stays(self) -> bool:
-        """True if it never leaves the robot."""
+        """True if messages of this subject never leave the robot."""
         return self.channel is not None and not self.channel.remote
 
     @cached_property
     def bridged(self) -> bool:
-        """True if it is forwarded with other messages; media has connections of its own."""
+        """True if the bridge forwards messages of this subject; media has connections of its own."""
         return self.channel is None or self.channel.bridged
 
     @cached_property
@@ -58,7 +58,7 @@ class Subject:
 
     @cached_property
     def prompt(self) -> bool:
-        """True if it never waits for room on a thin link."""
+        """True if a message never waits for room on a thin link."""
         return self.channel is not None and self.channel.prompt
 
     @cached_property
@@ -71,22 +71,22 @@ class Subject:
 
     @cached_property
     def stamped(self) -> bool:
-        """True if its messages may carry their sender's clock and a key, which tell their age."""
+        """True if messages may carry the time of their sender's clock and a key, which tell their age."""
         return self.channel is not None and self.channel.payload in (Drive, ControlRequest)
 
     @cached_property
     def runs(self) -> bool:
-        """True if one message makes the robot do something: once, although the message may circulate."""
+        """True if one message makes the robot do something, which must happen once even if the message circulates."""
         return self.kind in (Kind.COMMAND, Kind.ACTION) and not self.drives and not self.is_stop
 
     @cached_property
     def counted(self) -> bool:
-        """True if a robot takes a bounded number of its messages: of actions, and of those beyond the contract."""
+        """True if a robot takes a limited number of messages: for actions, and for metrics beyond the contract."""
         return self.channel is None or self.kind is Kind.ACTION
 
     @cached_property
     def is_two_way(self) -> bool:
-        """True if it is forwarded both ways even while remote-mirror is off, so that a broker may send it back."""
+        """True if messages pass both ways even while remote-mirror is off, so that a broker may send them back."""
         return self.kind in (Kind.FLAG, Kind.ACTION)
 
 
@@ -119,7 +119,7 @@ class Subjects(dict[str, Subject | None]):
         return subject
 
     def invented(self, topic: bytes) -> Kind | None:
-        """Return the kind of an incoming topic that the contract does not name, as UTF-8; found out quickly."""
+        """Return the kind of an incoming topic (as UTF-8) that the contract does not name; None for any other. Fast."""
         if not topic.startswith(self._incoming):
             return None
         metric = topic[len(self._incoming) :]

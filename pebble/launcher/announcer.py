@@ -39,7 +39,7 @@ class Announcer:
         os.set_blocking(pipe, False)
 
     def run(self, notify: Notifier) -> None:
-        """Run until :meth:`stop` or the end of the pipe; then publish the rest of the pipe, and the will."""
+        """Run until :meth:`stop` or the end of the pipe; then publish what is left in the pipe, and the will."""
         self._reactor.watch(self._pipe, self._receive)
         self._reactor.watch(self._wake.fileno(), self._publish_states)
         self._reactor.every(ALIVE_PERIOD_S, notify.alive)

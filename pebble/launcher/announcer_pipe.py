@@ -24,7 +24,7 @@ class Envelope(msgspec.Struct, frozen=True, array_like=True):
 
 
 class AnnouncerPipe:
-    """The launcher's end. Without room in the socket, records are dropped and counted; states are sent later.
+    """The launcher's end of the pipe. If the socket is full, records are dropped and counted; states are sent later.
 
     The kernel's buffer is the bound: some hundred log records that an announcer has not read yet.
     """
@@ -53,18 +53,18 @@ class AnnouncerPipe:
         self._send_states()
 
     def record(self, message: Message) -> None:
-        """Send a message that counts only now. Unsent states go first."""
+        """Send a message once, after the unsent states; without room it is dropped."""
         if not (self._send_states() and self._send("record", message)):
             self.dropped += 1
 
     def close(self) -> None:
-        """Close the launcher's end: the announcer reads the end of the pipe."""
+        """Close the launcher's end, so that the announcer reads the end of the pipe."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
     def _send_states(self) -> bool:
-        """Send the unsent states; False, and another attempt later, if there is no room."""
+        """Send the unsent states; True if all are sent, else arranges another attempt."""
         for topic in list(self._unsent):
             if not self._send("state", self._unsent[topic]):
                 if self._socket is not None and self._retry is None:

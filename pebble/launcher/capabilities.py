@@ -26,7 +26,7 @@ def capabilities(
 ) -> dict[str, Any]:
     """Return the ``value`` of a capabilities message, completed by extensions.
 
-    ``lacking`` and ``found`` are the features that its processes report now (pebble.launcher.features).
+    ``lacking`` and ``found`` are features that the robot's processes report now (pebble.launcher.features).
     """
     drive, estop, lights, telemetry = _motor(config, addresses, lacking)
     value = offers.CapabilitiesValue(
@@ -111,7 +111,7 @@ def _motor(
 
 
 def _estop(config: Config, owners: list[str]) -> offers.EstopOffer:
-    """Return the emergency stop: its topics, and the owners that confirm it; none if any of them lacks it."""
+    """Return the offer of an emergency stop, with the topics of ``owners``; not available if there are none."""
     return offers.EstopOffer(
         available=bool(owners),
         topic=c.ESTOP.topic(config.base),
@@ -122,14 +122,14 @@ def _estop(config: Config, owners: list[str]) -> offers.EstopOffer:
 
 
 def _imu(config: Config) -> tuple[bool, str]:
-    """Return whether there is an inertial sensor, by a line's protocol or name, and its topic."""
+    """Return if a serial line has an inertial sensor, and the topic of the sensor."""
     lines = [name for name, line in config.serial_instances().items() if SERIAL_PROTOCOLS[line.protocol].has_imu(name)]
     addresses = Addresses(view_of(config, lines[0]) if lines else config)
     return bool(lines), addresses[c.IMU].topic
 
 
 def _outlets(config: Config, found: Collection[str]) -> offers.OutletsOffer:
-    """Return the outlets of self-describing MCUs that are connected now, with the topics that they use."""
+    """Return the outlets of the self-describing MCUs that are connected now, with the topics in use."""
     topics: dict[str, dict[str, str]] = {}
     for key, channel in (("status_topic", c.OUTLET_STATUS), ("command_topic", c.OUTLET_COMMAND)):
         for feature in sorted(found):

@@ -19,8 +19,8 @@ class Child:
     """A process in a group of its own: a terminal's Ctrl-C reaches only the launcher, and no grandchild outlives it.
 
     ``output`` (stdout and stderr, in order), ``notes`` (pebble.runtime.notes) and ``exited`` are descriptors to wait
-    on; ``exited`` is None where the process has to be asked (pebble.runtime.exits). The caller closes ``stdin``. It
-    forks: only for a process with one thread and without sessions. Raises OSError.
+    on; ``exited`` is None where the process has to be polled (pebble.runtime.exits). The caller closes ``stdin``. The
+    constructor forks: the caller must have one thread and no sessions. Raises OSError.
     """
 
     def __init__(self, program: Program, environment: Mapping[str, str], config: Config, *, stdin: int) -> None:
@@ -45,7 +45,7 @@ class Child:
             os.kill(self.pid, signal.SIGTERM)
 
     def kill(self) -> None:
-        """Kill its process group. Safe at any time, also from a signal handler."""
+        """Kill the child's process group. Safe at any time, also from a signal handler."""
         if self._reaped:  # the number may belong to another process by now
             return
         try:
@@ -54,7 +54,7 @@ class Child:
             os.kill(self.pid, signal.SIGKILL)
 
     def end(self) -> str:
-        """Clean up after its exit; return ``exit code 1`` or ``signal 9``."""
+        """Clean up after the child's exit; return ``exit code 1`` or ``signal 9``, for example."""
         self._reaped = True  # first: a signal handler may come in between
         code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
         for descriptor in (self.output, self.notes, self.exited):
@@ -86,7 +86,7 @@ def _pipe(opened: list[int]) -> tuple[int, int]:
 
 
 def _fork(run: Callable[[], NoReturn]) -> int:
-    """Fork with signals blocked: until ``run`` sets its own handlers, a child would run the launcher's."""
+    """Fork with signals blocked, because a child has the launcher's handlers until ``run`` sets its own."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         pid = os.fork()

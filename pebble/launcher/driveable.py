@@ -13,7 +13,7 @@ _WORDS = {"init": "starting"}  # of a process's state
 
 
 def _shown(mcu: Mcu) -> dict[str, Any]:
-    """Return the state of a serial line as the robot's status has it."""
+    """Return the state of a serial line, in the form of the robot's status."""
     age = {} if mcu.silent_ms is None else {"heard_ms": mcu.silent_ms}
     starts = {"starts_per_minute": mcu.starts} if mcu.starts else {}
     why = mcu.why or _starts(mcu)
@@ -59,7 +59,7 @@ class Driveable:
 
     @property
     def mcus(self) -> dict[str, dict[str, Any]]:
-        """The states of the serial lines, by name, as the status has them."""
+        """The states of the serial lines, by name, in the form of the robot's status."""
         return {name: _shown(self._mcus[program]) for program, name in self._lines.items() if program in self._mcus}
 
     def mcu(self, program: str, note: Mcu) -> None:

@@ -29,9 +29,9 @@ def become(
 ) -> NoReturn:
     """Run ``program`` with these descriptors and no others, and exit with its code. Call right after the fork.
 
-    The program gets ``config`` as it is: its file may have changed since. All signals must be blocked. It never returns
-    or raises: the frames below belong to the launcher. They must stay as well, because closing one of their objects
-    would close a descriptor that by then belongs to another object.
+    The program gets ``config`` as it is: its file may have changed since. All signals must be blocked. Never return or
+    raise: the frames of the callers belong to the launcher, and unwinding them would close descriptors that by then
+    belong to other objects.
     """
     code = 1
 
@@ -44,14 +44,14 @@ def become(
         _run(program)
 
     try:
-        code = _exit_code(begin)
-        _exit_code(_finish)
+        code = _run_to_exit_code(begin)
+        _run_to_exit_code(_finish)
     finally:
         os._exit(code)
 
 
 def _arrange_descriptors(stdin: int, output: int, notes: int) -> None:
-    """Close all other descriptors: this child would hold the launcher's lock, for one, as long as it lives."""
+    """Set the child's descriptors, and close all others, such as the launcher's lock, which the child would keep."""
     wanted = (stdin, output, output, notes)
     clear = [fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, len(wanted)) for descriptor in wanted]
     for number, descriptor in enumerate(clear):
@@ -66,7 +66,7 @@ def _arrange_descriptors(stdin: int, output: int, notes: int) -> None:
 
 
 def _reset_signals() -> None:
-    """Set signals as in a fresh interpreter. What was ignored (nohup) stays ignored."""
+    """Set signals as in a fresh interpreter. Ignored signals (nohup) stay ignored."""
     signal.set_wakeup_fd(-1)
     for number in _SIGNALS:
         if callable(signal.getsignal(number)):
@@ -75,7 +75,7 @@ def _reset_signals() -> None:
 
 
 def _forget_launcher(environment: Mapping[str, str]) -> None:
-    """Remove the launcher's handlers and variables. Change only what differs: a written page is no longer shared."""
+    """Remove the launcher's handlers and variables. Change only what differs, as a written page is no longer shared."""
     atexit._clear()
     logging.getLogger().handlers.clear()
     for name in os.environ.keys() - environment.keys():
@@ -102,7 +102,7 @@ def _finish() -> None:
     sys.stderr.flush()
 
 
-def _exit_code(job: Callable[[], None]) -> int:
+def _run_to_exit_code(job: Callable[[], None]) -> int:
     try:
         job()
     except SystemExit as end:

@@ -90,7 +90,7 @@ class Launcher:
     # -- starting
 
     def _start(self) -> None:
-        """Start all programs without waiting: each process connects as soon as it can."""
+        """Start all programs without waiting for any; each process connects as soon as it can."""
         self._reactor.watch(self._signals.descriptor, self._signals.drain)
         preload(shared_modules(self._config, [supervisor.program for supervisor in self._supervisors]))
         for supervisor in self._supervisors:
@@ -169,7 +169,7 @@ class Launcher:
             log.error("%s", error)
 
     def _stop(self) -> None:
-        """Stop stage by stage, each within its share of the timeout: a hung process takes no time from later stages."""
+        """Stop stage by stage, each within its share of the timeout, which a hung process cannot exceed."""
         log.info("stopping")
         self._status.stopping()
         end = self._reactor.now() + self._config.services.launcher.shutdown_timeout_seconds

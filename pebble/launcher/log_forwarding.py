@@ -33,7 +33,7 @@ class LogForwarder:
         self._readers: dict[str, tuple[int, LevelReader]] = {}  # with the process id, by service
 
     def child_line(self, service: str, pid: int, line: str, *, published: bool = True) -> None:
-        """Forward a line of a child. Lines of the publishing process are not published: each would cause another."""
+        """Forward a line of a child. Lines of the announcer are not published, because each would cause another."""
         last_pid, reader = self._readers.get(service, (pid, None))
         if reader is None or last_pid != pid:  # the level of the last line belongs to the previous process
             reader = LevelReader()
@@ -42,7 +42,7 @@ class LogForwarder:
         self._forward(level, service, pid, text, logger="root", published=published)
 
     def tagged_line(self, service: str, pid: int, line: str) -> None:
-        """Forward a line of a child that may come from a process of the child: its tag names that one."""
+        """Forward a line of a child, or of a process of the child, which the tag of the line names."""
         tag = TAG.fullmatch(line)
         if tag is None:
             self.child_line(service, pid, line)

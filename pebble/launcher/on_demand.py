@@ -52,7 +52,7 @@ class OnDemand:
         self._follow(name)
 
     def hold(self, sender: Program, note: Held) -> None:
-        """Let a program wait, or no longer."""
+        """Let a program wait, or let it run again, as ``note`` says."""
         if self._may(sender, note):
             (self._held.add if note.on else self._held.discard)(note.program)
             self._follow(note.program)
@@ -67,7 +67,7 @@ class OnDemand:
             supervisor.request()
 
     def ended(self, program: Program) -> None:
-        """Note that a program has ended: its requests last for a while only, and it holds nothing any more."""
+        """Note that a program has ended: its requests last only OUTLIVE_S longer, and it holds no program any more."""
         if not program.may_request:
             return
         held, self._held = self._held, set()
@@ -89,7 +89,7 @@ class OnDemand:
             self._follow(name)
 
     def _may(self, sender: Program, note: Wanted | Held) -> bool:
-        """True if ``sender`` may request this program; a refusal is logged once."""
+        """True if ``sender`` may request this program; logs and remembers the first refusal of each sender."""
         may = sender.may_request and note.program in self._supervisors
         if not may and sender.name not in self._refused:
             self._refused.add(sender.name)

@@ -85,7 +85,7 @@ class ProcessSupervisor:
 
     @property
     def requested(self) -> bool:
-        """True if an on-demand program is to run."""
+        """True if an on-demand program was requested, and not released since."""
         return self.state in _ACTIVE
 
     def request(self) -> None:

@@ -40,7 +40,7 @@ def _core(config: Config) -> Iterator[tuple[bool, Program]]:
 
 
 def shared_modules(config: Config, table: Iterable[Program]) -> list[str]:
-    """Return the modules to import before the first fork: those of the programs, and those that several use."""
+    """Return the modules to import before the first fork: modules of the programs, and shared ones."""
     programs = list(table)
     shared = dict.fromkeys(module for program in programs for module in program.shares)
     entries = (program.entry or program.module for program in programs if program.preloaded)
@@ -48,7 +48,7 @@ def shared_modules(config: Config, table: Iterable[Program]) -> list[str]:
 
 
 def preload(modules: Iterable[str]) -> None:
-    """Import ``modules``: parent and children share the memory that was written before a fork.
+    """Import ``modules``, because parent and children share the memory that was written before a fork.
 
     A module that cannot be imported is left to the process that runs it, which reports the error.
     """
@@ -63,7 +63,7 @@ def preload(modules: Iterable[str]) -> None:
 
 
 def _transport_modules(config: Config) -> tuple[str, ...]:
-    """Return the modules of our transports that any process of this robot opens."""
+    """Return the modules of the transports that a process of this robot opens."""
     bridge = config.services.mqtt_bridge
     kinds = {config.transport.kind}
     if config.transport.mqtt_mirror is not None:

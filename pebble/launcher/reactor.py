@@ -19,7 +19,7 @@ Job = Callable[[], None]
 class Reactor:
     """A loop that calls jobs when a descriptor can be read or a time has come. For one thread only.
 
-    Its clock stands still while this process does, because the other processes then stand still, too, as a rule.
+    Its clock stands still while this process is suspended, because the other processes are mostly suspended, too.
     ``on_stall(seconds)`` is called afterwards.
     """
 
@@ -33,7 +33,7 @@ class Reactor:
         self._read: float | None = None  # when the clock was last read; None while nothing runs
 
     def now(self) -> float:
-        """Return the time by this reactor's clock, in seconds."""
+        """Return the time by this reactor's clock, in seconds; notes a stall since the last call."""
         now = self._clock()
         if self._read is not None:
             before, self._read = self._read, now
@@ -50,7 +50,7 @@ class Reactor:
         self._selector.unregister(descriptor)
 
     def at(self, due: float, job: Job) -> Timer:
-        """Call ``job`` at ``due`` on :meth:`now`."""
+        """Call ``job`` at the time ``due`` of :meth:`now`."""
         return self._timers.add(due, job)
 
     def after(self, seconds: float, job: Job) -> Timer:
@@ -77,7 +77,7 @@ class Reactor:
         self._selector.close()
 
     def _turn(self, *waits: float | None) -> None:
-        """Read descriptors, then run timers: a timer that checks for signs of life must know the newest."""
+        """Read descriptors, then run timers, because a timer that checks for signs of life must know the newest."""
         for key, _ in self._selector.select(min([_TURN_S, *(wait for wait in waits if wait is not None)])):
             if key.fd in self._selector.get_map():  # an earlier job of this turn may have forgotten it
                 key.data()

@@ -35,15 +35,15 @@ class RestartPolicy:
 
     @property
     def in_crash_loop(self) -> bool:
-        """True if the last exits came faster than another start is worth."""
+        """True if the last exits came so fast that a program is restarted only after a long wait."""
         return len(self._exits) == LOOP_EXITS and self._exits[-1] - self._exits[0] <= LOOP_WINDOW_S
 
     def exits_within_a_minute(self, now: float) -> int:
-        """Count unexpected exits, up to those of a crash loop."""
+        """Return the number of unexpected exits in the last minute, LOOP_EXITS at most."""
         return sum(now - at <= LOOP_WINDOW_S for at in self._exits)
 
     def request_delay_s(self, now: float) -> float:
-        """Return seconds to wait before an on-demand program that was released is started on a new request."""
+        """Return the seconds to wait before a released on-demand program is started on a new request."""
         return max(0.0, self._started + START_INTERVAL_S - now)
 
     def started(self, now: float, *, plain: bool = False) -> None:

@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 
 
 class RunLock:
-    """The lock of a run directory, which it makes for this user alone. The kernel releases it when the process ends.
+    """The lock of a run directory, created for this user alone. The kernel releases the lock when the process ends.
 
     A second lock is in the state directory, for launchers whose environment names another run directory.
 
@@ -29,7 +29,7 @@ class RunLock:
         self._problem = ""
 
     def take(self) -> Self:
-        """Make the directory, and take both locks."""
+        """Create the directory, and take both locks."""
         make_private(self._run_dir, close=True)
         self._lock = self._taken(self.path)
         try:
@@ -56,10 +56,10 @@ class RunLock:
                 lock.write(f"{os.getpid()}\n{self._robot}\n".encode())
 
     def keep(self) -> bool:
-        """Make the directory and the lock again if a cleaner or a logout has removed them. Call it every second.
+        """Create the directory and the lock again if a cleaner or a logout has removed them. Call this every second.
 
-        Return True if it did: programs that start now cannot reach those that run. Raises PebbleError if another
-        launcher has taken the lock.
+        Return True if they were created: programs that start now cannot reach those that run. Raises PebbleError if
+        another launcher has taken the lock.
         """
         lock, problem = self._lock, ""
         try:

@@ -1,4 +1,4 @@
-"""Reports to systemd: sd_notify(3) in pure Python. They do nothing if systemd does not listen."""
+"""Reports to systemd: sd_notify(3) in pure Python. Nothing is sent if systemd does not listen."""
 
 import logging
 import os

@@ -49,7 +49,7 @@ class StatusPublisher:
         return self._pipe.connect(self._will())
 
     def start(self) -> None:
-        """Publish now, on every change and on the configured intervals."""
+        """Publish status and capabilities now, on every change and at the configured intervals."""
         launcher = self._config.services.launcher
         interval_s = self._config.services.defaults.retained_publish_interval_seconds
         if self._systemd.watchdog_period_s is not None:
@@ -82,7 +82,7 @@ class StatusPublisher:
             self._pipe.record(self._message(LOGS, record))
 
     def stood_still(self) -> None:
-        """Give systemd a sign of life after this process stood still: its clock has run on."""
+        """Give systemd a sign of life after this process stood still, because systemd's clock has run on."""
         if self._systemd.watchdog_period_s is not None:
             self._systemd.watchdog()
 
@@ -90,7 +90,7 @@ class StatusPublisher:
         self._systemd.stopping()
 
     def publish_last(self) -> None:
-        """Publish the status before the announcer stops: it says how all other programs ended."""
+        """Publish the status, which says how all other programs ended, before the announcer stops."""
         if self._pipe.dropped:
             log.info(
                 "log records that were not published, because the announcer was away or busy: %d", self._pipe.dropped
@@ -114,7 +114,7 @@ class StatusPublisher:
     def _status(
         self, states: dict[str, ServiceState], mcus: dict[str, Any] | None = None, webrtc_url: str | None = None
     ) -> Status:
-        """Return the status message. ``webrtc_url``: of pictures that operator pages show."""
+        """Return the status message. ``webrtc_url``: the address of the pictures that operator pages show."""
         driveable = self._driveable.assessment({name: service.state for name, service in states.items()})
         more = {"mcu": mcus or None, "driveable": driveable, "webrtc_url": webrtc_url}
         return Status(t=_now_ms(), value={"services": states, **{name: part for name, part in more.items() if part}})

@@ -36,9 +36,10 @@ class Control:
         show_turn: Callable[[], object] = lambda: None,
         bridged: bool = False,
     ) -> None:
-        """Store the arguments; ``owners``: all of the robot; ``show_turn()`` is to send :meth:`turn` to the others.
+        """Store the arguments; ``owners``: all motor owners of the robot.
 
-        ``bridged``: silence counts only while :meth:`vouch` says so.
+        ``show_turn()`` must send the result of :meth:`turn` to the other owners. ``bridged``: the silence of a client
+        counts only as far as the bridge vouches (:meth:`vouch`) that it would have passed on messages.
         """
         self.boot = secrets.token_hex(4)  # of this life of the motor owner
         self._named = security.named
@@ -64,12 +65,12 @@ class Control:
         return isinstance(drive.key, str) and self.lease.holds(drive.key, self.account(drive) or "")
 
     def knows(self, request: ControlRequest) -> bool:
-        """True if its sender has control, or is the first that asks for it. Any thread may ask."""
+        """True if the sender of ``request`` has control, or is the first that asks for control. Any thread may ask."""
         client = self.sender(request)
         return client == self.lease.holder[:2] or client == self.lease.asker[:2]
 
     def sender(self, request: ControlRequest) -> tuple[str, str]:
-        """Return the account and the id, by which the lease tells clients apart. Any thread may ask."""
+        """Return the account and the id of a client, by which the lease tells clients apart. Any thread may ask."""
         return self._client(request)[:2]
 
     def request(self, request: ControlRequest, over: bool, now: float) -> None:
@@ -89,7 +90,7 @@ class Control:
         self.lease.doubt(_ms(now))
 
     def account(self, drive: Drive) -> str | None:
-        """Return the account of a command, "" where names are not checked; None: it is from a program of the robot."""
+        """Return the account of a command, "" where names are not checked; None for a program of the robot."""
         if not self._named:
             return ""
         return drive.by.partition("/")[0] if isinstance(drive.by, str) else None
@@ -100,7 +101,7 @@ class Control:
 
     @property
     def peers(self) -> frozenset[str]:
-        """The other owners whose turns this one needs."""
+        """The other motor owners whose turns this one needs."""
         return frozenset() if self._shared is None else self._shared.peers
 
     def receive_turn(self, owner: str, turn: ControlTurn, now: float) -> None:
@@ -109,19 +110,22 @@ class Control:
             self._shared.receive(owner, turn, _ms(now))
 
     def turn(self, barred: int, now: float) -> ControlTurn | None:
-        """Return the turn for the other owners; ``barred`` is the arbiter's."""
+        """Return the turn for the other motor owners; ``barred`` is the newest script run that the arbiter bars."""
         return None if self._shared is None else self._shared.shown(barred, _ms(now))
 
     def waits(self, now: float) -> bool:
-        """True if nothing may move because the robot's owners may differ."""
+        """True if nothing may move, because the robot's motor owners may follow different holders of control."""
         return self._shared is not None and self._shared.waits(_ms(now))
 
     def left_ms(self, now: float) -> int:
-        """Return for how long a command that is permitted now may move the motors at most."""
+        """Return the longest time for which a command that is permitted now may move the motors."""
         return sys.maxsize if self._shared is None else max(0, self._shared.until - _ms(now))
 
     def note(self, now: float) -> bool:
-        """Publish a changed state; return True if control has passed on: halt the motors then."""
+        """Publish a changed state; return True, once, if control has passed to another client or ended.
+
+        The caller must halt the motors then.
+        """
         lease = self.lease
         if lease.changed:
             lease.changed = False
@@ -138,7 +142,7 @@ class Control:
 
     @property
     def due(self) -> float | None:
-        """The time at which :meth:`tick` must run next; None: it need not."""
+        """The time at which :meth:`tick` must run next; None if nothing is due."""
         times = (self._next, self._state.due, self._turn_due, self._turns.due)
         return min((at for at in times if at is not None), default=None)
 

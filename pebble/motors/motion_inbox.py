@@ -60,7 +60,7 @@ class Batch(Struct):
 
 
 class MotionInbox:
-    """A bounded inbox. Any thread puts, one takes; a ``put`` returns True if it was empty: wake that thread up then.
+    """A bounded inbox. Any thread puts, one takes; a ``put`` returns True if the inbox was empty: wake the taker then.
 
     The newest drive command of each sender waits, and before it the zero that it replaced: a zero is always judged. The
     holder of control is a sender of its own, whom others do not replace. So is each client that requests control, by
@@ -122,7 +122,7 @@ class MotionInbox:
             return was_empty
 
     def note_state(self, state: State) -> None:
-        """Note that a connection is lost, and messages with it; it counts when the next ones come."""
+        """Note that a connection is lost, and messages with it; the loss counts when the next messages come."""
         if state is not State.CONNECTED:
             with self._lock:
                 self._lost = True
@@ -163,7 +163,7 @@ class MotionInbox:
 
 
 def run_of(drive: Drive) -> int:
-    """Return the run of a script's command; PERSON, or UNKNOWN_RUN."""
+    """Return the run of a script's drive command, PERSON for a person's, or UNKNOWN_RUN."""
     if drive.source != SCRIPT:
         return PERSON
     return drive.run if isinstance(drive.run, int) else UNKNOWN_RUN

@@ -63,7 +63,7 @@ class MotorGuard:
         self._can_save = False
 
     def begin(self, now: float) -> None:
-        """Continue as the file says, and publish the state."""
+        """Continue with the state in the file, and publish it."""
         self._can_save = self._file.can_save()
         if not self._can_save:
             log.warning("%s cannot be written: an emergency stop ends with a power cut", self._file.path)
@@ -89,7 +89,7 @@ class MotorGuard:
         return self._saving == self._saved if self._can_save else None
 
     def stop(self, command: EstopCommand, now: float) -> None:
-        """Latch. The caller has stopped the motors before."""
+        """Latch an emergency stop. The caller has stopped the motors before."""
         name = command.stop if isinstance(command.stop, str) else secrets.token_hex(8)
         by, why, earlier_by = _given(command.by), _given(command.why), self._latch.by
         if self._arbiter.stop(name, by, why, time.time_ns() // 1_000_000):
@@ -112,7 +112,7 @@ class MotorGuard:
         self._state.changed(now)
 
     def judge(self, drive: Drive, now: float) -> float | None:
-        """Return seconds from now for which this command moves the motors, 0: it stops them; None: it has no effect."""
+        """Judge a drive command; return the seconds for which it moves the motors (0: stop), None if it is refused."""
         valid_ms = drive.valid_ms if isinstance(drive.valid_ms, int) else -1
         run = run_of(drive)
         key = drive.key if isinstance(drive.key, str) else ""
@@ -135,7 +135,7 @@ class MotorGuard:
         return min(limit, self._control.left_ms(now)) / 1000
 
     def bar(self, run: int, now: float) -> None:
-        """Bar what another owner of the robot has barred."""
+        """Bar the script runs that another motor owner of the robot has barred."""
         self._arbiter.bar(run)
         if self._arbiter.barred != self._barred:
             self._note_barred(now)
@@ -146,7 +146,7 @@ class MotorGuard:
 
     @property
     def due(self) -> float | None:
-        """The time at which :meth:`tick` must run next; None: it need not."""
+        """The time at which :meth:`tick` must run next; None if nothing is due."""
         return min((at for at in (self._state.due, self._hold_until) if at is not None), default=None)
 
     def tick(self, now: float) -> None:
@@ -159,14 +159,14 @@ class MotorGuard:
         self._state.tick(now)
 
     def on_saved(self, number: int, succeeded: bool, now: float) -> None:
-        """Take note that a write has ended."""
+        """Note that write ``number`` of the file has ended."""
         if succeeded:
             self._saved = number
         if number == self._saving:
             self._state.changed(now)
 
     def save_again(self) -> None:
-        """Repeat a write that failed, or whose file was removed since; one that takes long is not repeated."""
+        """Repeat a write that failed, or whose file was removed since, unless the last write is still running."""
         if not self._can_save and self._file.can_save():
             self._can_save = True
             self._save()
@@ -176,7 +176,10 @@ class MotorGuard:
             self._barred_file.save(self._barred)
 
     def appeared_stop(self) -> EstopCommand | None:
-        """Return an unknown stop from a file that has just appeared, because its folder was mounted late; else None."""
+        """Return an unknown stop from a file that has just appeared, as after a late mount; else None.
+
+        A file that has appeared without an unknown stop is overwritten with the state here, which is newer.
+        """
         saved = None if self._file.busy or not self._can_save else self._file.appeared()
         if saved is None:
             return None

@@ -78,7 +78,7 @@ class MotorOwner(Service, ABC):
     @property
     @abstractmethod
     def owner(self) -> str:
-        """Its name in ``outgoing/estop/OWNER``, which ``Extension.motors`` has."""
+        """The name of this motor owner in ``outgoing/estop/OWNER``, as in ``Extension.motors``."""
 
     @property
     def drive_timeout_s(self) -> float:
@@ -87,7 +87,7 @@ class MotorOwner(Service, ABC):
 
     @property
     def latched(self) -> bool:
-        """True while an emergency stop lasts, for hardware with a lock of its own; it changes in :meth:`judge`."""
+        """True while an emergency stop lasts, for hardware with a lock of its own; changes only in :meth:`judge`."""
         return self._guard.latched
 
     @abstractmethod
@@ -96,7 +96,7 @@ class MotorOwner(Service, ABC):
 
     @abstractmethod
     def halt(self) -> None:
-        """Stop the motors now. Called again and again while they stand still."""
+        """Stop the motors now. This is called again and again while the motors stand still."""
 
     def report(self, able: bool, why: str = "") -> None:
         """Tell the launcher whether the motors can be moved, and if not, why: ``driveable`` in the robot's status."""
@@ -236,7 +236,7 @@ class MotorOwner(Service, ABC):
 
     @property
     def _latches(self) -> bool:
-        """True if a stop latches: without resets it would have no end, and without stops it is no promise."""
+        """True if an emergency stop latches: the broker refuses neither its topic nor the topic of resets."""
         return not (self.refused(c.ESTOP) or self.refused(c.ESTOP_RESET))
 
     def on_connected(self) -> None:
@@ -244,7 +244,7 @@ class MotorOwner(Service, ABC):
 
     @every(_CHECK_S)
     def check_subscriptions(self) -> None:
-        """Withdraw the emergency stop while its topics are refused. Raises TransportError if the drive topic is."""
+        """Withdraw the emergency stop while its topics are refused. Raises TransportError for a refused drive topic."""
         if self.refused(c.DRIVE):
             raise TransportError(
                 f"the broker refuses the subscription to {self.addresses[c.DRIVE].topic}: nothing can drive this robot."
@@ -319,7 +319,7 @@ class MotorOwner(Service, ABC):
             self.publish(c.CONTROL_TURN, turn, owner=self.owner)
 
     def _on_saved(self, number: int, succeeded: bool) -> None:
-        """Pass the result on, on the file's thread."""
+        """Pass the result of a write from the file's thread to the service's."""
 
         def note() -> None:
             self._guard.on_saved(number, succeeded, self.clock())

@@ -15,7 +15,7 @@ SETTLES_MS = FOLLOWS_MS + 100
 
 
 class SharedLease(VouchedLease):
-    """A lease that refuses motion for as long as the owners may differ."""
+    """A lease that refuses motion while the motor owners may follow different holders."""
 
     until = sys.maxsize  # when everything stops, unless another turn is received before
 
@@ -30,11 +30,11 @@ class SharedLease(VouchedLease):
 
     @abstractmethod
     def waits(self, now: int) -> bool:
-        """True if nothing may move, whoever commands it."""
+        """True if nothing may move, for any client."""
 
     @abstractmethod
     def receive(self, owner: str, turn: ControlTurn, now: int) -> None:
-        """Take a peer's turn."""
+        """Note the turn of a peer."""
 
     @abstractmethod
     def shown(self, barred: int, now: int) -> ControlTurn | None:
@@ -71,7 +71,7 @@ class FirstLease(SharedLease):
 
 
 class FollowingLease(SharedLease):
-    """The lease of another owner, which follows the first one's: it grants and ends nothing itself."""
+    """The lease of another motor owner, which follows the lease of the first: it grants and ends nothing itself."""
 
     until = 0
 
@@ -83,7 +83,7 @@ class FollowingLease(SharedLease):
         return now >= self.until
 
     def receive(self, _owner: str, turn: ControlTurn, now: int) -> None:
-        """Follow the newest turn; one with a time to come is of another clock."""
+        """Follow the newest turn; a turn with a time in the future is from another clock and is ignored."""
         earlier = self._followed
         if turn.t > now or (earlier is not None and turn.t < earlier.t):
             return

@@ -24,7 +24,7 @@ class Unreadable:
 
 
 class StateFile:
-    """A file with the newest value passed to :meth:`save`, as JSON; older ones that wait are not written.
+    """A file with the newest value passed to :meth:`save`, as JSON; older values that wait are not written.
 
     ``on_saved(number, ok)`` is called on the writing thread after each attempt, with the number that ``save`` returned.
     """
@@ -43,14 +43,14 @@ class StateFile:
 
     @property
     def in_place(self) -> bool:
-        """True unless the file that this process wrote is not there any more."""
+        """True unless the file that this process wrote was removed or replaced."""
         try:
             return self._own is None or self._own.in_place
         except OSError:  # what is there cannot be seen
             return True
 
     def can_save(self) -> bool:
-        """True if the folder can be written, or made."""
+        """True if the folder can be written, or created."""
         existing = next(folder for folder in self.path.parents if os.access(folder, os.F_OK))
         return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
 
@@ -72,14 +72,14 @@ class StateFile:
             return Unreadable()
 
     def appeared(self) -> Any:
-        """Load a file that is not from this process; None without one, or if that cannot be seen."""
+        """Return the value of a file that another process wrote; None if there is none, or it cannot be seen."""
         try:
             return None if self._own is not None and not self._own.replaced else self.load()
         except OSError:
             return None
 
     def save(self, value: Any) -> int:
-        """Write ``value`` soon; returns at once."""
+        """Write ``value`` soon; return at once, with the number of this write."""
         with self._changed:
             self._number += 1
             self._newest = self._number, value

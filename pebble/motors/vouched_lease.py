@@ -9,14 +9,14 @@ _IDLE_MS, _OTHERS_MS = 5000, 2000  # as in Lease
 class VouchedLease(Lease):
     """A lease for which a holder is quiet only during the time for which the bridge vouches.
 
-    All messages between its begin and its end have been passed on to the motor owner before the bridge says so.
+    The bridge vouches for a time after it has passed on all messages of that time to the motor owner.
     """
 
     vouched: tuple[int, int] | None = None  # None: there is no bridge, and all time counts
     _received_all_since = 0
 
     def vouch(self, begin: int, end: int, now: int) -> None:
-        """Note the time for which the bridge vouches; a time to come is of another clock."""
+        """Note the time for which the bridge vouches; a time in the future is from another clock and is ignored."""
         if self.vouched is not None and begin <= end <= now:
             self.vouched = max(begin, self._received_all_since), end
 
@@ -25,9 +25,9 @@ class VouchedLease(Lease):
         self._received_all_since = now
 
     def tick(self, now: int) -> None:
-        """End control that is over, as in Lease; that class has no method for a part of it, to save memory on boards.
+        """End control that is over, as in Lease, which has no method for a part of this, to save memory on boards.
 
-        No result about quiet time is remembered: that time may not count any more later.
+        The quiet time is computed anew in each call, because the vouched time may shrink.
         """
         if self.others and now - self._received >= _OTHERS_MS:
             self.others, self.changed = False, True
@@ -38,7 +38,7 @@ class VouchedLease(Lease):
             self._end(now)
 
     def _quiet_ms(self, since: int, now: int) -> int:
-        """Return for how long the holder has sent nothing, as far as that counts."""
+        """Return for how long the holder has sent nothing, as far as the bridge vouches."""
         quiet = now - since
         if self.vouched is None or quiet >= ENDS_AFTER_MS:
             return quiet

@@ -27,7 +27,7 @@ class Addresses:
         self._channels = {address.topic: channel for channel, address in self._of.items() if not channel.is_pattern}
 
     def __getitem__(self, channel: Channel) -> Address:
-        """Return the address of a channel; one that is made at run time, in no contract, has its own defaults."""
+        """Return the address of a channel; a channel made at run time, outside the contract, has its own defaults."""
         address = self._of.get(channel)
         return address if address is not None else _default(channel, self.base)
 

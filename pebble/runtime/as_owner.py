@@ -15,10 +15,10 @@ from pebble.runtime.whole_file import is_root
 
 @contextmanager
 def as_owner(folder: Path, *modules: str, make: bool = False) -> Iterator[None]:
-    """Do what follows as the owner of a folder, or of the first above it that exists; without being root, as before.
+    """Run the ``with`` block as the owner of a folder, or of its nearest parent that exists, if this process is root.
 
     For commands, whose process has one thread. ``modules`` are imported first: that user may not be able to read them.
-    ``make``: the folder, if it is missing. Raises PebbleError as :func:`owner_of`.
+    ``make``: create the folder if it is missing. Raises PebbleError as :func:`owner_of`.
     """
     if make:
         try:

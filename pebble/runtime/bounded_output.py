@@ -37,7 +37,7 @@ class BoundedOutput:
 
     @property
     def waits(self) -> bool:
-        """True if lines are missing that were not counted yet: call :meth:`tick` from time to time."""
+        """True if dropped lines were not counted in the log yet; call :meth:`tick` from time to time then."""
         return self._left_out + self._repeats > 0
 
     def feed(self, data: bytes, now: float) -> None:
@@ -52,7 +52,7 @@ class BoundedOutput:
         self.flooded = self._suppressed_at == now
 
     def tick(self, now: float) -> None:
-        """Write how many lines are missing, if it is time."""
+        """Write the number of dropped lines, if that is due."""
         self._tokens = min(self._most, self._tokens + (now - self._filled_at) * self._rate)
         self._filled_at = now
         quiet = now - self._suppressed_at >= _QUIET_S

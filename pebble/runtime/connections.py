@@ -85,10 +85,10 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
 
 
 def stops_transport(config: Config) -> Transport | None:
-    """Return the bridge's second connection to operators, only for stops; None: it has none.
+    """Return the bridge's second connection to operators, only for stops; None if there is none.
 
-    Without accounts at the broker it would be no better than the first connection, unless the link may be thin: there
-    a client that sends too much fills the first connection. This is no as-published connection.
+    Without accounts at the broker a second connection is no better than the first, unless the link may be thin: there
+    a client that sends too much fills the first connection. The second one is not as-published.
     """
     bridge = config.services.mqtt_bridge
     if config.security.level == "open" and (bridge.remote is not None or bridge.link.profile == "wide"):
@@ -102,7 +102,7 @@ def stops_transport(config: Config) -> Transport | None:
 
 
 def live_only(settings: MqttSettings) -> MqttSettings:
-    """Return the settings of a connection without retained messages, where MQTT 5 allows that: none delays others."""
+    """Return the settings of a connection without retained messages (MQTT 5), so that none delays others."""
     return replace_settings(settings, max_segment=SMALL_SEGMENT, sends_retained=False)
 
 

@@ -12,7 +12,7 @@ log = logging.getLogger(__name__)
 
 
 def exit_descriptor(pid: int) -> int | None:
-    """Return a descriptor that is readable after the end of a child; None: ask :func:`has_ended`. Raises OSError."""
+    """Return a descriptor, readable after the end of a child; None: poll :func:`has_ended` instead. Raises OSError."""
     try:
         return os.pidfd_open(pid)
     except OSError as error:
@@ -23,7 +23,7 @@ def exit_descriptor(pid: int) -> int | None:
 
 
 def has_ended(pid: int) -> bool:
-    """True if the child has ended; it is not reaped."""
+    """True if the child has ended; does not reap the child."""
     return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
 
 

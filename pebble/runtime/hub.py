@@ -68,7 +68,7 @@ def run_hub(settings: ZenohSettings, stop: EndSignal | threading.Event) -> None:
 
 
 def _accounts(settings: ZenohSettings) -> Admission | None:
-    """Return what admits accounts of other machines, by the file ``transport.access``; None: there is none."""
+    """Return the admission of accounts of other machines, by the file ``transport.access``; None without that file."""
     if settings.access is None:
         return None
     from pebble.extension import ours, part  # only who needs it pays for it

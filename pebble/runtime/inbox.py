@@ -16,7 +16,7 @@ LIMIT = 1000  # jobs that wait
 class Inbox:
     """A queue of jobs, posted by any thread and taken by one. Beyond ``limit`` jobs the oldest is dropped and counted.
 
-    Jobs without a name are dropped first: no number of them keeps out a command that ends something.
+    Jobs without a name are dropped first, so that no number of them keeps out a command that ends something.
 
     A signal handler may post while its own thread is inside any of these methods: the lock and the wakeup are
     reentrant.
@@ -33,9 +33,9 @@ class Inbox:
         self.dropped = 0
 
     def post(self, job: Job, *, newest_of: Hashable = None, last_of: Hashable = None) -> None:
-        """Queue ``job``. With ``newest_of`` it takes the place of a waiting job of that name.
+        """Queue ``job``. With ``newest_of`` the job takes the place of a waiting job of that name.
 
-        With ``last_of`` it replaces such a job as well, but is queued behind all others.
+        With ``last_of`` the job replaces such a job as well, but is queued behind all others.
         """
         with self._lock:
             if last_of is not None:
@@ -72,7 +72,7 @@ class Inbox:
         return bool(self._internal or self._jobs)
 
     def take(self, timeout: float | None = 0.0) -> Job | None:
-        """Return the next job, waiting up to ``timeout`` seconds; None if there was none, or on `wake`."""
+        """Remove and return the next job, waiting up to ``timeout`` seconds; None if there was none, or on `wake`."""
         if timeout != 0.0:
             self.wait(timeout)
         if self._internal:

@@ -1,4 +1,4 @@
-"""The side of a process towards its launcher: it ends with it, notifies it, and logs in the format that it reads."""
+"""A process's side towards its launcher: ends with the launcher, sends notes to it, and logs in its format."""
 
 import ctypes
 import logging
@@ -73,7 +73,7 @@ def end_with_parent(number: int | None = None) -> None:
 
 
 class ProgramRequest(NamedTuple):
-    """A request that an on-demand program runs, or ends; ``encoding``: it begins with it; empty: as configured."""
+    """A request that an on-demand program runs, beginning with ``encoding`` (empty: as configured), or ends."""
 
     on: bool
     encoding: str = ""
@@ -86,12 +86,12 @@ def earlier_requests() -> dict[str, ProgramRequest]:
 
 
 def requested_encoding() -> str | None:
-    """Return the encoding in the request that started this program; None: as configured."""
+    """Return the encoding in the request that started this program; None for the configured encoding."""
     return os.environ.get(ENCODING) or None
 
 
 class Notifier:
-    """A sender of notes to the launcher. It does nothing without a launcher.
+    """A sender of notes to the launcher. Without a launcher nothing is sent.
 
     A method returns False if the launcher was too busy: then call it again.
     """
@@ -120,11 +120,11 @@ class Notifier:
         return self._write(notes.Wanted(program, request.on, request.encoding))
 
     def hold(self, program: str, on: bool) -> bool:
-        """Let an on-demand program wait, at most until this process ends, or no longer; see :meth:`request`."""
+        """Let an on-demand program wait, until this process ends at most, or let it run again; see :meth:`request`."""
         return self._write(notes.Held(program, on))
 
     def feature(self, name: str, has: bool) -> bool:
-        """Report that this process provides a feature of pebble.launcher.features, or not; capabilities follow."""
+        """Report if this process provides a feature of pebble.launcher.features; the capabilities follow."""
         return self._write(notes.Feature(name, has))
 
     def local(self, connected: bool, why: str = "") -> bool:
@@ -164,6 +164,6 @@ class Reported:
         self._send, self._known = send, known
 
     def report(self, *value: object) -> None:
-        """Send ``value`` if the launcher does not know it. Call it regularly."""
+        """Send ``value`` if the launcher does not know it yet. Call this regularly."""
         if value != self._known and self._send(*value):
             self._known = value

@@ -39,7 +39,10 @@ class Step:
 
 
 def steps(bundle: int, bitrate: int) -> tuple[Step, ...]:
-    """Return the steps from as configured to as little as still makes sense; only those that save something."""
+    """Return the steps of quality, from the configured one down to the lowest useful one.
+
+    A step that would save nothing is left out.
+    """
     steps = [Step(bundle, bitrate)]
     if bundle < BUNDLE_LIMIT:
         steps.append(Step(BUNDLE_LIMIT, bitrate, f"{BUNDLE_LIMIT} parts a packet"))

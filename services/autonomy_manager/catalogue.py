@@ -46,10 +46,10 @@ log = logging.getLogger(__name__)
 
 
 def roots(config: Config, own: Path = _OWN_SCRIPTS) -> tuple[Path, ...]:
-    """Return the folders of scripts; of two scripts with one name, that in the first folder counts.
+    """Return the folders that are searched for scripts; the first script of a name counts.
 
-    An absolute path is the only folder; a relative one is searched beside the config, and then Pebble's own.
-    The original starts relative paths at its repository, two folders above its configs.
+    An absolute ``autonomy_root`` is the only folder. A relative one is taken from the config's folder and, as in the
+    original program, from two folders above a config in ``control/configs``; Pebble's own scripts come last.
     """
     given = in_home(config.section(AutonomyManager).autonomy_root)
     if given.is_absolute():

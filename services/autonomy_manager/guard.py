@@ -56,11 +56,11 @@ class Guard:
             time.sleep(_TRY_S)
 
     def watch(self, group: int, number: signal.Signals) -> Callable[[], None]:
-        """End this process group with ``number``, and with SIGKILL if it has not ended then. Raises OSError.
+        """Start a helper that ends a process group if this process dies, with ``number``, then with SIGKILL.
 
-        Call the returned function when the group has ended.
+        Return a function that calls the helper off: call it when the group has ended. Raises OSError.
         """
-        program = subprocess.Popen(
+        helper = subprocess.Popen(
             ["sh", "-c", _PROGRAM, "sh", number.name.removeprefix("SIG"), str(group)],
             env=child_environment(),
             stdin=subprocess.PIPE,
@@ -70,11 +70,11 @@ class Guard:
             pass_fds=() if self._locked < 0 else (self._locked,),
         )
 
-        def end() -> None:
-            program.kill()
-            program.communicate()
+        def call_off() -> None:
+            helper.kill()
+            helper.communicate()
 
-        return end
+        return call_off
 
     def close(self) -> None:
         """Let the next manager begin, once no script is left."""

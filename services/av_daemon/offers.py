@@ -23,7 +23,7 @@ def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
 
 
 def _completed(offer: Any, captured: Any, keys: tuple[str, ...], available: bool, obeys: bool) -> Any:
-    """Return an offer with what is captured, where operators are not sent something else."""
+    """Return ``offer`` with each of ``keys`` that it leaves open (None) filled in from ``captured``."""
     missing = {key: getattr(captured, key) for key in keys if getattr(offer, key) is None}
     return replace(offer, available=available, controls=available and obeys, **missing)
 

@@ -19,7 +19,7 @@ class Heartbeat:
         self._sent: deque[bytes] = deque(maxlen=_REMEMBERED)
 
     def will(self, now_ms: int) -> Message:
-        """Return what the broker publishes when the connection is lost. ``t`` is when the process started."""
+        """Return the will that the broker publishes when the connection is lost. ``t`` is the start of the process."""
         return Message(
             self.topic, codec.encode(ONLINE, HeartbeatPayload(t=now_ms, online=False)), QoS.DELIVERED, retain=True
         )
@@ -33,5 +33,5 @@ class Heartbeat:
         transport.publish(self.topic, payload, qos=self._qos if qos is None else QoS(qos), retain=self._retain)
 
     def is_ours(self, message: Message) -> bool:
-        """True if we have sent exactly this; that of another program may be equal by chance."""
+        """True if we have sent exactly this heartbeat; another program's may be equal by chance."""
         return message.topic == self.topic and message.payload in tuple(self._sent)

@@ -51,7 +51,7 @@ class Leftovers:
         self._at_remote.clear()
 
     def ask_next(self) -> bool:
-        """Ask the broker for some of the topics; False if all were asked for. Waits for its answer."""
+        """Ask the broker for some of the topics, and wait for the answer; False if all were asked for already."""
         on_robot = self._on_robot or set()
         while self._sparing and self._next < len(self._filters) and self._filters[self._next] in on_robot:
             self._next += 1
@@ -68,7 +68,7 @@ class Leftovers:
     def remove(self, remove: Callable[..., bool]) -> list[str]:
         """Remove messages that only the broker retains, and return their topics; the last call.
 
-        ``remove(topic, unless=…)`` removes one, unless there is a reason not to, and returns whether it did.
+        ``remove(topic, unless=…)`` removes one message, unless there is a reason not to, and returns True if it did.
         """
         self._close()
         gone = [topic for topic in sorted(self._at_remote) if remove(topic, unless=self._stays)]

@@ -23,10 +23,10 @@ class Requests(ABC):
 
     @abstractmethod
     def take(self, channel: Channel, value: Any) -> None:
-        """Take the value of a message; of a flag that was removed or cannot be read it is False."""
+        """Handle the value of a message; the value of a flag that was removed or cannot be read is False."""
 
     def repeat(self) -> None:  # noqa: B027 - most do nothing
-        """Do again what was not possible; called once a second."""
+        """Try again the requests that failed; called once a second."""
 
 
 class OwnRequests:
@@ -45,21 +45,21 @@ class OwnRequests:
         self._takers = {channel.suffix: requests for requests in self._requests for channel in requests.channels}
 
     def message(self, channel: Channel, payload: bytes) -> None:
-        """Take a message that is no flag."""
+        """Handle a message that is no flag."""
         if channel is DRIVE:
             self._note_drive(payload)
         elif channel.kind is not Kind.FLAG and (value := self._decoded(channel, payload)) is not None:
             self._take(channel, value)
 
     def flag(self, channel: Channel, payload: bytes) -> None:
-        """Take the value of a flag."""
+        """Handle the value of a flag."""
         if channel is REMOTE_MIRROR:
             self._mirroring.switch(on=bool(payload and self._decode(channel, payload)))
         else:
             self._take(channel, bool(payload and self._decoded(channel, payload)))
 
     def repeat(self) -> None:
-        """Have all requests do again what was not possible."""
+        """Have all requests try again what has failed."""
         for requests in self._requests:
             requests.repeat()
 

@@ -59,12 +59,12 @@ class Owner:
         self.withdrawn_at: float | None = None  # since when it publishes that it has no emergency stop
 
     def confirms(self, name: str) -> bool:
-        """True if its newest state names this stop and would survive a restart, or shows that it was reset."""
+        """True if the owner's newest state names this stop and would survive a restart, or shows a reset."""
         state = self.state
         return state is not None and name in state.recent and (state.persisted is not False or not state.latched)
 
     def follow(self, state: EstopState | None, now: float) -> None:
-        """Note its newest state; None: it has withdrawn that."""
+        """Note the owner's newest state; None: the owner has withdrawn its state."""
         earlier, self.state = self.state, state
         if state is None:
             self.withdrawn_at = now if self.withdrawn_at is None else self.withdrawn_at
@@ -92,7 +92,10 @@ class PassedStops:
         return {key: owner.pending for key, owner in self._owners.items() if owner.pending is not None}
 
     def accept(self, payload: bytes) -> list[bytes]:
-        """Return the payloads to publish for a stop with a name; an owner that was reset since gets no copy of it."""
+        """Remember a stop with a name as passed; return the payloads to publish.
+
+        A motor owner that was reset since gets no copy of the stop.
+        """
         if not is_stop(payload):
             return [payload]
         stop = codec.decode(ESTOP, payload)
@@ -112,12 +115,12 @@ class PassedStops:
         return [payload]
 
     def follow(self, owner: str, state: EstopState | None) -> None:
-        """Note the newest state of an owner; None: it was withdrawn."""
+        """Note the newest state of an owner; None: the state was withdrawn."""
         with self._lock:
             self._owners[owner].follow(state, self._clock())
 
     def repeat(self) -> list[bytes]:
-        """Return the payloads to publish again, on the local side only; call it every ``REPEAT_S``."""
+        """Return the payloads to publish again, on the local side only; call this every ``REPEAT_S``."""
         with self._lock:
             waiting = self.pending.items()
             return [_addressed(stop.stop, key) for key, stop in waiting if self._owners[key].withdrawn_at is None]

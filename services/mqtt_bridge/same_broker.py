@@ -1,7 +1,7 @@
 """Detects that the bridge's two sides are one broker, whatever addresses lead to it (paper A.5.1).
 
-Then nothing may be mirrored: every message would come back and circulate for ever. A probe that is published on the
-remote side and received on the local side proves it.
+Then nothing may be mirrored, because every message would come back and circulate for ever. A probe that is published on
+the remote side and received on the local side proves this.
 """
 
 import time
@@ -21,8 +21,8 @@ _PERIOD_S = 1.0
 class SameBrokerProbe:
     """Probes, sent in rounds, and the newest round in which one was received on the local side.
 
-    On a robot with a mirror each probe is also announced on the robot's own transport. The mirror compares it with what
-    it receives from its broker, until it is announced that no probe is under way.
+    On a robot with a mirror each probe is also announced on the robot's own transport. The mirror compares the probe
+    with the messages of its broker, until the bridge announces that no probe is under way.
     """
 
     def __init__(self, config: Config, local: Transport, remote: Transport, clock: Callable[[], float]) -> None:
@@ -96,7 +96,7 @@ class SameBrokerProbe:
     # -- the transports' threads
 
     def proves_same_broker(self, message: Message) -> bool:
-        """True if ``message``, received on the local side on :attr:`topic`, is one of our probes, for the first time.
+        """True, once for each of our probes, if ``message`` is one, received on the local side on :attr:`topic`.
 
         A copy that a client keeps sending, or has retained, proves nothing.
         """

@@ -180,7 +180,7 @@ class MqttBridge(ForwardingService):
 
     @property
     def _subscribes_soon(self) -> bool:
-        """True if the heartbeat waits: operators that see it send commands, which would be lost before we subscribe."""
+        """True if the heartbeat must wait until we subscribe, because operators that see it send commands at once."""
         subscribed = self.subscriptions[Side.REMOTE] or self.forwarder.gate is Gate.SHUT
         return not subscribed and self._same_broker.both_connected
 
@@ -190,7 +190,7 @@ class MqttBridge(ForwardingService):
             self._publish_heartbeat()
 
     def _look_later(self) -> None:
-        """Look for messages that only the remote side retains, once all of the robot are known; wait for that again."""
+        """Wait until all messages that the robot retains are known; then look for those only at the remote side."""
         if self._leftovers.done:
             return
         if self._leftover_timer is not None:
@@ -302,7 +302,7 @@ class MqttBridge(ForwardingService):
 
     @every(PERIOD_S)
     def _vouch(self) -> None:
-        """Tell the motor owners up to when they have been sent everything."""
+        """Tell the motor owners the time up to which they have been sent all messages."""
         if not self.config.motor_owners:
             return
         gate, counters = self.forwarder.gate, self.forwarder.counters
@@ -352,7 +352,7 @@ class MqttBridge(ForwardingService):
             self._react(Side.LOCAL, admitted, self.forwarder.receive(Side.LOCAL, admitted))
 
     def _follow_control(self, payload: bytes) -> None:
-        """Learn who has control, and its key: the age of a command counts by it."""
+        """Note who has control, and the key of control, by which the age of a command counts."""
         keys = None
         with suppress(PayloadError):
             state: ControlState = codec.decode(CONTROL_STATE, payload)
@@ -377,7 +377,7 @@ class MqttBridge(ForwardingService):
         self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
 
     def _receive_stop(self, message: Message) -> None:
-        """Give a stop a name before anything else, so that all who wait for its confirmation know the same name."""
+        """Give a stop a name first, so that all who wait for its confirmation know the same name."""
         message = msgspec.structs.replace(message, payload=named(message.payload))
         self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
 
@@ -389,16 +389,19 @@ class MqttBridge(ForwardingService):
             self._passed_stops.follow(owner, codec.decode(ESTOP_STATE, payload) if payload else None)
 
     def _has_passed(self, message: Message) -> bool:
-        """True if this stop has come over the connection that stops have of their own."""
+        """True if this stop has come over the stops' own connection before; remembers or forgets the stop."""
         return self._stops is not None and not self.forwarder.mirroring.on and self._stops.is_copy(message)
 
     def _pass_stop(self, message: Message) -> None:
-        """Forward a stop of that connection. While the robot's own stops are mirrored, they come back there."""
+        """Forward a stop of the stops' own connection.
+
+        While mirroring is on, nothing is forwarded, because the robot's own stops come back there.
+        """
         if not self.forwarder.mirroring.on:
             self._receive_stop(message)
 
     def _react(self, side: Side, message: Message, routed: Routed) -> None:
-        """Do as the message requests of the bridge itself, whether or not a remote side is connected.
+        """Handle a message that requests something of the bridge itself, whether or not a remote side is connected.
 
         The bridge does not receive messages that it forwards to the local side, so this is the only occasion.
         """

@@ -37,8 +37,8 @@ class Way(Enum):
 class Copies:
     """A memory that recognises the second copy of a stop without a name, which comes both ways; thread-safe.
 
-    No stop is lost for it: one that only the main connection has had, while the other was dead and this was not known
-    yet, is returned by :meth:`lost`.
+    No stop is lost because of this memory: :meth:`lost` returns the stops that only the main connection has received
+    while the other was dead and this was not known yet.
     """
 
     def __init__(self, clock: Callable[[], float], notices_s: float) -> None:
@@ -50,7 +50,10 @@ class Copies:
         self._dropped = deque[tuple[float, Message]](maxlen=_DROPPED)
 
     def is_copy(self, way: Way, message: Message, *, other: bool) -> bool:
-        """True if this stop has come the other way before; ``other``: it can come that way now."""
+        """True if this stop has come the other way before, and forgets it; else remembers the stop.
+
+        ``other``: the stop can come the other way now.
+        """
         key, now, expected = hash((message.topic, message.payload)), self._clock(), self._expected[way]
         with self._lock:
             while expected and expected[0][1] < now:
@@ -68,13 +71,13 @@ class Copies:
             return False
 
     def forget(self) -> None:
-        """Expect no copy: a connection was lost."""
+        """Forget all stops, because a connection was lost: no copy is expected."""
         with self._lock:
             for expected in self._expected.values():
                 expected.clear()
 
     def lost(self) -> list[Message]:
-        """Note that the connection of stops was lost; return the stops that only the main one may have had."""
+        """Note that the stop connection was lost; return the stops that only the main connection may have received."""
         self.forget()
         with self._lock:
             since, dropped = self._clock() - self._notices_s, list(self._dropped)
@@ -85,9 +88,9 @@ class Copies:
 class StopConnection:
     """The second connection, kept as long as the broker lets it.
 
-    ``pass_on`` gets each of its stops, on its thread, but for those without a name that came over the main connection
-    before. ``main`` returns True while that one is there, and messages are forwarded. Call :meth:`check` once a second
-    and :meth:`main_lost`, on the service's thread.
+    ``pass_on`` gets each stop of this connection, on its thread, but for stops without a name that came over the main
+    connection before. ``main`` returns True while the main connection is there, and messages are forwarded. Call
+    :meth:`check` once a second and :meth:`main_lost`, on the service's thread.
     """
 
     def __init__(
@@ -104,7 +107,7 @@ class StopConnection:
     ) -> None:
         """Store the arguments; ``notices_s``: seconds after which the loss of the connection is known.
 
-        ``grace_s``: seconds for which it is tried. ``wanted`` returns True while it is worth its cost.
+        ``grace_s``: seconds for which connecting is tried. ``wanted`` returns True while this is worth its cost.
         """
         self._grace_s, self._wanted = grace_s, wanted
         self._transport, self._filters, self._clock = transport, tuple(filters), clock
@@ -123,7 +126,7 @@ class StopConnection:
         return self._transport.state is State.CONNECTED and not self._transport.not_received
 
     def is_copy(self, message: Message) -> bool:
-        """True if a stop that the main connection has received has passed already, and has no name."""
+        """True if a stop without a name from the main connection has passed already; remembers or forgets the stop."""
         return not is_named(message.payload) and self._copies.is_copy(Way.MAIN, message, other=self.listens)
 
     def check(self) -> None:

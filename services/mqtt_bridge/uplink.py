@@ -17,7 +17,7 @@ POLL_S = 0.1
 
 
 class Uplink:
-    """A wide link, over which nothing waits. What an extension overrides is called on the service's thread."""
+    """A wide link, over which nothing waits. Methods that an extension overrides run on the service's thread."""
 
     channels: tuple[Channel, ...] = ()  # that it publishes on the remote side itself
 
@@ -28,29 +28,29 @@ class Uplink:
 
     @property
     def heartbeat_qos(self) -> int | None:
-        """The QoS of heartbeats; None: as configured."""
+        """The QoS of heartbeats; None for the configured QoS."""
         return None
 
     def heartbeat_due(self) -> bool:
-        """Return True if it is time for a heartbeat, and there is room for it."""
+        """Return True if a heartbeat is due, and there is room for it on the link."""
         return True
 
     def pause(self, seconds: float) -> float:
-        """Return how long to wait between two requests that can wait."""
+        """Return the time to wait between two requests that are not urgent; ``seconds`` on a wide link."""
         return seconds
 
     def poll(self) -> bool:
-        """Measure the link and send what has waited, every POLL_S; True if heartbeats follow these polls."""
+        """Measure the link and send waiting messages, every POLL_S; True if heartbeats are sent with these polls."""
         return False
 
     def note_drive(self, payload: bytes) -> None:
-        """Note a drive command that has come over the link. Any thread may call it."""
+        """Note a drive command that has come over the link. Any thread may call this."""
 
 
 def uplink_of(
     config: Config, addresses: Addresses, remote: Transport, forwarder: Forwarder, clock: Callable[[], float]
 ) -> Uplink:
-    """Return the uplink of a robot. Raises ConfigError if its link may be thin and no extension is there for that."""
+    """Return the uplink of a robot. Raises ConfigError if the link may be thin and no extension provides that."""
     if config.services.mqtt_bridge.link.profile == "wide":
         return Uplink()
     for extension in config.installed:

@@ -12,8 +12,8 @@ PERIOD_S = 0.5
 class Vouching:
     """The time that ends with the newest prompt answer of the broker, and begins after the newest loss or delay.
 
-    Messages that the broker had before it answered have been passed on before the time is told. So a motor owner that
-    counts silence in this time only does not take late or lost messages for silence.
+    Messages that the broker had before its answer have been passed on before the motor owner gets this time. A motor
+    owner that counts silence only within this time does not take late or lost messages for silence.
     """
 
     def __init__(self, remote: Transport, now: float, noticed_s: float | None = None) -> None:
@@ -23,7 +23,7 @@ class Vouching:
         self._losses: Hashable = None
 
     def check(self, passes: bool, losses: Hashable, now: float) -> ControlVouched:
-        """Return the time; call it every PERIOD_S. ``losses`` changes whenever a message may have been lost here.
+        """Update and return the time, every PERIOD_S. ``losses`` changes whenever a message may have been lost here.
 
         A broker is late if its answer takes longer than a drive command may wait.
         """
@@ -36,7 +36,7 @@ class Vouching:
         return ControlVouched(begin=round(1000 * self._begin), end=round(1000 * self._end))
 
     def _delivered_s(self) -> float | None:
-        """Return how many seconds ago all messages were sent that are delivered now; None: the broker is late."""
+        """Return the seconds since which messages may not be delivered yet; None if the broker is late."""
         if self._noticed_s is not None:
             return self._noticed_s
         answer = self._remote.answer

@@ -1,6 +1,6 @@
 """Offers a Zenoh robot's topics on a broker on the robot.
 
-docs/bridge.md explains when it forwards, and when it refuses to.
+docs/bridge.md explains when the mirror forwards, and when it refuses to.
 """
 
 import time
@@ -87,7 +87,7 @@ class MqttMirror(ForwardingService):
             self._check_broker(epoch)
 
     def _check_broker(self, epoch: int) -> None:
-        """Wait for probes of the bridge from that broker, before anything is forwarded."""
+        """Wait for probes of the bridge from the broker, before anything is forwarded."""
         self.forwarder.rearm()
         self._announced, self._under_way = False, bool(self._watched)
         self.unsubscribe(Side.REMOTE)
@@ -136,7 +136,7 @@ class MqttMirror(ForwardingService):
         self._refuse("is the remote one, which the bridge serves already", seconds)
 
     def _refuse(self, why: str, seconds: float = CHECK_AGAIN_S) -> None:
-        """Forward nothing until the next check: the address may lead to another broker by then."""
+        """Forward nothing until the next check, when the address may lead to another broker."""
         self.forward_nothing(seconds)
         if why != self._refused:
             self._refused = why
@@ -178,7 +178,7 @@ class MqttMirror(ForwardingService):
             self.post_message(ONLINE, self._request_again, newest_of="suspect")
 
     def _is_fresh(self, message: Message) -> bool:
-        """True if a heartbeat is current: a retained one may be old. Its sender uses the same clock."""
+        """True if a heartbeat is current; a retained heartbeat may be old. The sender uses the same clock."""
         try:
             heartbeat = codec.decode(ONLINE, message.payload)
         except PayloadError:

@@ -22,7 +22,10 @@ AWAY_S = silent_after(0.5)  # boards publish four heartbeats a second
 
 
 class BoardNeighbours(NeighboursService):
-    """Others learn that the robot is there while its heartbeats come: this program may be there without it."""
+    """The neighbours of a board, which announce it to others only while its heartbeats arrive.
+
+    This program runs elsewhere and may outlive the board.
+    """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)

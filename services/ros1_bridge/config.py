@@ -154,16 +154,16 @@ class DiagnosticsMetric(Sampled, frozen=True, kw_only=True):
 class LevelMetric(Metric, frozen=True, kw_only=True):
     """The battery, as a value of the diagnostics."""
 
-    status_name: Annotated[str, doc("The part of the base.")] = "/Jackal Base/General/Battery"
+    status_name: Annotated[str, doc("The name of the diagnostics entry.")] = "/Jackal Base/General/Battery"
     key: Annotated[str, doc("Its value; with (V) or (%) it has that unit.")] = "Battery Voltage (V)"
 
 
 class StatusOfCharger(Metric, frozen=True, kw_only=True):
-    """The state of the charger, as a value of the diagnostics."""
+    """The entry of the diagnostics that says whether the robot charges."""
 
     enabled: Annotated[bool, doc("Publish it.")] = False
-    status_name: Annotated[str, doc("The part of the base.")] = ""
-    key: Annotated[str, doc("Its value.")] = ""
+    status_name: Annotated[str, doc("The name of the diagnostics entry.")] = ""
+    key: Annotated[str, doc("The key in that entry.")] = ""
     truthy_values: Annotated[tuple[str, ...], doc("These mean that it charges.")] = ("true", "charging", "yes", "1")
     falsey_values: Annotated[tuple[str, ...], doc("These mean that it does not.")] = (
         "false", "not charging", "no", "0",

@@ -1,4 +1,4 @@
-"""Sensors whose values change while the wheels turn: one that repeats itself then is broken. Pure."""
+"""Sensors whose values change while the wheels turn: a sensor that repeats itself then is broken. Pure."""
 
 from collections import defaultdict
 from collections.abc import Hashable, Mapping
@@ -7,14 +7,14 @@ from pebble.runtime.source_check import REPEATS_S, SourceCheck
 
 
 class MovingSensors:
-    """The sensors of one board, by their names. At rest, one may repeat itself."""
+    """The sensors of one board, by their names. At rest a sensor may repeat itself."""
 
     def __init__(self) -> None:
         self._checks: dict[str, SourceCheck] = defaultdict(SourceCheck)
         self._drives_until = float("-inf")
 
     def drive(self, until: float) -> None:
-        """Note that the wheels are commanded until then; an earlier time ends that."""
+        """Note the time until which the wheels are commanded; an earlier time than now ends the motion."""
         self._drives_until = until
 
     def take(self, values: Mapping[str, Hashable], now: float) -> None:
@@ -23,7 +23,7 @@ class MovingSensors:
 
     @property
     def problem(self) -> str:
-        """The problem; empty: none. A sensor that never changes may not be connected, unless no other changes."""
+        """The problem in words; empty if there is none. A sensor that never changes counts only if all stand still."""
         still = [name for name, check in self._checks.items() if check.repeats]
         if len(still) < len(self._checks):
             still = [name for name in still if self._checks[name].changes]

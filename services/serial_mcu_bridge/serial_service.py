@@ -113,7 +113,7 @@ class SerialService(Service, ABC):
             self._understood = self.line.opened, times + 1 if opened == self.line.opened else 1
 
     def note_start(self) -> None:
-        """Note that the board has started: again, if that is not the first thing heard since the line was opened."""
+        """Note that the board has started; a restart, if the board was heard before since the line was opened."""
         opened, times = self._understood
         if opened == self.line.opened and times > 1:
             self._starts.began(time.monotonic())
@@ -147,7 +147,7 @@ class SerialService(Service, ABC):
 
     @every(HOLDERS_S)
     def name_holders(self) -> None:
-        """Warn of other programs at this device: they need not ask for it alone, as we do."""
+        """Warn of other programs at this device, which may open it although we have locked it."""
         if self.line.state in (LineState.BOOTING, LineState.READY):
             threading.Thread(target=self._name_holders, name="holders", daemon=True).start()  # it takes a while
 
@@ -162,7 +162,7 @@ class SerialService(Service, ABC):
     def _queue_input(self, chunk: bytes) -> None:
         """Queue input on the reading thread, which also parses it if the service is idle.
 
-        At most one job waits, however much the MCU sends: commands are not delayed.
+        At most one job waits, however much the MCU sends, so that commands are not delayed.
         """
         with self._input_lock:
             if len(self._input) + len(chunk) > _INPUT_LIMIT:

@@ -1,7 +1,7 @@
 """Finds out whether a broker has bridge mode, which MQTT 3.1.1 does not define. Pure.
 
-A broker without it answers CONNECT with return code 1, or hangs up. So does a proxy whose broker is away: a hang-up
-counts only if the same broker accepts a plain CONNECT, and then hangs up once more.
+A broker without bridge mode answers CONNECT with return code 1, or hangs up. A proxy whose broker is away hangs up as
+well, so a hang-up counts only if the same broker accepts a plain CONNECT, and then hangs up once more.
 """
 
 from enum import Enum
@@ -23,7 +23,7 @@ class Result(Enum):
 
 
 class BridgeMode:
-    """The next way to connect. Each connection tries bridge mode again: an address may lead to another broker."""
+    """The next way to connect. Each connection tries bridge mode again, as the address may lead to another broker."""
 
     def __init__(self) -> None:
         self.next_attempt = Attempt.BRIDGE

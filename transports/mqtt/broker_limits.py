@@ -21,7 +21,7 @@ class Limits:
     will: bool = True
 
     def fit(self, message: Message) -> Message:
-        """Return ``message`` as this broker takes it."""
+        """Return ``message`` with the QoS and the retain flag that this broker takes."""
         return Message(message.topic, message.payload, QoS(min(message.qos, self.qos)), message.retain and self.retain)
 
     def fit_will(self, will: Message | None) -> Message | None:
@@ -32,7 +32,7 @@ class Limits:
 
     @property
     def losses(self) -> str:
-        """The functions that this broker lacks, in words; empty: none."""
+        """The functions that this broker lacks, in words; empty if it lacks none."""
         lost = []
         if not self.retain:
             lost.append(
@@ -64,7 +64,7 @@ class BrokerLimits:
 
     On 3.1.1 a broker hangs up on a will that is retained or has QoS 1, as mosquitto does, and so does a proxy whose
     broker is away: a hang-up counts only after the same broker has accepted a CONNECT without a will. A client without
-    a will does not learn it: it withholds the topics on which the broker hangs up.
+    a will does not learn these limits; such a client withholds the topics on which the broker hangs up.
     """
 
     def __init__(self) -> None:
@@ -79,7 +79,7 @@ class BrokerLimits:
 
     @property
     def asks_again(self) -> bool:
-        """True if the same broker is to be asked once more, in another way."""
+        """True if another CONNECT is to be sent to the same broker at once."""
         return self._asking is not Asking.NOTHING
 
     def begin(self, now: float) -> None:

@@ -1,6 +1,6 @@
-"""A client of an MQTT broker for one connection: its socket, what waits to be written, and message ids.
+"""A client of an MQTT broker for one connection: its socket, the bytes that wait to be written, and message ids.
 
-Not locked, and without a thread: both are its connection's. One `recv` takes everything that has come, and one `send`
+Not locked, and without a thread: the connection has both. One `recv` takes everything that has come, and one `send`
 writes a message or all acknowledgements of what was read: a general client library takes several of each, and makes
 objects that nobody here looks at.
 """
@@ -45,11 +45,11 @@ def is_hang_up(error: OSError | None) -> bool:
 
 
 class TlsLateError(TimeoutError):
-    """TLS was not there in time."""
+    """Error of a TLS handshake that takes too long."""
 
 
 def begin_tls(plain: socket.socket, opening: Opening) -> ssl.SSLSocket:
-    """Return a socket that does not block; ``plain`` is closed with it, or if this fails. Raises OSError."""
+    """Return a non-blocking socket with TLS; ``plain`` is closed with it, or if the handshake fails. Raises OSError."""
     assert opening.context is not None  # noqa: S101 - else there is no TLS
     name = opening.settings.host.partition("%")[0]  # certificates have addresses without a network card
     sock = opening.context.wrap_socket(plain, server_hostname=name, do_handshake_on_connect=False)
@@ -63,7 +63,7 @@ def begin_tls(plain: socket.socket, opening: Opening) -> ssl.SSLSocket:
 
 
 def _shake_hands(sock: ssl.SSLSocket, patience_s: float) -> None:
-    """Shake hands, for HANDSHAKE_S at most and as long as no silence lasts ``patience_s``. Raises OSError."""
+    """Do the TLS handshake, within HANDSHAKE_S and without a silence of ``patience_s``. Raises OSError."""
     end = time.monotonic() + HANDSHAKE_S
     with closing(SocketPoll()) as poll:
         poll.register(sock)
@@ -79,7 +79,7 @@ def _shake_hands(sock: ssl.SSLSocket, patience_s: float) -> None:
 
 
 class SendQuota:
-    """The messages of QoS 1 that the broker takes without an answer (Receive Maximum); those beyond wait here."""
+    """A bound on unanswered messages of QoS 1 (the broker's Receive Maximum); messages beyond the bound wait here."""
 
     def __init__(self, send: Callable[[bytes], None]) -> None:
         self._send = send
@@ -90,7 +90,7 @@ class SendQuota:
         self._left = self._most = most
 
     def takes(self, packet: bytes) -> bool:
-        """Return True if ``packet`` may be sent now; else keep it, to send it later."""
+        """True if ``packet`` may be sent now, which then counts; else keeps ``packet``, to send it later."""
         if self._left <= 0:
             self._held.append(packet)
             return False
@@ -105,14 +105,14 @@ class SendQuota:
 
 
 def keep_unsent(sock: socket.socket, size: int) -> None:
-    """Have the kernel accept at most about ``size`` bytes beyond those on their way, where it can; 0: its own bound."""
+    """Have the kernel accept only about ``size`` bytes beyond those on their way, if supported; 0: its own bound."""
     if _NOTSENT_LOWAT is not None:
         with suppress(OSError):  # it may be closed already
             sock.setsockopt(socket.IPPROTO_TCP, _NOTSENT_LOWAT, size)
 
 
 def _mark(sock: socket.socket, dscp: int) -> None:
-    """Mark our packets for routers that serve some of them first; where the system permits it."""
+    """Mark our packets for routers that serve marked packets first, where the system permits it."""
     v6 = sock.family == socket.AF_INET6
     with suppress(OSError):
         sock.setsockopt(
@@ -173,9 +173,9 @@ class Client:
     # -- reading
 
     def receive(self) -> int:
-        """Take bytes out of the socket, once those taken before are read; return how many.
+        """Take bytes out of the socket, once all bytes taken before are read; return their number.
 
-        If the other side has closed the connection, there is no `socket` afterwards.
+        If the other side has closed the connection, `socket` is None afterwards.
         """
         sock, self.drained = self.socket, True
         if sock is None:
@@ -206,7 +206,7 @@ class Client:
         return bool(self._reader.acks)
 
     def acknowledge(self) -> None:
-        """Send the acknowledgements of all messages read, in one piece; call it after they were handled."""
+        """Send the acknowledgements of all messages read, in one piece; call this after the messages were handled."""
         reader = self._reader
         acks, reader.acks = bytes(reader.acks), bytearray()
         self._send(acks)
@@ -244,7 +244,7 @@ class Client:
         self._send(packets.PINGREQ)
 
     def disconnect(self) -> None:
-        """Send DISCONNECT, and close so that it arrives: a connection that is reset may lose it.
+        """Send DISCONNECT, and close so that it arrives, because a connection that is reset may lose it.
 
         A connection with unread data is reset when it is closed, and a proxy on the way then resets the broker's. So
         bytes that come until the broker closes it, or for `_ENDING_S`, are read and thrown away.
@@ -266,7 +266,7 @@ class Client:
         return self._mid
 
     def _send(self, data: bytes) -> None:
-        """Send bytes, or let them wait behind others. Hot."""
+        """Send bytes, or let them wait behind earlier ones. Hot."""
         if self.socket is None:
             return
         if not self.waiting:

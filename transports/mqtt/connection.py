@@ -139,7 +139,7 @@ class Connection:
             self._in_flight.end()
 
     def disconnect(self) -> None:
-        """Send DISCONNECT: the broker then discards our will."""
+        """Send DISCONNECT, on which the broker discards our will."""
         with self._lock:
             self._client.disconnect()
 
@@ -254,14 +254,14 @@ class Connection:
     # -- any thread
 
     def ping(self) -> PendingAck:
-        """Send a ping: its answer proves that the broker has processed everything sent before."""
+        """Send a ping, whose answer proves that the broker has processed everything sent before."""
         ack = PendingAck()
         with self._lock:
             self.pings.send(self._client, ack)
         return ack
 
     def publish(self, message: Message, *, expires_s: int | None = None) -> bool:
-        """Send a message; False if that is impossible. A LATEST one may wait, and be dropped for a newer one."""
+        """Send a message; False if that is impossible. A LATEST message may wait, and be dropped for a newer one."""
         with self._lock:
             client, limits = self._client, self.limits
             if client.socket is None:
@@ -313,7 +313,7 @@ class Connection:
         return self._request(self._client.unsubscribe, filters, [])
 
     def _request(self, send: Callable[[Sequence[T]], int], filters: Sequence[T], asked: Sequence[str]) -> PendingAck:
-        """Send a few filters in each packet, and return the answer to the last one, which follows the others."""
+        """Send a few filters in each packet, and return the answer to the last packet, which comes after the others."""
         ack = PendingAck()
         with self._lock:
             for at in range(0, len(filters), FILTERS):
@@ -329,12 +329,12 @@ class Connection:
 
     @property
     def where(self) -> str:
-        """The broker in words."""
+        """The address of the broker in words, for logs."""
         return self.incoming.where
 
     @property
     def socket(self) -> socket.socket | None:
-        """The socket; None once it is lost."""
+        """The socket; None once the connection is lost."""
         return self._client.socket
 
     @property
@@ -387,7 +387,7 @@ class Connection:
         return self._in_flight.lost_bytes
 
     def written_before_loss(self) -> dict[str, int] | None:
-        """Return the bytes by topic for which the other side may have closed the connection; None: another reason."""
+        """Return the bytes by topic for which the broker may have closed the connection; None for another reason."""
         with self._lock:
             incoming = self.incoming
             if not (incoming.may_concern_message or (self._client.hung_up and not incoming.reason)):

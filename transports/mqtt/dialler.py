@@ -24,7 +24,7 @@ _HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connec
 
 
 class Dialler:
-    """Remembers how the attempts at a broker have ended, and makes the next one."""
+    """Remembers how the attempts at a broker have ended, and makes the next attempt."""
 
     def __init__(
         self, client_id: str, settings: MqttSettings, will: Message | None, client_class: type[Client] = Client
@@ -127,7 +127,7 @@ class Dialler:
         return not self._asks_for_bridge_mode or self._bridge_mode.next_attempt is Attempt.BRIDGE
 
     def _note_result(self, result: Result) -> None:
-        """Note how a CONNECT has ended; the limits of a broker count once it is known whether it has bridge mode."""
+        """Note how a CONNECT has ended; limits are learned only once bridge mode is decided."""
         self._bridge_mode.note(result)
         if self._will is not None and (self._is_last_attempt or result is not Result.HUNG_UP):
             self.limits.note_connect(result, time.monotonic())
@@ -141,7 +141,7 @@ class Dialler:
 
     @property
     def loses_large(self) -> bool:
-        """True if the way to the broker seems to lose large packets: connections have small segments from then on."""
+        """True if the way to the broker seems to lose large packets; connections use small segments then."""
         return self._large_lost >= _LARGE_LOST and not self._settings.max_segment
 
     def _may_have_lost_large(self, lost: Lost) -> bool:
@@ -157,7 +157,7 @@ class Dialler:
         return attempt.lost_bytes > _LARGE or (answered_s is not None and answered_s < _SOON_S)
 
     def note_end(self, lost: Lost) -> bool:
-        """Note how a connection, or an attempt at one, has ended; return True if segments are small from now on."""
+        """Note how a connection, or an attempt, has ended; return True if segments are small from now on."""
         silent, late = isinstance(lost, Silent), isinstance(lost, TlsLate)
         self.stalled |= silent
         if late:
@@ -168,7 +168,7 @@ class Dialler:
         return self.loses_large
 
     def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
-        """Return True if the broker has gone: nothing listens, or it hangs up as it does while it ends."""
+        """True if the broker has gone: nothing listens, or it hangs up while it ends; remembers the time."""
         now, silent = time.monotonic(), isinstance(lost, Silent)  # then it may be we who stood still
         if connected:
             self._gone_at = now
@@ -182,7 +182,7 @@ class Dialler:
     def failed(self, problem: str, held_s: float) -> tuple[str, bool]:
         """End the turn of the address, unless its broker is to be asked once more in another way.
 
-        Returns the problem in words, empty if there is none yet, and True if it is worth a line in the log.
+        Returns the problem in words, empty if there is none yet, and True if the problem is worth a line in the log.
         """
         addresses, asks_again = self.addresses, self.limits.asks_again
         if self._is_last_attempt and not asks_again:

@@ -57,7 +57,10 @@ class BrokerFilters:
         return iter(list(self._subscribed))
 
     def add(self, wanted: str) -> tuple[str, list[str]]:
-        """Return the filter to subscribe to (again, if known: that gets retained messages), and those it replaces."""
+        """Add ``wanted``; return the filter to subscribe to, and the filters that it replaces.
+
+        The filter may be subscribed to already: subscribing again gets retained messages.
+        """
         merged: set[str] = set()
         while True:
             overlapping = [
@@ -72,7 +75,10 @@ class BrokerFilters:
         return wanted, sorted(merged - {wanted})
 
     def prune(self, unwanted: str, wanted: Iterable[str]) -> list[str]:
-        """Remove and return the filters that overlap ``unwanted``, which was wanted, and none of ``wanted``."""
+        """Remove and return the subscribed filters that overlap ``unwanted`` but none of ``wanted``.
+
+        ``unwanted`` is a filter that is no longer needed.
+        """
         needs = list(wanted)
         idle = [
             existing
@@ -110,7 +116,7 @@ class OwnMessageFilter:
         self._repeats.update(topic for topic in seen if overlap(topic, filter_))
 
     def is_echo(self, message: Message) -> bool:
-        """True if this is our own retained message, sent back because we subscribed."""
+        """True if this is our own retained message, sent back to us; else forgets ours, which is outdated."""
         if message.topic not in self._own:
             return False
         if self._own.get(message.topic) == _digest(message):
@@ -119,7 +125,7 @@ class OwnMessageFilter:
         return False
 
     def is_repeat(self, message: Message) -> bool:
-        """True if this is a retained message that the broker sends again because of `subscribe_again`."""
+        """True, once, if the broker sends a retained message again due to `subscribe_again`; remembers each message."""
         seen, digest = self._seen.get(message.topic), _digest(message)
         self._seen[message.topic] = digest
         if seen != digest or message.topic not in self._repeats:

@@ -36,7 +36,7 @@ class Sink(Protocol):
 
 
 class Incoming:
-    """The listener of a connection's client. Not locked: the connection is. ``where`` is the broker in words."""
+    """The listener of a connection's client, under the connection's lock. ``where``: the broker's address in words."""
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class Incoming:
     def read(self, client: Client, now: float) -> None:
         """Read up to a batch of packets, piece by piece. ``now``: a time before anything is read. Raises Lost.
 
-        More than one piece may have come, and TLS unpacks one after the other.
+        Several pieces may have come, and TLS unpacks one after the other.
         """
         age, began_with, size = self.age, self._packets, 0
         while (left := began_with + _BATCH - self._packets) > 0:
@@ -101,7 +101,7 @@ class Incoming:
     def _read_piece(self, client: Client, now: float, most: int) -> int:
         """Read up to ``most`` packets, from the bytes left over or else from the socket; return their bytes.
 
-        Afterwards `more` is True if there may be others. Raises Lost.
+        Afterwards `more` is True if there may be more packets. Raises Lost.
         """
         unread = self._left or self._receive(client, now)
         self.age.update(now, client.socket)
@@ -119,7 +119,7 @@ class Incoming:
         return unread - left
 
     def _receive(self, client: Client, now: float) -> int:
-        """Take a piece out of the socket and return its bytes; note how many are there."""
+        """Take a piece out of the socket and return its number of bytes; note how many bytes there were."""
         age, waiting = self.age, self.age.waiting
         age.received_at = now
         if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:
@@ -130,7 +130,7 @@ class Incoming:
 
     @property
     def answered_s(self) -> float | None:
-        """Seconds for which the broker has answered since it accepted us; None: it has not accepted us."""
+        """Seconds from the broker's CONNACK to its newest answer; None without a CONNACK."""
         return None if self.accepted is None else self.answered_at - self._accepted_at
 
     @property

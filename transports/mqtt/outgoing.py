@@ -1,6 +1,6 @@
 """Messages that one MQTT connection has accepted: the backlog before its socket, and those in flight.
 
-Neither class is locked: their connection is.
+Neither class is locked: the lock of the connection is held.
 """
 
 import itertools
@@ -39,8 +39,8 @@ _NEVER = 0xFFFFFFFF  # no round trip was measured yet
 class Backlog:
     """LATEST messages for a socket that accepts no more, in order (T4).
 
-    A new message replaces the oldest one when there are too many; a retained one is only replaced by a newer one of its
-    topic.
+    A new message replaces the oldest when there are too many; a retained message is replaced only by a newer one of
+    its topic.
     """
 
     def __init__(self) -> None:
@@ -99,7 +99,7 @@ class Backlog:
 
 
 class PendingAck:
-    """An answer to wait for. The loss of the connection completes it, too."""
+    """A pending answer of the broker. The loss of the connection completes it, too."""
 
     def __init__(self) -> None:
         self._answered = threading.Event()
@@ -117,7 +117,7 @@ class PendingAck:
 
 @dataclass(slots=True)
 class _Unconfirmed:
-    """A retained message the broker may not have. A PUBACK, or the answer to a later ping, confirms that it has."""
+    """A retained message that the broker may not have, until a PUBACK or the answer to a later ping confirms it."""
 
     message: Message
     mid: int | None = None
@@ -190,7 +190,7 @@ class InFlightTable:
         return sent_at
 
     def topic_of(self, mid: int) -> str | None:
-        """Return the topic of a DELIVERED message that is not acknowledged; None: there is no such message."""
+        """Return the topic of a DELIVERED message that is not acknowledged; None if there is no such message."""
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
@@ -256,16 +256,16 @@ class InFlightTable:
 
     @property
     def round_trip_s(self) -> float:
-        """The shortest recent round trip: a delayed answer gives the next stall no extra time."""
+        """The shortest recent round trip, so that a delayed answer gives the next stall no extra time."""
         return min(self._round_trips, default=0.0)
 
     def newest_answer(self, now: float) -> tuple[int, float]:
-        """Return the number of answered pings, and how long the newest answer took, or the next one if longer."""
+        """Return the number of answered pings, and the time of the newest answer, or of a longer unanswered ping."""
         waits = now - self._pings[0][0] if self._pings else 0.0
         return self._pong_number, max(self._newest_s, waits)
 
     def end(self) -> None:
-        """Complete everything: no answer can come any more."""
+        """Complete all pending answers, because none can come any more."""
         unanswered = self._pings[0][2] if self._pings else self._written
         self.lost_bytes = max((size for _, size in unanswered.values()), default=0)
         self.complete()
@@ -276,7 +276,7 @@ class InFlightTable:
 
 
 def _note(table: dict[str, tuple[float, int]], topic: str, at: float, size: int) -> None:
-    """Note a message, unless one that was as large is in ``table`` already, or there is no room."""
+    """Note a message in ``table``, unless one as large is there already, or there is no room."""
     known = table.get(topic)
     if (known is None and len(table) < TOPICS) or (known is not None and size > known[1]):
         table[topic] = at, size

@@ -184,7 +184,7 @@ class Quota(Protocol):
     """A count of the messages that the broker has not acknowledged; it is called before the listener."""
 
     def begin(self, most: int) -> None:
-        """Note how many of them the broker takes."""
+        """Note how many unacknowledged messages the broker takes."""
 
     def acknowledged(self) -> None: ...
 
@@ -203,16 +203,16 @@ class Reader:
 
     @property
     def unread(self) -> int:
-        """Bytes of whole packets that wait for the next `read`, and of what follows these."""
+        """Bytes that wait for the next `read`: whole packets, and the beginning of another."""
         return len(self._data) - self._at
 
     @property
     def partial(self) -> int:
-        """Bytes of a packet that is not whole."""
+        """Bytes of an incomplete packet."""
         return len(self._partial)
 
     def feed(self, data: bytes) -> None:
-        """Take received bytes; call it when nothing is `unread`."""
+        """Take received bytes; call this when nothing is `unread`."""
         if self._discarded:
             data = self._discard(data)
         if self._partial:
@@ -368,7 +368,7 @@ def _read_variable(data: bytes, at: int) -> tuple[int, int]:
 
 
 def properties(data: bytes) -> dict[int, int]:
-    """Return MQTT 5's properties with numbers as values, by their own numbers. ``data`` begins with their length."""
+    """Return the numeric MQTT 5 properties, by property identifier. ``data`` begins with the properties' length."""
     values = dict[int, int]()
     if not data:
         return values

@@ -43,7 +43,7 @@ class Pings:
         client.ping()
 
     def send_after_stall(self, client: Client, now: float) -> None:
-        """Send a ping for each time without reading: its answer comes after all that waited at the broker by then."""
+        """Send a ping once after each time without reading: its answer follows all that waited at the broker."""
         since = self._age.waiting.checked_at
         if since != self._stalled_since:
             self._stalled_since = since

@@ -38,7 +38,7 @@ class WaitingTime:
             self.since, self.checked_at, self._counted = self.checked_at, now, size
 
     def read(self, size: int) -> None:
-        """Note that ``size`` bytes were taken out of it."""
+        """Note that ``size`` bytes were taken out of the socket."""
         self._counted -= size
 
 
@@ -68,7 +68,7 @@ class BrokerDelay:
         self._prompt = 0  # answers in a row that came right after the newest of several pings
 
     def usual(self, seconds: float) -> None:
-        """Note how long an answer took that waited for nothing."""
+        """Note the time of an answer that did not wait."""
         self._shortest = min(self._shortest, seconds)
 
     def asked(self, now: float, *, clear: bool) -> None:
@@ -104,7 +104,7 @@ class BrokerDelay:
         self._delivered = self._read
 
     def delivery(self, now: float) -> tuple[float, float]:
-        """Return how long ago the ping was sent before whose answer all is delivered, and how late that answer is."""
+        """Return the age of the newest ping whose earlier messages are all delivered, and how late its answer was."""
         sent_at, took = self._delivered
         waits = now - self._asked[0][1] if self._asked else 0.0
         return now - sent_at, max(took, waits) - self._shortest

@@ -65,12 +65,12 @@ def may_concern_message(code: int) -> bool:
 
 
 def concerns_login(code: int) -> bool:
-    """True if a CONNACK, of either version, or another answer refuses who asks, and nothing else about it."""
+    """True if an answer (a CONNACK of either version, or another) refuses the login, not the request."""
     return _OF_3_1_1.get(code, code) in _OF_LOGIN
 
 
 def connection_refused(code: int) -> str:
-    """Return why a CONNACK, of either version, refuses."""
+    """Return the reason in words of a CONNACK, of either version, that refuses us."""
     code = _OF_3_1_1.get(code, code)
     if code == 0x87:  # mosquitto's answer to a wrong password on 3.1.1
         return "not authorized (bad user name or password?)"

@@ -1,7 +1,7 @@
 """Topics on which a broker takes no messages: it says so on MQTT 5, or hangs up on them, as 3.1.1 has no words for it.
 
-A topic is withheld after three losses in a row, each soon after a message on it. Where that is true of several, they
-are tried one at a time from then on, so that only the one at fault stays withheld. Pure but for the log.
+A topic is withheld after three losses in a row, each soon after a message on it. If several topics are withheld, they
+are tried one at a time from then on, so that only the topic at fault stays withheld. Pure but for the log.
 """
 
 import logging
@@ -38,7 +38,11 @@ class Trial(NamedTuple):
 
 
 class RefusedTopics:
-    """Topics that are withheld; ``vital``: filters of those that are so for their size only. Publishing locks it."""
+    """A table of topics that are not sent, because the broker closes the connection for them.
+
+    Topics that match ``vital`` are withheld only if the messages are large. The transport's lock for publishing guards
+    ``withheld`` and the trial.
+    """
 
     def __init__(self, client_id: str, vital: tuple[str, ...]) -> None:
         self._client_id, self._vital = client_id, vital
@@ -50,14 +54,14 @@ class RefusedTopics:
         self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)
 
     def accepts(self, message: Message) -> bool:
-        """True if it may be sent."""
+        """True if ``message`` may be sent: its topic is not withheld, or on trial."""
         entry = self.withheld.get(message.topic)
         if entry is None or len(message.payload) < entry.size:
             return True
         return self._trial is not None and self._trial.topic == message.topic
 
     def admits(self, message: Message, now: float) -> bool:
-        """True if it may be sent; the next one of a topic that is due is its trial."""
+        """True if ``message`` may be sent; begins the trial of a withheld topic that is due."""
         if self._trial is None and not self.accepts(message) and self._is_due(message.topic, now):
             self._trial = Trial(message.topic, now + WINDOW_S)
         return self.accepts(message)
@@ -81,7 +85,7 @@ class RefusedTopics:
                 return
 
     def note_loss(self, where: str, written: Mapping[str, int] | None, now: float) -> None:
-        """Note a lost connection. ``written``: bytes by topic, just before; None: it was not lost for a message."""
+        """Note a lost connection. ``written``: bytes by topic, just before; None if no message was the reason."""
         written, trial, self._trial = written or {}, self._trial, None
         self._quiet_at = now + QUIET_S
         if trial is not None and {topic for topic in written if not self._is_vital(topic)} == {trial.topic}:
@@ -109,7 +113,7 @@ class RefusedTopics:
         return any(matches(filter_, topic) for filter_ in self._vital)
 
     def report(self, where: str, topic: str, why: str, now: float, level: int = logging.WARNING) -> None:
-        """Log it once for each topic, and again after a while: any number of messages may follow."""
+        """Log a refused topic, at most once in a while for each topic, because many messages may follow."""
         if now - self.not_taken.get(topic, ("", -inf))[1] >= _NOT_TAKEN_S:
             self.not_taken[topic] = why, now
             log.log(level, "%s: %s does not take a message on %s: %s", self._client_id, where, topic, why)

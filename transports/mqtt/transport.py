@@ -45,7 +45,7 @@ class _Run:
         self.thread = threading.Thread(target=target, args=(self,), name=name, daemon=True)
 
     def join(self, timeout: float) -> None:
-        """Wait for its end, unless it is the caller's thread."""
+        """Wait for the end of the thread, unless the caller runs on it."""
         if self.thread is not threading.current_thread():
             self.thread.join(timeout)
 
@@ -112,7 +112,7 @@ class MqttTransport(Transport):
         self._network.thread.start()
 
     def _close(self, will: Message | None) -> None:
-        """End the network thread. One that is connecting is not waited for: it ends by itself, within HANDSHAKE_S."""
+        """End the network thread, without waiting if it is connecting: then it ends by itself, within HANDSHAKE_S."""
         run = self._network
         if run is None:
             return
@@ -300,7 +300,7 @@ class MqttTransport(Transport):
         self._initial_sync(known)
 
     def _let_catch_up(self, connection: Connection, stopping: threading.Event) -> None:
-        """Wait before subscribing: a broker that was suspended first forwards old messages of others."""
+        """Wait before subscribing, because a broker that was suspended first forwards old messages of others."""
         end = time.monotonic() + _CATCH_UP_S
         while not stopping.is_set() and (left := end - time.monotonic()) > 0:
             connection.pump(left, ignore)
@@ -309,7 +309,7 @@ class MqttTransport(Transport):
     def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
         """Return own topics that need not be sent again: the broker has our newest message, or others publish there.
 
-        A ping's answer follows these messages (QoS 0).
+        Also sets ``went_back``. The messages have arrived when a ping is answered, because they have QoS 0.
         """
         self.went_back = False
         with self._publishing:

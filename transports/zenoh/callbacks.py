@@ -42,13 +42,13 @@ ensure_state = ctypes.pythonapi.PyGILState_Ensure
 
 
 class Calls:
-    """The callbacks that one thread has begun and ended, by number, and those that the guard has seen."""
+    """Counters of one thread: callbacks begun, callbacks ended, and the number begun that the guard saw last."""
 
     __slots__ = ("begun", "ended", "known", "ran")
 
     def __init__(self) -> None:
         self.begun = self.ended = self.known = 0
-        self.ran = False
+        self.ran = False  # when the guard looked last, a callback was running
 
 
 class Guard:
@@ -64,12 +64,12 @@ class Guard:
         self._sessions: list[zenoh.Session] = []
 
     def use(self, session: zenoh.Session) -> None:
-        """Note a session by which a thread can be given work: any will do, as Zenoh's threads belong to all."""
+        """Note a session by which a thread can be given work. Any session will do, as all share Zenoh's threads."""
         with self._lock:
             self._sessions.append(session)
 
     def forget(self, session: zenoh.Session) -> None:
-        """Forget a session, before it is closed: a reference to it keeps its memory and files."""
+        """Forget a session, before it is closed, because a reference would keep its memory and files."""
         with self._lock:
             self._sessions = [other for other in self._sessions if other is not session]
 
@@ -109,7 +109,7 @@ class Guard:
             self.rests, quiet = False, 0
 
     def _look(self) -> bool:
-        """Look for callbacks; True if one has begun since the last time, or is still running."""
+        """Look for callbacks, and help if one takes long; True if any has begun since the last look, or still runs."""
         active = self._suspects = False
         for calls in self._calls:
             begun, runs = calls.begun, calls.begun != calls.ended

@@ -39,7 +39,7 @@ class HubConnection:
         self._connection = 0
 
     def open(self) -> None:
-        """Begin when the client is opened, or opened again."""
+        """Begin a connection: the client is opened, or opened again."""
         self.name, self.watch = "", HubWatch()
 
     def renew(self) -> None:
@@ -51,7 +51,7 @@ class HubConnection:
     def put(self, session: zenoh.Session, message: Message, *, again: bool) -> None:
         """Send a retained message to the hub, before the live one: a subscription made in between gets one of the two.
 
-        ``again``: it was published before, and siblings that run have it.
+        ``again``: the message was published before, and running siblings have it.
         """
         if not again:
             self.retained_count += 1
@@ -81,16 +81,16 @@ class HubConnection:
         return wire.encode(wire.Hello(self.name, self.retained_count, self._will, gone | retained))
 
     def greet(self, session: zenoh.Session, hello: bytes, timeout: float) -> set[str] | None:
-        """Return the topics that the hub lacks; None: no hub answers in time."""
+        """Send a hello; return the topics that the hub lacks, or None if no hub answers in time."""
         answer = wire.ask(session, wire.asked(wire.HELLO, self._account), hello, timeout)
         return None if answer is None else {key_to_topic(key) for key in wire.decode_keys(answer)}
 
     def leave(self, session: zenoh.Session) -> None:
-        """Have our will forgotten."""
+        """Have the hub forget our will."""
         wire.ask(session, wire.asked(wire.BYE, self._account), wire.encode(self.name), GOODBYE_S)
 
     def fetch(self, session: zenoh.Session, subscriptions: Iterable[Subscription], counts: dict[str, int]) -> None:
-        """Query retained messages and wait for them, so that none comes among messages published after we returned.
+        """Query retained messages and wait for them, so that none comes after messages published later.
 
         ``counts``: how many retained messages each sibling has sent; the hub answers once it has received those.
         """

@@ -17,7 +17,10 @@ _V = TypeVar("_V")
 
 
 class Publishers:
-    """Publishers, declared for topics that this client publishes often. ``is_invented``: strangers choose the topic."""
+    """A declared Zenoh publisher for each topic of this client, up to a number.
+
+    ``is_invented(topic)`` is True for topics that strangers chose: no publisher is declared for these.
+    """
 
     def __init__(self, is_invented: Callable[[str], bool]) -> None:
         self._is_invented = is_invented

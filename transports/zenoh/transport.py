@@ -204,7 +204,7 @@ class ZenohTransport(Transport):
         self._opened.set()
 
     def _follow(self, view: HubView, seen: int, linked: int) -> int:
-        """Process a change; return the connection to a hub that works now, 0 for none."""
+        """Process a change of hubs or connections; return the hub connection that works now, 0 for none."""
         if not view.hubs:
             self.problem = f"the hub of {self.settings.run_dir} is away"
             self._set_state(State.CONNECTING)
@@ -245,7 +245,7 @@ class ZenohTransport(Transport):
     def _send_lacking(self, session: zenoh.Session, lacking: set[str]) -> bool:
         """Send the hub the messages that are pending and those that it lacks; False if there are none.
 
-        Others receive those that are new to them.
+        Other clients receive the messages that are new to them.
         """
         with self._publishing:
             owed = bool(self._own.pending or lacking)
@@ -339,7 +339,7 @@ class ZenohTransport(Transport):
     def _is_late(self, sample: zenoh.Sample, stamp: wire.LiveStamp, now: float) -> bool:
         """True if it waited in a socket while this process was stopped, longer than the lease of a connection (T19).
 
-        Retained messages are accepted in any case, because they are not sent again; and stops: none is ever too late.
+        Retained messages are never late, because they are not sent again; nor are stops, which must always take effect.
         """
         topic = key_to_topic(str(sample.key_expr))
         if not stamp.boot or self.policy.is_stop(topic):

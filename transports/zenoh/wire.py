@@ -146,12 +146,12 @@ decode_counts = msgspec.msgpack.Decoder(dict[str, int]).decode
 
 
 def asked(what: str, account: str) -> str:
-    """Return the key of a query to the hub, from an account or from this machine."""
+    """Return the key of a query to the hub, from an account or from a process of this machine."""
     return f"{what}/{account}" if account else what
 
 
 def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> bytes | None:
-    """Return the answer of the hub; None: there is none within ``timeout`` seconds.
+    """Send a query and return the answer of the hub; None if none comes within ``timeout`` seconds.
 
     Where a hub has just died, the query ends for others long after the next hub has answered it.
     """

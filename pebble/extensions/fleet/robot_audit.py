@@ -76,7 +76,7 @@ class Audit(Observer):
         self._writer.add({"t": round(time.time(), 3), "what": what, "who": who, **more})
 
     def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
-        """Note what it says, without parameters and keys."""
+        """Note the content of a message that has passed, without parameters and keys."""
         says = _COMMANDS.get(channel.suffix)
         if says is None and channel.kind not in (Kind.FLAG, Kind.ACTION):
             return
@@ -84,7 +84,7 @@ class Audit(Observer):
             if says is not None:
                 command = codec.decode(channel, payload)
                 row, who = says(command), _sender(by, command)
-                if row and not self._is_repeated(row.get("stop", ""), who):
+                if row and not self._noted_before(row.get("stop", ""), who):
                     self.note(who=who, **_place(by), **row)
             else:
                 on = bool(payload) and bool(codec.decode(channel, payload))
@@ -93,7 +93,7 @@ class Audit(Observer):
                     self.note(channel.kind.name.lower(), _sender(by), **_place(by), name=name, on=on)
 
     def refused(self, drop: Drop, channel: Channel | None, by: str | None) -> None:
-        """Note it, so many at most of strangers."""
+        """Note a message that was refused, only a limited number of strangers."""
         if drop in _REFUSED:
             name, who = "" if channel is None else channel.metric, _sender(by)
             row = {"t": round(time.time(), 3), "what": "refused", "who": who, **_place(by), "name": name}
@@ -112,8 +112,11 @@ class Audit(Observer):
     def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
         self.note("stop-not-confirmed", owner=owner, stop=str(stop.stop))
 
-    def _is_repeated(self, stop: str, who: str) -> bool:
-        """True if a stop of this name and sender has been noted; it may come with a checked name and without one."""
+    def _noted_before(self, stop: str, who: str) -> bool:
+        """True if this sender's stop was noted before; remembers the stop.
+
+        A stop may arrive twice, with a checked sender and without: the two count as different senders.
+        """
         repeated = (stop, who) in self._stops
         if stop and not repeated:
             self._stops.append((stop, who))

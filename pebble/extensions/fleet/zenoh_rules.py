@@ -38,7 +38,10 @@ def zenoh_text(fleet: Fleet) -> bytes:
 
 
 def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
-    """Return a robot retains what it publishes and leaves its will there; others retain flags without a name."""
+    """Return the rules of a hub for an account.
+
+    A robot may retain what it publishes, and leave its will there. Others may retain flags without a name.
+    """
     writes = [rule.filter for rule in held if rule.access == "write"]
     robot = ProgramRole.ROBOT in account.roles
     wills = [f"{base}/{OUTGOING}/#" for base in account.bases if robot]

@@ -16,9 +16,9 @@ _DEEPEST: Final = 8
 
 
 def json_spec(topic: str, channel: Channel | None) -> ChannelSpec:
-    """Return the channel for this topic.
+    """Return the Foxglove channel of this topic.
 
-    Foxglove plots only fields that a schema names, so one that cannot name all of them is left out: then the channel
+    Foxglove plots only fields that a schema names. A schema that cannot name every field is left out: then the channel
     holds any JSON.
     """
     name, schema = (_ANY, b"") if channel is None else _schema_of(channel.suffix, channel.payload)

@@ -87,6 +87,6 @@ def _signalled() -> Iterator[asyncio.Event]:
 
 
 def _call(loop: asyncio.AbstractEventLoop, robots: Robots, topic: str, on: bool) -> None:
-    """Call the loop from a thread of the SDK; it may have ended meanwhile."""
+    """Tell ``robots``, on the thread of the loop, that a topic is (un)subscribed; ignored if the loop has ended."""
     with contextlib.suppress(RuntimeError):
         loop.call_soon_threadsafe(lambda: robots.wake(topic, subscribed=on))

@@ -134,10 +134,10 @@ class Robots:
     def take(
         self, interest: Interest, now: float, *, large: bool
     ) -> tuple[tuple[tuple[str, str, Any, float], ...], bool]:
-        """Return what this page has not received yet, None for what was removed; it counts as received from now on.
+        """Return the values this page has not received yet (None: removed), and whether a large one is among them.
 
-        With it, whether there is a large value among them: one if it may be ``large``, the others wait. What is open is
-        taken first; what does not fit into a message waits for the next one.
+        The values count as received from now on. The component that the page has open comes first. At most one large
+        value is taken, and only with ``large``. The others, and what does not fit into this message, wait for the next.
         """
         dirty, interest.dirty = interest.dirty, set()
         taken, has_large, left = [], False, MAX_STATE_BYTES

@@ -146,7 +146,10 @@ def url_of(settings: WebSettings, listener: socket.socket) -> str:
 
 
 def _raise_limit_of_descriptors() -> None:
-    """Let there be as many connections as the system allows: those that strangers hold keep out no stop."""
+    """Raise the limit of open files as far as the system allows.
+
+    Otherwise many idle connections of strangers could keep a stop from being received.
+    """
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 

@@ -1,4 +1,4 @@
-"""The settings of an operator page, and those of a robot's config; ``pebble.extensions.page`` serves it."""
+"""The settings of an operator page, and how a robot's config gives them; ``pebble.extensions.page`` serves the page."""
 
 from __future__ import annotations
 

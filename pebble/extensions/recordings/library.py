@@ -36,7 +36,7 @@ def files(places: Iterable[Path]) -> list[Path]:
 
 
 def recordings_in(folder: Path) -> Iterator[Path]:
-    """Yield them by their names; a link that leads nowhere is one that cannot be read."""
+    """Yield the recordings by name; a link that leads nowhere counts as a recording that cannot be read."""
     for path in folder.rglob(f"*{SUFFIX}*"):
         if path.name.endswith((SUFFIX, ACTIVE)) and (path.is_file() or path.is_symlink()):
             yield path

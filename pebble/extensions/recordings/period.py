@@ -131,7 +131,10 @@ def _clock(option: str, text: str) -> time:
 
 
 def _moment(option: str, text: str, now: datetime, days: int = 0) -> int:
-    """Return the moment of a text; ``days`` are added to a day."""
+    """Return the time in ``text`` as nanoseconds since 1970. Raises PebbleError if ``text`` names none.
+
+    A date without a time means its beginning, plus ``days``.
+    """
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:

@@ -56,19 +56,19 @@ def shifted(payload: bytes, by_ns: int) -> bytes:
 
 
 def is_media(payload: bytes) -> bool:
-    """True if it is a picture or sound, by its first bytes: a robot may rename its topics."""
+    """True if the payload is a picture or sound, by its first bytes, because a robot may rename its topics."""
     return payload[:4] in (PBVD, PBAT) or is_picture(payload)
 
 
 def is_picture(payload: bytes) -> bool:
-    """True if it is a picture: PBVD, a JPEG or JSON with ``id`` and ``keyframe``."""
+    """True if the payload is a picture: PBVD, a JPEG or JSON with ``id`` and ``keyframe``."""
     if payload[:4] == PBVD or payload[:2] == _JPEG:
         return True
     return payload[:6] == b'{"id":' and b'"keyframe"' in payload[:_PICTURE_HEAD]
 
 
 def is_keyframe(payload: bytes) -> bool:
-    """True if it is a picture that can be decoded without earlier ones."""
+    """True if the payload is a picture that can be decoded without earlier pictures."""
     header = read_header(payload) if is_picture(payload) else None
     return header is not None and header.keyframe
 

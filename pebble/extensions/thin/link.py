@@ -81,10 +81,10 @@ class Crowd:
 
 
 class LinkMeter:
-    """The level of a link, from answers to pings: at `auto` by the queue, their time beyond that of the shortest one.
+    """A meter of the level of a link (thin to wide), from answers to pings.
 
-    A level ends early for the next lower one, and late for the next higher one. Each rise that fails doubles the time
-    without a queue that the next one takes, up to ten minutes.
+    At `auto` the level depends on the queue: how much longer answers take than the fastest one. It changes down early
+    and up late: after each rise that fails, the time without a queue before the next rise doubles, up to ten minutes.
     """
 
     def __init__(self, profile: str, kbit: float | None = None) -> None:
@@ -130,7 +130,7 @@ class LinkMeter:
             self._decide(now)
 
     def lost(self) -> None:
-        """Note that the connection is lost: the next measurements are of another one."""
+        """Note that the connection is lost; the next measurements are of another connection."""
         self._answers = 0
         self._crowd = Crowd()
         self._forget()
@@ -203,14 +203,17 @@ class Room:
 
 
 class LateRun:
-    """Commands of senders that do not follow the link: late ones, one soon after the other, since a prompt one."""
+    """A count of late commands in a row, from senders that do not adapt to the link.
+
+    A command that is on time, or a pause, starts the count again.
+    """
 
     def __init__(self) -> None:
         self.count = 0
         self._since = self._newest_at = 0.0
 
     def note(self, late: bool, now: float) -> None:
-        """Note a command that does not tell its age."""
+        """Count a command that does not tell its age, or start again."""
         if not late:
             self.count = 0
             return
@@ -219,5 +222,5 @@ class LateRun:
         self.count, self._newest_at = self.count + 1, now
 
     def seconds(self, now: float) -> float:
-        """Return how long all of them were late."""
+        """Return for how long commands have been late without a break; 0 if none was."""
         return now - self._since if self.count else 0.0

@@ -129,7 +129,7 @@ class Sieve:
         return True
 
     def _note(self, rank: Rank, topic: str) -> None:
-        """Note that a message is sent: a stream's next turn is later."""
+        """Note that a message is sent, so that its stream's next turn is later."""
         if rank is not Rank.STREAM:
             return
         self._sent_at.pop(topic, None)

@@ -1,4 +1,4 @@
-"""What the bridge does besides forwarding: system actions, programs for pictures and sound, earlier names."""
+"""The work of the bridge besides forwarding: system actions, programs for pictures and sound, earlier names."""
 
 from pebble.extension import Extension
 

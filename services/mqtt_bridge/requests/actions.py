@@ -65,7 +65,7 @@ class Action:
         return self._process is not None and self._process.poll() is None
 
     def request(self) -> bool:
-        """Run the command; return False, with a log line, if that is refused."""
+        """Run the command; return False, with a log line, if the request is refused."""
         if not self.control.command:
             if not self._warned:
                 self._warned = True

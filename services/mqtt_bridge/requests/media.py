@@ -55,7 +55,7 @@ class Media:
         self.send()
 
     def request(self, channel: Channel, request: MediaRequest) -> None:
-        """Take the newest request, which counts as a whole: without a known encoding it means the configured one."""
+        """Note the newest request. Without a known encoding the request means the configured encoding."""
         row = _ROWS[channel.suffix]
         encoding = request.encoding if request.encoding in row.encodings else None
         self._requested[row] = ProgramRequest(request.enabled, encoding or "")

@@ -54,7 +54,7 @@ def claims(manifest: McuManifest, lookup: Lookup = c.channel_of) -> Claims:
 
 
 def outlet_feature(claim: str) -> set[str]:
-    """Return what the robot's capabilities list while this claim is in use: the topic of an outlet, or nothing."""
+    """Return the feature for the robot's capabilities while this claim is in use: an outlet's topic, or none."""
     return {claim.partition("/")[2]} if c.channel_of(claim) in (c.OUTLET_STATUS, c.OUTLET_COMMAND) else set()
 
 

@@ -27,7 +27,7 @@ Body = Callable[[McuSample], Payload | None]
 
 @dataclass(frozen=True, slots=True)
 class Alias:
-    """A channel of an interface's own, and the claim that no other device may make."""
+    """An extra channel for one interface. While two devices have the same ``claim``, neither uses it."""
 
     claim: str
     channel: c.Channel
@@ -55,18 +55,18 @@ class Device:
 
     @property
     def has_motion(self) -> bool:
-        """True if there is an inertial sensor, which sends continuously."""
+        """True if the MCU has an inertial sensor, which sends continuously."""
         return any(route.interface.profile == imu.MOTION for route in self.routes.values())
 
     @property
     def local_only(self) -> McuLocalOnly:
-        """Return the topics of its interfaces that stay on the robot."""
+        """The topics of this MCU's interfaces that stay on the robot."""
         routes = [route for route in self.routes.values() if route.interface.local_only]
         aliases = [route.alias.claim for route in routes if route.alias is not None]
         return McuLocalOnly(topics=[*(route.generic.suffix for route in routes), *aliases])
 
     def sample(self, reading: Reading, t: int) -> McuSample:
-        """Return the payload of the generic topic."""
+        """Return a reading as the payload of its interface's generic topic."""
         interface = reading.interface
         return McuSample(
             t=t,
@@ -79,7 +79,7 @@ class Device:
         )
 
     def alias_body(self, route: Route, sample: McuSample) -> Payload | None:
-        """Return the alias's payload; None where there is none yet."""
+        """Return a sample as the payload of the alias; None if there is none yet. Stores motion for summaries."""
         body = "" if route.alias is None else route.alias.body
         if route.interface.profile == imu.MOTION and imu.fits(imu.MOTION, sample.value):
             motion = self._reports.motion(sample.t, sample.seq, sample.mcu_ms, sample.value)  # summaries repeat it
@@ -110,7 +110,7 @@ class Device:
         return Alias(claim, claimed, interface.profile if fits else "")
 
     def _renamed(self, interface: Interface) -> Interface:
-        """Return it with the channel's effective name, if the config sets one and the name is valid as a channel."""
+        """Return ``interface`` with the effective name of its channel, if the config sets one that is valid."""
         if interface.direction is Direction.IN:
             return interface
         channel = c.channel_of(f"{c.OUTGOING}/{interface.channel}")

@@ -20,7 +20,7 @@ _MARK = b'"device_uid"'  # in every value under an alias: the MCU it belongs to
 
 
 class LocalOnly(PrivateTopics):
-    """The lists of all MCUs."""
+    """The private topics of all self-describing MCUs, by the list of each MCU."""
 
     def __init__(self, base: str) -> None:
         super().__init__(base)
@@ -32,7 +32,7 @@ class LocalOnly(PrivateTopics):
         self._commands = f"{base}/{MCU_COMMAND.suffix.partition('{')[0]}"
 
     def stays(self, topic: str) -> bool:
-        """True if a topic is on a list, or of a command to an MCU without one, or of a request for a manifest."""
+        """True if ``topic`` is on a list, or is for a command to an MCU without a list, or for a manifest request."""
         if topic.startswith(self._commands):
             uid = topic.removeprefix(self._commands).partition("/")[0]
             if uid not in self._listed or topic.endswith(_QUESTION):
@@ -40,7 +40,7 @@ class LocalOnly(PrivateTopics):
         return bool(self._private) and any(topic in topics for topics in list(self._private.values()))
 
     def admit(self, message: Message) -> list[Message]:
-        """Return ``message`` or none; with a list, the values that waited for it."""
+        """Return ``message`` if it may pass now, else store a value; for a list, return the values that waited."""
         with self._lock:
             if not message.payload:
                 self._waiting.pop(message.topic, None)  # removed: nothing to forward any more
@@ -51,7 +51,7 @@ class LocalOnly(PrivateTopics):
             return self._judge(message)
 
     def _learn(self, uid: str, payload: bytes) -> None:
-        """Learn a list. One that is removed, or cannot be read, lets nothing pass; its topics stay private."""
+        """Store a list. A list that is removed, or cannot be read, lets no value pass; its topics stay private."""
         self._listed.discard(uid)
         try:
             listed: McuLocalOnly = codec.decode(MCU_LOCAL_ONLY, payload)
@@ -75,7 +75,7 @@ class LocalOnly(PrivateTopics):
         return []
 
     def _uid_of(self, message: Message) -> str | None:
-        """Return the uid of the MCU that sent a value; None if it is none of an MCU, or a manifest."""
+        """Return the uid of the MCU that sent a value; None for a message of another program, or a manifest."""
         if message.topic.startswith(self._values):
             uid = message.topic.removeprefix(self._values).partition("/")[0]
             return None if message.topic.endswith(_QUESTION) else uid
@@ -85,7 +85,7 @@ class LocalOnly(PrivateTopics):
 
 
 def _object(payload: bytes) -> dict[str, Any]:
-    """Return the JSON object that ``payload`` is; empty for anything else."""
+    """Return the JSON object in ``payload``; an empty dict for anything else."""
     try:
         plain = codec.plain(MCU_DESCRIBE, payload)
     except PayloadError:

@@ -99,7 +99,7 @@ class SerialLine:
     def drive(self, line: bytes, valid_s: float = float("inf")) -> bool:
         """Send a drive line now, or once earlier bytes are sent unless a newer one replaces it. False: no device.
 
-        One that could not be sent for ``valid_s``, or for ``drive_timeout_s``, becomes a stop.
+        A drive line that could not be sent for ``valid_s``, or for ``drive_timeout_s``, becomes a stop.
         """
         outbox = self.output.outbox
         return self._hand_over(lambda now: outbox.drive(line, now, valid_s), line if valid_s > 0 else b"")
@@ -109,7 +109,7 @@ class SerialLine:
         return self._hand_over(lambda _now: self.output.outbox.halt(), self.output.stop)
 
     def send(self, kind: str, line: bytes) -> bool:
-        """Send a line that drives nothing; a waiting one of the same ``kind`` is replaced. False: no device."""
+        """Send a line that drives nothing; a waiting line of the same ``kind`` is replaced. False: no device."""
         return self._hand_over(lambda _now: self.output.outbox.put(kind, line), line)
 
     def close(self, timeout: float = 0.8) -> None:

@@ -59,7 +59,7 @@ class HallMemory:
             os.close(descriptor)
 
     def _keep(self) -> None:
-        """Open it, also after it was removed: Python's own SharedMemory does so when a reader ends."""
+        """Open the memory, also after it was removed, as Python's own SharedMemory does when a reader ends."""
         if self._opened is not None and self._in_place(self._opened[0]):
             return
         self.close()
@@ -80,7 +80,7 @@ class HallMemory:
         return os.path.samestat(found, os.fstat(descriptor))
 
     def _open(self) -> tuple[int, mmap.mmap, memoryview]:
-        """Make the memory, or open an existing one. It appears whole: a reader would keep what it maps too early."""
+        """Create the memory, or open an existing one. It appears whole, as a reader keeps what it maps too early."""
         flags, made = os.O_RDWR | os.O_CLOEXEC, False
         try:
             descriptor = os.open(self._path, flags | os.O_NOFOLLOW)

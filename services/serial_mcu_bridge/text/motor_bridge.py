@@ -42,9 +42,9 @@ class MotorProtocol(Protocol):
 
 
 class MotorBridge(MotorOwner, SerialService):
-    """The motor owner of a serial line.
+    """A motor board on a serial line, as a motor owner.
 
-    SerialLine sends the stop at the start, and at the end from its close(), which runs by :meth:`on_stop`.
+    SerialLine sends the stop line when it opens, and in close(), which :meth:`on_stop` calls.
 
     A bridge of another text protocol sets ``protocol`` and ``stop_line``.
     """

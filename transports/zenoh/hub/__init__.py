@@ -54,7 +54,7 @@ class ZenohHub:
 
     @property
     def retained(self) -> dict[str, bytes]:
-        """The payloads that it retains, by topic."""
+        """The retained payloads, by topic."""
         if self._store is None:
             return {}
         return {retained.key: retained.payload for retained in self._store.retained()}
@@ -100,7 +100,7 @@ class ZenohHub:
 
     @property
     def _newest(self) -> tuple[object, object]:
-        """The certificates and rules, as their files are now."""
+        """The certificates and rules as now in their files."""
         return None if self._certificates is None else self._certificates.get(), self._admission.newest()
 
     def close(self) -> None:

@@ -40,7 +40,7 @@ class Admission:
         return {}
 
     def hello(self, account: str, hello: Hello) -> Hello | None:
-        """Return a hello as it is taken; None: it is not answered."""
+        """Return ``hello`` as it may be stored; None if it is not answered."""
         return None if account else hello
 
     def owns(self, account: str, session: str) -> bool:
@@ -48,7 +48,7 @@ class Admission:
         return not account and bool(session)
 
     def admitted(self, record: Record) -> Record | None:
-        """Return ``record`` as it may be stored, with no will in place of a refused one; None: it may not."""
+        """Return ``record`` as it may be stored, without a refused will, which is counted; None if it may not be."""
         if isinstance(record, Retained):
             refused = bool(self._unretained) and _matches_any(self._unretained, key_to_topic(record.key))
             return None if refused else record
@@ -62,12 +62,12 @@ class Admission:
         return next((taken for filter_, taken in self._wills if matches(filter_, topic)), True)
 
     def refuse_will(self, will: Will, why: str) -> None:
-        """Count a refused will, and log the first one of its client."""
+        """Count a refused will, and log the first refusal of its client."""
         self.refused += 1
         self.log(will.client[:_LOGGED], "will", f"{why} ({will.topic[:_LOGGED]})")
 
     def log(self, client: str, what: str, why: str) -> None:
-        """Log the first refusal of a client, of so many clients."""
+        """Log the first refusal of each client, for a limited number of clients."""
         if client in self._logged or len(self._logged) >= _CLIENTS:
             return
         self._logged.add(client)

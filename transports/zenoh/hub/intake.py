@@ -25,7 +25,7 @@ _OnQuery = Callable[[zenoh.Query], None]
 
 
 class Intake:
-    """Tasks in the order of their arrival, with a query after each of them: neither keeps the other waiting."""
+    """Tasks and queries in the order of their arrival, taken in turn, so that neither kind keeps the other waiting."""
 
     def __init__(self) -> None:
         self.dropped = 0  # tasks
@@ -105,7 +105,7 @@ class Intake:
             return task
 
     def _has_room(self, size: int) -> bool:
-        """True if ``size`` bytes fit; a task that is larger than all the room fits if no other waits."""
+        """True if ``size`` bytes fit; a task larger than all the room fits if no other task waits."""
         return not self._bytes or self._bytes + size <= QUEUE_BYTES
 
     def _note_dropped(self) -> None:

@@ -21,7 +21,7 @@ _NEVER = float("inf")
 
 
 class Journal:
-    """A file of records: ``load()`` and ``rewrite()`` with the current ones, then ``put()``, finally ``close()``.
+    """A file of records: ``load()`` and ``rewrite()`` with the current records, then ``put()``, finally ``close()``.
 
     A disk that is full, missing or cannot be written is no error of the caller: one line in the log says so, and
     ``rewrite_at`` when to try again. Until then nothing, or only a part, is stored.
@@ -76,7 +76,7 @@ class Journal:
             self._syncer.start()
 
     def put(self, name: str, record: bytes | None) -> None:
-        """Store a record instead of the one with this name; None: remove that."""
+        """Store a record in place of the record with this name; None removes that record."""
         if self._database is None:
             return
         try:
@@ -117,7 +117,7 @@ class Journal:
             self._database = None
 
     def _fail(self, error: Exception) -> None:
-        """Try again later; say so once."""
+        """Arrange another attempt later, and log the failure once."""
         if self.rewrite_at == _NEVER:
             log.error(
                 "journal %s: %s; a restart of the hub loses retained messages; tried again every %.0f s",
@@ -128,7 +128,7 @@ class Journal:
         self.rewrite_at = self._clock() + RETRY_S
 
     def _sync(self) -> None:
-        """Sync to disk on a thread of its own: a slow SD card must not delay ``put``."""
+        """Sync to disk on a thread of its own, because a slow SD card must not delay ``put``."""
         while not self._closing.is_set():
             self._dirty.wait()
             self._closing.wait(SYNC_S)

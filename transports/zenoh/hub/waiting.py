@@ -22,7 +22,7 @@ class WaitingQueries:
         self._received[client] = count
 
     def received(self, client: str, count: int) -> None:
-        """Note a message, the ``count``-th that this client has retained; 0: it does not count them."""
+        """Note a message, the ``count``-th that this client has retained; 0: the client does not count messages."""
         if count and client in self._received:
             self._received[client] = max(count, self._received[client])
             self._looks = self._looks or client in self._awaited
@@ -34,7 +34,7 @@ class WaitingQueries:
         self._received.clear()
 
     def add(self, needs: dict[str, int], query: zenoh.Query, now: float) -> bool:
-        """Have a query wait; False: it is to be answered now."""
+        """Add a query that waits; False if the query must be answered now."""
         if len(self._waiting) >= QUERIES or self._has_arrived(needs):
             return False
         self._waiting.append((now + PATIENCE_S, needs, query))
@@ -48,7 +48,7 @@ class WaitingQueries:
         return float("-inf") if self._looks else self._waiting[0][0]
 
     def take(self, now: float) -> list[zenoh.Query]:
-        """Return the queries that have waited for long enough, or for nothing more."""
+        """Remove and return the queries that have waited for long enough, or have nothing more to wait for."""
         due = []
         while self._waiting and now >= self._waiting[0][0]:
             due.append(self._waiting.popleft())

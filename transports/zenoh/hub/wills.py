@@ -13,7 +13,7 @@ class WillTimes:
         self._due: dict[str, float] = {}
 
     def on_hello(self, name: str, now: float, *, alive: bool, has_will: bool) -> None:
-        """Note a client's will. If its token never comes, it has died meanwhile."""
+        """Note a client's will. If the client's token never comes, the client has died meanwhile."""
         if alive:
             self._due.pop(name, None)
         elif has_will:
@@ -24,12 +24,12 @@ class WillTimes:
         self._due[name] = now + GONE_S
 
     def on_restart(self, names: Iterable[str], now: float) -> None:
-        """Note wills of before a restart; their clients may come back."""
+        """Note the wills from before a restart, whose clients may come back."""
         for name in names:
             self._due.setdefault(name, now + RETURN_S)
 
     def forget(self, name: str) -> None:
-        """Forget the will of a client that is there, or has none any more."""
+        """Forget the will of a client that is present, or has no will any more."""
         self._due.pop(name, None)
 
     @property
@@ -37,7 +37,7 @@ class WillTimes:
         return min(self._due.values(), default=float("inf"))
 
     def take_due(self, now: float) -> list[str]:
-        """Return the clients whose wills are due; each is returned once."""
+        """Remove and return the clients whose wills are due."""
         taken = [name for name, due in self._due.items() if now >= due]
         for name in taken:
             del self._due[name]

@@ -230,7 +230,7 @@ class HubWorker:
     # -- store and journal
 
     def apply(self, record: Record) -> None:
-        """Store ``record`` as it is admitted."""
+        """Store the part of ``record`` that is admitted."""
         admitted = self._admission.admitted(record)
         if admitted is not None and self._store.apply(admitted) and self._journal is not None:
             self._journal.put(admitted.id, None if admitted.is_removal else wire.encode(admitted))

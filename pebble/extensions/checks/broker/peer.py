@@ -206,13 +206,14 @@ class BrokerTrial:
         self._peers, self.base = [], f"{self.below}/{secrets.token_hex(8)}"
 
     def peer(self, *, protocol: str = "3.1.1", bridge: bool = False, will: Message | None = None) -> Peer:
-        """Connect a client, or raise RefusedError; the topic of ``will`` is below the probe's."""
+        """Connect a client, or raise RefusedError; the topic of ``will`` is relative to the probe's base topic."""
         password = self._credentials.password()
         settings = replace(self.settings, protocol=protocol, keepalive_s=_KEEPALIVE_S, password=password)
         name = self.settings.client_id or client_ids.unique(NAME)
         if will is not None:
             will = Message(f"{self.base}/{will.topic}", will.payload, will.qos, retain=will.retain)
-            self.left |= {will.topic: None} if will.retain else {}
+            if will.retain:
+                self.left[will.topic] = None
         opening = Opening(name, settings, self._credentials.context(), will, self._address, self.patience_s)
         try:
             peer = Peer(self, self.base, opening, bridge=bridge)

@@ -288,11 +288,11 @@ def _after_long_ones(robot: Observer) -> CheckResult:
 
 
 def _repeated(robot: Observer) -> CheckResult:
-    """Repeat a stop during it, and after its reset, when a repetition may still be on its way."""
-    names: list[str] = []
+    """Check that the same stop sent again changes nothing, while the robot is stopped and after the reset."""
+    stop_names: list[str] = []  # the name that while_stopped chose
 
-    def again(robot: Observer, name: str) -> CheckResult:
-        names.append(name)
+    def send_same_stop(robot: Observer, name: str) -> CheckResult:
+        stop_names.append(name)
         before = _counts(robot)
         robot.send(c.ESTOP, EstopCommand(stop=name, by=BY, why=_WHY))
         robot.look(robot.patience_s)
@@ -301,9 +301,9 @@ def _repeated(robot: Observer) -> CheckResult:
             return failed(f"its repetition counts again ({some_of(counted)})", "a name in recent is the same stop")
         return ok("the same stop counts once")
 
-    outcome = while_stopped(again)(robot)
+    outcome = while_stopped(send_same_stop)(robot)
     if outcome.state is State.OK:
-        outcome = again(robot, names[0])
+        outcome = send_same_stop(robot, stop_names[0])
         if robot.view.latched:
             outcome = failed("its repetition after a reset stops it again", "keep recent when the stop ends")
             freed(robot)

@@ -55,7 +55,7 @@ class RobotSide(Observer):
         self.transport.ask([*estop.missing, *estop.missing_control])
 
     def others(self) -> tuple[dict[str, list[str]], set[str]]:
-        """Return the retained topics of each other robot, by its base, and which of these robots send heartbeats."""
+        """Return the retained topics of all robots but this one, by base topic, and the bases that send heartbeats."""
         topics: defaultdict[str, list[str]] = defaultdict(list)
         live: set[str] = set()
         with self.beside("selftest-others", *(channel.filter(_ANY) for channel in _STATES)) as (_, messages):

@@ -37,9 +37,9 @@ def gateway(file: FileArgument) -> int:
     \b
         pebble fleet gateway gate-1.json
 
-    Boards cannot speak Zenoh: with "boards", their broker on a LAN, instead of
-    "hub" it carries them, and "neighbours" lets robots of the LAN's hub receive
-    and drive them.
+    Boards cannot speak Zenoh. For them, give their broker on the LAN as "boards"
+    instead of "hub". With "neighbours" as well, robots at the LAN's hub can
+    receive from the boards and drive them.
     """
     from pebble.extensions.fleet.gateway.connections import gateway_transports
     from pebble.extensions.fleet.gateway.gateway import Gateway, will

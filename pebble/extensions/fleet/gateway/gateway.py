@@ -51,7 +51,7 @@ def will(name: str) -> Message:
 
 
 def is_stop(topic: str) -> bool:
-    """True if it is a stop, with the name of a sender or without."""
+    """True if the message is a stop, with the name of a sender or without."""
     return f"/{ESTOP.direction}/" in topic and topic.endswith(_STOP_END)
 
 

@@ -48,7 +48,7 @@ class GatewayFile(Section, frozen=True, kw_only=True):
 
     @property
     def operators(self) -> Mqtt | None:
-        """Their broker; None: it carries no robot."""
+        """The settings of the operators' broker; None if this gateway only serves neighbours."""
         return self.mqtt or (None if self.neighbours else Mqtt())
 
 

@@ -29,7 +29,7 @@ class OtherGateways:
         self._others.clear()
 
     def left(self, name: str) -> None:
-        """Note that the broker has published the will of that gateway, or that it has left in order."""
+        """Note that a gateway has gone: the broker has published its will, or it has left in order."""
         self._others.pop(name, None)
 
     def heard(self, name: str, run: str, robots: tuple[str, ...], now: float) -> None:

@@ -71,7 +71,7 @@ class Slice(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Connection(NamedTuple):
-    """A connection, as its end uses it: three functions."""
+    """The three calls that each side of the benchmark makes on a connection."""
 
     subscribe: Callable[[str, Handler], object]  # to a topic
     publish: Callable[[str, bytes], object]

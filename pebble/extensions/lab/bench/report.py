@@ -157,7 +157,7 @@ def _span(seconds: float) -> str:
 
 
 def text(folder: Path) -> str:
-    """Return the whole report as Markdown, of what is in the folder: the first table, and what each command printed."""
+    """Return the Markdown report of the results in ``folder``: a summary table, then the output of each command."""
     measured = dict[str, Results]()
     for section in SECTIONS:
         with suppress(PebbleError):  # it failed, or was not measured

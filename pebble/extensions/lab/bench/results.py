@@ -88,7 +88,7 @@ class Cell(msgspec.Struct, kw_only=True):
 def round_cell(
     variant: str, measure: str, unit: str, samples: Iterable[float], params: Params | None = None, **figures: float
 ) -> Cell:
-    """Return the cell of one round."""
+    """Return a result with the samples of one round."""
     return Cell(
         variant=variant, measure=measure, unit=unit, rounds=[list(samples)], params=dict(params or {}),
         figures={name: [value] for name, value in figures.items()},

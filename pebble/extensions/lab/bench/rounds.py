@@ -1,4 +1,4 @@
-"""Variants take turns in rounds, and rounds are the observations: the ratio of two variants has an interval over them.
+"""A comparison of variants in rounds: the confidence interval of a ratio comes from the rounds.
 
 Samples of one round are not independent: they share processes, a memory layout and a moment of the machine. So each
 round counts as one observation, and the variation is estimated by resampling the rounds (decision 0010).

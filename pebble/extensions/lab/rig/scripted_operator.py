@@ -70,9 +70,9 @@ class ScriptedOperator:
             self.command(Drive())
 
     def command(self, drive: Drive) -> float:
-        """Send one command, with the key of control; nothing while a person has that. One who asks for it gets it.
+        """Send one drive command, with the control key if there is one; nothing while a person has control.
 
-        Return when it was handed over, by time.monotonic(); infinite: it was not.
+        A person who asks for control gets it. Return the time.monotonic() of sending; infinite: nothing was sent.
         """
         if self.control.asked_by:
             self.control.release()

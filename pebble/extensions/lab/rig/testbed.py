@@ -185,7 +185,10 @@ class Testbed(Processes):
         return self.server
 
     def start_recorder(self, into: Path, *options: object) -> Program:
-        """``pebble record`` of everything at the operators' broker, which is starting; ``options`` are further ones."""
+        """Start ``pebble record`` for everything at the operators' broker and return it; it may not be ready yet.
+
+        ``options`` are further arguments of the command.
+        """
         url = f"mqtt://{HOST}:{self.broker_port}"
         command = python("pebble.cli", "record", "--url", url, "--into", into, *options)
         return self.add(Program("pebble record", command, self.folder / "record.log"), OPERATORS)

@@ -35,5 +35,5 @@ def assumed(base: str, axes: Collection[str], name: str = "") -> dict[str, Any]:
 
 
 def encode(drive: Drive, axes: Collection[str]) -> bytes:
-    """Return a command of these axes alone: its client drops messages that are longer than 256 bytes."""
+    """Return a drive command with these axes only: the board's MQTT client drops messages longer than 256 bytes."""
     return msgspec.json.encode({axis: round(getattr(drive, axis), 3) for axis in axes})

@@ -102,7 +102,7 @@ class ControlClient:
     # -- what is wanted
 
     def ask(self, now: float, *, over: bool = False) -> None:
-        """Want control from now on. Who drives is asked for it; ``over``: it is taken from them."""
+        """Want control from now on: ask the person who drives for it, or (``over``) take it from them."""
         if not self.wanted:
             self.failed, self._out = "", []  # a release that was not sent yet is none
         self.wanted, self._take = True, over
@@ -159,7 +159,7 @@ class ControlClient:
 
     @property
     def done(self) -> bool:
-        """True if it neither wants anything nor has anything to publish."""
+        """True if this client neither wants control nor has anything to publish."""
         return not self.wanted and not self._out
 
     @property
@@ -184,7 +184,7 @@ class ControlClient:
         return any(state.id == self.id for state in self.robot.states)
 
     def _hopeless(self, now: float) -> str:
-        """Return why it is given up; empty: it is not."""
+        """Return why the request for control is given up; empty if it is not."""
         if now - self._answered_at > self._pace_of().answer_s:
             return f"{self.robot.base.rpartition('/')[2]} {UNANSWERED}"
         return f"{self.robot.who} drives on" if now - self._asked_at > ASKS_S else ""

@@ -75,7 +75,7 @@ _APPLIES: dict[Code, Callable[[Situation], bool]] = {
 
 
 def first_reason(situation: Situation, order: Sequence[Code] = ORDER) -> Code | None:
-    """Return the reason that counts; None: nothing speaks against driving."""
+    """Return the first reason that applies; None if nothing speaks against driving."""
     return next((code for code in order if _APPLIES[code](situation)), None)
 
 

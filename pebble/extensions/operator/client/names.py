@@ -98,7 +98,10 @@ def _with_synonyms(channel: Channel) -> Iterator[Channel]:
 
 
 def _refuse_misspelt(name: str) -> None:
-    """Raise NamingError for a single word or a near match: other topics may exist on a broker outside the contract."""
+    """Raise NamingError if ``name`` looks like a misspelt topic of the contract: it resembles one, or has no slash.
+
+    Other names are allowed, because a broker may carry topics outside the contract.
+    """
     spellings = {spelling for channel in CHANNELS for spelling in (channel.metric, channel.suffix)}
     near = difflib.get_close_matches(name, sorted(spellings), n=1)
     if near:

@@ -49,7 +49,7 @@ class RobotEstop:
 
     @property
     def states(self) -> dict[str, EstopState]:
-        """The states by owner; with capabilities only of the owners that these list: others are no longer there."""
+        """The stop states by motor owner. Once capabilities are known, only of the owners that they list."""
         if not self.has_capabilities:
             return dict(self._states)
         return {owner: self._states[owner] for owner in self.owners if owner in self._states}
@@ -82,7 +82,7 @@ class RobotEstop:
 
     @property
     def old(self) -> bool:
-        """True if it is known to have no emergency stop; one that announces it, but cannot receive it, is not old."""
+        """True if the robot is known to have no emergency stop; a robot that cannot receive its own is not old."""
         return self.has_capabilities and not self.announces
 
     def subscribe(self, transport: Transport) -> None:

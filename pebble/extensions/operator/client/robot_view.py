@@ -71,7 +71,7 @@ class Liveness:
         return None if self.received_at is None else now - self.received_at
 
     def online(self, now: float, at_least_s: float = 0.0) -> bool | None:
-        """True if it is there; None while there are too few heartbeats. A silence below ``at_least_s`` is none."""
+        """True if the robot is there; None while heartbeats are too few. A silence below ``at_least_s`` is none."""
         if self.reported_offline:
             return False
         interval = self.interval_s
@@ -117,25 +117,25 @@ class RobotView:
     # -- what arrives
 
     def receive(self, channel: c.Channel | None, message: Message, now: float, wall: float) -> None:
-        """Take a message of it that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds).
+        """Handle a message of this robot that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds).
 
-        What it says is known from ``channel``. A malformed one changes nothing: the last valid state stays. An empty
-        one removes what was retained.
+        ``channel`` says what the message means (None: unknown). A malformed message changes nothing. An empty message
+        removes the retained value.
         """
         if channel in _FOR_STOPS:
-            self._remember(message)
+            self._keep_for_late_stop(message)
         if channel in (c.CAPABILITIES, c.ESTOP_STATE):
             self._receive_stop(channel, message, now)
         elif channel is c.CONTROL_STATE:
             self.control.receive(message)
         elif channel is c.LINK:
-            self.link = link_of(message.payload)  # absent or unreadable it is wide
+            self.link = link_of(message.payload)  # no link, or an unreadable one, counts as wide
             self.liveness.link = "wide" if self.link is None else self.link.level
         elif channel is c.STATUS:
             self._status = message.payload
-            self._announce(message.payload)
+            self._take_announced(message.payload)
         elif channel is c.DRIVE:
-            self._park(message)
+            self._note_retained_drive(message)
         elif channel in _DECODED:
             with suppress(PayloadError):
                 self._receive_decoded(channel, message, codec.decode(channel, message.payload), now, wall)
@@ -150,12 +150,12 @@ class RobotView:
         elif channel is c.AUTONOMY_STATUS:
             self.autonomy = payload
         else:
-            self._announce(message.payload)
+            self._take_announced(message.payload)
             if not message.retain:  # a heartbeat that is retained is no sign of life
                 self.liveness.heartbeat(now, wall - payload.t / 1000, online=payload.online is not False, t=payload.t)
 
-    def _announce(self, payload: bytes) -> None:
-        """Take what a heartbeat or status lists, unless it publishes capabilities."""
+    def _take_announced(self, payload: bytes) -> None:
+        """Take what a heartbeat or status lists as capabilities, unless the robot publishes capabilities."""
         if not self.capabilities or "announced" in self.capabilities:
             value = announced(self.base, payload)
             self.capabilities = self.capabilities if value == self.capabilities else value or self.capabilities
@@ -171,15 +171,15 @@ class RobotView:
                 before = {} if self.is_assumed else self.capabilities
                 self.capabilities = codec.decode(c.CAPABILITIES, message.payload).value or before
 
-    def _park(self, message: Message) -> None:
-        """Take note of a drive command that was retained. An empty message removes it, and is not retained itself."""
+    def _note_retained_drive(self, message: Message) -> None:
+        """Note whether a drive command that moves is retained; an empty message, not retained itself, removes it."""
         if message.retain or not message.payload:
             self.parked = bool(message.payload)
             with suppress(PayloadError):
                 self.parked = self.parked and codec.decode(c.DRIVE, message.payload).moves
 
-    def _remember(self, message: Message) -> None:
-        """Keep it for an emergency stop that begins later; invented owners keep no capabilities out."""
+    def _keep_for_late_stop(self, message: Message) -> None:
+        """Keep the message for an emergency stop that begins later; invented owners keep no capabilities out."""
         topics = (*self.remembered, c.CAPABILITIES.topic(self.base))
         if not message.payload:
             self.remembered.pop(message.topic, None)
@@ -190,7 +190,7 @@ class RobotView:
 
     @property
     def silent(self) -> bool:
-        """True if it has not said what it can do: by no capabilities, and by no list of what it subscribes to."""
+        """True if the robot has published neither capabilities nor a list of the topics it subscribes to."""
         return not self.estop.has_capabilities and (not self.capabilities or self.is_assumed)
 
     @property
@@ -199,7 +199,7 @@ class RobotView:
         return "assumed" in self.capabilities
 
     def assume(self, axes: Collection[str], name: str = "") -> bool:
-        """Take a silent board for one that drives by these axes, or by none; return whether that is new."""
+        """Assume that a silent board drives by these axes, or by none; return True if that is new."""
         before = self.capabilities
         if self.silent:
             self.capabilities = assumed.assumed(self.base, axes, name)
@@ -233,18 +233,18 @@ class RobotView:
 
     @property
     def drives(self) -> bool:
-        """True if it offers driving; without capabilities nothing is assumed (paper A.8.6)."""
+        """True if the robot offers driving; without capabilities nothing is assumed (paper A.8.6)."""
         drive = section_of(self.capabilities, "drive")
         return drive.get("available") is True and drive.get("controls") is not False
 
     @property
     def arbitrates(self) -> bool:
-        """True if it decides itself between a script and a person."""
+        """True if the robot itself decides between a script and a person."""
         return section_of(self.capabilities, "drive").get("arbitrates") is True
 
     @property
     def controlled(self) -> bool:
-        """True if it decides itself which person drives it."""
+        """True if the robot itself decides which person drives it."""
         return section_of(self.capabilities, "drive").get("control") is True
 
     @property
@@ -258,12 +258,12 @@ class RobotView:
 
     @property
     def named(self) -> bool:
-        """True if it takes commands only with the name of their sender in the topic."""
+        """True if the robot takes commands only with the name of their sender in the topic."""
         return self.estop.named
 
     @property
     def slow_s(self) -> float | None:
-        """The seconds that commands take over its thin link; None: it has reported none, or is gone."""
+        """The seconds that commands take over the robot's thin link; None if there is none, or the robot is gone."""
         link = self.link
         return None if link is None or link.level == "wide" or self.liveness.reported_offline else way_s(link)
 
@@ -273,7 +273,7 @@ class RobotView:
         return pace_of(self.link)
 
     def topic(self, channel: c.Channel) -> str | None:
-        """Return the topic that its capabilities name for ``channel``; None: none, or none of its own."""
+        """Return the topic that the robot's capabilities name for ``channel``; None for none, or a foreign topic."""
         return named_topic(self.base, self.capabilities, channel)
 
     def offers(self, section: str) -> bool:
@@ -281,7 +281,7 @@ class RobotView:
         return section_of(self.capabilities, section).get("controls") is True
 
     def ready(self, now: float) -> bool:
-        """True if it is online, with a known drive topic."""
+        """True if the robot is online, with a known drive topic."""
         return self.topic(c.DRIVE) is not None and self.liveness.online(now) is True
 
     def online(self, now: float) -> bool | None:

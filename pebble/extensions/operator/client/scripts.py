@@ -36,7 +36,7 @@ class RobotScripts:
 
     @property
     def answer_s(self) -> float:
-        """The seconds after which a robot whose status has not changed does not follow a command."""
+        """The seconds to wait for a changed status before a command counts as ignored."""
         return max(_STARTS_S, self.robot.pace.answer_s)
 
     def subscribe(self, transport: Transport) -> None:

@@ -209,7 +209,7 @@ def _print_rate(meter: RateMeter, *, silent: bool) -> None:
 
 
 def _moves(names: Names, message: Draft) -> bool:
-    """True if it would move a robot."""
+    """True if the message would move a robot."""
     if names.channel(message.topic) is not DRIVE:
         return False
     try:

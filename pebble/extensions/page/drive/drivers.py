@@ -87,7 +87,10 @@ class Drivers:
             self.closed(tab)
 
     def drive(self, tab: Tab, op: m.DriveOp, blocked: str) -> tuple[bool, str]:
-        """Judge a command of a gesture, and publish what follows: whether wheels move now, and why it was refused."""
+        """Publish the drive commands of a gesture, if it is allowed.
+
+        Return whether wheels move now, and why the gesture was refused (empty: it was not).
+        """
         now, robot = clock(), self.robot(op.ref)
         commands, refused = robot.drive(tab, op, now, blocked or self.refusals.of_driving(op.ref))
         accepted = self._publish(commands, tab.user)

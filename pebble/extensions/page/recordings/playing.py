@@ -211,7 +211,7 @@ class PlayedRobot:
         )
 
     def _flush(self, now: float) -> None:
-        """Send what has changed, and a few times a second where it is."""
+        """Send the changed values and log lines and, a few times a second, the position in the recording."""
         if now - self._flushed_at < _FLUSH_S or self.player.restores:
             return
         self._flushed_at = now

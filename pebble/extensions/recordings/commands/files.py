@@ -33,8 +33,8 @@ def mend(
 ) -> int:
     """Copy what can be read of damaged or unfinished recordings.
 
-    In a folder that is what a killed recorder left, as the next recorder there does: a file of which not all could be
-    read stays beside its copy, as ….mcap.damaged. FILE stays as it is.
+    In a folder, finish the files that a killed recorder left, as the next recorder there would. If a file could not be
+    read completely, the original is kept beside the copy, as ….mcap.damaged. FILE itself is not changed.
     """
     if not source.is_dir():
         return _mend_file(source, target)

@@ -264,7 +264,7 @@ class _Drawing:
 
 
 def is_h264(payload: bytes) -> bool:
-    """True if it is a picture in H.264, by its header."""
+    """True if the payload is a picture in H.264, by its header."""
     return payload.startswith(PBVD) and payload[5:6] == bytes([PictureKind.H264])
 
 

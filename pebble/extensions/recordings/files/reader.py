@@ -136,7 +136,7 @@ class RecordingFile:
         return self.damage.report(active=self.path.name.endswith(ACTIVE))
 
     def reaches_into(self, since_ns: int, until_ns: int) -> bool:
-        """True if it may hold messages of a period: one that is not finished has no end."""
+        """True if the file may hold messages of a period; an unfinished file has no end."""
         ends = self.damage.finished and self.last_ns < since_ns
         return bool(self.chunks) and self.first_ns < until_ns and not ends
 
@@ -170,7 +170,7 @@ class RecordingFile:
             yield from messages
 
     def messages(self, chunk: Chunk, chooses: Chooses = lambda _channel: True) -> list[Recorded]:
-        """Return those of one chunk in the order of time; none if it is damaged."""
+        """Return the messages of one chunk in the order of time; none if the chunk is damaged."""
         return self._unpacked(chunk, chooses)[0]
 
     def metadata(self) -> dict[str, dict[str, str]]:
@@ -215,7 +215,7 @@ class RecordingFile:
             self._look_through()
 
     def _summary(self) -> Summary | None:
-        """Return the summary; None: it is not finished, its end is damaged, or it has none."""
+        """Return the summary; None if the file is not finished, its end is damaged, or it has no summary."""
         tail = FOOTER.size + len(MAGIC)
         file_size = self.size
         footer = self._read(max(0, file_size - tail), tail)
@@ -309,28 +309,30 @@ class RecordingFile:
     # -- both
 
     def _unpacked(self, chunk: Chunk, chooses: Chooses) -> tuple[list[Recorded], tuple[int, int] | None]:
-        """Return the chosen messages of a chunk, and the numbers of its first and last one."""
+        """Return the chosen messages of a chunk, and the sequence numbers of its first and last message."""
         found: list[Recorded] = []
         first, last = -1, -1
-        chosen: dict[int, Channel | None] = {}
-        lost: set[int] = set()
+        chosen: dict[int, Channel | None] = {}  # by channel number; None: not chosen
+        unnamed: set[int] = set()
         try:
             data = self._records(chunk)
             for op, begin, end in records(data):
                 if op != Op.MESSAGE:
                     self._declare(data[begin - HEAD.size : end], self.channels)
                     continue
-                number, sequence, log_ns, publish_ns = MESSAGE.unpack_from(data, begin)
+                channel_number, sequence, log_ns, publish_ns = MESSAGE.unpack_from(data, begin)
                 first, last = sequence if first < 0 else first, sequence
-                if number not in chosen:
-                    channel = self._channel(number)
-                    lost |= {number} - self.channels.keys()
-                    chosen[number] = channel if channel.topic == OLD_OTHER or chooses(channel) else None
-                if lost and number in lost:
+                if channel_number not in chosen:
+                    channel = self._channel(channel_number)
+                    if channel_number not in self.channels:
+                        unnamed.add(channel_number)
+                    chosen[channel_number] = channel if channel.topic == OLD_OTHER or chooses(channel) else None
+                if channel_number in unnamed:
                     self.damage.unnamed += 1
-                taken = chosen[number]
+                taken = chosen[channel_number]
                 if taken is not None:
                     found.append(Recorded(taken, sequence, log_ns, publish_ns, data[begin + MESSAGE.size : end]))
+            # Old files have all topics without a channel on one: they are chosen by the topic inside the message.
             if any(channel is not None and channel.topic == OLD_OTHER for channel in chosen.values()):
                 found = [message for message in map(_with_own_topic, found) if chooses(message.channel)]
         except DamageError as error:

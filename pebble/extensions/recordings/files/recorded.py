@@ -88,7 +88,7 @@ class Damage:
 
 
 def unnamed(number: int) -> Channel:
-    """Return a channel in place of one that has lost its name."""
+    """Return a channel in place of a channel that has lost its name."""
     return Channel(number, f"{UNNAMED}{number}", "application/octet-stream")
 
 

@@ -124,7 +124,7 @@ class _Output(BufferedIOBase):
 
 
 def _packed(channels: list[Channel]) -> bytes:
-    """Return the records of channels. One with a schema is not repeated: its schema had to be, too."""
+    """Return the records of the channels without a schema: with one, the schema had to be repeated, too."""
     from mcap.data_stream import RecordBuilder
 
     builder = RecordBuilder()

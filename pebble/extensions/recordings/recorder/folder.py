@@ -81,7 +81,7 @@ class Folder:
 
     @property
     def in_place(self) -> bool:
-        """True if it is the folder that was taken: it may be removed, or its disk taken away or brought back."""
+        """True if the folder at the path is still the one taken; its disk may have been removed or brought back."""
         return self._own.in_place
 
     def release(self) -> None:

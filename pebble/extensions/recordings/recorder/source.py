@@ -153,7 +153,7 @@ class _Copies:
 
     @property
     def failed(self) -> bool:
-        """True if it has never been connected for long enough."""
+        """True if the connection has never lasted for long enough."""
         now = time.monotonic()
         return now > self._ends_at and now - self._quiet_since <= _QUIET_S
 

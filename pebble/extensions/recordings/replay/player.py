@@ -42,7 +42,7 @@ class Output(Protocol):
         ...
 
     def send(self, message: Recorded, position_ns: int) -> bool:
-        """Return whether it is done; else it is tried again."""
+        """Send the message; False: not sent now, and the caller tries again later."""
         ...
 
     def halt(self) -> None:
@@ -245,7 +245,7 @@ class Player:
             self._reading.advance()
 
     def _send(self, message: Recorded, position_ns: int) -> bool:
-        """True if it is done; else it is tried again."""
+        """Send the message; False: not sent now, and it is tried again later."""
         done = self._output.send(message, position_ns)
         if not done:
             self._pass(_RETRY_S)

@@ -198,7 +198,7 @@ def _rebased(plain: Any, old: str, new: str) -> Any:
 
 
 def _is_elsewhere(key: str, value: Any, old: str) -> bool:
-    """True if it names a topic outside the robot's base, which a config may do."""
+    """True if ``value`` of ``key`` names a topic outside the robot's base, which a config may do."""
     if not isinstance(value, str):
         return False
     return not value.startswith(old) and (key.endswith("topic") or parse_topic(value) is not None)

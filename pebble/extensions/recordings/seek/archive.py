@@ -108,7 +108,7 @@ class Archive:
         return sorted(found[:LOG_LINES], key=lambda message: message.log_ns)
 
     def pictures(self, robot: str, at_ns: int) -> list[Recorded]:
-        """Return the last picture before ``at_ns``, and before it all from its key frame on; empty if there is none."""
+        """Return the last picture before ``at_ns`` and those it needs, from its key frame on, oldest first; or none."""
         chain: list[Recorded] = []
         size = 0
         for message in self._pictures_before(robot, at_ns):
@@ -135,7 +135,7 @@ class Archive:
         return found
 
     def files(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[SeekableFile]:
-        """Return those that may hold messages of a robot in a period, opened, in the order of time."""
+        """Return the files that may hold messages of a robot in a period, opened, in the order of time."""
         lane = lane_of(f"{robot}/", is_media=True)
         found = []
         for named in self._list():
@@ -172,7 +172,7 @@ class Archive:
         return self._named
 
     def _opened(self, path: Path) -> SeekableFile | None:
-        """Return None for one that has gone meanwhile, or is no recording."""
+        """Return a file, opened; None if it has gone meanwhile, or is no recording."""
         file = self._open.pop(path, None)
         try:
             if file is not None and file.is_replaced():

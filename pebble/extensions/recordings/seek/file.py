@@ -22,11 +22,11 @@ class SeekableFile(RecordingFile):
         self._about = os.fstat(self._file.fileno())
 
     def robots(self) -> set[str]:
-        """Return all that a channel belongs to."""
+        """Return all robots to which a channel belongs."""
         return {robot for channel in self.channels.values() if (robot := robot_of(channel)) is not None}
 
     def channels_of(self, robot: str) -> frozenset[int]:
-        """Return those of a robot, and of topics that have no channel of their own in a file of the last version."""
+        """Return the channels of a robot, and in a file of the last version the channel of all other topics."""
         return frozenset(
             number
             for number, channel in self.channels.items()
@@ -40,7 +40,7 @@ class SeekableFile(RecordingFile):
         return grown or not os.path.samestat(now, then)
 
     def messages_of(self, chunk: Chunk) -> list[Recorded]:
-        """Return those of a chunk in the order of time; empty if it is damaged."""
+        """Return the messages of a chunk in the order of time; empty if the chunk is damaged."""
         known = self._unpacked_chunks.get(chunk.at)
         if known is None:
             known = self._unpacked_chunks[chunk.at] = self.messages(chunk)

@@ -49,7 +49,7 @@ _days: Days
 
 
 def begin(folder: Path) -> None:
-    """Make this process the one that answers."""
+    """Prepare this process to answer questions about the recordings in ``folder``."""
     global _archive, _days
     _in_background(_NICE)
     _archive = Archive(folder)

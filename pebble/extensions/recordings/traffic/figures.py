@@ -45,7 +45,7 @@ class Figure(Struct, frozen=True):
 
 
 def figures(robot: RobotTraffic) -> list[Figure]:
-    """Return those that a robot has data for."""
+    """Return the figures that a robot has data for."""
     drawn = [_outages(robot), _latency(robot), _bandwidth(robot)]
     return [figure for figure in drawn if figure is not None]
 

@@ -104,7 +104,7 @@ def about(index: Path, connection: DuckDBPyConnection) -> About | None:
 
 
 def is_of(index: Path, recording: Path, connection: DuckDBPyConnection) -> bool:
-    """True if it was made from the recording as it is now."""
+    """True if the index was made from the recording as it is now."""
     if not index.is_file():
         return False
     made, now = about(index, connection), recording.stat()

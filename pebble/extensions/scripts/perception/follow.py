@@ -85,7 +85,10 @@ class Pulses:
         self._on_until = self._off_until = float("-inf")
 
     def turn(self, x: float, on_s: float, off_s: float, now: float) -> float:
-        """Return the ``x`` of now; a new pulse begins when the last one and its pause are over."""
+        """Return the turn to command now: the ``x`` of the pulse while it lasts, then 0.
+
+        ``x`` counts only when a new pulse begins, after the last pulse and its pause.
+        """
         if now >= self._off_until:
             self._x = x
             self._on_until = now + on_s

@@ -62,8 +62,10 @@ class Neighbour:
         return self._way.latest(channel, max_age)
 
     def drive(self, x: float = 0.0, z: float = 0.0, y: float = 0.0) -> bool:
-        """Drive it, as :meth:`Robot.drive` does this one, for 0.3 s at most. False: that has no effect, as far as is
-        known. Raises NotGrantedError if it does not let this robot drive it.
+        """Drive the other robot, for 0.3 s at most, like :meth:`Robot.drive`.
+
+        False: the command has no effect, as far as is known. Raises NotGrantedError if the other robot's config does
+        not let this robot drive it.
         """
         self._way.check_drives()
         command = Drive(x=float(x), z=float(z), y=float(y), source=SCRIPT, run=self._way.wheels.run)
@@ -76,6 +78,7 @@ class Neighbour:
         refusal = self._way.wheels.drive_another() or self.why_refused
         if command.moves and refusal:
             return False
+        # a change between moving and standing is sent at once, all else at most 50 times a second
         if command.moves is self._moves and now - self._sent_at < _SLOT_S:
             return not refusal
         self._sent_at = now

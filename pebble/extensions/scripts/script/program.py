@@ -37,13 +37,13 @@ def run(
     needs: Mapping[str, Mapping[str, Any]] | None = None,
     drives: bool = True,
 ) -> None:
-    """Be the program of ``main(robot)`` or ``main(robot, options)``, ``options`` being a msgspec Struct of your own.
+    """Run ``main(robot)``, or ``main(robot, options)`` with your own msgspec Struct, as this script's whole program.
 
-    ``label`` is its name for operators, ``summary`` the sentence that says what it does (else the first line of its
-    docstring), ``main_options`` names up to three options that they see first (else the first three); ``needs`` lists
-    other scripts that must run, with their options. ``drives`` False: it only measures, so an emergency stop does not
-    end it, and every command raises PebbleError. Returns when main has returned; raises SystemExit otherwise. The
-    wheels are stopped in any case.
+    ``label`` is the script's name for operators, ``summary`` the sentence that says what the script does (default: the
+    first line of main's docstring). ``main_options`` names up to three options that operators see first (default: the
+    first three). ``needs`` lists other scripts that must run, with their options. With ``drives=False`` the script only
+    measures: an emergency stop does not end the script, and every command raises PebbleError. Returns when main has
+    returned; raises SystemExit if main failed or was stopped. The wheels are stopped in any case.
     """
     options = _options_of(main)
     name = _name()

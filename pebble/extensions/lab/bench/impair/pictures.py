@@ -59,28 +59,31 @@ def over_trials(cells: Sequence[Cell], more: str) -> list[Picture]:
         "audio-latency": (f"Latency of the audio that arrived, {form} 4.8; {more}", _LATENCY),
     }
     return [
-        Picture(f"impair-{name}", caption, partial(_trials, cells, caption, shown))
+        Picture(f"impair-{name}", caption, partial(_draw_trials, cells, caption, shown))
         for name, (caption, shown) in captions.items()
     ]
 
 
-def _trials(cells: Sequence[Cell], title: str, shown: Sequence[Panel]) -> Figure:
+def _draw_trials(cells: Sequence[Cell], title: str, shown_panels: Sequence[Panel]) -> Figure:
     """Draw all panels; logarithmic ones have one scale."""
-    figure, every = panels(len(shown), 1, (10.5, 3.4), title)
+    figure, all_axes = panels(len(shown_panels), 1, (10.5, 3.4), title)
     names = list(dict.fromkeys(str(cell.params["trial"]) for cell in cells))
     style_of = styles([cell.variant for cell in cells])
-    seen = [_lines(axes, cells, names, style_of, panel) for axes, panel in zip(every, shown, strict=True)]
-    ends = around([value for panel, values in zip(shown, seen, strict=True) if panel.log for value in values])
-    for axes, panel, values in zip(every, shown, seen, strict=True):
+    drawn_values = [
+        _lines(axes, cells, names, style_of, panel) for axes, panel in zip(all_axes, shown_panels, strict=True)
+    ]
+    of_panels = zip(shown_panels, drawn_values, strict=True)
+    log_limits = around([value for panel, values in of_panels if panel.log for value in values])
+    for axes, panel, values in zip(all_axes, shown_panels, drawn_values, strict=True):
         top = max([*values, 1.0])
         if panel.log:
-            log_axis(axes, "y", panel.label, *ends)
+            log_axis(axes, "y", panel.label, *log_limits)
         else:
             axes.set(ylabel=panel.label, ylim=(-0.04 * top, 1.1 * top))
         axes.set_xlim(-0.6, len(names) - 0.4)
         axes.set_xticks(range(len(names)), [])
-    every[-1].set_xticks(range(len(names)), names, rotation=40, ha="right", rotation_mode="anchor")
-    every[-1].set_xlabel("trial: condition of the network, in the order of the run")
+    all_axes[-1].set_xticks(range(len(names)), names, rotation=40, ha="right", rotation_mode="anchor")
+    all_axes[-1].set_xlabel("trial: condition of the network, in the order of the run")
     legend(figure, {**style_of, "the original program itself, measured once elsewhere": _CROSS})
     return figure
 

@@ -174,9 +174,10 @@ def robots(settings: Settings) -> Iterator[list[ImpairedRobot]]:
 
 
 def measure(settings: Settings, progress: Progress, ended: list[str]) -> Iterator[Cell]:
-    """Measure all trials; one that fails ends them, which ``ended`` gets to know, and the earlier ones count.
+    """Yield the results of all trials.
 
-    Raises PebbleError if there are none.
+    If a trial fails, stop, add the reason to ``ended`` and keep the earlier results. Raises PebbleError if there are
+    no results.
     """
     progress("starting the robots")
     with robots(settings) as every:

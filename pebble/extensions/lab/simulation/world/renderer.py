@@ -97,24 +97,28 @@ class Renderer:
     # -- plan: (n, 2, 2) left and right edge of each surface, as distance ahead of the camera and to its right
 
     def _seen(self, surfaces: Sequence[Surface], me: RobotPose) -> tuple[_Floats, list[int]]:
-        """Return the parts of surfaces that are in front of the camera, and which surfaces they are of."""
+        """Return the parts of surfaces that are in front of the camera, and the index of the surface of each."""
         edges = np.array([(surface.left, surface.right) for surface in surfaces])
         plan = self._to_camera(edges, me)
         (ahead1, right1), (ahead2, right2) = plan[:, 0].T, plan[:, 1].T
         shows_front = right2 * ahead1 - right1 * ahead2 > 0
         slope = (self._width / 2 + _BESIDE_PX) / self._focal
-        from_, to = np.zeros(len(plan)), np.ones(len(plan))
-        for inside1, inside2 in (
+        share_from, share_to = np.zeros(len(plan)), np.ones(len(plan))
+        # The near plane, then the right and the left edge of the view. Each cuts a surface to the share (0 to 1 of its
+        # length) that is visible. A distance is that of an end, positive on the visible side.
+        for distance1, distance2 in (
             (ahead1 - _NEAR_M, ahead2 - _NEAR_M),
             (slope * ahead1 - right1, slope * ahead2 - right2),
             (slope * ahead1 + right1, slope * ahead2 + right2),
         ):
-            crossing = inside1 / np.where(inside1 == inside2, np.inf, inside1 - inside2)
-            from_ = np.where(inside1 < 0, np.maximum(from_, np.where(inside2 > 0, crossing, 1.0)), from_)
-            to = np.where(inside2 < 0, np.minimum(to, np.where(inside1 > 0, crossing, 0.0)), to)
-        shown = np.flatnonzero(shows_front & (from_ < to))
+            crossing = distance1 / np.where(distance1 == distance2, np.inf, distance1 - distance2)
+            cut_from = np.maximum(share_from, np.where(distance2 > 0, crossing, 1.0))
+            cut_to = np.minimum(share_to, np.where(distance1 > 0, crossing, 0.0))
+            share_from = np.where(distance1 < 0, cut_from, share_from)
+            share_to = np.where(distance2 < 0, cut_to, share_to)
+        shown = np.flatnonzero(shows_front & (share_from < share_to))
         start, along = plan[shown, 0], plan[shown, 1] - plan[shown, 0]
-        cut = np.stack((start + along * from_[shown, None], start + along * to[shown, None]), axis=1)
+        cut = np.stack((start + along * share_from[shown, None], start + along * share_to[shown, None]), axis=1)
         return cut, shown.tolist()
 
     def _to_camera(self, points: _Floats, me: RobotPose) -> _Floats:

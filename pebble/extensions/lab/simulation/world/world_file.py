@@ -165,7 +165,7 @@ def read_world(path: Path) -> World:
 
 
 def parse_world(raw: Any) -> World:
-    """Return the same from plain data."""
+    """Return a world from parsed JSON. Raises ConfigError with every mistake."""
     reader = Reader(Path(), {}, ())
     world = reader.section(World, plain(raw, reader.notes))
     if not reader.notes.problems:

@@ -197,7 +197,7 @@ class ViewerQueue:
         self.forget_lateness(now)
 
     def waiting_s(self, now: float) -> float:
-        """Return how long it has waited for a key frame of the robot's own pictures."""
+        """Return for how long the page has waited for a key frame of the robot's own pictures."""
         return now - self._waiting_since if self.waiting and not self.rescued else 0.0
 
     def _note_waiting(self, now: float) -> None:

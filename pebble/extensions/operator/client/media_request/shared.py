@@ -139,7 +139,7 @@ class SharedRequest:
             await self._broker.unsubscribe(subscription)
 
     def _is_over(self) -> bool:
-        """True if it was withdrawn: not without a broker, or the robot would go on sending afterwards."""
+        """True if the request was withdrawn, and the broker is there: otherwise the robot would go on sending."""
         idle = not self._wanted and time.monotonic() - self._wanted_at >= LINGER_S
         return idle and (self._broker.connected or self._request is None)
 

@@ -27,7 +27,10 @@ class KeyDecoder:
 
     @property
     def due(self) -> float | None:
-        """The time to call :meth:`feed` although nothing was read; None: not before something is."""
+        """The time to call :meth:`feed` even if no byte has arrived, so that a lone Escape is reported.
+
+        None: nothing is pending.
+        """
         return self._since + ALONE_S if self._waiting else None
 
     def feed(self, data: bytes, now: float) -> list[str]:

@@ -76,7 +76,7 @@ class Terminal:
                 _write(f"\r{line[: max(10, shutil.get_terminal_size().columns) - 1]}{_ERASE_REST}")
 
     def on_signal(self, number: int, _frame: FrameType | None) -> None:
-        """Note a signal that ends it."""
+        """Note a signal that ends the terminal session."""
         self.ended = self.ended or signal.Signals(number).name
 
 
