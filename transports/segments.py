@@ -14,31 +14,6 @@ def sweep(folder: Path = SHM) -> int:
     return sum(map(_remove_if_unused, folder.glob("*.zenoh")))
 
 
-def has_room(size: int, folder: Path = SHM) -> bool:
-    """True if a segment of ``size`` bytes may be made now."""
-    try:
-        found = os.statvfs(folder)
-    except OSError:
-        return False
-    return found.f_bavail * found.f_frsize >= size and not found.f_flag & os.ST_RDONLY
-
-
-def mappings() -> list[tuple[int, int, str]]:
-    """Return the mapped segments of this process: first address, the address after the last, and the file."""
-    found = []
-    for line in Path("/proc/self/maps").read_text(encoding="utf-8").splitlines():
-        place, *_, path = line.split(maxsplit=5)
-        if ".zenoh" in path and path.startswith(str(SHM)):
-            start, end = (int(address, 16) for address in place.split("-"))
-            found.append((start, end, path))
-    return found
-
-
-def mapped() -> int:
-    """Return how many bytes of shared memory this process has mapped."""
-    return sum(end - start for start, end, _ in mappings())
-
-
 def _remove_if_unused(segment: Path) -> bool:
     try:
         descriptor = os.open(segment, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)

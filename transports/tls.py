@@ -23,14 +23,7 @@ def make_context(tls: TlsSettings) -> ssl.SSLContext:
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     context.check_hostname = not tls.insecure
     if (cert := tls.client_cert) is not None:
-        _try(f"tls.client_cert: {cert}", lambda: context.load_cert_chain(cert, tls.client_key, _no_password))
-    return context
-
-
-def make_server_context(certificate: Path, key: Path | None) -> ssl.SSLContext:
-    """Return the context of a server with this certificate; raises TransportError that names the file."""
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    _try(f"the certificate {certificate}", lambda: context.load_cert_chain(certificate, key, _no_password))
+        _try(f"tls.client_cert: {cert}", lambda: context.load_cert_chain(cert, tls.client_key, no_password))
     return context
 
 
@@ -41,6 +34,6 @@ def _try(what: str, load: Callable[[], _T]) -> _T:
         raise TransportError(f"{what} cannot be used: {error}") from None
 
 
-def _no_password() -> str:
+def no_password() -> str:
     """Refuse: without this, OpenSSL asks the terminal for the password of an encrypted key, and waits."""
     raise OSError("the key is encrypted, and no password can be entered")

@@ -1,4 +1,4 @@
-"""Who has control of one motor owner: a lease that it gives, renews and ends. Pure; boards and Linux robots share it.
+"""Control of one motor owner: a lease that it gives, renews and ends. Pure; boards and Linux robots share it.
 
 Control orders people; it is no safety function. A stop and a zero need none. A drive command names the control under
 which it is sent by a key, which is new whenever another client gets control: so earlier commands have no effect.

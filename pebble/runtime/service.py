@@ -230,11 +230,6 @@ class Service:
         finally:
             self._tear_down()
 
-    @classmethod
-    def handles(cls) -> tuple[Channel, ...]:
-        """Return the channels this service subscribes to."""
-        return tuple(getattr(cls, name).channel for name in _marked(cls, "channel"))
-
     # -- the service's thread
 
     def set_up(self) -> None:

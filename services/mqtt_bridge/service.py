@@ -15,15 +15,13 @@ from pebble.contract import (
     ESTOP,
     ESTOP_STATE,
     ONLINE,
-    REMOTE_MIRROR,
-    Channel,
     codec,
 )
 from pebble.contract.levels import LEVELS
 from pebble.contract.names import with_name
 from pebble.contract.payloads import ControlState
 from pebble.errors import ConfigError, PayloadError
-from pebble.extension import ours, part
+from pebble.extension import part
 from pebble.forwarding.forwarder import Routed, barrier
 from pebble.forwarding.names import Names
 from pebble.forwarding.observer import ROBOT, Observers, Step, steps_of
@@ -72,11 +70,6 @@ class MqttBridge(ForwardingService):
     rules = TABLE_A1
     probed_sides = (Side.REMOTE,)
     arriving_s = 2.0
-
-    @classmethod
-    def handles(cls) -> tuple[Channel, ...]:
-        places = (place for extension in ours() for place in extension.requests)
-        return (REMOTE_MIRROR, *(channel for place in places for channel in part(place).channels))
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)

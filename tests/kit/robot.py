@@ -20,7 +20,9 @@ from typing import Any, Self
 import msgspec
 
 from pebble.config import Config, load, parse
+from pebble.contract import Channel
 from pebble.errors import PebbleError
+from pebble.runtime import service as service_module
 from pebble.runtime.connections import local_transport
 from pebble.service import Service
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
@@ -249,3 +251,8 @@ class ProgramRobot:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
+
+
+def handled(service: type[Service]) -> list[Channel]:
+    """Return the channels that a service subscribes to, in this order."""
+    return [getattr(service, name).channel for name in service_module._marked(service, "channel")]

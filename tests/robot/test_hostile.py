@@ -13,9 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from pebble.contract import CHANNELS, ESTOP, INCOMING, Kind
+from pebble.contract import CHANNELS, ESTOP, INCOMING, REMOTE_MIRROR, Kind
+from pebble.extension import ours, part
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
+from tests.kit.robot import handled
 from tests.robot.rig import Rig
 from tests.support import cases, until
 
@@ -62,7 +64,10 @@ def test_malformed_messages(rig: Rig) -> None:
     assert until(lambda: any("refused" in seen.json["message"] for seen in rig.operator.on("outgoing/logs", began)), 10)
     assert rig.stop() == 0
     refused = _totals(rig, "refused in all")
-    received = {channel.metric for service in SERVICES for channel in service.handles()}
+    requests = (part(place) for extension in ours() for place in extension.requests)
+    channels = [REMOTE_MIRROR, *(channel for taker in requests for channel in taker.channels)]
+    channels += [channel for service in SERVICES for channel in handled(service)]
+    received = {channel.metric for channel in channels}
     expected = {metric: number for metric, number in sent.items() if metric in received}
     assert refused.keys() == expected.keys()
     # QoS 0: a connection that is reset on a busy machine loses what is on its way, and there drive commands are late. A

@@ -13,13 +13,13 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from pebble.errors import PebbleError
+from pebble.errors import PebbleError, TransportError
 from pebble.extensions.fleet import certificates
 from pebble.extensions.page.app import create_app
 from pebble.extensions.page.setting import WebSettings
 from pebble.transports.renewed import Renewed
 from pebble.transports.socket_holders import why_not
-from pebble.transports.tls import make_server_context
+from pebble.transports.tls import no_password
 
 _LARGEST_MESSAGE = 64 * 1024
 _END_S = 1
@@ -64,10 +64,20 @@ async def _report(
         on_ready(url)
 
 
+def _server_context(certificate: Path, key: Path | None) -> ssl.SSLContext:
+    """Return the context of a server with this certificate. Raises TransportError that names the file."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(certificate, key, no_password)
+    except OSError as error:  # ssl.SSLError is one
+        raise TransportError(f"the certificate {certificate} cannot be used: {error}") from None
+    return context
+
+
 def renew_certificate(listening: ssl.SSLContext, certificate: Path, key: Path | None) -> None:
     """Have each new connection to ``listening`` use the certificate that the files hold then."""
     files = [certificate] if key is None else [certificate, key]
-    newest = Renewed(files, lambda: make_server_context(certificate, key), listening)
+    newest = Renewed(files, lambda: _server_context(certificate, key), listening)
 
     def choose(connection: ssl.SSLObject, _name: str | None, _context: ssl.SSLContext) -> None:
         connection.context = newest.get()

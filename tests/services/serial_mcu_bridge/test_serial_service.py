@@ -18,6 +18,7 @@ from pebble.services.serial_mcu_bridge.line.holders import holders
 from pebble.services.serial_mcu_bridge.line.port import Port
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.kit.robot import handled
 from tests.services.serial_mcu_bridge.motor_rig import STOPPED, Bench
 from tests.support import until
 
@@ -130,7 +131,7 @@ def test_a_command_is_valid_for_its_valid_ms(bench: Bench) -> None:
 
 
 def test_stops_are_subscribed_to_before_drive_commands() -> None:
-    assert MotorBridge.handles()[:5] == (ESTOP, ESTOP_RESET, CONTROL, CONTROL_TAKE, DRIVE)
+    assert handled(MotorBridge)[:5] == [ESTOP, ESTOP_RESET, CONTROL, CONTROL_TAKE, DRIVE]
 
 
 def test_robots_with_one_state_directory_do_not_share_a_stop(tmp_path: Path) -> None:

@@ -15,10 +15,9 @@ import numpy as np
 import zenoh
 
 from pebble.errors import TransportError
-from pebble.extensions.media.frames import shared_memory, views
+from pebble.extensions.media.frames import memory, shared_memory, views
 from pebble.extensions.media.frames.frame import Frame, FrameInfo, decode
 from pebble.extensions.media.frames.session import METADATA, SharingError, StreamNames, open_reading
-from pebble.transports import segments
 from pebble.transports.counters import Counters
 from pebble.transports.peers import prepare_run_dir
 from pebble.transports.wakeup import Wakeup
@@ -228,7 +227,7 @@ class FrameReader:
             self._reopen_soon(problem)
 
     def _why_not_map(self, size: int, segment: str) -> str:
-        mapped = segments.mappings()
+        mapped = memory.mappings()
         if any(file.endswith(segment) for _, _, file in mapped):
             return ""  # as before: only the connection was lost
         if (left := sum(end - start for start, end, _ in mapped)) > MAPPED_LIMIT:

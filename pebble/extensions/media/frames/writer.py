@@ -15,7 +15,7 @@ import numpy as np
 import zenoh
 
 from pebble.errors import TransportError
-from pebble.extensions.media.frames import shared_memory, views
+from pebble.extensions.media.frames import memory, shared_memory, views
 from pebble.extensions.media.frames.frame import FrameInfo, encode
 from pebble.extensions.media.frames.session import METADATA, SharingError, StreamNames, open_writing
 from pebble.extensions.media.frames.shared_memory import MARGIN, Chunk, SharedPool
@@ -112,7 +112,7 @@ class FrameWriter:
         return time.monotonic() >= self._retry_at and self._has_room()
 
     def _has_room(self) -> bool:
-        return segments.has_room(self._pool_size + 2 * METADATA)
+        return memory.has_room(self._pool_size + 2 * METADATA)
 
     def _declare_publisher(self, session: zenoh.Session, when_full: zenoh.CongestionControl) -> zenoh.Publisher:
         return session.declare_publisher(

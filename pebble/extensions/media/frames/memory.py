@@ -1,0 +1,31 @@
+"""The segments of shared memory that frames are in: what this process has mapped, and whether another one has room."""
+
+import os
+from pathlib import Path
+
+from pebble.transports.segments import SHM
+
+
+def has_room(size: int, folder: Path = SHM) -> bool:
+    """True if a segment of ``size`` bytes may be made now."""
+    try:
+        found = os.statvfs(folder)
+    except OSError:
+        return False
+    return found.f_bavail * found.f_frsize >= size and not found.f_flag & os.ST_RDONLY
+
+
+def mappings() -> list[tuple[int, int, str]]:
+    """Return the mapped segments of this process: first address, the address after the last, and the file."""
+    found = []
+    for line in Path("/proc/self/maps").read_text(encoding="utf-8").splitlines():
+        place, *_, path = line.split(maxsplit=5)
+        if ".zenoh" in path and path.startswith(str(SHM)):
+            start, end = (int(address, 16) for address in place.split("-"))
+            found.append((start, end, path))
+    return found
+
+
+def mapped() -> int:
+    """Return how many bytes of shared memory this process has mapped."""
+    return sum(end - start for start, end, _ in mappings())
