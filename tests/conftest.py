@@ -25,6 +25,7 @@ os.environ["XDG_STATE_HOME"] = f"{_FOLDER}/state"
 import pytest
 from hypothesis import settings
 
+from pebble.extensions.media.frames import memory
 from pebble.transports import segments
 from tests.kit import rows
 from tests.kit.workers import pytest_addoption as pytest_addoption  # of the initial conftest
@@ -167,7 +168,7 @@ def _described(pid: int) -> str:
 
 def _remove_segments() -> None:
     """Zenoh leaves files of shared memory behind, however its processes end, and keeps those of this one locked."""
-    for _, _, path in segments.mappings():
+    for _, _, path in memory.mappings():
         Path(path).unlink(missing_ok=True)
     if any(segments.SHM.glob("*.zenoh")):
         time.sleep(segments.YOUNG_S)

@@ -19,9 +19,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from pebble.extensions.media.frames import Frame, FrameInfo, FrameReader, FrameWriter, views
+from pebble.extensions.media.frames import Frame, FrameInfo, FrameReader, FrameWriter, memory, views
 from pebble.runtime.parent import end_with_parent as die_with_parent
-from pebble.transports import segments
 
 FORMAT = "bgr24"
 _PR_SET_DUMPABLE = 4
@@ -184,7 +183,7 @@ def _memory() -> dict[str, Any]:
     return {
         "rss": int(status["VmRSS"].split()[0]),
         "locked": int(status["VmLck"].split()[0]),
-        "mapped": segments.mapped() >> 10,
+        "mapped": memory.mapped() >> 10,
     }
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from pebble.errors import TransportError
-from pebble.extensions.media.frames import FrameInfo, FrameReader, FrameWriter
+from pebble.extensions.media.frames import FrameInfo, FrameReader, FrameWriter, memory
 from pebble.extensions.media.frames import reader as frame_reader
 from pebble.extensions.media.frames.frame import encode
 from pebble.extensions.media.frames.session import METADATA, StreamNames, open_writing
@@ -207,7 +207,7 @@ def test_a_writer_knows_when_its_memory_was_removed(tmp_path: Path) -> None:
     with FrameWriter(tmp_path / "run", "camera", capacity=50_000) as writer:
         assert writer.in_place
         # Only the pool of this writer: what Zenoh shares for its own bookkeeping serves all writers of this process.
-        for path in {path for start, end, path in segments.mappings() if METADATA > end - start > 6 * 50_000}:
+        for path in {path for start, end, path in memory.mappings() if METADATA > end - start > 6 * 50_000}:
             Path(path).unlink()
         assert not writer.in_place
     with writer:
@@ -331,12 +331,12 @@ def test_anything_with_bytes_can_be_written(tmp_path: Path) -> None:
 @needs_shared_memory
 def test_a_reader_may_choose_bytes_and_then_maps_nothing(tmp_path: Path) -> None:
     program = (
-        "import sys; from pathlib import Path; from pebble.transports import segments\n"
+        "import sys; from pathlib import Path; from pebble.extensions.media.frames import memory\n"
         "from pebble.extensions.media.frames import *\n"
         "with FrameReader(Path(sys.argv[1]), 'camera', sharing=False) as reader:\n"
         "    frame = reader.read(10)\n"
         "    print(frame.data.tobytes() == bytes([7]) * 60_000, frame.shared, reader.shared, repr(reader.problem))\n"
-        "    print(segments.mapped())\n"
+        "    print(memory.mapped())\n"
     )
     with FrameWriter(tmp_path, "camera", capacity=60_000) as writer, FrameReader(tmp_path, "camera") as other:
         with subprocess.Popen(
