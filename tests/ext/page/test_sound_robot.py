@@ -90,7 +90,7 @@ def state(opened: Tab) -> str:
 def is_played(opened: Tab, within: float = 20.0) -> bool:
     """True if a second and a half of what the page plays agrees with the speech; a busy machine may take a while."""
     opened.page.evaluate(TAP)
-    rate = int(opened.page.evaluate("pebble.sound.model.context.sampleRate"))
+    rate = int(opened.page.evaluate("pebble.sound.model.speaker.context.sampleRate"))
     end = time.monotonic() + within
     while time.monotonic() < end:
         opened.page.evaluate("() => { recorded.length = 0 }")
