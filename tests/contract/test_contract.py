@@ -19,6 +19,7 @@ from pebble.contract import CHANNELS, DRIVE, ESTOP_STATE, INCOMING, OUTGOING, Ch
 from pebble.contract.identity import Identity, parse_topic
 from pebble.contract.payloads import Payload
 from pebble.service import Service
+from tests.kit.robot import handled
 from tests.support import ROOT
 
 BASE = "pebble/robots/goob"
@@ -205,7 +206,7 @@ def test_services_publish_what_goes_out_and_handle_what_comes_in() -> None:
         name = getattr(service, "name", "")
         incoming = [channel for channel in service.publishes if channel.direction != OUTGOING]
         assert [channel.suffix for channel in incoming if (name, channel) not in AGAINST_THE_DIRECTION] == [], service
-        received = [channel for channel in service.handles() if channel.remote]  # others pass between our own programs
+        received = [channel for channel in handled(service) if channel.remote]  # others pass between our own programs
         outgoing = [channel for channel in received if channel.direction != INCOMING]
         assert [channel.suffix for channel in outgoing if (name, channel) not in AGAINST_THE_DIRECTION] == [], service
 

@@ -128,7 +128,7 @@ def test_a_stopped_reader_does_not_starve_the_others(net: FramesNet) -> None:
     printed = writer.has(fallbacks=1, reclaimed=1)
     before = other.ask()
     seen = other.has(frames=before["frames"] + 100)
-    assert seen.get("missed", 0) + seen.get("torn", 0) + seen["invalid"] <= 0.05 * seen["last"]
+    assert seen.get("missed", 0) + seen.get("torn", 0) + seen["invalid"] <= 0.2 * seen["last"]
     assert seen["wrong"] == 0
     stopped.signal(signal.SIGCONT)
     back = stopped.ask()
