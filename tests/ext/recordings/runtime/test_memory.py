@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+from tests.support import ROOT
+
 # A last block that lives keeps all pages below it, which hold nothing, at the process.
 _TEST = """
 import os
@@ -25,5 +27,6 @@ print(before - own_mb(os.getpid()))
 
 @pytest.mark.skipif("CS_GNU_LIBC_VERSION" not in os.confstr_names, reason="needs glibc")
 def test_free_pages_are_returned() -> None:
-    done = subprocess.run([sys.executable, "-c", _TEST], capture_output=True, text=True, check=True, timeout=30)
+    command = [sys.executable, "-c", _TEST]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=30)
     assert float(done.stdout) > 30
