@@ -58,9 +58,9 @@ gstreamer)
     ;;
 ros1)
     { [ -x /usr/lib/topic_tools/relay ] &&
-        /usr/bin/python3 -c "import rosmaster, rospy, nav_msgs, diagnostic_msgs, actionlib_msgs" 2>/dev/null; } ||
-        debian =topic-tools =python3-rosmaster =python3-rospy =python3-nav-msgs =python3-diagnostic-msgs \
-            =python3-actionlib-msgs
+        /usr/bin/python3 -c "import rosmaster, rospy, nav_msgs.msg, diagnostic_msgs.msg, actionlib_msgs.msg" 2>/dev/null; } ||
+        debian =topic-tools =python3-rosmaster =python3-rospy =python3-nav-msgs =python3-geometry-msgs =python3-std-msgs \
+            =python3-diagnostic-msgs =python3-actionlib-msgs
     tests -ra tests/ext/ros1_bridge
     ;;
 firmware) tests --log-cli-level=INFO tests/firmware/test_heap.py ;;
