@@ -1,4 +1,4 @@
-"""Checks of a machine, of a broker, of a robot that runs, and of a robot by the contract: one engine, four tables."""
+"""Checks of a machine, of a broker, of a running robot, and of a robot's conformance to the contract."""
 
 from pebble.extension import Command, Extension
 

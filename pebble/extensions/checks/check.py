@@ -1,4 +1,4 @@
-"""The engine of all checks: what a check is, and how a table of checks is run."""
+"""The engine of all checks: a check as a row of a table, and how such a table is run."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ Subject = TypeVar("Subject")
 
 
 def some_of(names: Collection[str], most: int = 3) -> str:
-    """Return the first names, for one line, and how many more there are."""
+    """Return the first ``most`` names, separated by commas, and the number of the others."""
     more = f", and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(islice(names, most)) + more
 
 
 @dataclass(frozen=True, slots=True)
 class Check(Generic[Subject]):
-    """One row of a table of checks.
+    """A row of a table of checks.
 
-    ``run`` returns a result, or one for each thing that it has looked at. ``needs`` are asked in their order: the first
-    that returns a text is why the check is skipped. ``binds`` returns True if the subject has this duty at all.
-    ``why`` says what goes wrong for people where the check fails.
+    ``run`` returns one result, or several if it looks at several things. ``needs`` are called in their order: the first
+    text that is not empty is why the check is skipped. ``binds`` returns True if the check applies to the subject at
+    all. ``why`` says what goes wrong for people where the check fails.
     """
 
     name: str
@@ -40,9 +40,9 @@ class Check(Generic[Subject]):
 def run(
     checks: Iterable[Check[Subject]], subject: Subject, *, refresh: Callable[[], object] = lambda: None
 ) -> Iterator[tuple[Check[Subject], CheckResult]]:
-    """Run one check after the other, and return the results with their subject's name.
+    """Run the checks in their order; yield each with its results.
 
-    ``refresh`` reads what has arrived before each.
+    ``refresh`` is called before each check, to read what has arrived.
     """
     for check in checks:
         refresh()

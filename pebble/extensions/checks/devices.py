@@ -1,4 +1,4 @@
-"""Checks of serial ports, camera, microphone and loudspeaker: are they there, and the same after the next start?"""
+"""Checks of serial ports, camera, microphone and loudspeaker: they exist, and keep their name over a restart."""
 
 import os
 import re
@@ -20,9 +20,10 @@ _LIBCAMERA = ("rpicam-vid", "libcamera-vid")
 
 
 def device(path: Path, what: str, key: str, names: Path) -> CheckResult:
-    """Check a device file; warn if its number may change at the next start, and it has a name that stays.
+    """Check a device file; warn if its number may change at the next start although it has a lasting name.
 
-    ``what`` is at its other end; ``key`` of the config names it; ``names`` is the folder with links such as by-id/.
+    ``what`` is connected to it; ``key`` is the config key that names it; ``names`` is the folder of its lasting names,
+    such as by-id/.
     """
     if not path.exists():
         links = [link for link in names.glob("by-id/*") if not _METADATA.search(link.name)]
@@ -52,7 +53,7 @@ def serial_port(path: Path, key: str, names: Path = _SERIAL_NAMES) -> CheckResul
 
 
 def cameras(config: Config, folder: Path = Path("/dev")) -> Iterator[CheckResult]:
-    """Check the camera, if it has one. ``folder``: of device files."""
+    """Check the camera, if the config has one. ``folder``: where device files are."""
     daemon = config.section(AvDaemon)
     if daemon.enabled and daemon.video.enabled:
         yield camera(daemon.video.backend, daemon.video.device, folder)
@@ -76,13 +77,13 @@ def microphone(config: Config) -> Iterator[CheckResult]:
 
 
 def _program(names: tuple[str, ...], fix: str) -> CheckResult:
-    """Look for one of ``names``."""
+    """Check that one of the programs ``names`` is installed."""
     name = next((name for name in names if shutil.which(name) is not None), None)
     return failed(f"{' or '.join(names)} is not installed", fix) if name is None else ok(f"uses {name}")
 
 
 def loudspeaker(config: Config) -> Iterator[CheckResult]:
-    """Look for the players of sounds and of an operator's voice, if it plays them."""
+    """Check that the players of sounds and of an operator's voice are installed, if the config uses them."""
     devices, sounds = config.section(AvDaemon), config.section(SoundboardHandler)
     talk_back = devices.enabled and devices.audio.enabled
     wav, raw = sounds.playback.player_command, config.section(Media).audio_receiver.command

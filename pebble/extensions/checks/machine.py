@@ -1,4 +1,4 @@
-"""Checks of this machine, which change nothing on it."""
+"""Checks of this machine. They change nothing on it."""
 
 import os
 import subprocess
@@ -16,7 +16,7 @@ _BUILT = 1735689600  # 2025: a clock before this has not been set
 
 
 def memory_lock(limit: int, *, root: bool) -> CheckResult:
-    """Judge the memory ``limit`` (bytes, or RLIM_INFINITY): readers that cannot lock shared memory lose all frames."""
+    """Check the lockable memory ``limit`` (bytes, or RLIM_INFINITY): with too little, readers get no frames."""
     if limit == RLIM_INFINITY or limit >= _ENOUGH_LOCKED or root:
         return ok("no limit that matters")
     return warn(
@@ -26,7 +26,7 @@ def memory_lock(limit: int, *, root: bool) -> CheckResult:
 
 
 def clock(now: float, synchronised: bool | None) -> CheckResult:
-    """Judge the clock. ``now`` in epoch seconds; ``synchronised`` None if unknown."""
+    """Check the clock. ``now``: epoch seconds; ``synchronised``: None if it is unknown."""
     fix = "sudo timedatectl set-ntp true"
     if now < _BUILT:
         return failed(f"is set to {time.gmtime(now).tm_year}: stamps will be wrong", fix)
@@ -42,7 +42,7 @@ def synchronised() -> bool | None:
 
 
 def output_of(program: str, *arguments: str, seconds: float = 5.0, **user: Any) -> str:
-    """Return what a program of the system prints; ``user`` is as whom it runs. Raises PebbleError."""
+    """Return the standard output of a system program, run as ``user``. Raises PebbleError."""
     command: tuple[str, ...] = (program, *arguments)
     try:
         done = run(command, seconds, cwd="/", **user)
@@ -56,7 +56,7 @@ def output_of(program: str, *arguments: str, seconds: float = 5.0, **user: Any) 
 
 
 def printed(*command: str) -> str:
-    """Return what a program of the system prints; nothing if it is not there, or does not end."""
+    """Return the standard output of a system program; empty if it is not installed or does not end in time."""
     try:
         return output_of(*command)
     except PebbleError:

@@ -1,4 +1,4 @@
-"""New files for people, such as reports and backups, which others cannot read."""
+"""Files such as reports and backups, created so that only their owner can read them."""
 
 import os
 from pathlib import Path
@@ -8,7 +8,7 @@ from pebble.runtime.whole_file import sync_folder
 
 
 def write_new(file: Path, content: bytes) -> None:
-    """Write a new file for people, which others cannot read. Raises PebbleError."""
+    """Write a new file that only its owner can read. Raises PebbleError."""
     try:
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o600)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""One robot as a client sees it: everything that it publishes, and what is sent to it."""
+"""A robot as a client sees it: all that it publishes, and the commands that it is sent."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _RETAINED_S = 1.0  # some brokers send what is retained a moment after the subsc
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A message, when it arrived (monotonic), and its value by the contract; ``wrong``: why it has none."""
+    """A received message: when it arrived (monotonic) and its value by the contract, or ``wrong``: why it has none."""
 
     at: float
     metric: str  # below the base: ``outgoing/online``
@@ -38,10 +38,10 @@ class Record:
 
 
 class Observer:
-    """The messages of one robot at one connection. :meth:`wait` lets time pass and reads them."""
+    """The messages of one robot on one connection. They are read in :meth:`wait`."""
 
     def __init__(self, target: Target, transport: Transport, names: Names, filters: Iterable[str] = ()) -> None:
-        """``filters``: instead of all that the robot publishes."""
+        """Subscribe to all that the robot publishes, or to ``filters`` instead."""
         self.base, self.target, self.transport, self.account = names.base, target, transport, names.account
         self._names, self.view = names, RobotView(self.base)
         self.records: deque[Record] = deque(maxlen=_MOST)
@@ -82,7 +82,7 @@ class Observer:
         return Record(at, metric, message.payload, message.retain, channel, value, wrong)
 
     def of(self, channel: c.Channel, since: float = 0.0, *, retained: bool = False) -> list[Record]:
-        """Return its live messages of a channel, or with ``retained`` all."""
+        """Return the robot's live messages of a channel, or with ``retained`` all of them."""
         return [
             record
             for record in self._of[channel]
@@ -92,7 +92,7 @@ class Observer:
     # -- time
 
     def wait(self, condition: Callable[[], object], seconds: float) -> bool:
-        """Read what arrives until ``condition``; return False if it does not hold within ``seconds``."""
+        """Read messages until ``condition`` holds; return False if it does not within ``seconds``."""
 
         def holds() -> object:
             self.read()
@@ -101,13 +101,13 @@ class Observer:
         return wait_for(holds, seconds)
 
     def look(self, seconds: float) -> float:
-        """Let time pass; return when that began."""
+        """Read messages for so many seconds; return when that began."""
         began = time.monotonic()
         self.wait(lambda: False, seconds)
         return began
 
     def answers(self, condition: Callable[[], object], seconds: float = ANSWER_S) -> bool:
-        """True if the robot does what was asked, in time."""
+        """True if ``condition`` comes to hold in the time that a robot has for an answer."""
         began = time.monotonic()
         done = self.wait(condition, seconds)
         if done:
@@ -116,28 +116,28 @@ class Observer:
 
     @property
     def patience_s(self) -> float:
-        """Return how long to look on to be sure that something does not happen: it may answer late, here or always."""
+        """Return how long to wait before concluding that something does not happen (seconds)."""
         return 2 * self._slowest_s
 
     def happens(self, condition: Callable[[], object]) -> bool:
-        """True if the robot does what it must not do."""
+        """True if ``condition`` comes to hold while a violation of a duty would show."""
         return self.wait(condition, self.patience_s)
 
     # -- what is sent
 
     def send(self, channel: c.Channel, value: object) -> float:
-        """Publish a command, as bytes or as its struct; return when."""
+        """Publish a command, as bytes or as its struct; return when (monotonic)."""
         payload = value if isinstance(value, bytes) else codec.encode(channel, value)
         self.transport.publish(channel.topic(self.base), payload, qos=QoS(channel.default_qos), urgent=True)
         return time.monotonic()
 
     def sent(self, seconds: float) -> float:
-        """Wait until the broker has all that was sent, so long at most; return when."""
+        """Wait until the broker has acknowledged all commands, at most ``seconds``; return when (monotonic)."""
         self.wait(lambda: self.transport.outgoing.waiting == 0, seconds)
         return time.monotonic()
 
     def send_as(self, account: str, channel: c.Channel, value: object) -> bool:
-        """Publish a command with another account in its topic, or "": without one; True if the broker delivers it."""
+        """Publish a command under another account, "" for none; True if the broker delivers it."""
         payload = value if isinstance(value, bytes) else codec.encode(channel, value)
         topic = channel.topic(self.base)
         with self.beside("conform-other", f"{self.base}/{c.INCOMING}/#") as (beside, messages):
@@ -145,7 +145,7 @@ class Observer:
             return self.wait(lambda: any(message.payload == payload for message in list(messages)), _RETAINED_S)
 
     def retained(self) -> list[Record]:
-        """Return what the broker has retained of it and for it, as one gets it who connects now."""
+        """Return the retained messages of the robot and for it, as a new client gets them."""
         filters = (f"{self.base}/{direction}/#" for direction in (c.OUTGOING, c.INCOMING))
         with self.beside("conform-retained", *filters) as (_, messages):
             self.look(_RETAINED_S)
@@ -153,7 +153,7 @@ class Observer:
 
     @contextmanager
     def beside(self, program: str, *filters: str) -> Iterator[tuple[Transport, deque[Message]]]:
-        """Connect again, to see what arrives there; each filter is a subscription, as some brokers refuse one."""
+        """Yield a second connection that reads ``filters``, each as a subscription of its own: some brokers refuse one."""
         messages: deque[Message] = deque(maxlen=_MOST)
         with connected(replace(self.target, program=program)) as (beside, _):
             for filter_ in filters:
@@ -171,7 +171,7 @@ def observed(target: Target, seconds: float) -> Iterator[Observer]:
 
 
 def why_not_free(view: RobotView) -> str:
-    """Return who has the robot, or has stopped it: a test takes nothing from them. Empty if it is free."""
+    """Return who drives the robot or has stopped it, as a test must not interfere; empty if it is free."""
     if view.stopped_by is not None:
         return f"it is stopped by {view.stopped_by.by or 'unknown'}, which only a person ends"
     if view.autonomy is not None and view.autonomy.running:

@@ -1,4 +1,4 @@
-"""A run of a program of this machine to its own end."""
+"""A program of this machine, run until it ends."""
 
 import os
 import subprocess
@@ -13,7 +13,7 @@ _LONGEST = 8 << 20  # bytes of output, the last ones, that are kept
 
 
 class Finished(NamedTuple):
-    """The end of a program, and the last that it wrote."""
+    """The end of a program: its exit code, and the last part of its output."""
 
     code: int
     output: str
@@ -21,9 +21,9 @@ class Finished(NamedTuple):
 
 
 def run(command: Sequence[str], timeout_s: float, *, stderr: int = subprocess.PIPE, **options: Any) -> Finished:
-    """Run a program to its own end: what it leaves behind may hold its output open.
+    """Run a program until it ends, even if children that it leaves behind keep its output open.
 
-    ``options``: further ones of subprocess. Raises OSError, and after killing it subprocess.TimeoutExpired.
+    ``options``: further ones of subprocess. Raises OSError and, after killing the program, subprocess.TimeoutExpired.
     """
     deadline, nothing = time.monotonic() + timeout_s, subprocess.DEVNULL
     with subprocess.Popen(command, stdin=nothing, stdout=subprocess.PIPE, stderr=stderr, **options) as process:

@@ -1,4 +1,4 @@
-"""Checks of the robot on this machine, by its config. They change nothing; an unreachable broker takes seconds."""
+"""Checks of the robot that this machine's config describes. They change nothing; an unreachable broker takes seconds."""
 
 import os
 from collections.abc import Iterator
@@ -40,7 +40,7 @@ _DRIVERS = {
 
 
 def run_checks(config: Config | None) -> Iterator[CheckResult]:
-    """Check this machine, and ``config``'s robot on it."""
+    """Run the checks of this machine and of ``config``'s robot on it."""
     yield from (result for _, result in run(MACHINE, None))
     if config is None:
         return
@@ -50,7 +50,7 @@ def run_checks(config: Config | None) -> Iterator[CheckResult]:
 
 
 def who_drives(config: Config) -> Iterator[CheckResult]:
-    """Tell its level, and who may drive it at that."""
+    """Report the security level, and which accounts may drive the robot at that level."""
     level = config.security.level
     if warning := warning_of_open(config):
         yield warn(warning, "pebble fleet init, then the account of this robot")
@@ -71,7 +71,7 @@ def who_drives(config: Config) -> Iterator[CheckResult]:
 
 
 def _accounts(fleet: Fleet) -> str:
-    """Return those whose roles let them drive, servers of the page with a word more."""
+    """Return the accounts whose roles let them drive; those of page servers are marked."""
     names = [
         f"{name} (a page server: its people, too)" if ProgramRole.PAGE in account.roles else name
         for name, account in fleet.accounts.items()
@@ -81,14 +81,14 @@ def _accounts(fleet: Fleet) -> str:
 
 
 def _folders(config: Config) -> list[Path]:
-    """Return where the files of its fleet are: beside its config, or the authority that it trusts."""
+    """Return the folders of the robot's fleet: beside its config, or that of the authority which it trusts."""
     ca_cert = config.services.mqtt_bridge.remote_mqtt.tls.ca_cert
     places = [config.folder, *([] if ca_cert is None else [Path(ca_cert).parent])]
     return [folder for folder in (place.absolute() for place in places) if (folder / FLEET).is_file()][:1]
 
 
 def state_directory(path: Path) -> CheckResult:
-    """Find a place where an emergency stop cannot be saved: it would end with a power cut."""
+    """Check that emergency stops can be saved; a stop that cannot would end with a power cut."""
     existing = next(folder for folder in (path, *path.parents) if os.access(folder, os.F_OK))
     if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
         return warn(
@@ -99,7 +99,7 @@ def state_directory(path: Path) -> CheckResult:
 
 
 def config_of_running(config: Config) -> Iterator[CheckResult]:
-    """Find a file that has changed since the robot was started with it."""
+    """Check that no file of the config has changed since the robot was started with it."""
     lock = config.run_dir() / LAUNCHER_LOCK
     if config.path is None or not launcher_runs(config.run_dir()):
         return
@@ -110,7 +110,10 @@ def config_of_running(config: Config) -> Iterator[CheckResult]:
 
 
 def operator_page(config: Config) -> Iterator[CheckResult]:
-    """Check that the page that the robot itself serves can start; if it has users, only its own user can read that."""
+    """Check that the page that the robot serves can start.
+
+    If the page has users, only the robot's own user can check that.
+    """
     if not config.section(WebHandler).enabled:
         return
     try:
@@ -135,7 +138,7 @@ def operator_page(config: Config) -> Iterator[CheckResult]:
 
 
 def brokers(config: Config) -> Iterator[CheckResult]:
-    """Check each broker that the robot uses: its login, its account, and where else it answers."""
+    """Check each broker that the robot uses: its login, its rights, and on which other addresses it answers."""
     level, link = config.security.level, config.services.mqtt_bridge.link
     sections = {str(path[-1]): mqtt for path, mqtt in exposure.brokers(config)}
     for section, name in _BROKERS.items():
@@ -153,7 +156,7 @@ def brokers(config: Config) -> Iterator[CheckResult]:
 
 
 def page_brokers(config: Config) -> Iterator[CheckResult]:
-    """Check that the broker of an operator page that has its own lets it in, and delivers what all robots send."""
+    """Check that the broker of an operator page accepts its login and delivers what all robots publish."""
     mqtt, level = config.section(WebInterface).mqtt, config.security.level
     if not mqtt.host:
         return
@@ -165,7 +168,7 @@ def page_brokers(config: Config) -> Iterator[CheckResult]:
 
 
 def extensions(config: Config) -> Iterator[CheckResult]:
-    """Run the checks that extensions add for a robot, each under the extension's name."""
+    """Run the checks that extensions add, each under its extension's name."""
     for extension in config.installed:
         try:
             results = items(extension, "checks", CheckResult, config) if extension.checks else []

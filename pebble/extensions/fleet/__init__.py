@@ -1,4 +1,4 @@
-"""People and certificates: who may use the operator page, what they did, and the small authority that signs for it."""
+"""Fleets: accounts of brokers and people of the operator page, their rights, certificates, the audit, and gateways."""
 
 from pebble.extension import Command, Extension
 

@@ -1,4 +1,4 @@
-"""Changes of a fleet: its table becomes the files of its brokers and hubs, and mosquitto reads them again."""
+"""Changes of a fleet: writes its table into the files of brokers and hubs, and makes mosquitto reload them."""
 
 import os
 import signal
@@ -21,8 +21,9 @@ _STARTING_S = 3.0  # a small board loads many accounts
 def make(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None, others: Sequence[str] = ()) -> None:
     """Write all files of a new fleet. Raises PebbleError.
 
-    ``passwords``: of the accounts that it begins with. ``others``: machines of the fleet that the broker's certificate
-    names, too, and that its authority may sign for. A broker that is ``included`` has its configuration elsewhere.
+    ``passwords``: those of its first accounts. ``others``: further machines of the fleet, which the broker's
+    certificate names too and which its authority may sign for. A broker that is ``included`` has its configuration
+    elsewhere.
     """
     if (folder / CONF).exists():
         raise FleetError(f"{folder / CONF} exists already: name another folder")
@@ -38,7 +39,7 @@ def make(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None,
 
 
 def names_of(server: Server) -> list[str]:
-    """Return the names in the broker's certificate; by the last ones programs of this machine reach it."""
+    """Return the names for the broker's certificate. The last ones are for programs of the broker's own machine."""
     return list(dict.fromkeys((server.host, "localhost", _LOOPBACK)))
 
 
@@ -48,9 +49,9 @@ def write_conf(folder: Path, fleet: Fleet) -> None:
 
 
 def conf_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
-    """Yield the lines of `mosquitto.conf` that are not what :func:`write_conf` wrote: another listener is another door.
+    """Yield each line of `mosquitto.conf` that :func:`write_conf` did not write: it may open another listener.
 
-    They may be there for a reason, so no command takes them back.
+    Such lines may be there for a reason, so no command removes them.
     """
     file = folder / CONF
     try:
@@ -66,9 +67,9 @@ def conf_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
 
 
 def apply(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None) -> str:
-    """Make broker and hubs know this fleet, then write `fleet.json`. Returns how, in words. ``passwords``: new ones.
+    """Write the rules, make broker and hubs use them, then write `fleet.json`. Return what was done, in words.
 
-    Raises FleetError if the broker does not know it then; `fleet.json` stays as it is.
+    ``passwords``: new ones. Raises FleetError if the broker does not use the rules; then `fleet.json` stays as it is.
     """
     if obeys_plugin(folder):
         why = "mosquitto still obeys its dynamic-security plugin: `pebble fleet apply` prints the lines to change"
@@ -83,7 +84,7 @@ def apply(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None
 
 
 def copies(folder: Path, fleet: Fleet) -> Iterator[str]:
-    """Yield where copies of the folder's rules count: there nothing changes until they are copied again."""
+    """Yield the places to which the folder's rules were copied; a change counts there once they are copied again."""
     again = f"its copies of {folder / ACL} and {PASSWORDS}: copy them again, and send it SIGHUP"
     yield from (f"broker {server.host}:{server.port} obeys {again}" for server in fleet.brokers[1:])
     if fleet.hubs == "elsewhere":
@@ -91,14 +92,14 @@ def copies(folder: Path, fleet: Fleet) -> Iterator[str]:
 
 
 def write_zenoh(folder: Path, fleet: Fleet) -> None:
-    """Write the rules for Zenoh hubs; one that reads them here obeys within a second or two. Raises FleetError."""
+    """Write the rules for Zenoh hubs; a hub that reads them here obeys within two seconds. Raises FleetError."""
     from pebble.extensions.fleet.zenoh_rules import zenoh_text  # Zenoh, which few fleets need
 
     write(folder / ZENOH, zenoh_text(fleet), 0o644, FleetError)
 
 
 def zenoh_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
-    """Yield a line if the rules for Zenoh hubs are not those of the table."""
+    """Yield a line if the rules for Zenoh hubs differ from the table."""
     from pebble.extensions.fleet.zenoh_rules import zenoh_text
 
     file = folder / ZENOH
@@ -107,7 +108,7 @@ def zenoh_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
 
 
 def pid_of(folder: Path) -> int | None:
-    """Return the process of this folder's mosquitto on this machine; None: it does not run."""
+    """Return the process id of this folder's mosquitto on this machine; None if it does not run."""
     try:
         pid = int(read_plain(folder / PID))
     except (OSError, ValueError):
@@ -117,7 +118,7 @@ def pid_of(folder: Path) -> int | None:
 
 
 def _is_broker(pid: int) -> bool:
-    """True if this program is mosquitto: the owner of a folder writes any number into its file."""
+    """True if this process is mosquitto. The pid file is not proof: the folder's owner can write any number into it."""
     try:
         if is_root():  # others see that of their own only; " (deleted)" is behind it after an upgrade
             return bytes(Path(f"/proc/{pid}/exe").readlink()).removesuffix(b" (deleted)").endswith(b"/mosquitto")
@@ -127,7 +128,7 @@ def _is_broker(pid: int) -> bool:
 
 
 def obeys_plugin(folder: Path) -> bool:
-    """Return True if mosquitto has the dynamic-security plugin: by its configuration, or in the process that runs."""
+    """True if mosquitto uses the dynamic-security plugin, by its configuration or in the running process."""
     configured, pid = "", pid_of(folder)
     with suppress(FileNotFoundError):
         lines = read_plain(folder / CONF).decode().splitlines()
@@ -139,7 +140,7 @@ def obeys_plugin(folder: Path) -> bool:
 
 
 def passwords_of(folder: Path) -> dict[str, broker_files.Hashed]:
-    """Return the passwords that the broker's file has, by account. Raises FleetError."""
+    """Return the hashed passwords in the broker's file, by account. Raises FleetError."""
     file = folder / PASSWORDS
     try:
         return broker_files.passwords_in(read_plain(file).decode())
@@ -150,14 +151,17 @@ def passwords_of(folder: Path) -> dict[str, broker_files.Hashed]:
 
 
 def write_rules(folder: Path, fleet: Fleet, passwords: Mapping[str, broker_files.Hashed]) -> None:
-    """Write the two files that mosquitto reads. Raises FleetError. Accounts without a password cannot log in."""
+    """Write the two files that mosquitto reads. Raises FleetError.
+
+    Accounts without a password cannot log in.
+    """
     known = {name: passwords[name] for name in fleet.accounts if name in passwords}
     for name, text in ((PASSWORDS, broker_files.passwords_text(known)), (ACL, broker_files.acl_text(fleet))):
         write(folder / name, text.encode(), 0o600, FleetError)
 
 
 def _reload(folder: Path) -> str:
-    """Make mosquitto read its files again, and end the connections of those who may not be there. Returns how."""
+    """Make mosquitto reload its files and disconnect accounts that lost their access. Return what was done."""
     pid = pid_of(folder)
     if pid is None:
         return f"in {folder / ACL}: mosquitto does not run"
@@ -177,7 +181,10 @@ def _reload(folder: Path) -> str:
 
 
 def _handles_signal(pid: int) -> bool:
-    """Wait while mosquitto starts: it listens before it handles SIGHUP, which would end it (2.0.11, measured)."""
+    """Wait until mosquitto handles SIGHUP.
+
+    It listens before that, and the signal would end it (2.0.11, measured).
+    """
     deadline = time.monotonic() + _STARTING_S
     while time.monotonic() < deadline:
         status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")

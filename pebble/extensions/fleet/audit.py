@@ -1,4 +1,4 @@
-"""The audit of a page server: who did what to which robot, one table."""
+"""The audit of a page server, as one table: who did what to which robot."""
 
 import sqlite3
 import threading
@@ -34,7 +34,7 @@ DELETE FROM audit WHERE number IN (
 
 
 class Entry(Struct, frozen=True):
-    """A row of the audit; ``at`` is in epoch seconds. With a ``count``: so many more of the minute before."""
+    """A row of the audit. ``at``: epoch seconds. ``count``: this many further rows of the last minute were left out."""
 
     at: float
     what: str
@@ -65,7 +65,7 @@ class Audit:
         self._writer.add({"t": time.time(), "what": what, **texts}, like, OF_STRANGERS if refused else DIFFERENT)
 
     def read(self, limit: int, ref: str = "") -> list[Entry]:
-        """Return the newest rows, the newest last; of one robot, and of all robots, if ``ref`` names it.
+        """Return the newest rows, the newest last. ``ref``: those of one robot and of all robots.
 
         Raises DatabaseError.
         """
@@ -78,13 +78,13 @@ class Audit:
         return [Entry(*row) for row in reversed(rows)]
 
     def close(self) -> None:
-        """Write what waits, for at most a few seconds."""
+        """Write the waiting rows, for at most a few seconds."""
         self._writer.close()
         with self._lock:
             self._database.close()
 
     def _store(self, rows: list[Row]) -> None:
-        """Store all rows. Raises DatabaseError or OSError, and then none is stored."""
+        """Store all rows. Raises DatabaseError or OSError; then none is stored."""
         with self._lock:
             if removed := self._database.removed:
                 raise OSError(removed)
@@ -100,13 +100,13 @@ class Audit:
 
 
 def _values(row: Row) -> tuple[float | str | int, ...]:
-    """Return a row as it is stored; without texts it stands for those that differ too much."""
+    """Return a row as it is stored. Without its texts it stands for rows that differ too much to be counted together."""
     texts = (row.get(field, OTHERS if field == "user" else "") for field in _FIELDS)
     return (row["t"], row["what"], *texts, row.get("count", 1))
 
 
 def _take_over(database: sqlite3.Connection) -> None:
-    """Bring what an older version stored in several tables into one."""
+    """Move the rows of an older version's tables into the present one."""
     database.execute("BEGIN IMMEDIATE")  # another process may do the same
     if "count" not in {row[1] for row in database.execute("PRAGMA table_info(audit)")}:
         database.execute("ALTER TABLE audit ADD COLUMN count INTEGER NOT NULL DEFAULT 1")

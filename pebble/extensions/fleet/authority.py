@@ -1,4 +1,4 @@
-"""A small certificate authority, with the package cryptography: it signs for machines of its own network only."""
+"""A small certificate authority, made with the package cryptography. It signs only for machines of its own network."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -36,9 +36,9 @@ class Authority:
     file: Path
 
     def sign(self, name: str, hosts: Sequence[str], file: Path, key_file: Path, *, is_client: bool) -> None:
-        """Write a certificate and a new key, for who listens at ``hosts``, logs in with it, or both.
+        """Write a certificate and a new key, for a machine that listens at ``hosts``, logs in with it, or both.
 
-        ``name`` is no host: OpenSSL applies the constraints for names to one that is an address. Raises
+        ``name`` must not look like a host: OpenSSL would apply the authority's name constraints to it. Raises
         CertificateError for hosts that it may not sign for.
         """
         _check_permitted(self, hosts)
@@ -62,7 +62,7 @@ def make(file: Path, key_file: Path, hosts: Sequence[str]) -> None:
 
 
 def read(file: Path, key_file: Path) -> Authority:
-    """Return the authority of two files. Raises CertificateError."""
+    """Read an authority from its two files. Raises CertificateError."""
     certificate = certificate_in(file)
     try:
         key: Any = load_pem_private_key(read_plain(key_file), None)
@@ -74,7 +74,7 @@ def read(file: Path, key_file: Path) -> Authority:
 
 
 def certificate_in(file: Path) -> x509.Certificate:
-    """Return the certificate of a file. Raises CertificateError."""
+    """Read a certificate from a file. Raises CertificateError."""
     try:
         return x509.load_pem_x509_certificate(read_plain(file))
     except OSError as error:
@@ -84,14 +84,14 @@ def certificate_in(file: Path) -> x509.Certificate:
 
 
 def names_of(certificate: x509.Certificate) -> tuple[str, ...]:
-    """Return the hosts that a certificate is for."""
+    """Return the hosts in a certificate."""
     values = (extension.value for extension in certificate.extensions)
     names = (name for value in values if isinstance(value, x509.SubjectAlternativeName) for name in value)
     return tuple(shown(str(name.value)) for name in names)
 
 
 def fingerprint(certificate: x509.Certificate) -> str:
-    """Return its SHA-256 as browsers show it."""
+    """Return a certificate's SHA-256 in the form that browsers show."""
     return certificate.fingerprint(SHA256()).hex(":").upper()
 
 
@@ -122,7 +122,7 @@ def _check_permitted(authority: Authority, hosts: Sequence[str]) -> None:
 def _write(
     file: Path, key_file: Path, name: str, extensions: Iterable[x509.ExtensionType], issuer: Authority | None = None
 ) -> None:
-    """Write a new key and its certificate; without an ``issuer`` it is an authority, which signs itself."""
+    """Write a new key and its certificate. Without an ``issuer`` it is an authority, which signs itself."""
     key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
     subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
     until = now + timedelta(days=SERVER_DAYS if issuer else _AUTHORITY_DAYS) - _CLOCKS_DIFFER

@@ -20,7 +20,7 @@ _MAX_MESSAGE, MAX_CONNECTIONS = 1024 * 1024, 4000  # twice what one page shows
 
 
 class Hashed(NamedTuple):
-    """A password as a broker stores it."""
+    """A hashed password, as the broker stores it."""
 
     salt: str
     hash: str
@@ -33,7 +33,7 @@ class Hashed(NamedTuple):
 
 
 def new_password() -> str:
-    """Return four groups of four letters that can be typed on a phone."""
+    """Return a new password of four groups of four letters, easy to type on a phone."""
     return "-".join("".join(secrets.choice(_ALPHABET) for _ in range(4)) for _ in range(4))
 
 
@@ -44,7 +44,7 @@ def hashed(password: str) -> Hashed:
 
 
 def conf_text(fleet: Fleet, folder: Path, user: str) -> str:
-    """Return `mosquitto.conf`; all paths are absolute."""
+    """Return the text of `mosquitto.conf`. All its paths are absolute."""
     server = fleet.brokers[0]
     where = f" {server.host}" if is_loopback(server.host) else ""
     tls = [f"cafile {folder / CA_CERT}", f"certfile {folder / SERVER_CERT}", f"keyfile {folder / SERVER_KEY}"]
@@ -66,7 +66,7 @@ def conf_text(fleet: Fleet, folder: Path, user: str) -> str:
 
 
 def acl_text(fleet: Fleet) -> str:
-    """Return the file `acl`, with the rules of all accounts."""
+    """Return the text of the file `acl`: the rules of all accounts."""
     return "".join(
         f"user {name}\n" + "".join(f"topic {access} {filter_}\n" for access, filter_ in fleet.rules_of(name)) + "\n"
         for name in fleet.accounts
@@ -74,12 +74,12 @@ def acl_text(fleet: Fleet) -> str:
 
 
 def passwords_text(passwords: Mapping[str, Hashed]) -> str:
-    """Return the file `passwords`, as `mosquitto_passwd` writes it."""
+    """Return the text of the file `passwords`, in the form that `mosquitto_passwd` writes."""
     return "".join(f"{name}:$7${hashed.iterations}${hashed.salt}${hashed.hash}\n" for name, hashed in passwords.items())
 
 
 def passwords_in(text: str) -> dict[str, Hashed]:
-    """Return the passwords in such a file, by account. Raises ValueError for what is none."""
+    """Return the hashed passwords in such a text, by account. Raises ValueError for a line that is none."""
     passwords = {}
     for line in filter(None, map(str.strip, text.splitlines())):
         name, _, rest = line.partition(":")
@@ -91,7 +91,7 @@ def passwords_in(text: str) -> dict[str, Hashed]:
 
 
 def rules_in(acl: str) -> Iterator[str]:
-    """Yield each rule after the name of its account; those before the first one hold for everybody."""
+    """Yield each rule with its account's name; "" for rules before the first account, which hold for everybody."""
     name = "everybody"
     for line in filter(None, map(str.strip, acl.splitlines())):
         word, _, rest = line.partition(" ")

@@ -1,4 +1,4 @@
-"""Certificates of one's own, so that browsers and phones in a lab can use https: their files, names and dates."""
+"""Certificates for https in a lab without a public authority: their files, names and dates."""
 
 import re
 import socket
@@ -17,12 +17,12 @@ _CERTIFICATE = re.compile(rb"-----BEGIN CERTIFICATE-----[\w+/=\s]+-----END CERTI
 
 
 class CertificateError(PebbleError):
-    """Certificates cannot be made or read. Example: ``tls/ca.pem exists: …``."""
+    """An error with certificates. Example: ``tls/ca.pem exists: …``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """The content of one certificate file."""
+    """The content of a certificate file."""
 
     file: Path
     names: tuple[str, ...]  # empty for an authority
@@ -50,9 +50,9 @@ def init(folder: Path, names: Sequence[str]) -> None:
 
 
 def renew(folder: Path, names: Sequence[str] = ()) -> None:
-    """Write a server certificate and key by the folder's authority, for ``names`` or those of before.
+    """Write a new server certificate and key by the folder's authority. Raises CertificateError.
 
-    Raises CertificateError.
+    For ``names``, or for the names of the certificate before.
     """
     from pebble.extensions.fleet import authority
 
@@ -64,7 +64,7 @@ def renew(folder: Path, names: Sequence[str] = ()) -> None:
 def of_account(folder: Path, account: str, hosts: Sequence[str] = ()) -> tuple[Path, Path]:
     """Write a certificate with the name of an account, and its key. Raises CertificateError.
 
-    ``hosts``: where it listens itself, as the hub of a robot does.
+    ``hosts``: addresses at which the account itself listens, as a robot's hub does.
     """
     from pebble.extensions.fleet import authority
 
@@ -76,7 +76,7 @@ def of_account(folder: Path, account: str, hosts: Sequence[str] = ()) -> tuple[P
 
 
 def show(file: Path) -> Shown:
-    """Return what a file holds. Raises CertificateError."""
+    """Return the content of a certificate file. Raises CertificateError."""
     from pebble.extensions.fleet import authority
 
     certificate = authority.certificate_in(file)
@@ -85,12 +85,15 @@ def show(file: Path) -> Shown:
 
 
 def only_certificates(content: bytes) -> bytes:
-    """Return the certificates in a file that others get, and nothing else of it: a config may name any file."""
+    """Return only the certificates in a file.
+
+    They are sent to others, and a config may name any file.
+    """
     return b"\n".join([*_CERTIFICATE(content), b""])
 
 
 def own_names() -> list[str]:
-    """Return names by which other machines probably reach this one."""
+    """Return the names under which other machines probably reach this one."""
     names = [f"{socket.gethostname().partition('.')[0].lower()}.local"]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
@@ -102,7 +105,7 @@ def own_names() -> list[str]:
 
 
 def hosts_of(names: Iterable[str]) -> list[str]:
-    """Return host names and addresses, each once and in its one spelling. Raises CertificateError."""
+    """Return host names and addresses without duplicates, each in its usual spelling. Raises CertificateError."""
     try:
         hosts = list(dict.fromkeys(host_of(name).lower() for name in names))
     except HostError as error:

@@ -1,4 +1,4 @@
-"""Compares the files of a fleet with its table, and names certificates that end soon; one line each."""
+"""Differences between a fleet's table and its files, and certificates that end soon, a line each."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,12 +13,12 @@ _SOON_DAYS = 30
 
 
 def by_hand(folder: Path, fleet: Fleet) -> list[str]:
-    """Return what no command mends; each line names what does. Raises FleetError."""
+    """Return the differences that no command removes, each with what to do. Raises FleetError."""
     return [*conf_differences(folder, fleet), *_certificates(folder, fleet)]
 
 
 def of_rules(folder: Path, fleet: Fleet) -> list[str]:
-    """Return the differences of accounts and rules, which `pebble fleet apply` takes back. Raises FleetError."""
+    """Return the differences of accounts and rules, which `pebble fleet apply` removes. Raises FleetError."""
     return [*zenoh_differences(folder, fleet), *_of_acl(folder, fleet), *_of_passwords(folder, fleet)]
 
 

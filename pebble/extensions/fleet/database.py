@@ -1,4 +1,4 @@
-"""The SQLite file of people, sessions and the audit log."""
+"""The SQLite file with people, sessions and the audit."""
 
 import errno
 import os
@@ -17,7 +17,7 @@ _BUSY_S = 5.0  # another process may be writing
 
 
 class DatabaseError(PebbleError):
-    """The file cannot be read or written now. Example: ``people.sqlite: database or disk is full``."""
+    """A file that cannot be read or written now. Example: ``people.sqlite: database or disk is full``."""
 
     def __init__(self, path: Path | None, error: Exception) -> None:
         self.why = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
@@ -25,11 +25,10 @@ class DatabaseError(PebbleError):
 
 
 class Database:
-    """A connection for use under a lock, each statement a transaction. ``path`` None: in memory.
+    """A connection to a SQLite file, for use under a lock; each statement is a transaction.
 
-    If its file is removed, or another one takes its place, the connection goes on with the one that it has opened.
-
-    A new file, and what SQLite writes beside it, may be read by its owner only. Raises PebbleError if it cannot be
+    ``path`` None: in memory. If the file is removed or replaced, the connection goes on with the one that it opened. A
+    new file, and what SQLite writes beside it, is readable by its owner only. Raises PebbleError if it cannot be
     opened; ``upgrade`` changes the tables of older versions.
     """
 
@@ -54,7 +53,7 @@ class Database:
 
     @property
     def removed(self) -> str:
-        """The error if its file is not where others find it; else empty."""
+        """Return an error text if the file was removed or replaced; else empty."""
         gone = self._own is not None and not self._own.in_place
         return f"{self._path} was removed or replaced: put it back, or start the page again" if gone else ""
 
@@ -64,12 +63,15 @@ class Database:
             return self._connection.execute(statement, values).fetchall()
 
     def execute(self, statement: str, values: Sequence[Any] = ()) -> sqlite3.Cursor:
-        """Execute a change. Raises DatabaseError; IntegrityError for what the tables forbid."""
+        """Execute a statement that changes something.
+
+        Raises DatabaseError, and IntegrityError for what the tables forbid.
+        """
         with self._errors():
             return self._connection.execute(statement, values)
 
     def version(self) -> tuple[int, int]:
-        """Return a number that differs after each change, by this process or any other. Raises DatabaseError."""
+        """Return a number that differs after each change by any process. Raises DatabaseError."""
         with self._errors():
             (by_others,) = self._connection.execute("PRAGMA data_version").fetchone()
             return by_others, self._connection.total_changes
@@ -85,7 +87,7 @@ class Database:
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
-        """Execute all that the block does on the connection, or nothing. Raises DatabaseError."""
+        """Execute the block's statements together: all of them, or none if it raises. Raises DatabaseError."""
         with self._errors():
             connection = self._connection
             connection.execute("BEGIN IMMEDIATE")
@@ -101,7 +103,7 @@ class Database:
 
 
 def _connection(path: Path | None, tables: str) -> sqlite3.Connection:
-    """Open the file, and make the tables that it lacks. Raises OSError and sqlite3.Error."""
+    """Open the file and create missing tables. Raises OSError and sqlite3.Error."""
     if path is not None:
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))

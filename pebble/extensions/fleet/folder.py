@@ -1,4 +1,4 @@
-"""The folder of one broker, and `fleet.json` in it: who has an account, as what. There is no secret in that file."""
+"""The folder of a broker's fleet, with `fleet.json`: the accounts and their roles. It holds no secret."""
 
 import logging
 import os
@@ -32,7 +32,7 @@ _METRIC = re.compile(r"[^/#$+\x00-\x20\x7f]+|\+")  # one level
 
 
 class FleetError(PebbleError):
-    """An account, a folder or a broker that cannot be used. Example: ``hall/fleet.json has no account 'ann'``."""
+    """An account, folder or broker that cannot be used. Example: ``hall/fleet.json has no account 'ann'``."""
 
 
 class Server(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -51,9 +51,9 @@ class Server(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
 class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The content of `fleet.json`. The first broker is the one whose files are in this folder.
 
-    ``rules``: `plugin` if an earlier version made it for mosquitto's dynamic-security plugin: `pebble fleet apply`
-    turns it into files. ``plain``: all robots keep their topics without names beside those with names. ``hubs``: where
-    Zenoh hubs run that read the rules for them, on this machine in this folder or elsewhere from copies.
+    ``rules``: `plugin` if an earlier version made it for mosquitto's dynamic-security plugin; `pebble fleet apply`
+    turns it into files. ``plain``: all robots keep their topics without account names beside those with them. ``hubs``:
+    the machines of Zenoh hubs that read the rules, here in this folder or elsewhere.
     """
 
     level: Literal["login", "named"]
@@ -81,7 +81,7 @@ class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def load(folder: Path) -> Fleet:
-    """Read the fleet of a folder. Raises FleetError with the mistake in it."""
+    """Read a folder's fleet. Raises FleetError with the mistake in it."""
     file = folder / FLEET
     try:
         fleet = msgspec.json.decode(read_plain(file), type=Fleet)
@@ -111,13 +111,13 @@ def load(folder: Path) -> Fleet:
 
 
 def save(folder: Path, fleet: Fleet) -> None:
-    """Replace `fleet.json` at once. Raises FleetError."""
+    """Replace `fleet.json` in one step. Raises FleetError."""
     text = msgspec.json.format(msgspec.json.encode(fleet), indent=2) + b"\n"
     write(folder / FLEET, text, 0o644, FleetError)
 
 
 def refused(fleet: Fleet, name: str, account: Account) -> str:
-    """Return why this account may not be added; empty if it may."""
+    """Return why this account cannot be added; empty if it can."""
     if not NAME.fullmatch(name):
         return f"{name!r} is no name: use 1 to 32 of a-z, 0-9, _ and -"
     if name in fleet.accounts:
@@ -156,7 +156,7 @@ def _refused_base(base: str, *, several: bool) -> str:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Let one command at a time change the folder. Raises FleetError if there is none."""
+    """Hold the folder's lock, so that one command at a time changes it. Raises FleetError if there is no folder."""
     try:
         descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | _NO_LINK, 0o600)
     except OSError as error:

@@ -1,6 +1,6 @@
-"""Rights of connections from other machines at a hub, by the name in their certificate: Zenoh's access_control.
+"""Rights of other machines at a hub, by the name in their certificate, enforced by Zenoh's access_control.
 
-The hub itself refuses what Zenoh cannot: wills, and what is retained, of accounts that it is not for.
+Zenoh has no rules for wills and retained messages; the hub itself refuses those.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _FIELDS = ("flows", "messages", "key_exprs")
 
 
 class Grant(NamedTuple):
-    """Messages that may pass, by their keys."""
+    """A permission for the messages of some keys."""
 
     flows: tuple[str, ...]
     messages: tuple[str, ...]
@@ -38,7 +38,7 @@ EVERYTHING = (Grant((*IN, *OUT), ALL_MESSAGES, wire.ALL_KEYS),)
 
 
 class HubAccount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Topics, as filters: those on which the account may leave a will, and those that it may retain."""
+    """An account's topic filters at a hub: where it may leave a will, and which messages it may retain."""
 
     wills: tuple[str, ...] = ()
     retains: tuple[str, ...] = ()
@@ -49,7 +49,7 @@ class _Metadata(msgspec.Struct, frozen=True):
 
 
 class _File(msgspec.Struct, frozen=True):
-    """The access file. It is a configuration of Zenoh, too, which lets others use its ``metadata``."""
+    """The access file. It is a configuration of Zenoh, whose ``metadata`` is free for others."""
 
     access_control: dict[str, Any]
     metadata: _Metadata
@@ -57,7 +57,7 @@ class _File(msgspec.Struct, frozen=True):
 
 
 class Access(NamedTuple):
-    """The rules, the accounts by their names, which are those in certificates, and what goes first: `first`."""
+    """The content of the access file: rules, accounts by the name in their certificate, and priorities (:func:`first`)."""
 
     control: Mapping[str, Any]
     accounts: Mapping[str, HubAccount]
@@ -65,7 +65,7 @@ class Access(NamedTuple):
 
 
 def read_access(file: Path) -> Access:
-    """Read what ``pebble fleet zenoh`` wrote. Raises TransportError."""
+    """Read the access file, as ``pebble fleet zenoh`` writes it. Raises TransportError."""
     try:
         content = msgspec.json.decode(file.read_bytes(), type=_File)
     except OSError as error:
@@ -78,16 +78,16 @@ def read_access(file: Path) -> Access:
 
 
 def written(access: Access) -> bytes:
-    """Return ``access`` as a file."""
+    """Return the bytes of the access file."""
     text = msgspec.json.encode(_File(dict(access.control), _Metadata(dict(access.accounts)), dict(access.qos)))
     return msgspec.json.format(text, indent=1) + b"\n"
 
 
 def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dict[str, Any]:
-    """Let connections of this machine do everything, and those with a certificate what the row of their name grants.
+    """Return Zenoh's access_control: this machine may do everything, an account what its row grants.
 
-    Equal grants become one rule, because Zenoh reads 1 MB a second. It does not refuse the others, but drops all that
-    they send, and sends them nothing. It reads this once.
+    Equal grants become one rule, because Zenoh reads only 1 MB a second at its start. Accounts without a row are not
+    disconnected: Zenoh drops their messages and sends them none.
     """
     rules: dict[Grant, dict[str, Any]] = {}
     subjects: list[Mapping[str, Any]] = []
@@ -106,11 +106,10 @@ def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dic
 
 
 def first(commands: Sequence[str], stops: Sequence[str]) -> dict[str, Any]:
-    """Return Zenoh's qos: of what other machines send, ``stops`` alone have the first priority, and wait.
+    """Return Zenoh's qos: among what other machines send, only ``stops`` have the first priority, and only they block.
 
-    Else a sender chooses: with that priority it would hold up the stops of others, and with what waits for room it
-    would have the hub close the connection of a receiver that reads slower than it sends. Both are keys; stops are
-    commands.
+    Otherwise the sender chooses: commands with the first priority would delay stops, and a blocking sender would make
+    the hub disconnect a slow receiver. Both parameters are keys; ``stops`` are among ``commands``.
     """
     rows = (("commands", commands, _COMMANDS), ("stops", stops, _STOPS))
     fields = {"messages": ["put"], "flows": [*IN], "link_protocols": OTHER_MACHINES}
@@ -127,7 +126,7 @@ def _named(names: Sequence[str]) -> dict[str, Any]:
 
 
 class AccountAdmission(Admission):
-    """The admission of clients at a hub, also of accounts of other machines, by the access file."""
+    """The admission of clients at a hub, including accounts of other machines, by the access file."""
 
     def __init__(self, file: Path, wills: Sequence[tuple[str, bool]], unretained: Sequence[str] = ()) -> None:
         super().__init__(wills, unretained)
@@ -142,9 +141,9 @@ class AccountAdmission(Admission):
         return {"access_control": control, "qos": qos}
 
     def hello(self, account: str, hello: wire.Hello) -> wire.Hello | None:
-        """Return ``hello`` without what this account may not; None: it is not answered.
+        """Return ``hello`` reduced to what the account may do; None if it is not to be answered.
 
-        Its certificate allows an account to ask under its own name only.
+        An account may only use session names that begin with its own.
         """
         if not account:
             return hello

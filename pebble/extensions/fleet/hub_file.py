@@ -19,7 +19,7 @@ from pebble.transports import ZenohSettings
 
 
 class HubFile(ZenohSection, frozen=True, kw_only=True):
-    """A hub: where it listens, and to which Zenoh routers it connects."""
+    """A hub: the addresses where it listens, and the Zenoh routers that it connects to."""
 
     run_dir: Annotated[File | None, doc("Folder of its socket and lock; unset: one of its own.")] = None
     journal: Annotated[File | None, doc("File for what it retains; unset: memory only.")] = None
@@ -35,7 +35,7 @@ class HubFile(ZenohSection, frozen=True, kw_only=True):
 
 
 def load_hub(path: Path, env: Mapping[str, str] = os.environ) -> tuple[HubFile, Path]:
-    """Read such a file; returns it and its run directory. Raises ConfigError with every problem in it."""
+    """Read the file; return it and its run directory. Raises ConfigError with all problems."""
     path = path.absolute()
     raw = decode(read_text(path), path.name)
     reader = Reader(path.parent, env, CHECKS, file=path)
@@ -48,7 +48,7 @@ def load_hub(path: Path, env: Mapping[str, str] = os.environ) -> tuple[HubFile, 
 
 
 def settings_of(hub: HubFile, run_dir: Path) -> ZenohSettings:
-    """Return the settings of a hub of its own, for several robots."""
+    """Return the transport settings of a hub for several robots."""
     return ZenohSettings(
         run_dir=run_dir,
         listen=hub.listen,

@@ -1,8 +1,8 @@
-"""Names of senders in messages to a robot at the level ``named``: read in topics, written into payloads. Pure.
+"""Accounts of senders at the level ``named``: read from topics, written into payloads. Pure.
 
-The broker vouches for the account in ``incoming/by/{account}/{metric}``. On the robot itself the topic is without it,
-and the sender stands in the payload: ``"by": "otto"``, or ``"page-1/ann"`` where a page server has put the person
-there. What has no ``by`` is from a program of the robot.
+The broker vouches for the account in ``incoming/by/{account}/{metric}``. On the robot itself the topic has no account,
+and the payload has the sender: ``"by": "otto"``, or ``"page-1/ann"`` where a page server adds the person. A message
+without ``by`` is from a program of the robot.
 """
 
 from functools import lru_cache
@@ -33,7 +33,7 @@ _decoder, _encoder = msgspec.json.Decoder(), msgspec.json.Encoder()
 
 
 class CheckedNames(Names):
-    """Senders by topic; ``strangers``: what those may do who have no name."""
+    """The senders of messages, by topic. ``strangers``: the rights of senders without an account."""
 
     def __init__(self, base: str, subjects: Subjects, strangers: Strangers) -> None:
         super().__init__()
@@ -62,10 +62,10 @@ class CheckedNames(Names):
         return Sender(bare.account, bare.topic, self._subjects[bare.topic])
 
     def sign(self, sender: Sender, message: Message) -> Signed | Drop:
-        """Return ``message`` with its sender in the payload, or why it does not pass. Hot.
+        """Return ``message`` with its sender in the payload, or why it is refused. Called for each message.
 
-        A ``by`` that stood there is a claim: an account's becomes the person, a stranger's is gone. A stop needs no
-        name; there the claim stays, with a mark.
+        A ``by`` that the sender wrote is a claim: from an account it becomes the person, from a stranger it is removed.
+        A stop needs no account; its claim stays, with a mark.
         """
         subject, account, payload = sender.subject, sender.account, message.payload
         channel = None if subject is None else subject.channel
@@ -98,7 +98,7 @@ def _moved(message: Message, topic: str, payload: bytes) -> Message:
 
 
 def _doubted(payload: bytes) -> bytes:
-    """Mark who a stop without a name claims to be from. What cannot be read names no sender to its readers."""
+    """Mark the claimed sender of a stop that has no account; return the payload unchanged if it cannot be read."""
     fields = _object(payload)
     body = {} if fields is None else _body(fields)
     claim = body.get("by")
@@ -109,7 +109,7 @@ def _doubted(payload: bytes) -> bytes:
 
 
 def _body(command: dict[str, Any]) -> dict[str, Any]:
-    """Return the object that holds the fields."""
+    """Return the JSON object that holds the message's fields."""
     return inner if isinstance(inner := command.get("value"), dict) else command
 
 
@@ -121,7 +121,7 @@ def _is_zero(channel: Channel, payload: bytes) -> bool:
 
 
 def _object(payload: bytes) -> dict[str, Any] | None:
-    """Return the JSON object in ``payload``, as all readers of the contract find it; None: they find none."""
+    """Return the JSON object in ``payload`` as all readers of the contract parse it; None if they cannot."""
     try:
         usual = payload[:1] == b"{" and payload[-1:] == b"}" and len(payload) <= _USUAL_BYTES
         if usual and payload.isascii() and b"\0" not in payload:  # else there may be something around it

@@ -1,4 +1,4 @@
-"""People who may use the operator page, their sessions, and settings of the server: one SQLite file."""
+"""The people of an operator page, their sessions, and settings of the server, in one SQLite file."""
 
 import hashlib
 import hmac
@@ -46,7 +46,7 @@ class PeopleError(PebbleError):
 
 
 class TooManyTriesError(PebbleError):
-    """Too many passwords were tried from one address or for one name; ``wait_s`` is when the next one is read."""
+    """Too many password tries from one address or for one name; the next is possible after ``wait_s`` seconds."""
 
     def __init__(self, wait_s: float) -> None:
         self.wait_s = wait_s
@@ -55,14 +55,14 @@ class TooManyTriesError(PebbleError):
 
 @dataclass(frozen=True, slots=True)
 class User:
-    """A person."""
+    """A person with a role."""
 
     name: str
     role: Role
 
 
 class People:
-    """Thread-safe. Each call reads the file, so that changes by another process count at once.
+    """The table of people and sessions. Thread-safe; reads the file on each call, as other processes may change it.
 
     ``path`` None: in memory. Passwords are stored as scrypt hashes, session tokens as their SHA-256.
     """
@@ -101,42 +101,42 @@ class People:
             raise _exists(name) from None
 
     def check_name(self, name: str) -> None:
-        """Raise PeopleError for a name that cannot be added."""
+        """Raise PeopleError for a name that cannot be used."""
         if not NAME.fullmatch(name):
             raise PeopleError(f"{name!r} is no name: use 1 to 32 of a-z, 0-9, _ and -")
         if self._rows("SELECT 1 FROM people WHERE name = ?", name):
             raise _exists(name)
 
     def remove(self, name: str) -> None:
-        """Remove a person, and end the person's sessions. Raises PeopleError."""
+        """Remove a person and end their sessions. Raises PeopleError."""
         self._change_one(name, "DELETE FROM people WHERE name = ?", name)
 
     def set_password(self, name: str, password: str) -> None:
-        """Change a password, and end the person's sessions. Raises PeopleError."""
+        """Change a password and end the person's sessions. Raises PeopleError."""
         salt = secrets.token_bytes(16)
         hashed = _hash(usable(password), salt)
         self._change_one(name, "UPDATE people SET salt = ?, hash = ? WHERE name = ?", salt, hashed, name)
         self._change("DELETE FROM sessions WHERE name = ?", name)
 
     def set_role(self, name: str, role: Role) -> None:
-        """Change what a person may do, in running sessions as well. Raises PeopleError."""
+        """Change a person's role, in running sessions too. Raises PeopleError."""
         self._change_one(name, "UPDATE people SET role = ? WHERE name = ?", role.value, name)
 
     def list(self) -> list[User]:
         return [User(name, Role(role)) for name, role in self._rows("SELECT name, role FROM people ORDER BY name")]
 
     def version(self) -> tuple[int, int]:
-        """Return what differs after each change of people and sessions, by any process. Raises DatabaseError."""
+        """Return a number that changes with each change of people and sessions, by any process. Raises DatabaseError."""
         with self._lock:
             return self._database.version()
 
     # -- sessions
 
     def check(self, name: str, password: str, address: str) -> User | None:
-        """Return the person with this password. Blocks for some 20 ms, with accents 60, the same for unknown names.
+        """Return the person with this name and password. Blocks for about 20 ms, 60 with accents.
 
-        Raises TooManyTriesError. A name whose tries are used up still logs in from an address where it has a session:
-        others cannot keep a person out.
+        It takes as long for unknown names. Raises TooManyTriesError. With its tries used up, a name can still log in
+        from an address where it has a session, so that others cannot lock a person out.
         """
         self._count_try(name, address)
         looked_up = name if NAME.fullmatch(name) else ""
@@ -152,7 +152,7 @@ class People:
         return User(stored_name, Role(role))
 
     def start_session(self, user: User, address: str = "") -> str:
-        """Return a new session's token; the only copy of it."""
+        """Start a session; return its token, the only copy of it."""
         token = secrets.token_urlsafe(32)
         now = self._clock()
         self._change("DELETE FROM sessions WHERE expires <= ?", now)
@@ -175,9 +175,9 @@ class People:
         return token
 
     def session(self, token: str) -> Session | None:
-        """Return the running session of this token, with the person's role of now.
+        """Return the session of this token, with the person's present role.
 
-        While the file cannot be read it is what it was: who drives can go on, and stop robots.
+        While the file cannot be read, the last known answer is returned, so that the driver can go on and stop robots.
         """
         digest, now = _digest(token), self._clock()
         try:
@@ -223,7 +223,7 @@ class People:
             raise TooManyTriesError(wait_s)
 
     def _rows(self, statement: str, *values: Any) -> Sequence[Any]:
-        """Return the rows that a statement yields. Raises DatabaseError, as all methods do."""
+        """Return the rows of a statement. Raises DatabaseError, as all methods do."""
         with self._lock:
             self._note_place()
             return self._database.rows(statement, values)
@@ -251,7 +251,7 @@ def _exists(name: str) -> PeopleError:
 
 
 def has_user(path: Path | None, name: str = "") -> bool:
-    """Return True if the database knows this person, or without a name anybody. Raises DatabaseError."""
+    """True if the database has this person, or without a name any person. Raises DatabaseError."""
     if path is None:
         return False
     try:
@@ -274,7 +274,7 @@ def _has_user(path: Path, name: str) -> bool:
 
 
 def usable(password: str) -> str:
-    """Return the password as it is stored, with accents as most keyboards write them (NFC). Raises PeopleError."""
+    """Return the password in composed form (NFC), in which it is stored. Raises PeopleError."""
     password = normalize("NFC", password)
     if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:
         raise PeopleError(f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters")
@@ -282,7 +282,7 @@ def usable(password: str) -> str:
 
 
 def _spellings(password: str) -> set[str]:
-    """Return the spelling that is stored, and those that earlier versions stored: as typed, on macOS decomposed."""
+    """Return the forms of a password to compare: composed, and as typed, which earlier versions stored."""
     return {normalize("NFC", password), password, normalize("NFD", password)}
 
 

@@ -1,4 +1,4 @@
-"""Pieces of configs for a fleet's accounts: where they connect, and as whom."""
+"""Parts of configs for a fleet's accounts: the address to connect to, and the account's credentials."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ HUB_PORT = 7447
 
 
 def of_broker(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str, Any]:
-    """Return what a robot needs in its config to be at the fleet's broker."""
+    """Return the part of a robot's config that connects it to the fleet's broker."""
     server = fleet.brokers[0]
     login = {"host": server.host, "port": server.port, "username": name, "password": secret}
     link = login | {"tls": {"enabled": True, "ca_cert": certificates.CA_CERT}}
@@ -21,9 +21,9 @@ def of_broker(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str,
 
 
 def of_certificate(fleet: Fleet, name: str) -> dict[str, Any]:
-    """Return what the holder of a certificate needs in its config, or as a file of its own.
+    """Return the part of a config for the holder of a certificate, or a file of its own for it.
 
-    Keys and authority lie beside it.
+    Key and authority are in the same folder.
     """
     roles = fleet.accounts[name].roles
     at_hub = _at_hub(fleet, name, certificates.CA_CERT, name)
@@ -38,17 +38,17 @@ def of_certificate(fleet: Fleet, name: str) -> dict[str, Any]:
 
 
 def hub_file(keys: str) -> dict[str, Any]:
-    """Return the file of a hub that obeys the rules beside it.
+    """Return the file of a hub that uses the rules in its folder.
 
-    ``keys``: its certificate and key without their suffix.
+    ``keys``: the path of its certificate and key without their suffix.
     """
     return {"listen": [f"tls/0.0.0.0:{HUB_PORT}"], "tls": _tls(certificates.CA_CERT, keys), "access": ZENOH}
 
 
 def boards_file(fleet: Fleet, name: str, below: str) -> dict[str, Any]:
-    """Return the file of a gateway of boards: those that have an account as a neighbour are in it.
+    """Return the file of a gateway for boards that have an account as a neighbour.
 
-    ``below``: how that file names what is in the fleet's folder.
+    ``below``: the path prefix of the fleet's folder in that file.
     """
     server, ca = fleet.brokers[0], below + certificates.CA_CERT
     login = {"username": name, "password_file": f"{name}-password", "tls": {"enabled": True, "ca_cert": ca}}
@@ -65,7 +65,7 @@ def host_and_port(server: Server) -> str:
 
 
 def _at_hub(fleet: Fleet, name: str, ca: str, keys: str) -> dict[str, Any]:
-    """Return how this account connects to the fleet's hub."""
+    """Return the settings by which this account connects to the fleet's hub."""
     return {"account": name, "connect": [f"tls/{fleet.brokers[0].host}:{HUB_PORT}"], "tls": _tls(ca, keys)}
 
 
@@ -74,9 +74,9 @@ def _tls(ca: str, keys: str) -> dict[str, Any]:
 
 
 def _who(fleet: Fleet, name: str) -> dict[str, Any]:
-    """Return the id with the account, which may do nothing below another base.
+    """Return the robot section and the security level of an account's config.
 
-    Its messages would be dropped in silence.
+    The base must be the account's: it may do nothing below another one, and its messages would be dropped in silence.
     """
     account = fleet.accounts[name]
     parts = dict(zip(("system", "type", "id"), account.bases[0].split("/"), strict=True))

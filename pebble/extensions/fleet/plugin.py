@@ -1,4 +1,4 @@
-"""Turns a fleet that an earlier version made for mosquitto's dynamic-security plugin into one of files."""
+"""Conversion of a fleet made for mosquitto's dynamic-security plugin, by an earlier version, into one of files."""
 
 import json
 from collections.abc import Iterator
@@ -16,9 +16,9 @@ SECURITY = "dynamic-security.json"
 
 
 def convert(folder: Path, fleet: Fleet) -> tuple[Fleet, list[str]]:
-    """Write the plugin's passwords and the rules of the table as files. Returns the fleet, and who is left out.
+    """Write the plugin's passwords and the table's rules as files. Return the fleet and the accounts left out.
 
-    Raises FleetError. The plugin's own file stays as it is; mosquitto obeys it until its configuration is changed.
+    Raises FleetError. The plugin's own file stays; mosquitto uses it until its configuration is changed.
     """
     file = folder / SECURITY
     try:
@@ -47,6 +47,6 @@ def _left_out(fleet: Fleet, clients: dict[str, dict[str, Any]]) -> Iterator[str]
 
 
 def _gets_in(name: str, client: dict[str, Any]) -> bool:
-    """Return True if the plugin lets this account in, with its role, and with a password as our files have it."""
+    """True if the plugin accepts this account, with its role and a password in the form of our files."""
     has_role = any(role.get("rolename") == f"account-{name}" for role in client.get("roles", ()))
     return has_role and not client.get("disabled") and all(map(client.get, ("salt", "password", "iterations")))

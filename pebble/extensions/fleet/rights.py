@@ -1,6 +1,6 @@
-"""The rights on a robot, and the commands that each of them allows.
+"""The rights on a robot, and the commands that each right allows.
 
-pebble/extensions/fleet/roles.py gives them to roles. A robot uses the table for commands without a name.
+pebble/extensions/fleet/roles.py gives rights to roles. A robot uses this table for commands without an account.
 """
 
 from collections.abc import Mapping

@@ -1,6 +1,6 @@
-"""The robot's audit: one log of JSON lines, who did what to it, written where the bridge passes a command in.
+"""The robot's audit: a log of JSON lines about who did what, written by the bridge as commands pass.
 
-Forwarding never waits for it. Commands to drive are not in it, and of other commands neither parameters nor keys.
+Forwarding never waits for it. It holds no driving commands, and no parameters or keys of others.
 """
 
 import errno
@@ -55,7 +55,7 @@ def files(config: Config) -> list[Path]:
 
 
 class Audit(Observer):
-    """Notes commands, refusals and who has control. Thread-safe, but for :meth:`control`."""
+    """A writer of commands, refusals and changes of control. Thread-safe, except for :meth:`control`."""
 
     def __init__(self, config: Config, clock: Callable[[], float] = time.monotonic) -> None:
         self._path, self._older = files(config)
@@ -72,11 +72,11 @@ class Audit(Observer):
         self._writer.close()
 
     def note(self, what: str, who: str = ROBOT, **more: str | float | bool) -> None:
-        """Write down what was done, or found; ``what`` is of a fixed set."""
+        """Add a row; ``what`` is one of a fixed set."""
         self._writer.add({"t": round(time.time(), 3), "what": what, "who": who, **more})
 
     def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
-        """Note the content of a message that has passed, without parameters and keys."""
+        """Add a row for a message that passed, without its parameters and keys."""
         says = _COMMANDS.get(channel.suffix)
         if says is None and channel.kind not in (Kind.FLAG, Kind.ACTION):
             return
@@ -93,14 +93,14 @@ class Audit(Observer):
                     self.note(channel.kind.name.lower(), _sender(by), **_place(by), name=name, on=on)
 
     def refused(self, drop: Drop, channel: Channel | None, by: str | None) -> None:
-        """Note a message that was refused, only a limited number of strangers."""
+        """Add a row for a refused message; only for a limited number of strangers."""
         if drop in _REFUSED:
             name, who = "" if channel is None else channel.metric, _sender(by)
             row = {"t": round(time.time(), 3), "what": "refused", "who": who, **_place(by), "name": name}
             self._writer.add({**row, "why": drop.value}, most=OF_STRANGERS)
 
     def control(self, state: ControlState) -> None:
-        """Note who has got control and who has it no longer; the motor owner that decides has told this."""
+        """Add rows for who gained and who lost control, as reported by the motor owner."""
         before, self._holder = self._holder, state
         if before is None or (before.key, before.boot) == (state.key, state.boot):
             return
@@ -113,9 +113,9 @@ class Audit(Observer):
         self.note("stop-not-confirmed", owner=owner, stop=str(stop.stop))
 
     def _noted_before(self, stop: str, who: str) -> bool:
-        """True if this sender's stop was noted before; remembers the stop.
+        """True if this sender's stop has a row already; remembers the stop.
 
-        A stop may arrive twice, with a checked sender and without: the two count as different senders.
+        A stop may arrive twice, with an account and without; the two count as different senders.
         """
         repeated = (stop, who) in self._stops
         if stop and not repeated:
@@ -123,7 +123,7 @@ class Audit(Observer):
         return repeated
 
     def _append(self, rows: list[Row]) -> None:
-        """Write all of them, or raise OSError: then the file is as before."""
+        """Write all rows; if that raises OSError the file is as before."""
         lines = b"".join(msgspec.json.encode(row) + b"\n" for row in rows)
         self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if self._path.exists() and self._path.stat().st_size >= _MOST_BYTES:
@@ -144,7 +144,7 @@ class Audit(Observer):
 
 
 def _sender(by: str | None, command: Any = None) -> str:
-    """Return the account; else what the sender claims to be, marked as such."""
+    """Return the account, or else the sender that the payload claims, marked as unchecked."""
     claim = getattr(command, "by", None)
     name = shown(claim.rstrip(_UNCHECKED), _NAME) if isinstance(claim, str) else ""
     if by == ROBOT:
@@ -153,5 +153,5 @@ def _sender(by: str | None, command: Any = None) -> str:
 
 
 def _place(by: str | None) -> dict[str, str]:
-    """Return where a command came from."""
+    """Return the field of a row that names the side from which a command came."""
     return {"from": "robot" if by == ROBOT else "operators"}

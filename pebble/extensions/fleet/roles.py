@@ -1,6 +1,7 @@
-"""The one table of who may do what: roles, and the rights of each (rights.py has their channels).
+"""The table of roles and the rights of each.
 
-Rules for brokers, the rights of people on the operator page, and the tables of docs/ext/fleet.md are made from it.
+The rules of brokers, the rights of people on the operator page, and the tables of docs/ext/fleet.md are made from it;
+rights.py has the channels of each right.
 """
 
 import re
@@ -24,7 +25,7 @@ _ANY = "+/+/+"  # any component
 
 
 class Role(StrEnum):
-    """One role of a person."""
+    """A role of a person."""
 
     VIEWER = "viewer"
     DRIVER = "driver"
@@ -34,7 +35,7 @@ class Role(StrEnum):
 
 
 class ProgramRole(StrEnum):
-    """The role of a program that has an account of its own."""
+    """A role of a program that has its own account."""
 
     PAGE = "page"  # a server of the operator page, which asks the rights of its own people
     ROBOT = "robot"
@@ -65,17 +66,17 @@ _ALONE = frozenset(ProgramRole)
 
 
 class Rule(NamedTuple):
-    """One thing that a broker lets an account do. ``access``: ``read`` or ``write``."""
+    """A permission of an account at a broker. ``access``: ``read`` or ``write``."""
 
     access: str
     filter: str
 
 
 class Account(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One account in `fleet.json`. ``bases``: of a robot its own, of a gateway those that it carries.
+    """An account in `fleet.json`. ``bases``: its own base topic, or those that a gateway carries.
 
-    ``plain``: a robot that does not know names, so its topics stay as they are without them. ``people``: the database
-    of a page server's own people, if that is on this machine.
+    ``plain``: a robot whose topics have no account names, as it does not know them. ``people``: the database of a page
+    server's people, if it is on this machine.
     """
 
     roles: tuple[str, ...]
@@ -94,7 +95,7 @@ class Extra(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True)
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """One login. ``id`` names it in the audit log; it cannot be used to log in."""
+    """A login. ``id`` names it in the audit; it cannot be used to log in."""
 
     id: str
     user: str
@@ -106,23 +107,26 @@ LOCAL = Session("local", "local", Role.ADMIN)
 
 
 def rights(roles: Iterable[str], level: SecurityLevel) -> frozenset[Right]:
-    """Return what a person with these roles may do, which add up. Below ``named`` those who drive also reset."""
+    """Return the rights of a person with these roles together.
+
+    Below the level ``named``, those who may drive may also reset.
+    """
     held = frozenset[Right]().union(*(_RIGHTS[role] for role in roles))
     return held | {Right.RESET} if level != "named" and Right.DRIVE in held else held
 
 
 def page_rights(role: Role, level: SecurityLevel = "open") -> frozenset[str]:
-    """Return what a person may do on the operator page beyond what everybody may there."""
+    """Return what a person may do on the operator page beyond what everybody may."""
     return frozenset(right.value for right in rights((role,), level) - _EVERYBODY)
 
 
 def right_of(channel: Channel) -> str:
-    """Return the right that may write this channel."""
+    """Return the right that is needed to write this channel."""
     return next(right.value for right, channels in WRITES.items() if channel in channels)
 
 
 def add_up(roles: Sequence[str]) -> str:
-    """Return why no account may have these roles together; empty if one may."""
+    """Return why these roles cannot be combined in one account; empty if they can."""
     unknown = [role for role in roles if role not in _RIGHTS]
     if unknown or not roles:
         return f"{unknown[0] if unknown else ''!r} is no role: use {', '.join(ROLES)}"
@@ -139,10 +143,10 @@ def rules(
     extra: Extra | None = None,
     at_hub: bool = False,
 ) -> tuple[Rule, ...]:
-    """Return all that a broker lets this account do. ``plain``: bases of robots that do not know names, or ``+/+/+``.
+    """Return all rules of this account at a broker.
 
-    ``at_hub``: what a Zenoh hub lets it do. That differs for a gateway, whose robots are at the hub, and their
-    operators at the broker.
+    ``plain``: bases of robots that do not know account names, or ``+/+/+``. ``at_hub``: return the rules at a Zenoh
+    hub. They differ for a gateway, whose robots are at the hub and their operators at the broker.
     """
     all_rules = [
         *_of_bases(name, account, at_hub=at_hub),
@@ -152,13 +156,13 @@ def rules(
 
 
 def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
-    """Return what the right may write below ``incoming/``, as parts of filters."""
+    """Return the metrics below ``incoming/`` that the right may write, as parts of filters."""
     declared = (channel if isinstance(channel, str) else channel.metric for channel in WRITES.get(right, ()))
     return (*(re.sub(r"{[^}]*}", "+", metric) for metric in declared), *getattr(extra, right, ()))
 
 
 def covered(right: Right, metric: str) -> str:
-    """Return a metric of the contract that a filter of ``extra`` covers, with any name, and another right writes."""
+    """Return a metric of the contract that a filter of ``extra`` covers although another right writes it."""
     for channel in c.CHANNELS:
         if channel.direction == INCOMING and channel not in WRITES[right]:
             declared = re.sub(r"{[^}]*}", "+", channel.metric)
@@ -168,7 +172,7 @@ def covered(right: Right, metric: str) -> str:
 
 
 def _overlap(filter_: str, other: str) -> bool:
-    """True if some topic is covered by both of two filters without #."""
+    """True if some topic matches both filters; neither has a #."""
     levels = filter_.split("/"), other.split("/")
     same = all("+" in pair or pair[0] == pair[1] for pair in zip(*levels, strict=False))
     return len(levels[0]) == len(levels[1]) and same
@@ -192,7 +196,10 @@ def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
 
 
 def _of_neighbour(base: str) -> Iterator[Rule]:
-    """Yield the rules of a robot: its id in topics of commands is that of its base, so no other one can claim it."""
+    """Yield the rules of a robot as a neighbour.
+
+    The id in its commands' topics must be its own, so that no other robot can claim it.
+    """
     kind, _, name = base.rpartition("/")
     yield Rule("read", f"{kind}/+/{OUTGOING}/#")
     yield Rule("write", f"{base}/{OUTGOING}/#")

@@ -1,4 +1,4 @@
-"""Rows of an audit, stored by a thread of its own: who adds one never waits for the disk."""
+"""A writer of audit rows on a thread of its own, so that no caller waits for the disk."""
 
 import logging
 import threading
@@ -20,9 +20,10 @@ Row = dict[str, Any]
 
 
 class RowWriter:
-    """Gives rows to ``store`` in their order; where that raises OSError or PebbleError they wait, and it is said once.
+    """A queue of rows that ``store`` gets in their order. Thread-safe.
 
-    A row has its time ``t``, its kind ``what``, and more. Kinds are a fixed set. Thread-safe.
+    If ``store`` raises OSError or PebbleError, the rows wait, and it is logged once. A row has its time ``t``, its kind
+    ``what``, and more; kinds are a fixed set.
     """
 
     def __init__(self, store: Callable[[list[Row]], None], clock: Callable[[], float] = time.monotonic) -> None:
@@ -40,7 +41,7 @@ class RowWriter:
         self._thread.start()
 
     def close(self) -> None:
-        """Store what waits, for a bounded time."""
+        """Store the waiting rows, for a bounded time."""
         self._closing.set()
         self._wake.set()
         self._thread.join(_END_S)
@@ -48,7 +49,10 @@ class RowWriter:
             log.error("audit: %d rows are lost", lost)
 
     def add(self, row: Row, like: Hashable = None, most: int = DIFFERENT) -> None:
-        """Store ``row``, or count it if one of this window is ``like`` it: without that, equal but for its time."""
+        """Store ``row``, or only count it if a row ``like`` it was stored in this window.
+
+        Without ``like``, rows are alike if they differ in their time only.
+        """
         like = (tuple(row.items())[1:],) if like is None else like
         now = self._clock()
         with self._lock:
@@ -63,7 +67,7 @@ class RowWriter:
         self._wake.set()
 
     def _end_window(self, now: float) -> None:
-        """Queue a row for each kind that was only counted, and start new counts."""
+        """Queue a row with the count for each kind that was only counted, and reset the counts."""
         for row, count in self._counts.values():
             if count:
                 self._put({**row, "count": count})

@@ -1,4 +1,4 @@
-"""Counts password tries, so that guessing takes years."""
+"""A limit on password tries, so that guessing would take years."""
 
 import ipaddress
 import threading
@@ -12,7 +12,7 @@ _KEYS = 10_000  # addresses or names that are remembered; beyond that the oldest
 
 
 class Tries:
-    """At most TRIES within WINDOW_S for each key. Thread-safe."""
+    """A count of tries for each key: at most TRIES within WINDOW_S. Thread-safe."""
 
     def __init__(self, monotonic: Callable[[], float]) -> None:
         self._monotonic = monotonic
@@ -20,7 +20,7 @@ class Tries:
         self._times: OrderedDict[str, deque[float]] = OrderedDict()
 
     def take(self, key: str) -> float:
-        """Count a try; 0, or if it is one too many the seconds until the next one."""
+        """Count a try; return 0, or the seconds until the next try if there were too many."""
         now = self._monotonic()
         with self._lock:
             times = self._times.setdefault(key[:64], deque(maxlen=TRIES))
@@ -33,7 +33,7 @@ class Tries:
             return 0.0
 
     def give_back(self, key: str) -> None:
-        """Give a try back that was right: it does not count."""
+        """Uncount a try with the right password."""
         with self._lock:
             times = self._times.get(key[:64])
             if times:
@@ -42,7 +42,10 @@ class Tries:
 
 @lru_cache(maxsize=256)
 def network_of(address: str) -> str:
-    """Return what counts as one address: with IPv6 the /64, because one machine can use every address in it."""
+    """Return the part of an address that counts as one machine.
+
+    For IPv6 it is the /64, because a machine can use every address in it.
+    """
     try:
         parsed = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:

@@ -1,4 +1,4 @@
-"""Rules for a Zenoh hub, of the same table as a broker's: what each account, named in its certificate, may do there."""
+"""The rules of a Zenoh hub, from the same table as a broker's: the rights of each account, named in its certificate."""
 
 from collections.abc import Iterable, Iterator, Sequence
 
@@ -38,9 +38,9 @@ def zenoh_text(fleet: Fleet) -> bytes:
 
 
 def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
-    """Return the rules of a hub for an account.
+    """Return an account's filters for wills and retained messages.
 
-    A robot may retain what it publishes, and leave its will there. Others may retain flags without a name.
+    A robot may retain what it publishes, and leave its will there. Others may retain flags without an account's name.
     """
     writes = [rule.filter for rule in held if rule.access == "write"]
     robot = ProgramRole.ROBOT in account.roles
@@ -51,7 +51,7 @@ def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
 
 
 def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: bool) -> Iterator[Grant]:
-    """Yield only what its client needs; so it cannot pose as a hub, nor answer queries of others."""
+    """Yield only the grants that an account's client needs; it cannot act as a hub or answer queries of others."""
     if is_hub:
         yield from EVERYTHING
         return

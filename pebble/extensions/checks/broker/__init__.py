@@ -1,4 +1,4 @@
-"""Checks of a broker: whom it lets in, what an account may do, and what robots have of it."""
+"""Checks of a broker: its logins, the rights of an account, and how it delivers and retains messages."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""Checks what an account may publish and receive at a broker, and whether that broker holds small messages back."""
+"""Checks of what an account may publish and receive at a broker, and of whether the broker delays small messages."""
 
 from __future__ import annotations
 
@@ -33,10 +33,11 @@ def robot_account(
     level: SecurityLevel = "open",
     reads: str = "",
 ) -> Iterator[CheckResult]:
-    """Publish probes, which no program takes for anything else, below ``base``, and see when they come back.
+    """Publish probe messages below ``base`` and check that the broker delivers them.
 
-    After ``answer_s`` one counts as lost. Above the level ``open`` one that poses as another robot has to be.
-    ``reads``: a filter that the broker must grant besides.
+    No program takes a probe for anything else. One that does not come back within ``answer_s`` counts as lost. Above
+    the level ``open``, a probe in the name of another robot must be lost. ``reads``: a further filter that the broker
+    must grant.
     """
     try:
         with reached(settings, "") as trial:
@@ -70,13 +71,13 @@ def robot_account(
 
 
 def page_account(what: str, settings: MqttSettings, level: SecurityLevel = "open") -> Iterator[CheckResult]:
-    """Check that a page server with this account is sent what robots publish, and may publish itself."""
+    """Check that a page server with this account receives what robots publish, and may publish itself."""
     base, states = Identity("pebble", SERVERS, "doctor").base, ONLINE.filter("+/+/+")
     return robot_account(what, settings, base, level=level, reads=states)
 
 
 def _echo(trial: BrokerTrial, peer: Peer, topic: str, nonce_bytes: int = 8) -> tuple[bool, str]:
-    """Publish a probe; True if it comes back, and why the broker does not take it, as far as it tells."""
+    """Publish a probe; return whether it came back, and the broker's reason if it refused the probe."""
     payload, began = new_probe(time.time_ns() // 1_000_000, nonce_bytes), time.monotonic()
     mid = peer.publish(topic, payload, qos=1)
 
@@ -91,7 +92,7 @@ def _echo(trial: BrokerTrial, peer: Peer, topic: str, nonce_bytes: int = 8) -> t
 
 
 def _rules(what: str, trial: BrokerTrial, peer: Peer, topic: str) -> CheckResult:
-    """Check that the broker has rules: no robot, and no page, may publish what a robot of another name does."""
+    """Check that the broker has access rules: this account must not be able to publish in the name of another robot."""
     other = BRIDGE_PROBE.topic(f"pebble/robots/doctor-{secrets.token_hex(4)}")
     peer.subscribe(other)
     payload = new_probe(time.time_ns() // 1_000_000)

@@ -1,4 +1,4 @@
-"""Checks whom a broker lets in, where it answers, and whether others can read what is sent to it."""
+"""Checks of a broker's logins, of its addresses, and of whether its connections are encrypted."""
 
 import time
 from collections.abc import Iterable, Iterator
@@ -24,9 +24,9 @@ _HERE_S = 1.0  # within which an address of this machine answers
 def broker(
     name: str, settings: MqttSettings, level: SecurityLevel = "open", answer_s: float = TIMEOUT_S
 ) -> Iterator[CheckResult]:
-    """Check that it answers, accepts the config's login, refuses anonymous ones, and is encrypted.
+    """Check that the broker answers, accepts the config's login, refuses anonymous clients, and encrypts.
 
-    Above the level ``open`` one that lets everybody in is no mere warning.
+    Above the level ``open``, a broker that accepts everybody is a failure instead of a warning.
     """
     what, is_here = f"{name} {settings.host}:{settings.port}", is_loopback(settings.host)
     answer = attempt(settings, login=True, timeout_s=answer_s)
@@ -93,7 +93,7 @@ def _encryption(settings: MqttSettings, answer: LoginAttempt, *, is_here: bool) 
 
 
 def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str]) -> Iterator[CheckResult]:
-    """Try the port of a broker that is meant for its machine alone at each of ``addresses``."""
+    """Try the port of a broker that should be reachable from its own machine only, at each of ``addresses``."""
     tls = None if settings.tls is None else replace(settings.tls, insecure=True)  # its certificate names the loopback
     answers = {
         address: attempt(replace(settings, host=address, tls=tls), login=False, timeout_s=_HERE_S)
@@ -116,5 +116,5 @@ def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str])
 
 
 def own_addresses() -> list[str]:
-    """Return the addresses of this machine on its networks; none on systems whose ``hostname`` does not tell them."""
+    """Return this machine's network addresses; empty on systems whose ``hostname`` cannot print them."""
     return printed("hostname", "-I").split()

@@ -1,4 +1,4 @@
-"""One login at a broker: the broker's answer, how long it took, and its certificate."""
+"""A trial login at a broker: the broker's answer, how long it took, and its certificate."""
 
 import ssl
 import time
@@ -17,9 +17,10 @@ TIMEOUT_S = 3.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoginAttempt:
-    """The result of one login. ``code`` is CONNACK's (0: accepted), None without one; ``problem`` is the reason.
+    """The result of a trial login.
 
-    With a code, ``problem`` names the addresses of the host that were tried before and failed.
+    ``code`` is that of CONNACK (0: accepted), or None if none came; ``problem`` is the reason then. With a code,
+    ``problem`` names the host's other addresses that were tried before and failed.
     """
 
     code: int | None = None
@@ -30,19 +31,20 @@ class LoginAttempt:
 
     @property
     def refusal(self) -> str:
-        """Return why there was no login; empty: it was accepted."""
+        """Return why the login failed; empty if it was accepted."""
         return self.problem if self.code is None else reasons.connection_refused(self.code) * bool(self.code)
 
     @property
     def refuses_login(self) -> bool:
-        """True if the broker refuses this login, or a client without one, and not the connection for another reason."""
+        """True if the broker refuses this user and password, or clients without; False for any other failure."""
         return self.code is not None and reasons.concerns_login(self.code)
 
 
 def attempt(settings: MqttSettings, *, login: bool, timeout_s: float = TIMEOUT_S) -> LoginAttempt:
     """Connect and disconnect, with the settings' user and password or (``login=False``) anonymously.
 
-    Where the host has several addresses, the first one counts that accepts the login, else the last one that answers.
+    If the host has several addresses, the result is that of the first address that accepts the login, or else of the
+    last one that answers.
     """
     if not login:
         settings = replace(settings, username=None, password=None, password_file=None)
@@ -78,7 +80,10 @@ def _expiry(sock: object) -> float | None:
 
 @contextmanager
 def reached(settings: MqttSettings, below: str, restart: Callable[[], bool] | None = None) -> Iterator[BrokerTrial]:
-    """Try the broker at the address that accepts a login; at the end everything is removed. Raises TransportError."""
+    """Yield a trial at the broker's first address that accepts the login, and clean up after it.
+
+    Raises TransportError if there is no such address.
+    """
     answer = attempt(settings, login=True)
     if answer.address is None:
         raise TransportError(f"broker {settings.host}:{settings.port} cannot be used: {answer.refusal}")

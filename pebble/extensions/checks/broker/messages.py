@@ -1,4 +1,4 @@
-"""Probes of a broker: what an account may do there, and how messages arrive."""
+"""Probes of a broker: the rights of an account, and how messages arrive."""
 
 from __future__ import annotations
 
@@ -36,7 +36,10 @@ _ODD_TOPICS = {
 
 
 def rights(trial: BrokerTrial) -> CheckResult:
-    """Publish and read; and find out for the other probes whether there is QoS 1, and whether anything is retained."""
+    """Check that the account may publish and read.
+
+    Also notes for the later probes whether the broker supports QoS 1 and retained messages.
+    """
     fix = (
         "use a robot's account and its topics: --below pebble/robots/ID; "
         f"or allow these ({MOSQUITTO}an acl_file with topic readwrite {trial.below}/#)"
@@ -70,7 +73,7 @@ def rights(trial: BrokerTrial) -> CheckResult:
 
 
 def _why_unread(trial: BrokerTrial, reader: Peer) -> str:
-    """Publish without QoS 1, too; return why even that is not read, or nothing."""
+    """Publish again without QoS 1; return why that message is not delivered either, or an empty text if it is."""
     writer = trial.peer()
     writer.publish("x")
     if not trial.wait(lambda: reader.received or writer.closed):
@@ -80,7 +83,7 @@ def _why_unread(trial: BrokerTrial, reader: Peer) -> str:
 
 
 def _kept(trial: BrokerTrial) -> Received | None:
-    """Return what a later subscriber gets of a message that was to be retained."""
+    """Return what a later subscriber gets of a message that was published as retained."""
     writer, late = trial.peer(), trial.peer()
     writer.publish("retained", qos=trial.qos, retain=True)
     writer.ping()
@@ -92,7 +95,7 @@ def _kept(trial: BrokerTrial) -> Received | None:
 
 
 def _is_forbidden(trial: BrokerTrial) -> bool | None:
-    """True if a message is not taken; only MQTT 5 tells, so None is possible."""
+    """True if the broker refuses to take a message; None if it cannot tell, as only MQTT 5 has such an answer."""
     try:
         writer = trial.peer(protocol="5")
     except RefusedError:
@@ -104,7 +107,10 @@ def _is_forbidden(trial: BrokerTrial) -> bool | None:
 
 
 def refusals(trial: BrokerTrial) -> CheckResult:
-    """Subscribe where no rule mentions the topic: an account with rules is refused that."""
+    """Check that the broker tells a client which subscriptions it refuses.
+
+    Subscribes to a topic that no access rule mentions, which a broker with rules must refuse.
+    """
     trial.base = f"{secrets.token_hex(8)}/doctor/one"
     reader, writer = trial.peer(), trial.peer()
     granted = reader.subscribe("#", qos=0)
@@ -142,7 +148,7 @@ def delay(trial: BrokerTrial) -> CheckResult:
 
 
 def held_back(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> CheckResult:
-    """Judge whether a message waits, by Nagle's algorithm, until the receiver's kernel has confirmed the one before."""
+    """Check whether a message is delayed, by Nagle's algorithm, until the receiver has acknowledged the previous one."""
     pairs = [pair for _ in range(_PAIRS) if (pair := _pair(trial, reader, writer, topic)) is not None]
     if len(pairs) < _PAIRS:
         return failed("they are lost on an idle connection", OTHER)
@@ -154,7 +160,7 @@ def held_back(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> Che
 
 
 def _pair(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> tuple[float, float] | None:
-    """Return the round trip of a message, and how long after it a second one comes; None if one is lost."""
+    """Return a message's round trip, and how long after it the next message arrives; None if either is lost."""
     reader.acknowledge_late()
     began, probes = time.monotonic(), [new_probe(number) for number in range(2)]
     for probe in probes:
@@ -183,7 +189,7 @@ def pings(trial: BrokerTrial) -> CheckResult:
 
 
 def _late(trial: BrokerTrial, peer: Peer) -> int:
-    """Return how many of twenty messages come after the answer to a ping that was sent after them."""
+    """Return how many of twenty messages arrive after the answer to a ping that was sent after all of them."""
     for place in range(20):
         peer.publish("x", b"%d" % place)
     peer.ping()
@@ -221,7 +227,7 @@ def as_published(trial: BrokerTrial) -> CheckResult:
 
 
 def _lacks_of_flags(trial: BrokerTrial, peer: Peer, *, modern: bool) -> str:
-    """Return what it lacks of noLocal and retain-as-published; empty if nothing."""
+    """Return which of noLocal and retain-as-published does not work; empty if both do."""
     other, granted = trial.peer(), peer.subscribe("#", qos=trial.qos, options=modern)
     peer.publish("own", qos=trial.qos)
     other.publish("other", b"1", qos=trial.qos, retain=trial.retains)

@@ -1,6 +1,6 @@
-"""A trial of a broker: clients on one thread that show what it does, packet by packet.
+"""A trial of a broker: clients on one thread that show its behaviour packet by packet.
 
-The transports hide what a broker lacks; here that is the result.
+The transports hide what a broker lacks; this module shows it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ NAME = "pebble-doctor-of-a-broker"  # as long as the names of a robot's programs
 
 
 class RefusedError(TransportError):
-    """The broker does not take this client. ``code``: of its CONNACK, if it sent one; the text says what it did."""
+    """The broker refuses this client. ``code``: that of its CONNACK, if it sent one."""
 
     def __init__(self, text: str, code: int | None = None) -> None:
         super().__init__(text)
@@ -42,7 +42,7 @@ class RefusedError(TransportError):
 
 
 class Received(NamedTuple):
-    """A message. ``topic`` is below that of the probe; ``at``: when it was read (monotonic)."""
+    """A received message. ``topic`` is relative to the probe's base topic; ``at`` is when it was read (monotonic)."""
 
     topic: str
     payload: bytes
@@ -51,7 +51,10 @@ class Received(NamedTuple):
 
 
 class Peer(packets.Listener):
-    """One connection, which reads in :meth:`BrokerTrial.wait`. Topics are below ``base``; whole ones if it is empty."""
+    """A connection, which is served in :meth:`BrokerTrial.wait`.
+
+    Topics are relative to ``base``; if ``base`` is empty they are complete.
+    """
 
     def __init__(self, trial: BrokerTrial, base: str, opening: Opening, *, bridge: bool) -> None:
         self.received: list[Received] = []
@@ -68,7 +71,10 @@ class Peer(packets.Listener):
     # -- what it does
 
     def subscribe(self, *filters: str, qos: int = 1, options: bool = False) -> bytes:
-        """Return the broker's answer: a code for each filter, nothing if none comes. ``options``: those of MQTT 5."""
+        """Subscribe; return the broker's code for each filter, or nothing if no answer comes.
+
+        ``options``: use the subscription options of MQTT 5 (noLocal, retain-as-published).
+        """
         names = map(self._whole, filters)
         wanted = [packets.Filter(name, qos, no_local=options, as_published=options) for name in names]
         mid = self._client.subscribe(wanted)
@@ -76,7 +82,7 @@ class Peer(packets.Listener):
         return self.granted.get(mid, b"")
 
     def publish(self, topic: str, payload: bytes = b"1", *, qos: int = 0, retain: bool = False) -> int:
-        """Return its number in `acks`, 0 with QoS 0."""
+        """Publish; return the message's number, as used in `acks`, or 0 with QoS 0."""
         if retain:
             self._trial.left[self._whole(topic)] = None
         return self._client.publish(self._whole(topic), payload, qos, retain=retain, expires_s=None)
@@ -85,13 +91,13 @@ class Peer(packets.Listener):
         return f"{self.base}/{topic}" if self.base else topic
 
     def ping(self) -> bool:
-        """Return False if it was not answered in time."""
+        """Ping the broker; return False if no answer came in time."""
         before = len(self.pongs)
         self._client.ping()
         return self._trial.wait(lambda: len(self.pongs) > before or self.closed) and not self.closed
 
     def leave(self) -> None:
-        """Say goodbye: the broker does not publish the will."""
+        """Disconnect in order: the broker does not publish the will."""
         self._client.disconnect()
         self._client.close()
 
@@ -102,7 +108,7 @@ class Peer(packets.Listener):
         self._client.close()
 
     def acknowledge_late(self) -> None:
-        """Let the kernel confirm what comes as late as it does for a program that sends nothing itself."""
+        """Let the kernel delay its TCP acknowledgements, as it does for a program that only receives."""
         if self.sock is not None and hasattr(socket, "TCP_QUICKACK"):
             self.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 0)
 
@@ -125,7 +131,7 @@ class Peer(packets.Listener):
     # -- inside
 
     def pump(self) -> None:
-        """Read what has come, and write what waits."""
+        """Read what has arrived, and write what is waiting."""
         client = self._client
         try:
             while len(self.received) < _MOST and client.receive():
@@ -177,9 +183,10 @@ class Peer(packets.Listener):
 
 
 class BrokerTrial:
-    """Peers at one broker, and what they left there. ``address``: of the host, one that accepted a login.
+    """Peers at one broker, and the retained messages that they left there.
 
-    Each probe has topics below ``{below}/{random digits}``, and what is retained there is removed by :meth:`close`.
+    ``address``: the host's address that accepted the login. Each probe has topics below ``{below}/{random digits}``;
+    :meth:`close` removes the retained ones.
     """
 
     def __init__(
@@ -200,7 +207,7 @@ class BrokerTrial:
         self._credentials = Credentials(settings)
 
     def begin(self) -> None:
-        """Let the peers of the last probe leave, and give this one topics of its own."""
+        """Disconnect the peers of the last probe, and choose new topics for the next."""
         for peer in self._peers:
             peer.leave()
         self._peers, self.base = [], f"{self.below}/{secrets.token_hex(8)}"
@@ -233,7 +240,10 @@ class BrokerTrial:
         return self.patience_s + 4 * self.round_trip_s
 
     def wait(self, condition: Callable[[], object], seconds: float | None = None) -> bool:
-        """Let all peers read until ``condition``; False: not within ``seconds``, or within a broker's usual answer."""
+        """Serve all peers until ``condition`` holds; return False if it does not in time.
+
+        ``seconds``: instead of the usual time of a broker's answer.
+        """
         end = time.monotonic() + (self.answer_s if seconds is None else seconds)
         while True:
             for peer in self._peers:
@@ -245,7 +255,7 @@ class BrokerTrial:
             time.sleep(_STEP_S)
 
     def wait_quiet(self, *peers: Peer) -> None:
-        """Wait until nothing more comes to these peers."""
+        """Serve all peers until nothing more arrives at these."""
         quiet_s, end = _QUIET_S + 4 * self.round_trip_s, time.monotonic() + self.answer_s
 
         def seen() -> int:
@@ -257,7 +267,7 @@ class BrokerTrial:
                 return
 
     def close(self) -> None:
-        """Remove all that is retained; what the broker does not take back stays in ``left``."""
+        """Remove all retained messages of this trial; those that the broker keeps stay in ``left``."""
         self.begin()
         if not self.left:
             return

@@ -1,4 +1,4 @@
-"""The needs of robots at a broker, as a table: each probe, and the loss if the broker fails it."""
+"""The probes of a broker as a table: each with what robots lose where the broker fails it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _RIGHTS, _WILDCARDS, _BRIDGE_MODE = "rights", "retained, to + and #", "bridge mo
 def _probe(
     name: str, costs: str, test: Callable[[BrokerTrial], CheckResult], *needs: Callable[[BrokerTrial], str]
 ) -> Probe:
-    """Return a probe on topics of its own, with new connections."""
+    """Return a check that runs with new connections and new topics."""
 
     def tried(trial: BrokerTrial) -> CheckResult:
         trial.begin()
@@ -77,7 +77,7 @@ PROBES = (
 
 
 def judge(trial: BrokerTrial) -> Iterator[tuple[Probe, CheckResult]]:
-    """Make one probe after the other; without rights none but the first."""
+    """Run the probes in their order; if the account lacks the rights, only the first."""
     for probe, result in run(PROBES, trial):
         yield probe, result
         if probe.name == _RIGHTS and result.state is State.FAILED:
@@ -85,7 +85,7 @@ def judge(trial: BrokerTrial) -> Iterator[tuple[Probe, CheckResult]]:
 
 
 def assessment(states: Mapping[str, State]) -> list[str]:
-    """Say what robots, operators and a mirror have of a broker, by the states of the probes."""
+    """Return what the results mean for robots, operators and a mirror, a sentence each."""
     broken = [name for name, state in states.items() if state is State.FAILED]
     if broken:
         return [f"robots cannot use it with this account: {', '.join(broken)}"]

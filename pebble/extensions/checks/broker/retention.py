@@ -1,4 +1,4 @@
-"""Probes of a broker: what it retains, for whom, and in which order that comes."""
+"""Probes of a broker: what it retains, for which subscriptions, and in which order it delivers it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The output of checks by commands: each result with the fix of a failure, or all as JSON."""
+"""The printed results of checks: each with the fix of a failure, or all as JSON."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _BAD = ("warn", "failed")
 
 
 class Printer:
-    """Prints results as they come, unless all are printed as JSON at the end; and counts them."""
+    """A printer of results, as they come or, with JSON, at the end; it counts failures and warnings."""
 
     def __init__(self, config: str = "CONFIG", *, as_json: bool) -> None:
-        """``config``: what fixes name as their config file."""
+        """Store ``config``, the path that the fixes name as the robot's config file."""
         self.rows: list[dict[str, str]] = []
         self._config, self._as_json = shlex.quote(config), as_json
 
     def take(self, result: CheckResult, why: str = "") -> None:
-        """Show a result. Texts come from the robot, so they are shown without secrets and control characters."""
+        """Print a result. Texts may come from the robot, so secrets and control characters are masked."""
         text, fix = (
             shown(without_secrets(words)) for words in (result.text, result.fix.replace("CONFIG", self._config))
         )
@@ -60,7 +60,7 @@ class Printer:
         return [row["name"] for row in self.rows if row["state"] == state]
 
     def end(self, *, warnings_count: bool = False, **more: object) -> int:
-        """Print the end, or all of it as JSON; returns 1 if a check failed, or if there were warnings that count."""
+        """Print the summary, or all results as JSON; return 1 if a check failed or a warning counts as a failure."""
         counts = {state: len(self.names(state)) for state in _COLOURS}
         bad = counts["failed"] + (counts["warn"] if warnings_count else 0)
         if self._as_json:
@@ -77,7 +77,7 @@ def _wrapped(text: str) -> str:
 
 
 def is_clear(name: str, how: str) -> bool:
-    """True if a person answers that the robot may move. Standard output is for the result."""
+    """True if a person confirms that the robot may move. Asks on standard error, as standard output is for results."""
     typer.echo(f"{shown(name)} will drive {how}.", err=True)
     typer.echo("Does it stand free, on the floor, with no person in its way? [y/N]: ", nl=False, err=True)
     if sys.stdin.readline().strip().lower() in ("y", "yes"):

@@ -1,1 +1,1 @@
-"""Judges robots of other makers against the contract, from outside: only by what they publish and how they answer."""
+"""Conformance of a robot to the contract, judged from outside: by what it publishes and how it answers."""

@@ -1,4 +1,4 @@
-"""The duties of a robot towards all who watch and stop it, as a table: each check, and why. No wheel turns here."""
+"""The duties of a robot towards its watchers and those who stop it, as a table. No check here turns a wheel."""
 
 from __future__ import annotations
 
@@ -48,19 +48,22 @@ controls = _offered("control", lambda view: view.controlled)
 
 
 def free(robot: Observer) -> str:
-    """Wait for the end of the check before, which may still be on its way."""
+    """Return who still drives or has stopped the robot; empty if it is free.
+
+    Waits first for the end of what the previous check began.
+    """
     robot.wait(lambda: not why_not_free(robot.view), ANSWER_S)
     return why_not_free(robot.view)
 
 
 def commanded(robot: Observer) -> str:
-    """Ask for an account where the robot takes commands of accounts only."""
+    """Return why the robot takes no commands from this account; empty if it takes them."""
     named = robot.view.named and not robot.account
     return "it takes commands only with a name: use an account, as in --url mqtts://ANN@BROKER" if named else ""
 
 
 def readable(robot: Observer) -> str:
-    """Send a request that changes nothing, and see whether the broker delivers it here, too."""
+    """Return why this account cannot see requests to the robot: it sends one that changes nothing, and waits for it."""
     account = (robot.account or "") if robot.view.named else ""
     is_read = robot.send_as(account, c.CONTROL, ControlRequest(id=secrets.token_hex(4), want="release"))
     return "" if is_read else "its broker does not let this account read incoming/: use an admin's"
@@ -102,7 +105,7 @@ def clock(robot: Observer) -> CheckResult:
 
 
 def _none_of(wrong: Collection[str], fix: str, fine: str, what: str = "") -> CheckResult:
-    """Return a failure that names the first ones of what is wrong; ``what`` is before them."""
+    """Return a failure that names the first wrong items after the words ``what``; a pass if there are none."""
     return failed(f"{what}{some_of(sorted(wrong))}", fix) if wrong else ok(fine)
 
 
@@ -177,7 +180,7 @@ def own_topics(robot: Observer) -> CheckResult:
 
 
 def _topics(value: object, path: str) -> Iterator[tuple[str, str]]:
-    """Return each value whose key calls it a topic, however deep it is."""
+    """Yield each value whose key says that it is a topic, at any depth."""
     for key, inner in value.items() if isinstance(value, dict) else ():
         where = f"{path}.{key}".lstrip(".")
         if isinstance(inner, str) and key.endswith("topic"):
@@ -248,7 +251,7 @@ def freed(robot: Observer) -> bool:
 
 
 def while_stopped(test: Callable[[Observer, str], CheckResult]) -> Callable[[Observer], CheckResult]:
-    """Run a test on the robot while it is stopped by a new stop, and free it afterwards."""
+    """Return a check that runs a test while a new stop holds the robot, and resets it afterwards."""
 
     def run(robot: Observer) -> CheckResult:
         name = secrets.token_hex(8)
@@ -288,7 +291,7 @@ def _after_long_ones(robot: Observer) -> CheckResult:
 
 
 def _repeated(robot: Observer) -> CheckResult:
-    """Check that the same stop sent again changes nothing, while the robot is stopped and after the reset."""
+    """Check that sending the same stop again changes nothing, before the reset and after it."""
     stop_names: list[str] = []  # the name that while_stopped chose
 
     def send_same_stop(robot: Observer, name: str) -> CheckResult:

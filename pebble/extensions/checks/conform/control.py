@@ -1,4 +1,4 @@
-"""The duties of a robot towards drivers in turn, as a table: control, and names where they are checked."""
+"""The duties of a robot towards several drivers, as a table: control, and accounts where they are checked."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ UNSEEN = "its broker does not show this account that it delivers such a message"
 
 
 class Driver:
-    """A program of a person who requests control, and drives with its key, if it has one."""
+    """A driving client for the trial: it requests control, and drives with the key that it was given."""
 
     def __init__(self, robot: Observer, by: str = BY) -> None:
         self._robot, self._by, self.id = robot, by, secrets.token_hex(4)
@@ -38,22 +38,22 @@ class Driver:
         self._robot.send(c.CONTROL, self.request(want, for_ms))
 
     def leaves(self) -> bool:
-        """Release it; return False if the robot keeps it."""
+        """Release control; return False if the robot does not take it back."""
         self.asks("release")
         return self._robot.answers(lambda: not self.holds)
 
     def takes(self) -> float:
-        """Take control without asking who has it; return when."""
+        """Take control from its present holder; return when (monotonic)."""
         return self._robot.send(c.CONTROL_TAKE, self.request())
 
     def send(self, z: object = 0, *, key: str | None = None, wrapped: bool = False, **fields: object) -> float:
-        """Send one command, and return when; ``key``: instead of its own, "" for none."""
+        """Send one command; return when (monotonic). ``key`` replaces its own key; "" sends none."""
         of = self.key if key is None else key
         command = {"x": 0, "z": z, **({"key": of} if of else {}), **fields}
         return self._robot.send(c.DRIVE, msgspec.json.encode({"value": command} if wrapped else command))
 
     def drive(self, seconds: float = DRIVES_S, *, z: object = SPEED, **fields: Any) -> tuple[float, float]:
-        """Send commands for so long, at the pace of its link; return when the first and the last one left."""
+        """Send commands for so many seconds, at the link's pace; return when the first and the last were sent."""
         began = last = time.monotonic()
         pace = self._robot.view.pace
         while time.monotonic() < began + seconds:
@@ -68,7 +68,7 @@ class Driver:
 
     @property
     def key(self) -> str:
-        """Return the keys of its control, one of each motor owner; empty while it has none."""
+        """Return the keys of its control, one for each motor owner; empty while it has no control."""
         keys = [state.key for state in self._robot.view.control.states if state.id == self.id]
         return " ".join(keys) if self.holds else ""
 
@@ -78,7 +78,7 @@ class Driver:
 
     @property
     def may_drive(self) -> bool:
-        """True if no other one has the robot."""
+        """True if nobody else has control of the robot."""
         return self.holds or not self._robot.view.controlled
 
 
@@ -147,7 +147,7 @@ def _taken(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _ends(robot: Observer, driver: Driver) -> CheckResult:
-    """Prolong it by commands: zeros, which move nothing."""
+    """Check that commands prolong control, with zeros, which move nothing, and that it ends after the last."""
     began = time.monotonic()
     while driver.holds and time.monotonic() < began + 1.5 * _SHORTEST_MS / 1000:
         driver.send()

@@ -1,4 +1,4 @@
-"""Checks that turn wheels, as far as the robot shows them. A person has agreed, and looks on."""
+"""Checks that turn wheels, judged by the motion that the robot reports. A person has agreed and is watching."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ _NOT_SHOWN = skipped(
 
 
 def moves_until(robot: Observer, since: float) -> float | None:
-    """Return when the last motion after ``since`` ended: infinite while it lasts, 0 without any, None if none is shown.
+    """Return when the last motion after ``since`` ended: inf while it lasts, 0 if none was seen.
 
-    It is shown by ``wheels`` in the status, which is published on change, by readings of hall sensors, or by speeds of
-    odometry.
+    None: the robot reports no motion. It may report ``wheels`` in its status (published on change), readings of hall
+    sensors, or speeds of its odometry.
     """
     reports = _shown(robot)
     readings = [(record.at, record.value.value) for record in robot.of(c.TOUCH_SENSORS) if record.value]
@@ -58,7 +58,7 @@ def moves_until(robot: Observer, since: float) -> float | None:
 
 
 def _swings(readings: list[tuple[float, Any]]) -> Iterator[float]:
-    """Return when a hall sensor's value differed from that at the last swing by more than noise."""
+    """Yield the times at which a hall sensor's value changed by more than noise since the previous such change."""
     level: tuple[int, ...] = ()
     for at, sensors in readings:
         values = msgspec.structs.astuple(sensors)
@@ -69,13 +69,13 @@ def _swings(readings: list[tuple[float, Any]]) -> Iterator[float]:
 
 
 def _shown(robot: Observer) -> list[tuple[float, list[float]]]:
-    """Return since when its wheels did what."""
+    """Return the reported wheel speeds, each with the time of its report."""
     reports = [(report.at, report.value.value.get("wheels")) for report in robot.of(c.STATUS) if report.value]
     return robot.eyes() or [(at, wheels) for at, wheels in reports if _are_wheels(wheels)]
 
 
 def _travelled(robot: Observer) -> list[tuple[float, list[float]]]:
-    """Return what its wheels did by its odometry, left and right, in metres a second."""
+    """Return the speeds of its odometry as those of a left and a right wheel (m/s), each with its time."""
     found = []
     for record in robot.of(c.WHEEL_ODOMETRY):
         value: dict[str, Any] = record.value.value if record.value else {}
@@ -88,7 +88,7 @@ def _travelled(robot: Observer) -> list[tuple[float, list[float]]]:
 
 
 def _moves(robot: Observer, since: float) -> list[float] | None:
-    """Return what its wheels do by commands since then; empty: nothing, None: it is not shown."""
+    """Return the wheel speeds that the robot reports after ``since``: empty if it rests, None if it reports none."""
 
     def moving() -> list[float]:
         shown = _shown(robot) or _travelled(robot)
@@ -105,7 +105,10 @@ def _are_wheels(value: Any) -> bool:
 
 @contextmanager
 def at_the_wheel(robot: Observer, by: str = BY, answer_s: float = ANSWER_S) -> Iterator[Driver]:
-    """Take control if it is free, and let go, so that a wait after a reset is over; at the end, too."""
+    """Yield a driver, which takes control if it is free.
+
+    It sends a zero first and last, since a reset holds until the stick was at rest.
+    """
     driver = Driver(robot, by)
     try:
         if robot.view.controlled:
@@ -135,7 +138,7 @@ def _rest(robot: Observer, began: float, last: float, limit_s: float, what: str 
 
 
 def rested(robot: Observer, began: float, last: float, limit_s: float, what: str = "the last command") -> CheckResult:
-    """Judge what was seen of a robot that was driven from ``began`` to ``last``, and had to rest soon after."""
+    """Check that a robot driven from ``began`` to ``last`` rested no more than ``limit_s`` after ``last``."""
     until = moves_until(robot, began)
     if until is None:
         return _NOT_SHOWN
@@ -148,7 +151,7 @@ def rested(robot: Observer, began: float, last: float, limit_s: float, what: str
 
 
 def _moved(robot: Observer, since: float, why: str, fix: str) -> CheckResult:
-    """Return a failure if it has moved."""
+    """Return a failure if the robot has moved after ``since``."""
     robot.look(robot.patience_s)
     until = moves_until(robot, since)
     if until is None:
@@ -161,7 +164,7 @@ def _dead_man(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _valid_ms(robot: Observer, driver: Driver) -> CheckResult:
-    """Drive by commands with a short time, and with one that is too long."""
+    """Check commands that are valid for a short time, and for a longer time than a robot may accept."""
     outcome = _rest(robot, *driver.drive(valid_ms=150), 0.15)
     if outcome.state is not State.OK:
         return outcome
@@ -170,7 +173,7 @@ def _valid_ms(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _zero(robot: Observer, driver: Driver) -> CheckResult:
-    """Send a zero that is not the driver's: it needs no key."""
+    """Check that a zero with another key than the driver's stops the robot: a zero needs no key."""
     began, _ = driver.drive()
     return _rest(robot, began, driver.send(key=_OTHER_KEY), 0.1, "a zero with another key")
 
@@ -192,7 +195,7 @@ def _steering(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _stop_moving(robot: Observer, driver: Driver) -> CheckResult:
-    """Go on with commands, and begin again after the stick was let go; they move nothing."""
+    """Check that commands after a stop move nothing, also those after a pause."""
     began, _ = driver.drive()
     at = time.monotonic()
     stop(robot, secrets.token_hex(8))
@@ -204,7 +207,7 @@ def _stop_moving(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _reset_waits(robot: Observer, driver: Driver) -> CheckResult:
-    """Hold the stick down meanwhile. A zero of another ends no wait while one has control."""
+    """Check that a stick held down over a reset moves nothing, and that another's zero does not end that wait."""
     stop(robot, secrets.token_hex(8))
     began, _ = driver.drive(2 * STEP_S)  # from before the reset on: a pause would end the wait
     reset(robot)
@@ -241,7 +244,7 @@ def _clamped(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _foreign_key(robot: Observer, driver: Driver) -> CheckResult:
-    """Drive with another's key while one has control, and while none has."""
+    """Check that commands with another's key move nothing, while someone has control and while nobody has."""
     why, fix = "it moves by another's key", "refuse what moves and has another key"
     outcome = _moved(robot, driver.drive(key=_OTHER_KEY)[0], why, fix)
     if outcome.state is not State.OK:
@@ -267,7 +270,7 @@ def _keyless(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _foreign_account(robot: Observer, driver: Driver) -> CheckResult:
-    """Send the key of control behind another account, and behind none."""
+    """Check that the right key moves nothing if it is sent by another account, or by none."""
     command = msgspec.json.encode({"x": 0, "z": SPEED, "key": driver.key})
     began = time.monotonic()
     delivered = [robot.send_as(account, c.DRIVE, command) for account in (_OTHER_ACCOUNT, "")]

@@ -1,1 +1,1 @@
-"""The report: what helps to find a fault from elsewhere, in one file without a secret."""
+"""The report: one file, without secrets, by which somebody elsewhere can find a fault."""

@@ -1,4 +1,4 @@
-"""A zip file that helps to find a fault from elsewhere, without a password or key."""
+"""The report as a zip file: configs, status, logs and facts of the machine, without passwords or keys."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _UNITS = ("etc/systemd/system", "usr/lib/systemd/system", "lib/systemd/system", 
 
 @dataclass(frozen=True)
 class Here:
-    """The robot that is reported: that installed below ``places``, or that of another config."""
+    """The robot to report on: the one installed below ``places``, or that of another config."""
 
     places: Places
     file: Path
@@ -55,7 +55,7 @@ Part = Callable[[Here], str]
 
 @dataclass
 class Report:
-    """``missing``: why a part is not in it; ``unread``: files whose secrets could not be searched for."""
+    """The written report. ``missing``: parts that are not in it, and why; ``unread``: files not searched for secrets."""
 
     parts: dict[str, str] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
@@ -70,7 +70,7 @@ class Report:
 
 
 def make(places: Places, file: Path | None = None) -> Report:
-    """Collect all parts, without a secret of this machine; a part that fails is named in the index."""
+    """Collect all parts, with this machine's secrets masked. A part that fails is named in the index."""
     here = _here(places, file or places.config)
     known = secrets_of(places, here.config, [here.file])
     report = Report(unread=known.unread)
@@ -106,7 +106,7 @@ def _index(report: Report, known: Secrets) -> str:
 
 
 def _config(here: Here) -> str:
-    """Return the config as written and as it is meant, with stars where there are secrets."""
+    """Return the config file and the config with its defaults, with secrets masked."""
     written = masked(plain(decode(read_text(here.file), here.file.name), Notes()))
     whole: dict[str, Any] = {"file": str(here.file), "written": written}
     whole |= {"problems": here.problem.splitlines()} if here.config is None else {"resolved": resolved(here.config)}
@@ -120,7 +120,10 @@ def _doctor(here: Here) -> str:
 
 
 def _status(here: Here) -> str:
-    """Return what the robot's own side publishes and retains; asked as its user, as root may not."""
+    """Return what the robot publishes and retains on its own transport.
+
+    It is read as the robot's user, as root may not.
+    """
     if here.config is None:
         raise PebbleError("the config cannot be read")
     user, file = user_of(here.config.run_dir()), str(here.file.absolute())
@@ -149,7 +152,7 @@ def _versions(here: Here) -> str:
 
 
 def _files(*patterns: str) -> Part:
-    """Return the part with all files that match, below the root."""
+    """Return the part that consists of all files that match, below the root."""
 
     def part(here: Here) -> str:
         files = sorted({file for pattern in patterns for file in here.places.root.glob(pattern)})
@@ -170,7 +173,7 @@ def _described(path: Path) -> str:
 
 
 def _programs(*commands: tuple[str, ...]) -> Part:
-    """Return the part with what these commands print."""
+    """Return the part that consists of the output of these commands."""
     return lambda _here: "".join(output_of(*command, seconds=_PROGRAM_S) for command in commands)
 
 

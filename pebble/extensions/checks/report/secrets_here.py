@@ -1,4 +1,4 @@
-"""Every password and key on a machine that a robot could have to do with, to be hidden in what leaves it."""
+"""The passwords and keys on this machine, found so that a report can mask them."""
 
 from __future__ import annotations
 
@@ -42,14 +42,17 @@ _keys = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----\n(.*?)-----END", re.DOTA
 
 
 class Secrets(NamedTuple):
-    """Secrets of a machine; ``unread`` files may hold more, and ``short`` ones have one that is too short."""
+    """Secrets of a machine.
+
+    ``unread``: files that could not be searched; ``short``: files with a secret too short to be masked safely.
+    """
 
     known: frozenset[str]
     unread: tuple[str, ...]
     short: tuple[str, ...]
 
     def hidden(self, text: str) -> str:
-        """Return ``text`` with stars in place of each, in whatever form it is written."""
+        """Return ``text`` with each secret masked by stars, in every form in which it may be written."""
         for value in sorted(self.known, key=len, reverse=True):
             for form in _forms(value):
                 text = text.replace(form, HIDDEN)
@@ -57,7 +60,7 @@ class Secrets(NamedTuple):
 
 
 def secrets_of(places: Places, config: Config | None, more: Collection[Path] = ()) -> Secrets:
-    """Return what is known on this machine. ``more``: further files and folders that may hold some."""
+    """Find the secrets on this machine. ``more``: further files and folders to search."""
     folders = [path for pattern in _PLACES for path in sorted(places.root.glob(pattern))]
     values: list[tuple[str, str]] = []  # and where each is written
     if config is not None:
@@ -78,7 +81,7 @@ def secrets_of(places: Places, config: Config | None, more: Collection[Path] = (
 
 
 def values_in(name: str, raw: bytes) -> Iterator[str]:
-    """Return the secrets in one file, by its name and by the keys in it."""
+    """Return the secrets in a file, found by the file's name and by its keys."""
     text = raw.decode(errors="replace")
     yield from _logins(text)
     keys = _keys(text)
@@ -112,6 +115,6 @@ def _walk(places: Iterable[Path], unread: set[str]) -> Iterator[Path]:
 
 
 def _forms(value: str) -> Iterator[str]:
-    """Return how it may be written: as it is, in JSON, in an address, and as base64."""
+    """Return the forms in which a secret may be written: plain, in JSON, in a URL, in base64."""
     yield from (value, json.dumps(value)[1:-1], quote(value, safe=""))
     yield base64.b64encode(value.encode()).rstrip(b"=").decode()

@@ -1,1 +1,1 @@
-"""Checks of a robot that runs, end to end, from its own side and from its operators'."""
+"""Checks of a running robot, end to end, from its own transport and from its operators' broker."""

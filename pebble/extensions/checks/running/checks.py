@@ -1,4 +1,4 @@
-"""The checks of a robot that runs, as a table: what needs to be reached and free for each, and what makes it."""
+"""The checks of a running robot, as a table: what each needs to reach, and what runs it."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def free(robot: RobotUnderTest) -> str:
 
 
 def processes(robot: RobotUnderTest) -> CheckResult:
-    """Check that its own side answers, and each of its processes is ready."""
+    """Check that the robot answers on its own transport, and that each of its processes is ready."""
     if why := robot.why_own or running(robot):
         return failed(why, "sudo systemctl start pebble, or pebble up CONFIG; and test it as the robot's user or root")
     if not robot.wait(lambda: _unready(robot) == [], robot.patience_s):
@@ -81,7 +81,10 @@ def _states(robot: RobotUnderTest) -> dict[str, str]:
 
 
 def _unready(robot: RobotUnderTest) -> list[str]:
-    """Return the unready programs; ``held`` ones wait while people drive, and those on demand for a request."""
+    """Return the programs that should be ready and are not.
+
+    Held ones wait while a person drives; those on demand wait for a request: neither counts.
+    """
     if not robot.own_side.status:
         return ["its status has not arrived: is it starting?"]
     states = {name: state for name, state in _states(robot).items() if state not in ("ready", "held")}
@@ -89,7 +92,7 @@ def _unready(robot: RobotUnderTest) -> list[str]:
 
 
 def heartbeats(robot: RobotUnderTest) -> CheckResult:
-    """Check that operators see it, without gaps."""
+    """Check that operators receive its heartbeats without gaps."""
     side, section = robot.operators, robot.config.services.mqtt_bridge.heartbeat
     if side is None:
         why = robot.why_operators
@@ -113,14 +116,14 @@ def heartbeats(robot: RobotUnderTest) -> CheckResult:
 
 
 def _gap(side: RobotSide) -> float:
-    """Return the longest one between the newest heartbeats; infinite until there are enough."""
+    """Return the longest gap between the newest heartbeats; inf until there are enough."""
     newest = side.heartbeats[-_IN_A_ROW:]
     gaps = [after - before for before, after in pairwise(newest)]
     return max(gaps) if len(newest) == _IN_A_ROW else math.inf
 
 
 def capabilities(robot: RobotUnderTest) -> CheckResult:
-    """Check that it offers, on both sides, what its config has."""
+    """Check that the capabilities on both sides list what the config has."""
     wanted = {*available(expected_capabilities(robot.config, Addresses(robot.config)))} - {"outlets"}  # with a device
     for side in robot.sides:
         where = "" if side.own else " to operators"
@@ -135,7 +138,7 @@ def capabilities(robot: RobotUnderTest) -> CheckResult:
 
 
 def boards(robot: RobotUnderTest) -> CheckResult:
-    """Check that each serial line's board was heard, and commands reach the motors."""
+    """Check that each serial line's board was heard, and that commands reach the motors."""
     lines = {name or "serial": line.serial.port for name, line in robot.config.serial_instances().items()}
     if not lines:
         return skipped("it has no serial line")
@@ -170,7 +173,7 @@ def _mcu(robot: RobotUnderTest, name: str) -> dict[str, object]:
 
 
 def battery(robot: RobotUnderTest) -> CheckResult:
-    """Read its voltage, and judge whether that is too low where its config has the number of cells."""
+    """Report the battery's voltage; warn if it is too low for the config's number of cells."""
     robot.wait(lambda: robot.view.volts is not None, _VOLTS_S)
     volts, cells = robot.view.volts, robot.config.robot.battery_cells
     if volts is None:
@@ -183,7 +186,7 @@ def battery(robot: RobotUnderTest) -> CheckResult:
 
 
 def leftovers(robot: RobotUnderTest) -> CheckResult:
-    """Find what robots of other ids have left retained on this machine: this one before it was renamed, for example."""
+    """Find retained messages of other robot ids on this machine, such as those from before a robot was renamed."""
     here = [side for side in robot.sides if side.is_here(robot.config)]
     if not here:
         return skipped("other ids at a broker elsewhere are other robots")

@@ -1,4 +1,4 @@
-"""Checks of the machine and of what the robot serves there: unit, slot, clock, disk, page. They send nothing to it."""
+"""Checks of the machine of a running robot: unit, slot, clock, disk, page. They send nothing to the robot."""
 
 import os
 import shutil
@@ -31,7 +31,7 @@ _ANY_HOST = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104 - where a page t
 
 
 def unit(robot: RobotUnderTest) -> CheckResult:
-    """Check that systemd runs it, and starts it with the machine."""
+    """Check that systemd runs the robot, and starts it with the machine."""
     if robot.config.path != robot.places.config:
         return skipped(f"{UNIT} would run {robot.places.config}, which is another file")
     if shutil.which("systemctl") is None or not Path("/run/systemd/system").is_dir():
@@ -43,7 +43,7 @@ def unit(robot: RobotUnderTest) -> CheckResult:
 
 
 def unit_of(properties: Mapping[str, str]) -> CheckResult:
-    """Judge what ``systemctl show`` prints."""
+    """Judge the output of ``systemctl show``."""
     if properties.get("LoadState") != "loaded":
         return skipped(f"{UNIT} is not installed")
     state, sub, restarts = (properties.get(name, "?") for name in ("ActiveState", "SubState", "NRestarts"))
@@ -57,7 +57,7 @@ def unit_of(properties: Mapping[str, str]) -> CheckResult:
 
 
 def slot(robot: RobotUnderTest) -> CheckResult:
-    """Check that the slot that runs is the active one, and whole."""
+    """Check that the slot which runs is the active one, and complete."""
     places = robot.places
     if not places.slots.is_dir() or not (places.slots / "active").is_symlink():
         return skipped("it is not installed in slots")
@@ -79,13 +79,13 @@ def slot(robot: RobotUnderTest) -> CheckResult:
 
 
 def clock(_robot: RobotUnderTest) -> CheckResult:
-    """Find a clock that was never set; a robot without a network has no time server, which is no failure."""
+    """Warn of a clock that was never set. A robot without a network has no time server, so it is no failure."""
     result = this_machine.clock(time.time(), this_machine.synchronised())
     return result if result.state is State.FAILED else ok(result.text)
 
 
 def disk(robot: RobotUnderTest) -> CheckResult:
-    """Check that stops, people and the audit can go on being saved."""
+    """Check that there is room to go on saving stops, people and the audit."""
     folder = Path(os.path.normpath(robot.config.state_dir()))  # a config may name it by ../..
     existing = next(place for place in (folder, *folder.parents) if place.exists())
     room = os.statvfs(existing)
@@ -104,7 +104,7 @@ def disk(robot: RobotUnderTest) -> CheckResult:
 
 
 def page(robot: RobotUnderTest) -> CheckResult:
-    """Check that the robot's own page answers, with the certificate of its config, and for how long that is valid."""
+    """Check that the robot's page answers with the config's certificate, and how long that is still valid."""
     if not robot.config.section(WebHandler).enabled:
         return skipped("the robot serves no page: services.web_handler is off")
     try:
@@ -142,7 +142,7 @@ def _status(host: str, port: int, context: ssl.SSLContext | None) -> int:
 
 
 def _trusting(certificate: Path | None) -> tuple[ssl.SSLContext | None, float | None]:
-    """Return what trusts just this certificate, at any name, and for how many days that is valid."""
+    """Return a TLS context that trusts this certificate only, under any name, and the days until it ends."""
     if certificate is None:
         return None, None
     context = ssl.create_default_context(cafile=str(certificate))

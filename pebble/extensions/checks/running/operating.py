@@ -1,4 +1,4 @@
-"""Checks of what operators do with a robot: they watch and hear it, stop it and drive it. It is free afterwards."""
+"""Checks that operate a robot: watch, listen, stop, drive. Afterwards it is free again."""
 
 import time
 from dataclasses import replace
@@ -34,7 +34,7 @@ _WHEEL_FIXES = {
 
 
 def received(robot: RobotUnderTest, medium: Medium, device: str) -> CheckResult:
-    """Request pictures or sound as an operator does, and give them back."""
+    """Check that requested pictures or sound arrive; then end the request."""
     if _PROGRAMS[medium] not in robot.config.on_demand_programs():
         return skipped(f"it has no {device}")
     receiver = MediaReceiver(robot.commanding_side.transport, robot.config.base)
@@ -62,7 +62,7 @@ def received(robot: RobotUnderTest, medium: Medium, device: str) -> CheckResult:
 
 
 def stop(robot: RobotUnderTest) -> CheckResult:
-    """Stop it as operators do, and end exactly this stop on its own side."""
+    """Check that an operator's stop is confirmed; then end exactly this stop from the robot's own side."""
     before = {owner: state.recent for owner, state in robot.view.estop.states.items()}
     side, name = robot.commanding_side, new_name()
     sender = StopSender(name, by=robot.by, why=_WHY, now=time.monotonic(), robots=[robot.config.base])
@@ -89,7 +89,7 @@ def stop(robot: RobotUnderTest) -> CheckResult:
 
 
 def _end(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> str:
-    """End this stop; return why the robot stays stopped, or nothing."""
+    """End this stop; return why the robot stays stopped, or an empty text."""
     view = robot.view
     robot.wait(lambda: all(name in state.recent for state in view.estop.states.values()), 1.0)
     if not view.latched:
@@ -105,10 +105,10 @@ def _end(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> str:
 
 
 def retained_commands(robot: RobotUnderTest) -> CheckResult:
-    """Leave a command retained at the broker, one that could do no harm, and see that the robot ignores it.
+    """Check that the robot ignores a retained command.
 
-    It is a reset that no motor owner could take: who reads it, publishes why it refuses it. A live one of another kind
-    follows, so that the silence before it means something.
+    The command is a reset that no motor owner could accept: an owner that reads it publishes why it refuses it. A live
+    reset of another kind follows, which must be answered: it shows that the silence before meant something.
     """
     operators = robot.commanding_side
     if robot.own_side.heartbeats:
@@ -147,7 +147,7 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
 
 
 def wheels(robot: RobotUnderTest) -> CheckResult:
-    """Drive a little way ahead and back, if a person has agreed; between the two, and after it, it stops by itself."""
+    """Drive a short way ahead and back, if a person has agreed; after each the robot must stop by itself."""
     if robot.view.charging:
         return skipped("it is on its charger")
     with at_the_wheel(robot.commanding_side, robot.by.partition("@")[0], _CONTROL_S) as driver:

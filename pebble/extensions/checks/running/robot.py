@@ -1,4 +1,4 @@
-"""The robot under test, as its own side and its operators' side show it."""
+"""The robot under test, seen from its own transport and from its operators' broker."""
 
 from __future__ import annotations
 
@@ -32,30 +32,30 @@ _ANY = "+/+/+"
 
 
 class RobotSide(Observer):
-    """A side of the robot: where its processes meet, or where its operators do."""
+    """A connection to one side of the robot: its own transport, or the broker of its operators."""
 
     def __init__(self, config: Config, target: Target, transport: Transport, names: Names, *, own: bool) -> None:
-        """``own``: the robot's own side."""
+        """Store the connection. ``own``: it is the robot's own transport."""
         self.own = own
         self._addresses = Addresses(config)
         watched = (*_WATCHED, c.TOUCH_SENSORS) if own else _WATCHED
         super().__init__(target, transport, names, [self._addresses[channel].topic for channel in watched])
 
     def is_here(self, config: Config) -> bool:
-        """True if it ends on this machine: what other robots have left there can only be left over."""
+        """True if this side is on this machine, so that other robots' retained messages are leftovers."""
         if self.own:
             return config.transport.kind != "mqtt" or is_loopback(config.local_mqtt.host)
         return is_loopback(config.services.mqtt_bridge.remote_mqtt.host)
 
     def ask(self, patience_s: float) -> None:
-        """Ask for what is retained by its name, which some brokers need; capabilities name some of it."""
+        """Subscribe to retained topics by name, as some brokers require; the capabilities list some of them."""
         estop = self.view.estop
         self.transport.ask([self._addresses[channel].topic for channel in _WATCHED if not channel.is_pattern])
         self.wait(lambda: estop.has_capabilities, patience_s)
         self.transport.ask([*estop.missing, *estop.missing_control])
 
     def others(self) -> tuple[dict[str, list[str]], set[str]]:
-        """Return the retained topics of all robots but this one, by base topic, and the bases that send heartbeats."""
+        """Return other robots' retained topics, by base topic, and the bases that send heartbeats."""
         topics: defaultdict[str, list[str]] = defaultdict(list)
         live: set[str] = set()
         with self.beside("selftest-others", *(channel.filter(_ANY) for channel in _STATES)) as (_, messages):
@@ -78,13 +78,13 @@ class RobotSide(Observer):
 
     @property
     def heartbeats(self) -> list[float]:
-        """Return when live ones arrived (monotonic)."""
+        """Return when live heartbeats arrived (monotonic)."""
         return [record.at for record in self.of(c.ONLINE) if record.value is not None]
 
 
 @dataclass(kw_only=True)
 class RobotUnderTest:
-    """A robot, and its sides as far as they are reached; ``why_own`` and ``why_operators`` are why they are not."""
+    """A robot and its two sides. ``why_own`` and ``why_operators`` say why a side could not be reached."""
 
     config: Config
     places: Places
@@ -102,12 +102,12 @@ class RobotUnderTest:
 
     @property
     def commanding_side(self) -> RobotSide:
-        """Return the side from which it is commanded: that of its operators, if it is reached."""
+        """Return the side to send commands from: the operators' if it is reached, else its own."""
         return self.operators or self.own_side
 
     @property
     def own_side(self) -> RobotSide:
-        """Return its own side, which the check needs."""
+        """Return the robot's own side, for a check that needs it."""
         assert self.own is not None  # noqa: S101
         return self.own
 
@@ -120,7 +120,7 @@ class RobotUnderTest:
             side.read()
 
     def wait(self, condition: Callable[[], object], seconds: float) -> bool:
-        """Read what arrives on both sides until ``condition``; return False if it does not hold within ``seconds``."""
+        """Read messages of both sides until ``condition`` holds; return False if it does not within ``seconds``."""
 
         def holds() -> object:
             self.read()
@@ -130,13 +130,16 @@ class RobotUnderTest:
 
 
 def user_of(folder: Path) -> pwd.struct_passwd | None:
-    """Return as whom root reaches the robot of this folder, so that it leaves no files of its own; None: as itself."""
+    """Return the user as whom root must reach the robot of this folder; None: no other user.
+
+    As that user, root leaves no files of its own.
+    """
     owner = folder.stat().st_uid if folder.is_dir() else 0
     return pwd.getpwuid(owner) if owner and os.geteuid() == 0 else None
 
 
 def become_user_of(folder: Path) -> None:
-    """Go on as :func:`user_of`."""
+    """Continue as the user that :func:`user_of` returns."""
     user = user_of(folder)
     if user is not None:
         os.initgroups(user.pw_name, user.pw_gid)
@@ -148,7 +151,7 @@ def become_user_of(folder: Path) -> None:
 def reached(
     config: Config, places: Places, by: str, *, patience_s: float = PATIENCE_S, rests_s: float = RESTS_S
 ) -> Iterator[RobotUnderTest]:
-    """Connect to both sides of a robot, as far as that is possible, until the block ends."""
+    """Connect to both sides of a robot as far as they can be reached; disconnect at the end of the block."""
     robot = RobotUnderTest(config=config, places=places, by=by, patience_s=patience_s, rests_s=rests_s)
     with ExitStack() as stack:
 

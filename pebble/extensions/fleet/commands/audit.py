@@ -43,7 +43,7 @@ def audit(
 
 
 def _row(line: bytes) -> tuple[str, ...]:
-    """Return the columns of a line; none if it cannot be read."""
+    """Return the columns of a line of the log; empty if it cannot be read."""
     try:
         row: dict[str, Any] = json.loads(line)
         at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(row["t"]))

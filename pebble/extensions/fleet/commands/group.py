@@ -1,4 +1,4 @@
-"""``pebble fleet``: the accounts of a broker, and what each of them may do."""
+"""``pebble fleet``: the accounts of a broker and their rights."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -335,7 +335,10 @@ def _init_again(place: Path, host: str | None, level: str | None, plain: bool | 
 
 @contextmanager
 def _changing(folder_: Path | None, *, any_rules: bool = False) -> Iterator[tuple[Path, Fleet]]:
-    """Lock a fleet; one that is still for the plugin only with ``any_rules``. Raises PebbleError."""
+    """Lock a fleet for a change. Raises PebbleError.
+
+    ``any_rules``: also a fleet that still uses mosquitto's plugin.
+    """
     place = _place(folder_)
     with as_owner(place, *LATE), folder.locked(place):
         fleet = folder.load(place)
@@ -346,7 +349,7 @@ def _changing(folder_: Path | None, *, any_rules: bool = False) -> Iterator[tupl
 
 
 def _place(folder_: Path | None) -> Path:
-    """Return the folder that is named, else the only fleet in this one. Raises PebbleError."""
+    """Return the named folder, or else the only fleet below the current one. Raises PebbleError."""
     if folder_ is not None:
         return folder_.absolute()
     folders = [Path(), *sorted(path for path in Path().iterdir() if path.is_dir() and not path.name.startswith("."))]
@@ -359,7 +362,7 @@ def _place(folder_: Path | None) -> Path:
 
 
 def _shown(path: Path) -> str:
-    """Show a path below this folder without the folder."""
+    """Return a path relative to the current folder, if it is below it."""
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
 
 
@@ -399,7 +402,7 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
 
 
 def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, Path]) -> None:
-    """Print where the certificate of an account and its key are, and what belongs into its config."""
+    """Print the paths of an account's certificate and key, and the lines for its config."""
     roles, until = fleet.accounts[name].roles, certificates.show(files[0]).until
     typer.echo(f"{' and '.join(map(_shown, files))} are for {name}, until {until:%Y-%m-%d}.")
     copies = " and ".join(map(_shown, (files[0], place / certificates.CA_CERT)))
@@ -413,7 +416,7 @@ def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, 
 
 
 def _left(lines: Iterable[str]) -> int:
-    """Print where a change does not count yet; the command's exit code."""
+    """Print the places where a change does not count yet; return the command's exit code."""
     code = 0
     for line in lines:
         typer.echo(f"pebble: {shown(line)}", err=True)
@@ -422,7 +425,7 @@ def _left(lines: Iterable[str]) -> int:
 
 
 def _remove_from_pages(fleet: Fleet, name: str) -> Iterator[str]:
-    """Remove the person from the pages' own lists on this machine; yields where that cannot be done."""
+    """Remove the person from the lists of page servers on this machine; yield a line for each that it cannot change."""
     for page, account in fleet.accounts.items():
         if ProgramRole.PAGE not in account.roles:
             continue

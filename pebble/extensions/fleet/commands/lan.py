@@ -119,7 +119,7 @@ def up(folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the fl
 
 
 def _commands(place: Path) -> dict[str, list[str]]:
-    """Return what runs here, by its name; nothing for what this LAN does not have. Raises PebbleError."""
+    """Return the programs to run for this LAN, by name. Raises PebbleError."""
     pebble = [sys.executable, "-Pm", "pebble"]  # nothing of the folder that we are in
     hub = {"hub": [*pebble, "fleet", "hub", str(place / HUB_FILE)]}
     if not (place / GATEWAY_FILE).exists():
@@ -148,7 +148,7 @@ def _running(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def _accounts(fleet: Fleet, robots: list[str], boards: list[str]) -> Fleet:
-    """Make each a neighbour of the others; boards are at the broker as well, with a gateway. Raises FleetError."""
+    """Give each robot an account as a neighbour of the others, and each board one at the broker. Raises FleetError."""
     bases = {name: f"pebble/robots/{name}" for name in (*robots, *boards)}
     for name, times in Counter((*robots, *boards)).items():
         if times > 1:
@@ -190,7 +190,7 @@ def _write_robot(place: Path, fleet: Fleet, name: str, others: list[str]) -> Non
 
 
 def _folder_of(place: Path, name: str) -> Path:
-    """Return the folder that is copied to a robot."""
+    """Return the folder that is to be copied to a robot."""
     its = place / ROBOTS / name
     its.mkdir(parents=True, exist_ok=True)
     write(its / certificates.CA_CERT, read_plain(place / certificates.CA_CERT), 0o644, FleetError)

@@ -1,1 +1,1 @@
-"""A program that carries the robots of a Zenoh hub to an MQTT broker, and their operators' commands back."""
+"""The gateway: a program that forwards between the robots of a Zenoh hub and their operators' MQTT broker."""

@@ -1,6 +1,6 @@
-"""A robot that the gateway carries: a forwarder and its subscriptions, which are new whenever it begins again.
+"""A robot that the gateway forwards for: a forwarder and its subscriptions.
 
-So what hub and broker retain then counts, as at the start of a bridge.
+Both are new whenever the gateway begins with the robot, so that retained messages count as at the start of a bridge.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -45,7 +45,7 @@ LARGEST = 1024 * 1024  # bytes of a message; the brokers of `pebble fleet` take 
 
 
 class NamedSubjects(Subjects):
-    """Subjects of a robot that renames nothing, also behind the name of a sender, which passes as it is."""
+    """The subjects of a robot without renamed topics. Topics with an account's name are forwarded unchanged."""
 
     def _find(self, topic: str) -> Subject | None:
         if not topic.startswith(f"{self._base}/{INCOMING}/{BY}/"):
@@ -59,9 +59,9 @@ class NamedSubjects(Subjects):
 
 
 class Beginning:
-    """Tells since when commands may have waited behind what the broker retains for a robot that begins.
+    """A record of since when commands may have waited behind a new robot's retained messages at the broker.
 
-    They share a connection with it, on which something of ours is nearly always on its way, so pings do not tell.
+    They share a connection that is almost never idle, so pings cannot tell their age.
     """
 
     LONG_S, REST_S = 0.5, 0.25  # what moves may wait so long; so long after it what had waited is still being read
@@ -80,7 +80,7 @@ class Beginning:
         self._began = None
 
     def aged(self, message: Message) -> Message:
-        """Return ``message`` with the time since when it may have waited. Hot."""
+        """Return ``message`` with the time since which it may have waited. Called for each message."""
         began = self._began
         if began is None and self._until == float("-inf"):
             return message
@@ -95,9 +95,9 @@ class Beginning:
 
 
 def begin(robots: Sequence["CarriedRobot"], hub: Transport, broker: Transport) -> None:
-    """Forward for ``robots`` from now on; first what the hub retains.
+    """Start to forward for ``robots``, beginning with what the hub retains.
 
-    Waits, bounded, for both sides: once for all robots, as a round trip takes longer than all else that one needs.
+    Waits, for a bounded time, for both sides: once for all robots, as a round trip takes longer than everything else.
     """
     _subscribe(robots, Side.LOCAL, hub, f"{OUTGOING}/#", f"{INCOMING}/flags/#")
     for robot in robots:
@@ -117,10 +117,10 @@ def _subscribe(robots: Sequence["CarriedRobot"], side: Side, transport: Transpor
 
 
 class CarriedRobot:
-    """A robot of the hub.
+    """A robot of the hub for which the gateway forwards.
 
-    ``stops_pass`` is asked for each stop: whether another way carries it. ``too_large`` is called with the topic of a
-    message that no broker takes.
+    ``stops_pass``: called for each stop; True if another connection carries it. ``too_large``: called with the topic of
+    a message that is too large for any broker.
     """
 
     def __init__(
@@ -151,12 +151,12 @@ class CarriedRobot:
         )
 
     def subscribing(self, side: Side, *below: str) -> dict[str, Handler]:
-        """Return what to subscribe to on ``side``; its retained messages arrive from now on."""
+        """Return the subscriptions to make on ``side``; retained messages arrive from now on."""
         self.forwarder.sides[side].subscribing()
         return {f"{self.base}/{metrics}": partial(self.receive, side) for metrics in below}
 
     def subscribed(self, side: Side, subscriptions: Iterable[Subscription]) -> None:
-        """Note that these are active, and that what is retained there has arrived."""
+        """Record that the subscriptions are active and that all retained messages have arrived."""
         self._subscriptions += subscriptions
         self.forwarder.subscribed(side)
         self._synchronize_at = self._clock() + INITIAL_SYNC_S
@@ -167,7 +167,7 @@ class CarriedRobot:
             subscription.close()
 
     def tick(self, now: float) -> None:
-        """Do what is due: forward what both sides retain, and look for cycles."""
+        """Forward what both sides retain, and look for cycles, when either is due."""
         if now >= self._synchronize_at:
             self._synchronize_at = float("inf")
             for side in Side:
@@ -195,7 +195,7 @@ class CarriedRobot:
     # -- media
 
     def _is_wanted(self, channel: Channel | None) -> bool:
-        """True if it is no medium, or one that is allowed and that no operator at the broker has ended."""
+        """True unless it is a medium that is not allowed, or that the operator at the broker has ended."""
         if channel not in self._requested:
             return True
         return self._allowed.get(channel, False) and self._requested[channel] is not False

@@ -18,8 +18,9 @@ from pebble.transports import Message, Transport, create
 def gateway_transports(
     gateway: GatewayFile, operators: Mqtt, run_dir: Path, will: Message
 ) -> tuple[Transport, Transport, Transport, Transport]:
-    """Return a gateway's connections: to where the robots are, and three to the operators' broker, one of them for its
-    heartbeats, with its will, and one for stops.
+    """Return a gateway's connections: one to the robots' hub, three to the operators' broker.
+
+    Of the three, one is for its heartbeats with its will, and one for stops.
     """
     base = will.topic.removesuffix(f"/{c.ONLINE.suffix}")
     forwards = mqtt_settings(operators, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S)

@@ -42,24 +42,24 @@ _decode, _encode = msgspec.json.Decoder(GatewayHeartbeat).decode, msgspec.json.e
 
 
 class SecondGatewayError(PebbleError):
-    """Another gateway carries the robots already."""
+    """An error at the start: another gateway already carries these robots."""
 
 
 def will(name: str) -> Message:
-    """Return the message that tells other gateways that this one has gone."""
+    """Return the message by which other gateways learn that this one has gone."""
     return Message(ONLINE.topic(Identity("pebble", GATEWAYS, name).base), b"", QoS.DELIVERED, True)
 
 
 def is_stop(topic: str) -> bool:
-    """True if the message is a stop, with the name of a sender or without."""
+    """True if the message is a stop, with an account's name in its topic or without."""
     return f"/{ESTOP.direction}/" in topic and topic.endswith(_STOP_END)
 
 
 class Gateway:
-    """The carrier of the robots whose bases match ``robots``. The transports are not yet open.
+    """A forwarder for all robots whose base topics match ``robots``. Its transports are not yet open.
 
-    ``broker`` is for what is forwarded, as published; ``presence``, with the :func:`will`, and ``stops`` are further
-    connections to the same broker.
+    ``broker`` carries what is forwarded, as it was published; ``presence``, with the :func:`will`, and ``stops`` are
+    further connections to the same broker.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Gateway:
     # -- the life of the program
 
     def run(self, ready: Callable[[], None] = lambda: None) -> None:
-        """Run until :meth:`quit`. Raises SecondGatewayError if another one carries its robots at the start."""
+        """Run until :meth:`quit`. Raises SecondGatewayError if another gateway carries its robots at the start."""
         try:
             self.open()
             ready()
@@ -128,13 +128,17 @@ class Gateway:
         self._presence.subscribe(ONLINE.filter(f"+/{GATEWAYS}/+"), self._on_gateway, direct=True)
 
     def close(self) -> None:
-        """Stop forwarding, and only then tell the others."""
+        """Stop forwarding, then publish that this gateway has gone."""
         self._end(self.carries)
         for transport in (self._broker, self._presence, self._stops, self._hub):
             transport.close()
 
     def tick(self) -> None:
-        """Take a turn: end what is over, begin what is heard, and tell other gateways."""
+        """Do one round.
+
+        End robots that are silent or carried by another gateway, begin newly heard ones, and publish this gateway's
+        heartbeat.
+        """
         if self._lost.is_set():
             self._lost.clear()
             self._end(self.carries)
@@ -158,7 +162,7 @@ class Gateway:
 
     @property
     def _is_connected(self) -> bool:
-        """True if robots can be carried, as far as this depends on connections."""
+        """True if all connections that forwarding needs are open."""
         return all(transport.state is State.CONNECTED for transport in (self._hub, self._broker, self._presence))
 
     def _leave_to_others(self, now: float) -> None:
@@ -226,7 +230,10 @@ class Gateway:
             self._quiet_log.warning("many", "the hub has more than %d robots: give it accounts", MAX_ROBOTS)
 
     def _differs(self, base: str, heartbeat: bytes) -> bool:
-        """True if an earlier heartbeat of that robot was another one, where live ones look like retained ones."""
+        """True if an earlier heartbeat of that robot was different.
+
+        Needed where a transport cannot tell live messages from retained ones.
+        """
         if base not in self._first and len(self._first) >= MAX_ROBOTS:
             self._first.clear()
         return self._first.setdefault(base, heartbeat) != heartbeat
@@ -256,7 +263,7 @@ class Gateway:
         self._quiet_log.warning("large", "a message on %s is larger than a gateway passes", topic[:200])
 
     def _stops_pass(self) -> bool:
-        """True if stops come by their own connection."""
+        """True if stops arrive on their own connection."""
         return self._stops.state is State.CONNECTED and not self._stops.not_received
 
     def _of(self, topic: str) -> CarriedRobot | None:

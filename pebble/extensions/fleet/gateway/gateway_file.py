@@ -1,4 +1,4 @@
-"""The file of ``pebble fleet gateway``: where robots are, the MQTT broker of their operators, and which robots."""
+"""The file of ``pebble fleet gateway``: the robots' hub, the operators' MQTT broker, and which robots to carry."""
 
 import os
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ class GatewayHub(ZenohSection, frozen=True, kw_only=True):
 
 
 class GatewayFile(Section, frozen=True, kw_only=True):
-    """A gateway between a hub, or the broker of a LAN, and the broker of the operators."""
+    """A gateway between a hub, or a LAN's broker, and the operators' broker."""
 
     id: Annotated[Level, doc("What it is called among gateways; unset: mqtt.username, the name of its account.")] = ""
     hub: Annotated[GatewayHub, doc("Where the robots are.")] = GatewayHub()
@@ -48,12 +48,15 @@ class GatewayFile(Section, frozen=True, kw_only=True):
 
     @property
     def operators(self) -> Mqtt | None:
-        """The settings of the operators' broker; None if this gateway only serves neighbours."""
+        """Return the settings of the operators' broker; None if this gateway only serves neighbours."""
         return self.mqtt or (None if self.neighbours else Mqtt())
 
 
 def load_gateway(path: Path, env: Mapping[str, str] = os.environ) -> tuple[GatewayFile, str, Path]:
-    """Read such a file; returns it, the gateway's name, and its run directory. Raises ConfigError with all problems."""
+    """Read the file; return it with the gateway's name and its run directory.
+
+    Raises ConfigError with all problems.
+    """
     path = path.absolute()
     reader = Reader(path.parent, env, (*CHECKS, *RULES), file=path)
     problem = reader.notes.problem

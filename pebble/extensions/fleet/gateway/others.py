@@ -1,4 +1,4 @@
-"""Other gateways at the same broker, by their `online`: a robot that one of them carries is not carried twice. Pure."""
+"""Other gateways at the same broker, known by their `online`, so that no robot is carried twice. Pure."""
 
 from dataclasses import dataclass
 
@@ -15,9 +15,10 @@ class _Other:
 
 
 class OtherGateways:
-    """The newest heartbeat of each. ``run`` names this one: of two that carry a robot the one with the greater goes on.
+    """The newest heartbeat of each other gateway.
 
-    Two that begin in the same moment both carry it until they hear each other.
+    ``run`` identifies this one: if two carry the same robot, the greater ``run`` continues. Two that begin at the same
+    moment both carry it until they hear each other.
     """
 
     def __init__(self, run: str) -> None:
@@ -25,15 +26,15 @@ class OtherGateways:
         self._others: dict[str, _Other] = {}
 
     def forget(self) -> None:
-        """Forget all: the connection on which they were heard was lost."""
+        """Forget all gateways, as the connection on which they were heard was lost."""
         self._others.clear()
 
     def left(self, name: str) -> None:
-        """Note that a gateway has gone: the broker has published its will, or it has left in order."""
+        """Record that a gateway has gone: its will was published, or it left in order."""
         self._others.pop(name, None)
 
     def heard(self, name: str, run: str, robots: tuple[str, ...], now: float) -> None:
-        """Note a live heartbeat of any gateway."""
+        """Record a live heartbeat of any gateway."""
         if run == self.run:
             return
         others = self._others
@@ -42,7 +43,7 @@ class OtherGateways:
         others[name] = _Other(now, run, frozenset(robots))
 
     def carrier(self, robot: str, now: float, *, carried: bool) -> str:
-        """Return which other gateway carries ``robot``; empty if none does. ``carried``: this one does so, too."""
+        """Return the other gateway that carries ``robot``; empty if none. ``carried``: this one carries it too."""
         for name, other in list(self._others.items()):
             if now - other.at <= FRESH_S and robot in other.robots and (not carried or other.run > self.run):
                 return name
