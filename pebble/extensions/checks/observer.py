@@ -153,7 +153,10 @@ class Observer:
 
     @contextmanager
     def beside(self, program: str, *filters: str) -> Iterator[tuple[Transport, deque[Message]]]:
-        """Yield a second connection that reads ``filters``, each as a subscription of its own: some brokers refuse one."""
+        """Yield a second connection that reads ``filters``.
+
+        Each filter is a subscription of its own, as some brokers refuse one of them.
+        """
         messages: deque[Message] = deque(maxlen=_MOST)
         with connected(replace(self.target, program=program)) as (beside, _):
             for filter_ in filters:

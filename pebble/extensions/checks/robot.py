@@ -1,4 +1,4 @@
-"""Checks of the robot that this machine's config describes. They change nothing; an unreachable broker takes seconds."""
+"""Checks of the robot that this machine's config describes. They change nothing; a dead broker takes seconds."""
 
 import os
 from collections.abc import Iterator

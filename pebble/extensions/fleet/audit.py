@@ -100,7 +100,10 @@ class Audit:
 
 
 def _values(row: Row) -> tuple[float | str | int, ...]:
-    """Return a row as it is stored. Without its texts it stands for rows that differ too much to be counted together."""
+    """Return a row as it is stored.
+
+    Without its texts it stands for rows that differ too much to be counted together.
+    """
     texts = (row.get(field, OTHERS if field == "user" else "") for field in _FIELDS)
     return (row["t"], row["what"], *texts, row.get("count", 1))
 

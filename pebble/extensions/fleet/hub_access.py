@@ -57,7 +57,7 @@ class _File(msgspec.Struct, frozen=True):
 
 
 class Access(NamedTuple):
-    """The content of the access file: rules, accounts by the name in their certificate, and priorities (:func:`first`)."""
+    """The content of the access file: rules, accounts by their certificate's name, and priorities (:func:`first`)."""
 
     control: Mapping[str, Any]
     accounts: Mapping[str, HubAccount]

@@ -18,8 +18,8 @@ _DEEPEST: Final = 8
 def json_spec(topic: str, channel: Channel | None) -> ChannelSpec:
     """Return the Foxglove channel of this topic.
 
-    Foxglove plots only fields that a schema names. A schema that cannot name every field is left out: then the channel
-    holds any JSON.
+    Foxglove plots only fields that a schema names. If the schema cannot name every field it is left out, so that the
+    channel may hold any JSON.
     """
     name, schema = (_ANY, b"") if channel is None else _schema_of(channel.suffix, channel.payload)
     return ChannelSpec(topic, "json", name, "jsonschema", schema)
@@ -35,7 +35,10 @@ def _schema_of(suffix: str, payload: type) -> tuple[str, bytes]:
 
 
 def _value(schema: dict[str, Any], definitions: dict[str, Any], depth: int) -> dict[str, Any] | None:
-    """Return the same in what Foxglove reads: plain types, objects with known fields, arrays of these; None if none."""
+    """Return a schema in the subset that Foxglove reads: plain types, objects with known fields, arrays of these.
+
+    None if it cannot be expressed so.
+    """
     if depth > _DEEPEST:
         return None
     if "$ref" in schema:

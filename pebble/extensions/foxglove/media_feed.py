@@ -1,4 +1,4 @@
-"""A medium of a robot for Foxglove: requested while a client subscribes to its channels, converted, published."""
+"""A robot's pictures or sound for Foxglove: requested while a client subscribes, converted, published."""
 
 import asyncio
 import logging
@@ -47,9 +47,9 @@ class Waiting(NamedTuple):
 
 
 class MediaFeed:
-    """The request for one medium of one robot, and what arrives of it; ``run`` is its task on the event loop.
+    """The request for a medium of one robot, and its payloads; ``run`` is its task on the event loop.
 
-    Payloads are converted on a thread, a few at a time: pictures that are decoded take milliseconds.
+    Payloads are converted on a thread, a few at a time, because decoding a picture takes milliseconds.
     """
 
     def __init__(self, broker: Broker, server: Server, schemas: Schemas, robot: RobotView, medium: Medium) -> None:
@@ -68,7 +68,7 @@ class MediaFeed:
         self._problem = self._reported = ""  # why the newest payload was not published; as shown
 
     def update(self) -> list[str]:
-        """Take note of new capabilities; returns the channels that it has by them, which stay."""
+        """Apply new capabilities; return the channels that they add. Channels are never removed."""
         channels, base = [], self._robot.base
         if not refusal(base, self._robot.capabilities, self._medium):
             self._topic = topic_of(base, self._robot.capabilities, _CHANNEL[self._medium])
@@ -77,12 +77,12 @@ class MediaFeed:
         return channels
 
     def wake(self, ending: str, *, subscribed: bool) -> None:
-        """Take note that a client has subscribed, or unsubscribed."""
+        """Note that a client has subscribed or unsubscribed."""
         self.wants_keyframe = self.wants_keyframe or (subscribed and ending == VIDEO[1])
         self._request.want(self._is_wanted())
 
     async def run(self) -> None:
-        """Request and convert until it is cancelled; then withdraw the request."""
+        """Request and convert until the task is cancelled; then withdraw the request."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._run_requests())
             tasks.create_task(self._run_conversion())
@@ -99,7 +99,7 @@ class MediaFeed:
         self._work.set()
 
     def _drop(self) -> None:
-        """Drop the oldest; of pictures all, because each builds on those before it."""
+        """Drop the oldest payload; of pictures all, because each builds on those before it."""
         is_video = self._medium == "video"
         count = len(self.waiting) if is_video else 1
         for _ in range(count):
@@ -110,7 +110,10 @@ class MediaFeed:
             self.wants_keyframe = True
 
     def encoding(self) -> str | None:
-        """Return the encoding to request: H.264 where a client wants it as it is, else what any viewer already gets."""
+        """Return the encoding to request: H.264 if a client subscribes to it, else the robot's configured one.
+
+        Without PyAV it is one that needs no decoding.
+        """
         encodings = offered(self._robot.capabilities, self._medium)
         if self._subscribed(VIDEO[1]) and "h264" in encodings:
             return "h264"
@@ -119,7 +122,10 @@ class MediaFeed:
         return next((name for name in _WITHOUT_PYAV[self._medium] if name in encodings), _AS_CONFIGURED)
 
     def _take_picture(self, payload: bytes) -> bool:
-        """True if it is a picture. One that is missing before it is noticed, and a key frame wanted."""
+        """True if the payload is a picture that can be shown.
+
+        Notices missing pictures, and requests a key frame then.
+        """
         header = self._sequence.take(payload)
         if header is None:
             return False
@@ -142,7 +148,7 @@ class MediaFeed:
         return any(self._subscribed(ending) for _, ending in (VIDEO, IMAGE, SOUND))
 
     def _declared(self, schema: str, ending: str) -> str:
-        """Declare a channel, unless it is; returns its topic."""
+        """Declare a channel if it is new; return its topic."""
         topic = f"{self._topic}/{ending}"
         if not self._server.declared(topic):
             self._server.declare(protobuf_spec(topic, self._schemas.make(schema), self._schemas))
@@ -167,7 +173,10 @@ class MediaFeed:
         self._report(self._request.problem or self._request.waits or self._why_nothing_is_shown())
 
     async def _request_keyframe(self) -> None:
-        """Request a key frame, unless another encoding still arrives: the one that was requested begins with one."""
+        """Request a key frame.
+
+        Not while another encoding still arrives: the requested one begins with a key frame anyway.
+        """
         if self._arriving and self._request.encoding in (_AS_CONFIGURED, self._arriving):
             await self._request.request_keyframe(self._arriving)
 
@@ -175,7 +184,7 @@ class MediaFeed:
         return self._subscribed(IMAGE[1]) and self._media.decoder(self._topic).wants_keyframe
 
     def _report(self, problem: str) -> None:
-        """Show a new problem in Foxglove, once."""
+        """Show a problem in Foxglove, once."""
         if problem and problem != self._reported:
             log.warning("the %s of %s: %s", self._medium, self._robot.base, problem)
             self._server.report(f"{self._topic}: {problem}")

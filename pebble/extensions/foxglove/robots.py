@@ -1,4 +1,4 @@
-"""Robots of a broker for Foxglove: their channels as they appear, and their telemetry."""
+"""Robots of a broker for Foxglove: their channels, declared as topics appear, and their telemetry."""
 
 import asyncio
 import logging
@@ -28,13 +28,13 @@ _MEDIA: Final[tuple[Medium, ...]] = ("video", "audio")
 
 
 def filters(base: str) -> list[str]:
-    """Return what to subscribe to: the telemetry of these robots, without pictures and sound."""
+    """Return the topic filters for the telemetry of these robots, without pictures and sound."""
     every = list(dict.fromkeys(channel.filter(base) for channel in (*FLEET, *WATCHED, *SYNONYMS)))
     return [filter_ for filter_ in every if not any(other != filter_ and matches(other, filter_) for other in every)]
 
 
 class Robots:
-    """Only the event loop calls it."""
+    """The robots shown in Foxglove. Used on the event loop only."""
 
     def __init__(self, broker: Broker, server: Server, schemas: Schemas) -> None:
         self.robots: dict[str, RobotView] = {}
@@ -48,16 +48,16 @@ class Robots:
 
     @property
     def dropped(self) -> int:
-        """Pictures and packets of sound that were too many at once."""
+        """Return how many pictures and packets of sound were dropped because they came too fast."""
         return sum(feed.dropped for feed in self._feeds.values())
 
     @property
     def refused(self) -> int:
-        """Payloads that cannot be shown: no JSON, damaged, or a picture without those that it builds on."""
+        """Return how many payloads could not be shown: no JSON, damaged, or a picture that builds on a missing one."""
         return self._refused + sum(feed.refused for feed in self._feeds.values())
 
     def receive(self, message: Message, at: float) -> None:
-        """Take a message that arrived at ``at`` (monotonic)."""
+        """Process a message that arrived at ``at`` (monotonic)."""
         address = parse_topic(message.topic)
         if address is None or address.identity.is_server or not message.payload:
             return
@@ -79,7 +79,7 @@ class Robots:
             self._publish(None, Message(f"{message.topic}/words", words, retain=True), at_ns)
 
     def wake(self, topic: str, *, subscribed: bool) -> None:
-        """Note that a client has subscribed to this channel, or unsubscribed."""
+        """Note that a client has subscribed to this channel or unsubscribed."""
         feed = self._by_channel.get(topic)
         if feed is not None:
             feed.wake(topic.rpartition("/")[2], subscribed=subscribed)
@@ -92,7 +92,7 @@ class Robots:
             await asyncio.wait(self._tasks, timeout=timeout)
 
     def _robot(self, base: str) -> RobotView | None:
-        """Return that robot; None: there are too many."""
+        """Return the robot of this base topic; None if there are too many."""
         if base not in self.robots and len(self.robots) < MOST_ROBOTS:
             self.robots[base] = RobotView(base)
         return self.robots.get(base)
@@ -100,7 +100,7 @@ class Robots:
     # -- telemetry
 
     def _publish(self, channel: Channel | None, message: Message, at_ns: int) -> None:
-        """Publish by Foxglove's schema what it has one for, other JSON as it is; remember the last value of a state."""
+        """Publish in Foxglove's schema if there is one, else as JSON; remember the last value of a state."""
         topic, payload = message.topic, message.payload
         remember = message.retain or (channel is not None and channel.default_retain)
         converted = self._telemetry.convert(topic, payload)

@@ -1,4 +1,4 @@
-"""Serves robots to Foxglove until a signal ends it."""
+"""The program that serves robots to Foxglove until a signal ends it."""
 
 import asyncio
 import contextlib
@@ -18,7 +18,7 @@ _WITHDRAW_S, _CLOSE_S = 1.0, 0.5
 
 
 class Settings(NamedTuple):
-    """``base``: the robot to show, or ``+/+/+``. ``where`` is the broker in words."""
+    """The program's settings. ``base``: the robot to show, or ``+/+/+``; ``where``: the broker in words."""
 
     broker: MqttSettings
     where: str
@@ -28,7 +28,7 @@ class Settings(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """The numbers of the last line."""
+    """The numbers of the program's last line."""
 
     robots: int
     published: int
@@ -68,7 +68,7 @@ async def serve(
 
 
 async def _show(settings: Settings, broker: Broker, robots: Robots, on_ready: Callable[[], None]) -> None:
-    """Show the robots until it is cancelled. Raises TransportError without a broker."""
+    """Show the robots until the task is cancelled. Raises TransportError if there is no broker."""
     await broker.open()
     if not broker.connected:
         raise TransportError(f"cannot connect to {settings.where}: {broker.problem}")
@@ -80,13 +80,16 @@ async def _show(settings: Settings, broker: Broker, robots: Robots, on_ready: Ca
 
 @contextlib.contextmanager
 def _signalled() -> Iterator[asyncio.Event]:
-    """Give an event that the signals set which end a program. Not all platforms let a loop handle signals."""
+    """Yield an event that is set by signals.
+
+    Not every platform lets an event loop handle signals.
+    """
     loop, event = asyncio.get_running_loop(), asyncio.Event()
     with handled_by(lambda *_: loop.call_soon_threadsafe(event.set)):
         yield event
 
 
 def _call(loop: asyncio.AbstractEventLoop, robots: Robots, topic: str, on: bool) -> None:
-    """Tell ``robots``, on the thread of the loop, that a topic is (un)subscribed; ignored if the loop has ended."""
+    """Call ``robots`` on the event loop's thread after a (un)subscription; does nothing if the loop has ended."""
     with contextlib.suppress(RuntimeError):
         loop.call_soon_threadsafe(lambda: robots.wake(topic, subscribed=on))

@@ -1,4 +1,4 @@
-"""Foxglove's WebSocket server: its channels, who subscribes to them, and what was last published on each."""
+"""Foxglove's WebSocket server: its channels, their subscribers, and the last message of each."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _HOW: Final = 'pip install "pebble-robot[foxglove]"'
 
 
 class ChannelSpec(NamedTuple):
-    """The description by which Foxglove reads a channel."""
+    """The description of a channel by which Foxglove decodes it."""
 
     topic: str
     encoding: str  # of its messages: json or protobuf
@@ -34,7 +34,7 @@ class ChannelSpec(NamedTuple):
 
 
 def protobuf_spec(topic: str, message: Any, schemas: Schemas) -> ChannelSpec:
-    """Return the channel for messages of this kind."""
+    """Return the description of a channel for Protobuf messages of this kind."""
     return ChannelSpec(topic, "protobuf", message.DESCRIPTOR.full_name, "protobuf", schemas.descriptors(message))
 
 
@@ -44,13 +44,13 @@ class _Remembered(NamedTuple):
 
 
 class Server:
-    """Serves clients that only look. Any thread may publish; one thread declares channels.
+    """A server for clients that only watch. Any thread may publish; one thread declares channels.
 
     ``on_change(topic, subscribed)`` runs on a thread of the SDK when a client subscribes, unsubscribes or leaves.
     """
 
     def __init__(self, name: str, on_change: Callable[[str, bool], None]) -> None:
-        """Raises PebbleError without the SDK."""
+        """Store the settings. Raises PebbleError if the SDK is not installed."""
         self.dropped = 0  # too large, or of a channel too many
         self.published = 0
         self._name, self._on_change = name, on_change
@@ -91,7 +91,10 @@ class Server:
         return topic in self._channels
 
     def declare(self, spec: ChannelSpec) -> None:
-        """Advertise a channel, once; it stays. Not beyond the limit: then what is published on it is dropped."""
+        """Advertise a channel, once, for good.
+
+        Beyond the limit it is not advertised, and what is published on it is dropped.
+        """
         if spec.topic in self._channels or len(self._channels) >= MOST_CHANNELS:
             return
         schema = self._sdk.Schema(name=spec.schema_name, encoding=spec.schema_encoding, data=spec.schema)
@@ -107,7 +110,10 @@ class Server:
             return bool(self._subscribers.get(topic))
 
     def publish(self, topic: str, data: bytes, log_ns: int, *, remember: bool = False) -> None:
-        """Publish on a channel that is declared; what is remembered, clients that subscribe later receive then."""
+        """Publish on a declared channel.
+
+        ``remember``: send it to clients that subscribe later, too.
+        """
         channel = self._channels.get(topic)
         fits = channel is not None and len(data) <= MAX_BYTES
         with self._lock:
@@ -119,7 +125,7 @@ class Server:
             channel.log(data, log_time=log_ns)
 
     def report(self, text: str) -> None:
-        """Show a problem in Foxglove."""
+        """Show a problem to Foxglove's users."""
         if self._server is not None:
             self._server.publish_status(text, self._sdk.StatusLevel.Warning)
 
@@ -134,7 +140,7 @@ class Server:
     # -- threads of the SDK
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        """Send a client what was last published there."""
+        """Send a client the remembered message of a channel."""
         topic = channel.topic
         with self._lock:
             self._subscribers.setdefault(topic, set()).add(client.id)
@@ -145,7 +151,7 @@ class Server:
         self._on_change(topic, True)
 
     def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
-        """Take note that a client has unsubscribed, or left."""
+        """Note that a client has unsubscribed or left."""
         with self._lock:
             self._subscribers.get(channel.topic, set()).discard(client.id)
         self._on_change(channel.topic, False)

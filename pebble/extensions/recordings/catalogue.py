@@ -1,4 +1,4 @@
-"""The contents of recordings, read from their summaries where they have them."""
+"""The contents of recordings, read from their summaries where they have some."""
 
 import json
 from collections import Counter
@@ -20,7 +20,7 @@ _LISTED: Final = 20  # names that a message lists
 
 @dataclass(slots=True)
 class FileInfo:
-    """One file."""
+    """The contents of one recording file."""
 
     path: Path
     size: int
@@ -42,9 +42,10 @@ class FileInfo:
 
 
 def look_at(path: Path, *, whole: bool = False, since_ns: int = 0, until_ns: int = FOREVER_NS) -> FileInfo:
-    """Return what a file holds, by its summary; one without, or ``whole``, is read completely. Raises RecordingError.
+    """Return a file's contents from its summary, or by reading it completely. Raises RecordingError.
 
-    Only messages from ``since_ns`` to before ``until_ns`` count.
+    It is read completely if it has no summary or with ``whole``. Only messages from ``since_ns`` to before ``until_ns``
+    count.
     """
     try:
         size = path.stat().st_size
@@ -97,7 +98,7 @@ def _count(info: FileInfo, channel: Channel, count: int) -> None:
 
 
 def events(paths: Iterable[Path]) -> Iterator[dict[str, Any]]:
-    """Yield what happened to the recording itself, in the order of time."""
+    """Yield the recorder's own events (begin, gaps, drops), in the order of time."""
     for message in merged(paths, chooses=lambda channel: channel.topic == EVENTS):
         try:
             event = json.loads(message.payload)
@@ -109,7 +110,7 @@ def events(paths: Iterable[Path]) -> Iterator[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """A choice of messages; without any condition all of robots, brokers and the recorder."""
+    """A selection of messages. Without conditions it selects all messages of robots, brokers and the recorder."""
 
     robot: str | None = None  # system/type/id
     topics: tuple[str, ...] = ()  # filters; one without the robot's identity begins at any robot's
@@ -125,9 +126,10 @@ class Query:
 
 
 def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> None:
-    """Raise RecordingError if the recordings of ``places`` have no such robot or topic, which may be a mistake.
+    """Raise RecordingError if no recording of ``places`` has this robot or topic, as it may be mistyped.
 
-    Where a file cannot be read completely, names are not known: it is the file's problem that is to be said.
+    If a file cannot be read completely, its names are unknown; then nothing is raised, since the file's problem is
+    reported.
     """
     if query.robot is None and not query.topics:
         return
@@ -150,7 +152,7 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
 
 
 def check_name(kind: str, name: str | None, known: Collection[str], places: Iterable[Path]) -> None:
-    """Raise RecordingError, which says what there is, if ``name`` is none of the ``known`` ones."""
+    """Raise RecordingError, with the known names, if ``name`` is not among ``known``."""
     if name is not None and name not in known:
         listed = [shown(text) for text in sorted(known)[:_LISTED]] or ["none"]
         more = f" and {len(known) - _LISTED} more" if len(known) > _LISTED else ""

@@ -30,5 +30,5 @@ class Recorder(ServiceSection, frozen=True, kw_only=True):
 
     @property
     def place(self) -> Path:
-        """The folder, also where none is named."""
+        """Return the folder for recordings, also if the config names none."""
         return self.folder or in_home("~/recordings")

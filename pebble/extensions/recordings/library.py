@@ -1,4 +1,4 @@
-"""Recordings as one stream of messages in the order of time, however many files they are in."""
+"""Recordings as one stream of messages in the order of time, in however many files."""
 
 from collections.abc import Iterable, Iterator
 from functools import partial
@@ -20,7 +20,7 @@ Damages = dict[Path, Damage]
 def files(places: Iterable[Path]) -> list[Path]:
     """Return the recordings among ``places`` and in folders there, finished or not.
 
-    Raises RecordingError if there is none.
+    Raises RecordingError if there are none.
     """
     found: list[Path] = []
     for place in places:
@@ -36,7 +36,7 @@ def files(places: Iterable[Path]) -> list[Path]:
 
 
 def recordings_in(folder: Path) -> Iterator[Path]:
-    """Yield the recordings by name; a link that leads nowhere counts as a recording that cannot be read."""
+    """Yield the recordings of a folder by name; a broken link counts as an unreadable recording."""
     for path in folder.rglob(f"*{SUFFIX}*"):
         if path.name.endswith((SUFFIX, ACTIVE)) and (path.is_file() or path.is_symlink()):
             yield path
@@ -58,8 +58,8 @@ def merged(
 ) -> Iterator[Recorded]:
     """Yield the messages of all files from ``since_ns`` to before ``until_ns``, by the time of their arrival.
 
-    A file is open only while its time has come: its chunks outside the period are not unpacked. What is wrong with
-    those that were read is in ``damages``. Raises RecordingError.
+    A file is open only while its messages are due; chunks outside the period are not decompressed. Damage of the read
+    parts is put into ``damages``. Raises RecordingError.
     """
     damages = {} if damages is None else damages
     due = []

@@ -1,4 +1,4 @@
-"""Periods that a user types: ``--since 10:00 --until +5m``. Pure."""
+"""Periods as a user types them: ``--since 10:00 --until +5m``. Pure."""
 
 import re
 from collections.abc import Iterator
@@ -48,7 +48,7 @@ def parse_period(since: str | None, until: str | None, *, now: datetime) -> tupl
 
 
 def _zoned(option: str, text: str, now: datetime) -> tuple[str, datetime]:
-    """Return the text without its zone, and ``now`` in that zone."""
+    """Return the text without its time zone, and ``now`` in that zone."""
     match = _ZONED.fullmatch(text)
     if match is None:
         return text, now
@@ -105,7 +105,7 @@ def _known(moments: list[datetime], zone: tzinfo | None) -> Iterator[tuple[int, 
 
 
 def _readings(moment: datetime, zone: tzinfo | None) -> set[int]:
-    """Return when clocks of a zone, or this machine's, show ``moment``: where they are changed twice, or never."""
+    """Return the times at which a zone's clocks show ``moment``: two or none when they are changed."""
     return {_ns(moment.replace(tzinfo=zone, fold=fold)) for fold in (0, 1)}
 
 
@@ -131,7 +131,7 @@ def _clock(option: str, text: str) -> time:
 
 
 def _moment(option: str, text: str, now: datetime, days: int = 0) -> int:
-    """Return the time in ``text`` as nanoseconds since 1970. Raises PebbleError if ``text`` names none.
+    """Parse a time; return nanoseconds since 1970. Raises PebbleError.
 
     A date without a time means its beginning, plus ``days``.
     """
@@ -166,7 +166,7 @@ def _length_ns(age: re.Match[str]) -> int:
 
 
 def _ns(moment: datetime) -> int:
-    """Return exact nanoseconds, unlike ``timestamp()``. A naive ``moment`` is in this machine's zone."""
+    """Return the exact nanoseconds, unlike ``timestamp()``. A ``moment`` without a zone is in this machine's."""
     try:
         if moment.tzinfo is None:  # astimezone() is wrong where it does not exist
             return _clipped(int(moment.replace(microsecond=0).timestamp()) * 10**9 + moment.microsecond * 1000)

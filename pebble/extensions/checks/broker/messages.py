@@ -148,7 +148,7 @@ def delay(trial: BrokerTrial) -> CheckResult:
 
 
 def held_back(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> CheckResult:
-    """Check whether a message is delayed, by Nagle's algorithm, until the receiver has acknowledged the previous one."""
+    """Check whether Nagle's algorithm delays a message until the receiver has acknowledged the previous one."""
     pairs = [pair for _ in range(_PAIRS) if (pair := _pair(trial, reader, writer, topic)) is not None]
     if len(pairs) < _PAIRS:
         return failed("they are lost on an idle connection", OTHER)

@@ -55,7 +55,7 @@ Part = Callable[[Here], str]
 
 @dataclass
 class Report:
-    """The written report. ``missing``: parts that are not in it, and why; ``unread``: files not searched for secrets."""
+    """The written report. ``missing``: parts that are not in it, and why; ``unread``: files not searched."""
 
     parts: dict[str, str] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)

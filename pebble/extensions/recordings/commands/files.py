@@ -1,4 +1,4 @@
-"""``pebble recordings`` mend and rm: what is done to the files themselves."""
+"""``pebble recordings`` mend and rm: repair and deletion of files."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def _rm(owner: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keep
 
 
 def _reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:
-    """True if a file may hold messages of a period: one that cannot be read may."""
+    """True if a file may hold messages of a period; an unreadable file may."""
     try:
         with RecordingFile(path) as file:
             return not file.chunks or file.reaches_into(since_ns, until_ns)
@@ -121,7 +121,7 @@ def _reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:
 
 
 def _delete_whole(path: Path, *, yes: bool) -> int:
-    """Delete whole files. Raises PebbleError for what is no file of a recorder, or is being written."""
+    """Delete whole files. Raises PebbleError for a file that no recorder wrote, or that is being written."""
     if path.is_symlink():
         raise PebbleError(f"{path} is a link: name the file itself")
     if not path.is_file() or not path.name.endswith((SUFFIX, ACTIVE, DAMAGED)):
@@ -165,7 +165,7 @@ def _mend_all(folder: Folder) -> int:
 
 
 def _archive_of(path: Path) -> Path:
-    """Return the folder of a recorder, which has one for each year, month and day."""
+    """Return the recorder's folder above a file, which has folders for years, months and days."""
     folder = path.resolve().parent
     while _DATE.fullmatch(folder.name):
         folder = folder.parent

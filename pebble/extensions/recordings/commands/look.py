@@ -1,4 +1,4 @@
-"""``pebble recordings`` list, info and search: what there is, and what was recorded."""
+"""``pebble recordings`` list, info and search."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -108,8 +108,8 @@ def _looked_at(
 ) -> tuple[list[FileInfo], list[str]]:
     """Return the files of a period by their times, and a line for each that cannot be read completely.
 
-    They are read as a whole with ``check``, or if that takes no more than seconds; else their summaries count.
-    ``inside``: only messages of the period count, for which files that reach beyond it are read.
+    Files are read completely with ``check``, or if that takes only seconds; else their summaries count. ``inside``:
+    count only messages of the period, for which files that reach beyond it are read.
     """
     since_ns, until_ns = period(since, until)
     counted_ns = {"since_ns": since_ns, "until_ns": until_ns} if inside else {}
@@ -136,7 +136,7 @@ def _looked_at(
 
 
 def _lane(path: Path) -> str:
-    """Return ``state`` or ``media of goob``, from the name of a recorder's file; else that name."""
+    """Return ``state`` or ``media of goob`` from the name of a recorder's file; any other name unchanged."""
     parts = path.name.removesuffix(".active").removesuffix(".mcap").split(".", 1)
     if len(parts) == 1:
         return shown(path.name)

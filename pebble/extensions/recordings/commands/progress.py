@@ -18,7 +18,10 @@ _QUIET_S = 2.0  # before progress is shown
 
 @contextmanager
 def progress_of_steps() -> Iterator[Callable[[str, float], None]]:
-    """Yield a function for what is done, and the share of it; shown on a terminal, where it takes over two seconds."""
+    """Yield a function that reports a step and the share of it that is done.
+
+    It shows a bar on a terminal if the work takes over two seconds.
+    """
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     bar, quiet_until = Progress(*columns, console=Console(stderr=True), transient=True), time.monotonic() + _QUIET_S
     task = bar.add_task("", total=1.0)
@@ -37,7 +40,7 @@ def progress_of_steps() -> Iterator[Callable[[str, float], None]]:
 
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[float], None]]:
-    """Yield a function for how much of one step is done."""
+    """Yield a function that reports the share of a single step that is done."""
     with progress_of_steps() as show:
         yield lambda done: show(what, done / max(1, total))
 

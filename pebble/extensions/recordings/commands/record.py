@@ -80,7 +80,7 @@ def record(
 
 
 def _free_bytes(into: Path) -> int:
-    """Return what stays free: as much as by default, or a tenth of a small disk."""
+    """Return how much of the disk must stay free: the default, or a tenth of a small disk."""
     place = next(path for path in (into, *into.absolute().parents) if path.exists())
     return min(Options().free_bytes, shutil.disk_usage(place).total // 10)
 
@@ -165,12 +165,12 @@ def _print_end(recorder: Recorder, into: Path) -> None:
 
 
 def seconds(text: str) -> float:
-    """Return the seconds. Raises PebbleError."""
+    """Parse a duration; return seconds. Raises PebbleError."""
     return _value(text, _SECONDS, "a duration: 30s, 10min, 1h or 7d")
 
 
 def size(text: str) -> int:
-    """Return the size in bytes. Raises PebbleError."""
+    """Parse a size; return bytes. Raises PebbleError."""
     return int(_value(text.removesuffix("B"), _BYTES, "a size: 64M, 2G or 1T"))
 
 

@@ -107,7 +107,7 @@ def replay(
 
 
 def _read(recordings: list[Path], options: Options) -> tuple[ReplaySource, Rules]:
-    """Return what is replayed. Raises PebbleError if that is nothing."""
+    """Return the recording to replay. Raises PebbleError if it has no messages to replay."""
     paths = files(recordings)
     source = ReplaySource(paths)
     topics = {channel.topic for channel in source.channels if not channel.topic.startswith("$")}
@@ -124,7 +124,7 @@ def _read(recordings: list[Path], options: Options) -> tuple[ReplaySource, Rules
 
 
 def _play(console: _Console, make: Make, rules: Rules, make_player: Callable[..., Player]) -> Player:
-    """Play to the end, for these robots. Raises TransportError."""
+    """Replay for these robots until the end. Raises TransportError."""
     terminal, bases = has_terminal(), list(rules.robots)
     with ExitStack() as stack:
         stack.enter_context(handled_by(console.on_signal))
@@ -149,7 +149,7 @@ def _maker(kind: str, settings: object) -> Make:
 
 
 class _Console:
-    """Waits for the player; meanwhile keys, signals and the state of the connection are looked at."""
+    """A terminal for the player: while the player waits it reads keys and signals, and shows the connection's state."""
 
     player: Player  # both are there once it plays
     robots: ReplayedRobots
@@ -182,13 +182,16 @@ class _Console:
             player.stop()
 
     def _report(self, problem: str) -> None:
-        """Print a line for each change where there is no status line."""
+        """Print a line for each change if there is no status line."""
         if problem != self._problem:
             self._problem = problem
             typer.echo(f"pebble: {shown(problem) or 'it goes on'}", err=True)
 
     def on_signal(self, number: int, _frame: object) -> None:
-        """End the replay; until all is cleaned up no further signal ends this process."""
+        """End the replay.
+
+        Later signals are ignored until everything is cleaned up.
+        """
         self.ended = self.ended or signal.Signals(number).name
 
     def _press(self, key: str, player: Player) -> None:
@@ -203,7 +206,7 @@ class _Console:
 
 
 def status(player: Player, problem: str) -> str:
-    """Return one line: the time in the recording, the speed, and what was sent."""
+    """Return the status line: time in the recording, speed, and number of sent messages."""
     moment = datetime.fromtimestamp(player.position_ns / 1e9).astimezone()
     doing = problem or ("paused" if player.paused else f"× {player.speed:g}")
     time_ = f"{moment:%Y-%m-%d %H:%M:%S}.{moment.microsecond // 100_000}"

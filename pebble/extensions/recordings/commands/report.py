@@ -1,4 +1,4 @@
-"""Lines that commands for recordings print: times, what could not be read, and what was left as it is."""
+"""Lines that several commands for recordings print: times, unreadable parts, and files left unchanged."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,7 +14,7 @@ from pebble.extensions.recordings.library import FOREVER_NS
 
 @contextmanager
 def errors_of_files(path: Path | None = None) -> Iterator[None]:
-    """Raise PebbleError for OSError; ``path`` is named where the error names no file."""
+    """Raise PebbleError in place of OSError. ``path`` is named if the error names no file."""
     try:
         yield
     except OSError as error:
@@ -22,7 +22,7 @@ def errors_of_files(path: Path | None = None) -> Iterator[None]:
 
 
 def report_unread(lines: list[str]) -> int:
-    """Return the exit code: 1 if there is a line."""
+    """Print the lines; return the exit code, 1 if there are any."""
     for line in lines:
         typer.echo(f"pebble: {shown(line)}", err=True)
     return 1 if lines else 0
@@ -40,7 +40,7 @@ def local_time(ns: int, *, fraction: bool = False) -> str:
 
 
 def period_words(since_ns: int, until_ns: int) -> str:
-    """Return a period in local time with its zone, and in UTC."""
+    """Return a period in words: in local time with its zone, and in UTC."""
     local, utc = (
         f"from {_end(since_ns, zone, 'the beginning')} to {_end(until_ns, zone, 'the end')}" for zone in (None, UTC)
     )

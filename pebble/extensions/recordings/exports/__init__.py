@@ -1,1 +1,1 @@
-"""Recordings in other forms, and back."""
+"""Conversion of recordings to other formats, and back."""

@@ -1,4 +1,4 @@
-"""One robot's pictures and sound as a film, or its sound alone: each at the time at which it was received."""
+"""A robot's pictures and sound as a film, or its sound alone, timed by when they were received."""
 
 import heapq
 import tempfile
@@ -48,9 +48,9 @@ def write_film(
 ) -> FilmResult:
     """Write the pictures and the sound of ``robot`` (its base) to ``target``, which ends in .mkv or .mp4.
 
-    The messages are read twice: for the sound, then for the pictures, which take long. If several of its topics carry
-    pictures, or sound, the first one counts. The film has the size of its first picture. Raises
-    RecordingError if there are no pictures or ``target`` cannot be written; PebbleError without PyAV.
+    The messages are read twice: for the sound, then for the pictures, which take long. If several topics carry
+    pictures, or sound, the first one counts. The film has the size of its first picture. Raises RecordingError if there
+    are no pictures or ``target`` cannot be written; PebbleError without PyAV.
     """
     if target.suffix not in _FORMATS:
         raise RecordingError(f"{target}: a film ends in {' or '.join(_FORMATS)}")
@@ -100,13 +100,16 @@ def write_wav(
 
 @contextmanager
 def _file_beside(target: Path) -> Iterator[Path]:
-    """Give a file that may become as large as the film: the folder for temporary files is often in memory."""
+    """Yield a path in a temporary folder beside ``target``.
+
+    The file may become as large as the film, and the usual folder for temporary files is often in memory.
+    """
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as name:
         yield Path(name, "sound.wav")
 
 
 def _media(messages: Iterable[Recorded], robot: str, on_time: Progress) -> Iterator[tuple[int, bytes]]:
-    """Yield the pictures and the sound of one robot, of one topic each, with milliseconds since the first one."""
+    """Yield the messages of one topic of pictures and one of sound, with milliseconds since the first message."""
     below, topics, first_ms = f"{robot}/{OUTGOING}/", dict[bool, str](), None
     for message in messages:
         on_time(message.log_ns)
@@ -120,7 +123,7 @@ def _media(messages: Iterable[Recorded], robot: str, on_time: Progress) -> Itera
 
 
 def _sound_packets(av: Any, path: Path, out: Any, codec: str) -> Iterator[Any]:
-    """Made while they are read, so that no more than a part of the sound is in memory."""
+    """Yield the sound's packets while the file is read, so that only a part of it is in memory."""
     with av.open(str(path), format="wav") as source:
         wav = source.streams.audio[0]
         layout = "mono" if wav.channels == 1 else "stereo"  # wav has no names for them
@@ -131,7 +134,7 @@ def _sound_packets(av: Any, path: Path, out: Any, codec: str) -> Iterator[Any]:
 
 
 class _Pictures:
-    """Pictures of any size and encoding as H.264 of one size, that of the first: the encoder scales the others."""
+    """An H.264 stream of one size, that of the first picture; others, in any encoding, are scaled to it."""
 
     def __init__(self, av: Any, out: Any) -> None:
         from pebble.extensions.media.decode import VideoDecoder
@@ -141,7 +144,7 @@ class _Pictures:
         self._av, self._out, self._decoder = av, out, VideoDecoder()
 
     def packets(self, pictures: Iterable[tuple[int, bytes]]) -> Iterator[Any]:
-        """Yield packets of a stream of ``out``: each picture is shown at its time (ms), but after the one before it."""
+        """Yield packets for a stream of ``out``: each picture at its time (ms), but never before the previous one."""
         stream: Any = None
         for at_ms, payload in pictures:
             decoded = self._decoder.feed(payload)
@@ -159,7 +162,10 @@ class _Pictures:
             yield from _lasting(stream.encode(None))
 
     def _opened(self, height: int, width: int) -> Any:
-        """Colour is stored for two by two pixels."""
+        """Open the encoder for the first picture's size, rounded down to even numbers.
+
+        H.264 stores colour for two by two pixels.
+        """
         stream = self._out.add_stream("libx264", rate=_NOMINAL_FPS, options=_OPTIONS)
         stream.width, stream.height = width & ~1, height & ~1
         stream.pix_fmt = "yuv420p"
@@ -170,7 +176,10 @@ class _Pictures:
 
 
 def _lasting(packets: list[Any]) -> list[Any]:
-    """Give each a length, which counts for the last one: the others are shown until the next."""
+    """Return the packets, each with a length.
+
+    Only the last one's length counts: the others are shown until the next.
+    """
     for packet in packets:
         packet.duration = _LAST_PICTURE_MS
     return packets

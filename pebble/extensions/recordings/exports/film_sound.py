@@ -29,7 +29,10 @@ class SoundResult:
 
 
 class SoundTrack:
-    """The film's sound as a wav file: silence where none was received. The first packet decides mono or stereo."""
+    """The film's sound as a wav file, with silence where none was received.
+
+    The first packet decides between mono and stereo.
+    """
 
     def __init__(self, path: Path) -> None:
         from pebble.extensions.media.sound import SoundDecoder
@@ -51,7 +54,7 @@ class SoundTrack:
             self._file.close()
 
     def add(self, payload: bytes, at_ms: int) -> None:
-        """Play a packet at ``at_ms``, or where the one before it ends, if that is near."""
+        """Add a packet at ``at_ms``, or directly after the previous one if its end is near."""
         sound = self._decoder.feed(payload)
         if sound is None:
             self.result.left_out += 1

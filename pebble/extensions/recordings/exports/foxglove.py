@@ -1,6 +1,6 @@
-"""Recordings for Foxglove: MCAP with its Protobuf schemas, which its panels show without further settings.
+"""Recordings for Foxglove: MCAP files in its Protobuf schemas, which its panels show without further settings.
 
-``foxglove_messages`` says what becomes of which topic; other JSON stays on its topic as it is.
+``foxglove_messages`` has the conversion of each topic; other JSON stays on its topic unchanged.
 """
 
 from collections import Counter
@@ -35,10 +35,10 @@ def write_foxglove(
     *,
     on_time: Progress = lambda _log_ns: None,
 ) -> dict[str, int]:
-    """Write ``messages`` to the MCAP file ``target``; returns how many there are by schema, ``json`` and ``left out``.
+    """Write ``messages`` to the MCAP file ``target``; return the number by schema, with ``json`` and ``left out``.
 
-    Left out are bytes that are no media of a known kind, pictures without those that they build on, and removals of
-    retained messages. Raises RecordingError if ``target`` cannot be written, PebbleError without Foxglove's schemas.
+    Left out are unknown media, pictures that build on missing ones, and removals of retained messages. Raises
+    RecordingError if ``target`` cannot be written, PebbleError without Foxglove's schemas.
     """
     schemas = Schemas()
     with unfinished(target) as path, path.open("wb", buffering=0) as file:
@@ -52,7 +52,7 @@ def write_foxglove(
 
 
 class _Export:
-    """One file in the making."""
+    """A file that is being written."""
 
     def __init__(self, copy: Copy, schemas: Schemas) -> None:
         self.counts: Counter[str] = Counter()

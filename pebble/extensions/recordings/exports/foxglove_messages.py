@@ -1,7 +1,7 @@
-"""Messages of robots as Foxglove's own, for its files and for its live connection.
+"""Conversion of robots' messages to Foxglove's schemas, for its files and for the live connection.
 
-Each topic that is converted gets an ending, because Foxglove expects one schema for a topic: ``…/front-camera/video``.
-Sources: https://docs.foxglove.dev/docs/sdk/schemas, and for the payloads ``pebble.contract.payloads``.
+A converted topic gets a suffix, because Foxglove expects one schema for each topic: ``…/front-camera/video``. Sources:
+https://docs.foxglove.dev/docs/sdk/schemas, and for the payloads ``pebble.contract.payloads``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _TAG_SHOWN_S: Final = 1  # a tag is published ten times a second
 
 
 class Converted(NamedTuple):
-    """A Protobuf message of Foxglove's, and the ending of its topic."""
+    """A Protobuf message of Foxglove's, and the suffix of its topic."""
 
     message: Any
     ending: str
@@ -51,7 +51,7 @@ class Schemas:
     """The classes of Foxglove's schemas, by name."""
 
     def __init__(self) -> None:
-        """Raises PebbleError."""
+        """Load the schemas. Raises PebbleError if they are not installed."""
         try:
             self._descriptors = importlib.import_module("google.protobuf.descriptor_pb2")
             importlib.import_module("foxglove_schemas_protobuf.RawAudio_pb2")
@@ -64,10 +64,7 @@ class Schemas:
         return getattr(importlib.import_module(f"foxglove_schemas_protobuf.{schema}_pb2"), schema)(**fields)
 
     def descriptors(self, message: Any) -> bytes:
-        """Return the file descriptors of a message's schema, each after those that it imports.
-
-        What MCAP calls its schema.
-        """
+        """Return the file descriptors of a message, each after those that it imports: a schema in MCAP's terms."""
         found: dict[str, Any] = {}
 
         def add(file: Any) -> None:
@@ -84,7 +81,7 @@ class Schemas:
 
 
 class Media:
-    """Pictures and sound: H.264 as it was sent, other pictures as whole JPEGs, all sound as samples."""
+    """A converter of media: H.264 as it was sent, other pictures to complete JPEGs, sound to samples."""
 
     def __init__(self, schemas: Schemas) -> None:
         self._make = schemas.make
@@ -92,15 +89,15 @@ class Media:
         self._sounds: dict[str, SoundDecoder] = {}
 
     def convert(self, topic: str, payload: bytes) -> Converted | None:
-        """Return None for bytes that are no media of a known kind, and for pictures that build on others not given."""
+        """Return the converted payload; None for unknown media, and for pictures that build on missing ones."""
         if payload.startswith(PBAT):
             return self.sound(topic, payload)
         return self.video(topic, payload) if is_h264(payload) else self.image(topic, payload)
 
     def video(self, topic: str, payload: bytes) -> Converted | None:
-        """Return H.264 as it was sent: Annex B, parameter sets in key frames, no B-frames, as Foxglove asks.
+        """Return H.264 as it was sent; None for another encoding or damaged data.
 
-        None for another encoding, and for what is damaged.
+        It is as Foxglove requires: Annex B, parameter sets in key frames, no B-frames.
         """
         from pebble.extensions.media.h264 import unseal
 
@@ -114,7 +111,7 @@ class Media:
         return Converted(self._make(schema, frame_id=_id(topic), data=unit, format="h264"), ending)
 
     def image(self, topic: str, payload: bytes) -> Converted | None:
-        """Return a whole JPEG of a picture in any encoding; None as of :meth:`convert`."""
+        """Return a picture in any encoding as a complete JPEG; None as in :meth:`convert`."""
         import cv2
 
         decoded = self.decoder(topic).feed(payload)
@@ -125,7 +122,10 @@ class Media:
         return Converted(self._make(schema, frame_id=_id(topic), data=jpeg, format="jpeg"), ending)
 
     def sound(self, topic: str, payload: bytes) -> Converted | None:
-        """Return samples: Foxglove knows no Opus. None for what is no sound, and for Opus without PyAV."""
+        """Return samples; None for other data, and for Opus without PyAV.
+
+        Foxglove does not read Opus.
+        """
         from pebble.extensions.media.sound import SoundDecoder
 
         decoder = self._sounds.get(topic) or self._sounds.setdefault(topic, SoundDecoder())
@@ -139,9 +139,9 @@ class Media:
         return Converted(made, ending)
 
     def decoder(self, topic: str) -> VideoDecoder:
-        """Return what decodes the pictures of this topic.
+        """Return the decoder of this topic's pictures.
 
-        It knows why one was refused, and whether it wants a key frame.
+        It knows why it refused a picture, and whether it needs a key frame.
         """
         from pebble.extensions.media.decode import VideoDecoder
 
@@ -149,7 +149,7 @@ class Media:
 
 
 class Telemetry:
-    """Payloads of the contract for which Foxglove has a schema."""
+    """A converter of those payloads of the contract for which Foxglove has a schema."""
 
     def __init__(self, schemas: Schemas) -> None:
         self._make = schemas.make
@@ -163,7 +163,7 @@ class Telemetry:
         }
 
     def convert(self, topic: str, payload: bytes) -> Converted | None:
-        """Return None for a payload that is to stay as it is, also if it is not what its channel has."""
+        """Return the converted payload; None if it is to stay as it is, also if it does not fit its channel."""
         levels = topic.split("/", 3)
         channel = channel_of(levels[3]) if len(levels) == 4 and levels[3].startswith((c.INCOMING, c.OUTGOING)) else None
         convert = None if channel is None else self._converters.get(channel)
@@ -180,7 +180,7 @@ class Telemetry:
         return Converted(self._make("Log", level=level, message=record.message, name=record.service), "log")
 
     def _odometry(self, topic: str, payload: bytes) -> Converted | None:
-        """Convert odometry; some robots have metres, and other names (paper A.8.12)."""
+        """Convert odometry. Some robots send metres, under other names (paper A.8.12)."""
         odometry = codec.decode(c.WHEEL_ODOMETRY, payload)
         value, per_metre = odometry.value, 1.0 if odometry.unit == "m" else _MILLIMETRES
         x, y = (_number(value, f"{axis}_mm", axis) for axis in "xy")
@@ -191,7 +191,7 @@ class Telemetry:
         return Converted(self._pose(f"{_id(topic)}/odom", x / per_metre, y / per_metre, 0.0, heading), "pose")
 
     def _localization(self, _topic: str, payload: bytes) -> Converted | None:
-        """Return the pose of a ROS robot: metres and radians in the frame that it names."""
+        """Convert the pose of a ROS robot: metres and radians in the frame that it names."""
         pose = codec.plain(c.LOCALIZATION_POSE, payload)
         value = pose.get("value", pose) if isinstance(pose, dict) else None
         if not isinstance(value, dict):
@@ -218,10 +218,7 @@ class Telemetry:
         return Converted(drawn.annotations, "annotations")
 
     def _followed(self, topic: str, payload: bytes) -> Converted:
-        """Return the tag that is followed, as a box around the robot: x ahead, y to the left.
-
-        Empty while it is not seen.
-        """
+        """Convert the followed tag to a box near the robot, x ahead, y to the left; empty while it is not seen."""
         tag: TagData = codec.decode(c.APRILTAG_DATA, payload)
         scene = self._make("SceneUpdate")
         if tag.detected and tag.distance_m is not None and tag.angle_rad is not None:
@@ -248,7 +245,7 @@ class Telemetry:
 
 
 class _Drawing:
-    """Lines and texts on a picture, from parts of its size to pixels."""
+    """A converter of lines and texts on a picture, from fractions of its size to pixels."""
 
     def __init__(self, annotations: Any, width: int, height: int) -> None:
         self.annotations, self._width, self._height = annotations, width, height
@@ -269,7 +266,10 @@ def is_h264(payload: bytes) -> bool:
 
 
 def stamped(message: Any, ns: int) -> bytes:
-    """Return the message with this time, as bytes. A scene has none itself, its parts have."""
+    """Return the message with this time, as bytes.
+
+    A scene has no time itself; its parts have it.
+    """
     parts = [message] if "timestamp" in message.DESCRIPTOR.fields_by_name else [*message.entities, *message.deletions]
     for part in parts:
         part.timestamp.FromNanoseconds(ns)
@@ -277,15 +277,15 @@ def stamped(message: Any, ns: int) -> bytes:
 
 
 def time_of(payload: bytes, received_ns: int, publish_ns: int = 0) -> int:
-    """Return the payload's own time, or when it was received."""
+    """Return the payload's stamp, or else the time at which it was received."""
     stamp = publish_ns or stamp_ns(payload)
     return stamp if stamp >= CLOCK_FROM_NS else received_ns
 
 
 def as_object(payload: bytes) -> bytes | None:
-    """Return the JSON object in ``payload``. Another JSON value is wrapped as the contract does (paper A.4.5).
+    """Return the JSON object in ``payload``; None if it is no JSON, or empty.
 
-    None for what is no JSON, and for an empty payload.
+    Another JSON value is wrapped as the contract does (paper A.4.5).
     """
     payload = codec.trim(payload)
     try:
@@ -297,12 +297,12 @@ def as_object(payload: bytes) -> bytes | None:
 
 
 def _id(topic: str) -> str:
-    """Return the id of the robot, which its frame is named after."""
+    """Return the robot's id, after which its frame is named."""
     return "/".join(topic.split("/")[2:3])
 
 
 def _number(value: dict[str, Any], *names: str) -> float | None:
-    """Return the first of the named fields that is a number; None if none is."""
+    """Return the first of the named fields that is a number; None if there is none."""
     found = (value.get(name) for name in names)
     return next(
         (float(number) for number in found if isinstance(number, int | float) and not isinstance(number, bool)), None

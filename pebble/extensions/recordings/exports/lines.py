@@ -33,7 +33,7 @@ Progress = Callable[[int], None]  # called with the log time of each message
 
 
 class BadLine(Struct, frozen=True):
-    """A line that holds no message."""
+    """A line that holds no valid message."""
 
     number: int  # from 1
     problem: str
@@ -67,10 +67,10 @@ _decoder = msgspec.json.Decoder(_Line)
 
 
 def write_lines(messages: Iterable[Recorded], out: BinaryIO, *, on_time: Progress = lambda _log_ns: None) -> int:
-    """Write a line for each message; returns how many.
+    """Write a line for each message; return their number.
 
-    Stamps have nine decimals, so that reading the lines again gives the same nanoseconds. Payloads of up to 64 KiB are
-    readable, too, where they are text or JSON.
+    Stamps have nine decimals, so that reading the lines restores the same nanoseconds. Payloads of up to 64 KiB are
+    also written readably if they are text or JSON.
     """
     count = 0
     for message in messages:
@@ -81,9 +81,9 @@ def write_lines(messages: Iterable[Recorded], out: BinaryIO, *, on_time: Progres
 
 
 def read_lines(file: BinaryIO) -> Iterator[Recorded | BadLine]:
-    """Yield the messages of a logger's file, in its order. Lines that are none are yielded as such; empty ones are not.
+    """Yield the messages of a logger's file, in its order; invalid lines as :class:`BadLine`; empty ones not at all.
 
-    Raises RecordingError at a line that is too long to be held in memory.
+    Raises RecordingError at a line that is too long for memory.
     """
     for number, line in enumerate(iter(partial(file.readline, LONGEST_LINE + 1), b""), 1):
         if len(line) > LONGEST_LINE:
@@ -141,10 +141,7 @@ def _metadata(line: _Line) -> dict[str, str]:
 
 
 def _stamp_ns(stamp: bytes) -> int:
-    """Return the time of a number, or of a text in ISO 8601, which is UTC unless it names another zone.
-
-    Raises ValueError.
-    """
+    """Parse a number, or a text in ISO 8601, which is UTC unless it names another zone. Raises ValueError."""
     if not stamp.startswith(b'"'):
         try:
             return _epoch_ns(Decimal(stamp.decode()))
@@ -156,7 +153,7 @@ def _stamp_ns(stamp: bytes) -> int:
 
 
 def _epoch_ns(stamp: Decimal) -> int:
-    """Return the nanoseconds since 1970 of a stamp in seconds or milliseconds. Raises ValueError."""
+    """Convert a stamp in seconds or milliseconds to nanoseconds since 1970. Raises ValueError."""
     if not 0 <= stamp < _LATEST_NS // 1_000_000:  # false for NaN, too
         raise ValueError("the stamp is no time")
     return int(stamp * (10**6 if stamp >= _MILLISECONDS_FROM else 10**9))

@@ -1,4 +1,4 @@
-"""A file that is there when it is whole."""
+"""A file that appears under its name only once it is complete."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,9 +11,9 @@ from pebble.runtime.as_owner import as_owner
 
 @contextmanager
 def unfinished(target: Path) -> Iterator[Path]:
-    """Give a path beside ``target`` to write to: it becomes ``target`` at the end, and is removed after an error.
+    """Yield a path beside ``target`` to write to; it is renamed to ``target`` at the end, removed after an error.
 
-    Raises RecordingError if there is a file already, no folder, or no room.
+    Raises RecordingError if ``target`` exists, its folder does not, or the disk is full.
     """
     if target.exists():
         raise RecordingError(f"{target} exists already")

@@ -1,8 +1,7 @@
-"""Reads MCAP files in any state: all that can be read, and how much is missing.
+"""A reader of MCAP files in any state: it reads what can be read, and reports how much is missing.
 
-A finished file is read by its summary. Where there is none, because the file is being written, or its recorder was
-killed, or its end is damaged, its records are looked through once. Behind damage reading goes on at the next chunk
-whose checksum is right.
+A finished file is read by its summary. Without one (the file is being written, its recorder was killed, or its end is
+damaged) its records are scanned once. After damage, reading continues at the next chunk with the right checksum.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ Chooses = Callable[[Channel], bool]
 
 
 class Chunk(NamedTuple):
-    """The place and contents of a chunk; ``channels`` empty: not known, so it may hold any."""
+    """The position and contents of a chunk; ``channels`` empty: unknown, so it may hold any."""
 
     start_ns: int
     end_ns: int
@@ -78,7 +77,7 @@ class Chunk(NamedTuple):
 
 
 class RecordingFile:
-    """One file, finished or not. Not thread-safe. Each method raises RecordingError."""
+    """A file, finished or not. Not thread-safe. Each method raises RecordingError."""
 
     def __init__(self, path: Path) -> None:
         require_package()
@@ -114,7 +113,7 @@ class RecordingFile:
 
     @property
     def first_ns(self) -> int:
-        """The time of the first message; 0: there is none."""
+        """Return the time of the first message; 0 if there is none."""
         return min((chunk.start_ns for chunk in self.chunks if chunk.start_ns), default=0)
 
     @property
@@ -127,12 +126,12 @@ class RecordingFile:
 
     @property
     def is_cut_off(self) -> bool:
-        """True if nothing is at its end but zeros, or the begin of one record: so a kill leaves it."""
+        """True if the file ends in the middle of a record or in zeros, as a kill leaves it."""
         return self._scan.is_cut_off
 
     @property
     def problem(self) -> str:
-        """The parts that could not be read, in words; "" if all was, as far as that is known."""
+        """Return the parts that could not be read, in words; "" if all that was read so far was intact."""
         return self.damage.report(active=self.path.name.endswith(ACTIVE))
 
     def reaches_into(self, since_ns: int, until_ns: int) -> bool:
@@ -141,7 +140,7 @@ class RecordingFile:
         return bool(self.chunks) and self.first_ns < until_ns and not ends
 
     def refresh(self) -> None:
-        """Find what was written since; a file that is finished does not change."""
+        """Find what was written since the last call; a finished file does not change."""
         if self.statistics is None:
             self._look_through()
 
@@ -150,7 +149,7 @@ class RecordingFile:
     ) -> Iterator[Recorded]:
         """Yield the messages of the channels that ``chooses`` accepts, in the order of time.
 
-        What is wrong is noted in :attr:`damage`. Chunks outside the period are left out; messages outside it may come.
+        Damage is noted in :attr:`damage`. Chunks outside the period are skipped; some messages outside it may come.
         """
         chunks = [chunk for chunk in self.chunks if chunk.end_ns >= since_ns and chunk.start_ns < until_ns]
         if any(chunk.end_ns > next_.start_ns for chunk, next_ in pairwise(chunks)):  # other programs write in any order
@@ -170,17 +169,17 @@ class RecordingFile:
             yield from messages
 
     def messages(self, chunk: Chunk, chooses: Chooses = lambda _channel: True) -> list[Recorded]:
-        """Return the messages of one chunk in the order of time; none if the chunk is damaged."""
+        """Return the messages of one chunk in the order of time; empty if the chunk is damaged."""
         return self._unpacked(chunk, chooses)[0]
 
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Return the named texts of the file; of two with one name the last."""
+        """Return the file's metadata by name; of two with one name the last."""
         from mcap.records import Metadata
 
         return {record.name: record.metadata for record in self.beside() if isinstance(record, Metadata)}
 
     def beside(self) -> Iterator[Metadata | Attachment]:
-        """Yield what the file holds beside messages."""
+        """Yield the file's metadata and attachments."""
         from mcap.records import Attachment, Metadata
 
         for at in self._beside:
@@ -215,7 +214,7 @@ class RecordingFile:
             self._look_through()
 
     def _summary(self) -> Summary | None:
-        """Return the summary; None if the file is not finished, its end is damaged, or it has no summary."""
+        """Return the summary; None if the file is unfinished, its end is damaged, or it has none."""
         tail = FOOTER.size + len(MAGIC)
         file_size = self.size
         footer = self._read(max(0, file_size - tail), tail)
@@ -235,7 +234,7 @@ class RecordingFile:
             return None
 
     def _take_over(self, summary: Summary) -> bool:
-        """True if the summary names all messages: those of other programs need not."""
+        """Use the summary; False if it does not cover all messages, as in files of other programs."""
         chunks = [_indexed(index) for index in summary.chunk_indexes if index.message_index_offsets]
         counted = summary.statistics
         if counted is None or counted.message_count != sum(chunk.messages for chunk in chunks):
@@ -252,7 +251,7 @@ class RecordingFile:
     # -- one that is not
 
     def _look_through(self) -> None:
-        """Find the chunks, and the names of channels, from where the last look has ended."""
+        """Find chunks and channels, from where the last scan ended."""
         for record in self._scan.records(self.size):
             if record.op == Op.MESSAGE_INDEX:
                 self._take_index(record)
@@ -275,7 +274,7 @@ class RecordingFile:
         self._take_indexes(are_all=False)
 
     def _take_index(self, record: Found) -> None:
-        """Count the messages of a channel in the last chunk, unless damage lies between."""
+        """Count the messages of a channel in the last chunk, unless there was damage between."""
         entries = record.end - record.at - INDEX.size
         if self._indexed is not None and record.at == self._indexed_to and entries >= 0:
             channel = INDEX.unpack(self._read(record.at, INDEX.size))[2]
@@ -283,7 +282,7 @@ class RecordingFile:
             self._indexed_to = record.end
 
     def _take_indexes(self, *, are_all: bool) -> None:
-        """Note what the last chunk holds; ``are_all``: none of its indexes is damaged, or not written yet."""
+        """Note the contents of the last chunk. ``are_all``: no index of it is damaged or still unwritten."""
         indexed = self._indexed
         if indexed is None:
             return
@@ -293,7 +292,7 @@ class RecordingFile:
             self._learn(chunk)
 
     def _learn(self, chunk: Chunk) -> None:
-        """Take over the names of channels in a chunk, which uses them first."""
+        """Read the channels that a chunk declares."""
         try:
             data = self._records(chunk)
             for op, begin, end in records(data):
@@ -351,7 +350,7 @@ class RecordingFile:
         opened[0] -= chunk.length
 
     def _declare(self, data: bytes, channels: dict[int, Channel]) -> None:
-        """Take over a record of a schema or of a channel. Raises DamageError."""
+        """Add a schema or channel from its record. Raises DamageError."""
         if data[0] in (Op.SCHEMA, Op.CHANNEL):
             self._name(record_of(data), channels)
 
@@ -367,7 +366,7 @@ class RecordingFile:
             channels.setdefault(record.id, channel)
 
     def _channel(self, number: int) -> Channel:
-        """Return the channel of this number, wherever it is named: the chunk that named it first may be lost."""
+        """Return the channel of this number, from any place that declares it: the first chunk that does may be lost."""
         if number not in self.channels and number in self._names:
             self.channels[number] = self._names[number]
         if number not in self.channels and not self._looked_everywhere:
@@ -392,9 +391,9 @@ class RecordingFile:
 
 
 def in_time_order(streams: Iterable[tuple[int, Callable[[], Iterator[Recorded]]]]) -> Iterator[Recorded]:
-    """Yield the messages of several streams by their times.
+    """Yield the messages of several streams in the order of time.
 
-    Of each stream: its first time, and what opens it when that has come.
+    ``streams``: each with its first time and a function that opens it; it is opened when that time has come.
     """
     due = sorted(streams, key=lambda stream: stream[0], reverse=True)
     heap: list[tuple[int, int, Recorded, Iterator[Recorded]]] = []
@@ -416,7 +415,7 @@ def in_time_order(streams: Iterable[tuple[int, Callable[[], Iterator[Recorded]]]
 
 
 def missing_before(metadata: dict[str, dict[str, str]]) -> int:
-    """Return how many messages were missing when this copy was made, by its metadata."""
+    """Return how many messages were already missing when this copy was made, by its metadata."""
     return sum(number_in(metadata.get(name, {}), MISSING) for name in (DAMAGE, OLD_COPY))
 
 

@@ -1,4 +1,4 @@
-"""The contents of a recording: messages of channels, and damage."""
+"""The contents of a recording: channels, messages, and damage."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class DamageError(PebbleError):
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """The description of a channel's messages: data for their encoding, such as a set of Protobuf descriptors."""
+    """The description of a channel's messages, such as a set of Protobuf descriptors."""
 
     name: str
     encoding: str
@@ -37,7 +37,7 @@ class Schema:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A topic with what its messages have in common; several channels may share a topic."""
+    """A topic and the common properties of its messages; several channels may have the same topic."""
 
     id: int
     topic: str
@@ -47,7 +47,7 @@ class Channel:
 
 
 class Recorded(msgspec.Struct, frozen=True):
-    """One message of a recording."""
+    """A message of a recording."""
 
     channel: Channel
     sequence: int  # its number in the file, from 0
@@ -58,7 +58,7 @@ class Recorded(msgspec.Struct, frozen=True):
 
 @dataclass(slots=True)
 class Damage:
-    """The damage of a file, as far as it was read."""
+    """The damage found in the parts of a file that were read."""
 
     parts: set[int] = field(default_factory=set)  # where chunks are damaged, and where bytes between records begin
     missing: int = 0  # messages; those at a torn end are not known
@@ -68,14 +68,14 @@ class Damage:
     why: str = ""  # the first reason
 
     def add(self, at: int, why: object, messages: int = 0) -> None:
-        """Note a damaged part once, and how many messages it held."""
+        """Note a damaged part once, with its number of messages."""
         if at not in self.parts:
             self.parts.add(at)
             self.missing += messages
             self.why = self.why or str(why)
 
     def report(self, *, active: bool = False) -> str:
-        """Return what could not be read, in words; "" if all was. One that is ``active`` needs no end."""
+        """Return the damage in words; "" if there is none. A file that is ``active`` needs no end."""
         reasons = [
             (len(self.parts), f"{len(self.parts):,} damaged parts"),
             (self.missing, f"{self.missing:,} messages missing"),
@@ -88,17 +88,17 @@ class Damage:
 
 
 def unnamed(number: int) -> Channel:
-    """Return a channel in place of a channel that has lost its name."""
+    """Return a stand-in for a channel whose declaration is lost."""
     return Channel(number, f"{UNNAMED}{number}", "application/octet-stream")
 
 
 def require_package() -> None:
-    """Raise RecordingError where the package ``mcap`` is not installed."""
+    """Raise RecordingError if the package ``mcap`` is not installed."""
     if find_spec("mcap") is None:
         raise RecordingError('recordings need the package mcap: pip install "pebble-robot[record]"')
 
 
 def number_in(items: Mapping[str, str], name: str) -> int:
-    """Return a number in metadata; 0 where there is none."""
+    """Return a number from metadata; 0 if it has none."""
     text = items.get(name, "")
     return int(text) if text.isascii() and text.isdigit() and len(text) < 18 else 0

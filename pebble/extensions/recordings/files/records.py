@@ -1,4 +1,4 @@
-"""The records of MCAP files, https://mcap.dev/spec, by the package ``mcap``: what it raises is damage."""
+"""The records of MCAP files (https://mcap.dev/spec), parsed by the package ``mcap``; its errors count as damage."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ LOOKS_LIKE_CHUNK: Final = re.compile(
 
 
 def records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, begin and end of the body of each record in ``data``. Raises DamageError at one that is cut off."""
+    """Yield opcode, begin and end of each record's body in ``data``. Raises DamageError if the last is cut off."""
     at, size = 0, len(data)
     while at < size:
         if at + HEAD.size > size:
@@ -67,7 +67,7 @@ def records(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def unpack_chunk(body: bytes) -> bytes:
-    """Return the records of a chunk. Raises DamageError if they are not what was written."""
+    """Return the records of a chunk. Raises DamageError if its checksum is wrong."""
     with _damage():
         _, _, size, checksum, name_length = CHUNK.unpack_from(body)
         at = CHUNK.size + name_length
@@ -81,7 +81,7 @@ def unpack_chunk(body: bytes) -> bytes:
 
 
 def with_own_topic(channel: Channel, payload: bytes) -> tuple[Channel, bytes]:
-    """Split a payload before which the topic and metadata of its own channel are. Raises DamageError."""
+    """Split a payload that begins with its channel's topic and metadata. Raises DamageError."""
     from mcap.data_stream import ReadDataStream
     from mcap.records import Metadata
 
@@ -92,7 +92,7 @@ def with_own_topic(channel: Channel, payload: bytes) -> tuple[Channel, bytes]:
 
 
 def record_of(data: bytes) -> McapRecord:
-    """Parse one whole record. Raises DamageError, also for a channel that is not exactly what it says."""
+    """Parse a complete record. Raises DamageError, also for a channel whose lengths do not fit exactly."""
     from mcap.data_stream import RecordBuilder
     from mcap.records import Channel as ChannelRecord
     from mcap.stream_reader import StreamReader
@@ -108,7 +108,7 @@ def record_of(data: bytes) -> McapRecord:
 
 
 def summary_of(tail: bytes) -> Summary | None:
-    """Parse the end of a file from its summary on. Raises DamageError."""
+    """Parse the end of a file, from its summary on. Raises DamageError."""
     from mcap.reader import NonSeekingReader
 
     with _damage():
@@ -117,7 +117,7 @@ def summary_of(tail: bytes) -> Summary | None:
 
 @contextmanager
 def _damage() -> Iterator[None]:
-    """Raise DamageError for what parsing damaged bytes raises."""
+    """Raise DamageError in place of the errors of parsing damaged bytes."""
     try:
         yield
     except PebbleError:
@@ -127,7 +127,7 @@ def _damage() -> Iterator[None]:
 
 
 def _unpack(name: str, packed: bytes, size: int) -> bytes:
-    """Return at most one byte more than ``size``: the size that the data themselves name may be any."""
+    """Decompress at most ``size`` + 1 bytes, since the size in the data may be wrong."""
     if not name:
         return packed
     with _damage():

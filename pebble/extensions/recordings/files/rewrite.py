@@ -1,4 +1,4 @@
-"""Copies recordings: what can be read of one that is damaged or was not finished, or without some of the messages."""
+"""Copies of recordings: the readable part of a damaged or unfinished one, or one without some of its messages."""
 
 import errno
 import os
@@ -36,8 +36,8 @@ class Rewritten:
 def rewrite(source: Path, target: Path, *, keeps: Keeps = lambda _message: True) -> Rewritten:
     """Write the messages of ``source`` to ``target``, in the order of time; both may be the same file.
 
-    A file is only replaced by a copy of all that is in it that ``keeps`` accepts: it stays as it is if not all could be
-    read, if the copy cannot be read again, and if nothing is left out. Raises RecordingError, OSError.
+    A file is only replaced by a complete copy of what ``keeps`` accepts: it stays as it is if it could not be read
+    completely, if the copy cannot be read again, or if nothing is left out. Raises RecordingError, OSError.
     """
     in_place = target.exists()
     part = target.with_name(f".{target.name}.{os.getpid()}{PART}")
@@ -61,7 +61,7 @@ def rewrite(source: Path, target: Path, *, keeps: Keeps = lambda _message: True)
 
 
 def _copy_state(source: Path, part: Path) -> None:
-    """Give the copy the age of the source, and its readers where the file system has that. Raises OSError."""
+    """Give the copy the age of the source and, if the file system has them, its readers. Raises OSError."""
     try:
         shutil.copystat(source, part)
     except OSError:
@@ -71,7 +71,7 @@ def _copy_state(source: Path, part: Path) -> None:
 
 
 def copy_beside(source: RecordingFile, writer: RecordingWriter, without: Container[str] = (DAMAGE, OLD_COPY)) -> int:
-    """Add the metadata and attachments of a file, without metadata of some names; returns how many attachments."""
+    """Copy a file's metadata, except of some names, and its attachments; return the number of attachments."""
     from mcap.records import Attachment
 
     attachments = 0
@@ -86,7 +86,7 @@ def copy_beside(source: RecordingFile, writer: RecordingWriter, without: Contain
 
 
 class Copy:
-    """Adds messages of any recordings to a file."""
+    """A writer that adds messages of other recordings to a file."""
 
     def __init__(self, writer: RecordingWriter) -> None:
         self._writer = writer
@@ -115,9 +115,9 @@ class Copy:
 def write_copy(
     messages: Iterable[Recorded], out: File, *, on_time: Callable[[int], None], beside: Iterable[Path] = ()
 ) -> int:
-    """Write ``messages`` as a recording; returns how many there were. ``on_time`` gets the time of each.
+    """Write ``messages`` as a recording; return their number. ``on_time`` gets the time of each.
 
-    ``beside``: files whose metadata and attachments go with them, as they are known after the last message.
+    ``beside``: files whose metadata and attachments are copied, after the last message.
     """
     writer = RecordingWriter(out)
     writer.metadata(_ABOUT, {"format": "1", "exported": "1"})
@@ -134,7 +134,7 @@ def write_copy(
 
 
 def _copy(source: Path, part: Path, keeps: Keeps, *, complete: bool) -> Rewritten:
-    """Write the copy. Raises RecordingError if it is not ``complete`` as it has to be, and OSError."""
+    """Write the copy. Raises OSError, and RecordingError if it must be ``complete`` and is not."""
     if shutil.disk_usage(part.parent).free < source.stat().st_size:
         raise OSError(errno.ENOSPC, f"there is no room for a copy of {source.name}", str(part.parent))
     left_out = 0
@@ -161,7 +161,7 @@ def _copy(source: Path, part: Path, keeps: Keeps, *, complete: bool) -> Rewritte
 
 
 def _refuse_part(file: RecordingFile, metadata: dict[str, dict[str, str]]) -> None:
-    """Raise RecordingError if a file may hold more than what was read of it."""
+    """Raise RecordingError if a file may hold more than could be read."""
     if text := file.damage.report():
         raise RecordingError(f"{file.path}: {text}; `pebble recordings mend` copies what can be read")
     if covered := number_in(metadata.get(DAMAGE, {}), _COVERED):
@@ -171,13 +171,13 @@ def _refuse_part(file: RecordingFile, metadata: dict[str, dict[str, str]]) -> No
 
 
 def _state(path: Path) -> tuple[int, ...]:
-    """Return what differs if a file is replaced or written to."""
+    """Return a value that differs if the file is replaced or written to."""
     about = path.stat()
     return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns
 
 
 def _check(part: Path, made: Rewritten) -> None:
-    """Read a copy again before it replaces anything. Raises RecordingError."""
+    """Read a copy again before it replaces the source. Raises RecordingError."""
     with RecordingFile(part) as file:
         messages = sum(len(file.messages(chunk)) for chunk in file.chunks)
         if messages != made.messages or file.damage.report():

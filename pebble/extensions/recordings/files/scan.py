@@ -1,4 +1,4 @@
-"""Finds the records of a file that has no summary, from its begin to its end, also behind damage."""
+"""A scan for the records of a file without a summary, from its begin to its end, also after damage."""
 
 from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
@@ -33,9 +33,9 @@ class Found(NamedTuple):
 
 
 class Scan:
-    """Goes on where it has ended when the file has grown.
+    """A scan that continues where it ended when the file has grown.
 
-    ``name`` is that of the file, for errors; ``is_ours``: what our own files never hold is damage.
+    ``name``: the file's, for errors; ``is_ours``: what our own files never hold counts as damage.
     """
 
     def __init__(self, name: object, read: Read, damage: Damage, *, is_ours: bool) -> None:
@@ -46,7 +46,7 @@ class Scan:
 
     @property
     def is_cut_off(self) -> bool:
-        """True if nothing is behind the last record but zeros, or the begin of one: so a kill leaves it."""
+        """True if only zeros, or the begin of a record, follow the last record, as a kill leaves it."""
         rest = self._read(self._at, min(self._damage.torn, LARGEST_RECORD))
         if len(rest) < HEAD.size or not any(rest):
             return len(rest) >= self._damage.torn
@@ -54,7 +54,7 @@ class Scan:
         return self._may_begin(op, length) and self._at + HEAD.size + length > self._size
 
     def records(self, size: int) -> Iterator[Found]:
-        """Yield what a file of ``size`` bytes has in addition to what was found before.
+        """Yield the records of a file of ``size`` bytes that were not yielded before.
 
         Raises RecordingError for a file whose messages are not in chunks.
         """
@@ -75,7 +75,7 @@ class Scan:
         self._damage.torn = 0 if self._ended else max(0, size - self._at)
 
     def _record_at(self, at: int) -> tuple[int, int] | None:
-        """Return the opcode of the record at ``at``, and its end; None if it is none, or not all of it is there."""
+        """Return the opcode of the record at ``at``, and its end; None if there is no complete record."""
         head = self._read(at, HEAD.size)
         if len(head) < HEAD.size:
             return None
@@ -105,7 +105,7 @@ class Scan:
         return is_known and length < 1 << 32
 
     def _is_chunk(self, at: int, length: int) -> bool:
-        """True if the lengths in its head agree."""
+        """True if the lengths in a chunk's head agree."""
         head = self._read(at + HEAD.size, CHUNK.size + _LONGEST_NAME + 8)
         if len(head) < CHUNK.size + 8 or length > LARGEST_RECORD:
             return False
@@ -113,7 +113,7 @@ class Scan:
         return bool(length == data_at + 8 + int.from_bytes(head[data_at : data_at + 8], "little"))
 
     def _is_channel(self, at: int, length: int) -> bool:
-        """True if it is exactly what it says: it has no checksum."""
+        """True if a channel's lengths agree exactly; it has no checksum."""
         try:
             record_of(self._read(at, HEAD.size + min(length, LARGEST_RECORD)))
         except DamageError:
@@ -121,7 +121,7 @@ class Scan:
         return True
 
     def _next_chunk(self, at: int) -> int | None:
-        """Return where behind damage the next chunk begins whose checksum is right."""
+        """Return the position of the next chunk with the right checksum."""
         while at < self._size:
             part, found = self._read(at, _SEARCHED + _OVERLAP), -1
             while (match := LOOKS_LIKE_CHUNK.search(part, found + 1)) is not None and match.start() < _SEARCHED:

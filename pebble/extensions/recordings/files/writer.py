@@ -1,4 +1,4 @@
-"""Writes an MCAP file so that a process that is killed loses what it has not flushed, and nothing else."""
+"""A writer of MCAP files that loses only what is not flushed when its process is killed."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _CHUNK: Final = b"\x06"
 
 
 class File(Protocol):
-    """An unbuffered file for the bytes. ``write`` may take a part of them."""
+    """An unbuffered file for the bytes. ``write`` may take only a part of them."""
 
     def write(self, data: memoryview, /) -> int | None: ...
 
 
 class RecordingWriter:
-    """One file. :meth:`flush` it at least once a second, and :meth:`finish` it."""
+    """A recording being written. :meth:`flush` it at least once a second, and :meth:`finish` it."""
 
     def __init__(self, file: File, library: str = LIBRARY) -> None:
-        """Raises RecordingError without the package ``mcap``; OSError, as all others."""
+        """Begin a file. Raises OSError, as all methods do, and RecordingError without the package ``mcap``."""
         require_package()
         from mcap.writer import Writer
 
@@ -44,24 +44,24 @@ class RecordingWriter:
 
     @property
     def size(self) -> int:
-        """The bytes that the file has taken."""
+        """Return the number of bytes written to the file."""
         return self._output.size
 
     @property
     def flushed(self) -> int:
-        """The messages that the file has taken."""
+        """Return the number of messages written to the file."""
         return self._output.messages
 
     def metadata(self, name: str, items: Mapping[str, str]) -> None:
-        """Add named texts about the file."""
+        """Add metadata about the file."""
         self._writer.add_metadata(name, dict(items))
 
     def attach(self, name: str, media_type: str, data: bytes, *, log_ns: int, create_ns: int) -> None:
-        """Add bytes that are no message."""
+        """Add an attachment."""
         self._writer.add_attachment(create_ns, log_ns, name, media_type, data)
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Declare what messages look like; returns its number for :meth:`channel`."""
+        """Declare the form of messages; return its number for :meth:`channel`."""
         number: int = self._writer.register_schema(name, encoding, data)
         return number
 
@@ -75,17 +75,17 @@ class RecordingWriter:
         return number
 
     def add(self, channel: int, log_ns: int, payload: bytes, publish_ns: int = 0) -> None:
-        """Add a message that was received at ``log_ns``. Hot."""
+        """Add a message that was received at ``log_ns``. Called for each message."""
         number, self.messages = self.messages, self.messages + 1
         self._log_ns = log_ns
         self._used.add(channel)
         self._writer.add_message(channel, log_ns, payload, publish_ns, number & 0xFFFFFFFF)
 
     def flush(self) -> None:
-        """Give all that was added to the file.
+        """Write all that was added to the file.
 
-        The package names a channel once, in a chunk, which damage may take: so each is named before that chunk, too,
-        and all are named again once a minute.
+        The package declares a channel once, in a chunk, which damage may destroy: so each is also declared before that
+        chunk, and all of them again once a minute.
         """
         self._named += self._new
         named, self._new = self._new, []
@@ -103,7 +103,7 @@ class RecordingWriter:
 
 
 class _Output(BufferedIOBase):
-    """A file as the package writes to it: each of its calls is written whole."""
+    """The file as the package writes to it: each of its calls is written completely."""
 
     def __init__(self, writer: RecordingWriter, file: File) -> None:
         self.size = self.messages = 0
@@ -119,12 +119,15 @@ class _Output(BufferedIOBase):
         return len(data)
 
     def seek(self, _offset: int, _whence: int = 0) -> int:
-        """Return the only position, which is the end: so its position is asked for."""
+        """Return the position, which is always the end; the package only asks for it."""
         return self.size
 
 
 def _packed(channels: list[Channel]) -> bytes:
-    """Return the records of the channels without a schema: with one, the schema had to be repeated, too."""
+    """Return the records of the channels that have no schema.
+
+    Of channels with one, the schema would have to be repeated as well.
+    """
     from mcap.data_stream import RecordBuilder
 
     builder = RecordBuilder()
