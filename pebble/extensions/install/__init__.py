@@ -1,4 +1,4 @@
-"""The set-up of a machine: its packages, its config, its boards, backups."""
+"""The set-up of a machine: packages, config, boards, backups, and signed releases."""
 
 from pebble.extension import Command, Extension
 

@@ -30,7 +30,10 @@ _stamped = msgspec.json.Decoder(_Stamped)
 
 
 def stamp_ns(payload: bytes) -> int:
-    """Return the payload's own stamp in nanoseconds since 1970; 0 if it has none, or one that no clock shows. Hot."""
+    """Return the payload's own stamp in nanoseconds since 1970; 0 if it has none, or an impossible one.
+
+    Called for each message.
+    """
     first = payload[:1]
     if first == b"{":
         try:
@@ -43,7 +46,7 @@ def stamp_ns(payload: bytes) -> int:
 
 
 def shifted(payload: bytes, by_ns: int) -> bytes:
-    """Return ``payload`` with its own stamps moved by ``by_ns``, in their units.
+    """Return ``payload`` with its stamps moved by ``by_ns``, in their units.
 
     Stamps that do not count from 1970, and those that would leave the range of a clock, stay as they are.
     """
@@ -74,7 +77,7 @@ def is_keyframe(payload: bytes) -> bool:
 
 
 def _media_header(payload: bytes) -> Picture | Sound | None:
-    """None if it is neither, or cut off."""
+    """Return the header of a picture or sound; None if it is neither, or cut off."""
     try:
         return Sound.unpack(payload) if payload[:4] == PBAT else Picture.unpack(payload)
     except PayloadError:
@@ -82,7 +85,10 @@ def _media_header(payload: bytes) -> Picture | Sound | None:
 
 
 def _in_ns(stamp: float | None, unit: int = 0) -> int:
-    """Exact to a microsecond. ``unit``: nanoseconds; 0: by its size. Returns 0 for what is no stamp."""
+    """Return a stamp in nanoseconds, exact to a microsecond; 0 if it is none.
+
+    ``unit``: in nanoseconds; 0: guessed from the stamp's size.
+    """
     if stamp is None or not 0 < stamp < _LATEST_NS:
         return 0
     ns = round(stamp * (unit or _unit(stamp)) / 1000) * 1000

@@ -112,7 +112,10 @@ def _private(
 
 
 def _wifi_password(ssid: str, file: Path | None) -> str:
-    """Never from the command line, where every user of this machine could read it."""
+    """Return the Wi-Fi password from a file, from the environment, or from the terminal.
+
+    Never from the command line, where every user of this machine could read it.
+    """
     if file is not None:
         return read_password(file, "--wifi-password-file")
     if WIFI_PASSWORD in os.environ:

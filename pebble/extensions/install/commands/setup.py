@@ -1,4 +1,4 @@
-"""``pebble setup``: from an installed package to a robot that runs; it also backs a robot up and restores it."""
+"""``pebble setup``: makes an installed package a running robot, and backs robots up."""
 
 from pathlib import Path
 from typing import Annotated
@@ -48,7 +48,7 @@ def setup(answers: _Answers = None, backup: _Backup = None, from_: _From = None)
 
 
 def back_up(file: Path, places: Places) -> int:
-    """Write the tar file, and read it again."""
+    """Write the backup as a tar file, and read it again to check it."""
     from pebble.extensions.install.setup import backup as backups  # of Linux only
 
     if file.exists():

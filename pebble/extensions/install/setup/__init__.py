@@ -1,1 +1,1 @@
-"""From an installed package to a robot that runs: questions, one config, credentials, a unit; backups of all that."""
+"""The set-up of a robot: questions, config, credentials and unit; and backups of all that."""

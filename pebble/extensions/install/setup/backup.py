@@ -88,7 +88,7 @@ class Backup:
 
 
 def make(places: Places) -> Backup:
-    """Read everything of the robot that is installed there. Raises BackupError; its database may be in use."""
+    """Read all files of the installed robot into a backup. Raises BackupError. The database may be in use."""
     if not places.config.is_file():
         raise BackupError(f"there is no {places.config}: no robot is installed there, so there is nothing to back up")
     config = load(places.config, {**os.environ, "STATE_DIRECTORY": str(places.state)})
@@ -108,7 +108,7 @@ def make(places: Places) -> Backup:
 
 
 def _files(places: Places, config: Config) -> Iterator[Path]:
-    """Yield what the robot cannot be made from again. A file that another one names may be anywhere."""
+    """Yield the files that cannot be made again. A file that another one names may be anywhere."""
     without = [_here(places, folder) for _, folder in _left_out(config)]
     for folder in (places.etc, places.state, _here(places, config.state_dir())):
         yield from _below(folder, without)
@@ -125,7 +125,7 @@ def _files(places: Places, config: Config) -> Iterator[Path]:
 
 
 def _here(places: Places, path: Path) -> Path:
-    """Return where a path of the robot is below the root."""
+    """Return the path of a robot's file below the root."""
     path = Path(os.path.normpath(path.absolute()))  # a config may name it by ../..
     return path if path.is_relative_to(places.root) else places.root / path.relative_to("/")
 
@@ -146,7 +146,7 @@ def _below(place: Path, without: Iterable[Path]) -> Iterator[Path]:
 
 
 def _add(backup: Backup, root: Path, file: Path) -> None:
-    """Add one file, as it is at one moment."""
+    """Add a file, in its state at one moment."""
     name = str(file.relative_to(root))
     if name.endswith(_NOT):
         return
@@ -167,7 +167,7 @@ def _add(backup: Backup, root: Path, file: Path) -> None:
 
 
 def _database(file: Path) -> bytes:
-    """Return a database as it is between two changes, by SQLite's own backup. Raises BackupError for a damaged one."""
+    """Return a consistent copy of a database, by SQLite's backup. Raises BackupError if it is damaged."""
     try:
         with (
             closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as there,
@@ -183,7 +183,7 @@ def _database(file: Path) -> bytes:
 
 
 def packed(backup: Backup) -> bytes:
-    """Return the tar file."""
+    """Return the backup as a tar file."""
     output = io.BytesIO()
     about = Saved(msgspec.json.format(msgspec.json.encode(backup.about)) + b"\n", 0o600)
     with tarfile.open(None, "w", output, format=tarfile.PAX_FORMAT) as tar:
@@ -199,7 +199,7 @@ def packed(backup: Backup) -> bytes:
 
 
 def read(file: Path) -> Backup:
-    """Read a whole backup, and check that it is one. Raises BackupError with one line."""
+    """Read a complete backup and check it. Raises BackupError with one line."""
     try:
         return unpacked(read_plain(file, _MOST + _LARGEST), str(file))
     except OSError as error:
@@ -207,7 +207,7 @@ def read(file: Path) -> Backup:
 
 
 def unpacked(raw: bytes, name: str) -> Backup:
-    """Read the same from the content of the file called ``name``."""
+    """Read a backup from the content of the file called ``name``."""
     try:
         with tarfile.open(fileobj=io.BytesIO(raw), mode="r:") as tar:
             members = iter(tar)
@@ -238,7 +238,7 @@ def _about(tar: tarfile.TarFile, member: tarfile.TarInfo | None, name: str) -> A
 
 
 def _path(member: tarfile.TarInfo, backup: Backup, name: str) -> str:
-    """Return the path of a member, by which nothing outside the root can be written."""
+    """Return the path of a tar member; it cannot lead outside the root."""
     path = PurePosixPath(member.name)
     if (
         not member.isfile()
@@ -255,7 +255,7 @@ def _path(member: tarfile.TarInfo, backup: Backup, name: str) -> str:
 
 
 def _content(tar: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
-    """Return what is in a file. Raises EOFError where it is cut off, or is not what it was."""
+    """Return the content of a member. Raises EOFError if it is cut off or has changed."""
     opened = tar.extractfile(member)
     content = b"" if opened is None else opened.read()
     if len(content) != member.size or member.pax_headers.get(_SHA256) not in (

@@ -1,4 +1,4 @@
-"""Devices of this machine: boards, which are only listened to, cameras, and the parts that a robot lacks."""
+"""The devices of this machine: boards, to which nothing is sent, cameras, and the parts that a robot lacks."""
 
 import re
 import shutil
@@ -42,7 +42,7 @@ OFFLINE = (
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A serial port, and what was received there. ``baud`` None: it was silent, or could not be opened."""
+    """A serial port, and what was received on it. ``baud`` None: nothing was received, or it could not be opened."""
 
     port: str
     baud: int | None
@@ -51,13 +51,13 @@ class Board:
 
 
 def boards(folder: Path, bauds: Sequence[int] = BAUDS, seconds: float = LISTEN_S) -> Iterator[Board]:
-    """Listen to each serial port that has a name that stays."""
+    """Listen on each serial port that has a lasting name."""
     for path in sorted(folder.glob("*")):
         yield listen(str(path), bauds, seconds)
 
 
 def listen(port: str, bauds: Sequence[int] = BAUDS, seconds: float = LISTEN_S) -> Board:
-    """Return what a port sends by itself. Nothing is written to it, and its reset lines stay as they are."""
+    """Return what a port sends by itself. Nothing is written to it, and its reset lines are not changed."""
     try:
         for baud in bauds:
             received = _received(port, baud, seconds)
@@ -80,7 +80,7 @@ def _received(port: str, baud: int, seconds: float) -> bytes:
 
 
 def _understood(received: bytes) -> tuple[str | None, str] | None:
-    """Return the protocol and what was received, in words; None: nothing that makes sense at this speed."""
+    """Return the protocol and what was received, in words; None if nothing makes sense at this speed."""
     if b"\0" in received:
         return ("pebble_serial_v1", "frames") if any(map(_is_frame, received.split(b"\0"))) else None
     lines = [line.strip() for line in received.split(b"\n") if line.strip()]
@@ -103,9 +103,9 @@ def _is_frame(stuffed: bytes) -> bool:
 
 
 def cameras(devices: Path) -> Iterator[str]:
-    """Yield device files that capture pictures, by names that stay; `libcamera` for one at the board's own connector.
+    """Yield the device files of cameras, by lasting names; `libcamera` for one at the board's camera connector.
 
-    udev gives a camera's other files, of its metadata, the names ``…-video-index1`` and so on.
+    A camera's other device files, for its metadata, have names such as ``…-video-index1`` and are left out.
     """
     yield from map(str, sorted((devices / "v4l/by-id").glob("*-video-index0")))
     program = next((name for name in _LIBCAMERA if shutil.which(name)), None)
@@ -119,7 +119,7 @@ def cameras(devices: Path) -> Iterator[str]:
 
 
 def lacks(places: Places) -> Iterator[str]:
-    """Yield what the robot has to do without, and what to type for it."""
+    """Yield each part that the robot will lack, with the command that adds it."""
     if not any((places.root / path).exists() for path in _POLKIT):
         yield NO_POLKIT
     found = clock(time.time(), synchronised())
@@ -130,7 +130,7 @@ def lacks(places: Places) -> Iterator[str]:
 
 
 def no_broker(places: Places) -> str:
-    """Return why the robot's own broker cannot be made here; empty: it can."""
+    """Return why the robot's own broker cannot be set up here; empty if it can."""
     if not any((places.root / path).exists() for path in ("usr/sbin/mosquitto", "usr/bin/mosquitto")):
         return NO_MOSQUITTO
     for file in (places.broker.parent.parent / "mosquitto.conf", *sorted(places.broker.parent.glob("*.conf"))):
@@ -170,7 +170,7 @@ def _is_taken(port: int) -> bool:
 
 
 def _has_network() -> bool:
-    """Return True if there is a way to other machines; sends nothing."""
+    """True if there is a route to other machines. Sends nothing."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))

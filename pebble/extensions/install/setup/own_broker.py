@@ -1,4 +1,4 @@
-"""The robot's own broker: the machine's mosquitto, with a folder that the commands of `pebble fleet` change later."""
+"""The robot's own broker: this machine's mosquitto, with a folder that `pebble fleet` can change later."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ LINKS = {CONF: "../conf.d/pebble.conf", PID: "../../../run/mosquitto/mosquitto.p
 
 
 def fleet_of(account: str, base: str, people: Path) -> Fleet:
-    """Return accounts for the robot and its page, at a broker that other machines reach with a login and TLS only."""
+    """Return a fleet with accounts for the robot and its page, whose broker requires a login and TLS from others."""
     accounts = {
         account: Account(roles=(ProgramRole.ROBOT,), bases=(base,)),
         PAGE: Account(roles=(ProgramRole.PAGE,), people=str(people)),
@@ -23,12 +23,12 @@ def fleet_of(account: str, base: str, people: Path) -> Fleet:
 
 
 def conf_text(places: Places, fleet: Fleet) -> bytes:
-    """Return what mosquitto includes; its paths are those of the machine whose root this is."""
+    """Return the configuration that mosquitto includes; its paths are valid on the machine of this root."""
     return broker_files.conf_text(fleet, Path(places.named(places.broker_folder)), "").encode()
 
 
 def make(new: Path, fleet: Fleet, passwords: dict[str, str]) -> None:
-    """Fill a new folder."""
+    """Fill a new folder with the broker's files."""
     applying.make(new, fleet, passwords)
     with folder.locked(new):
         pass  # its file belongs to the folder
@@ -36,14 +36,14 @@ def make(new: Path, fleet: Fleet, passwords: dict[str, str]) -> None:
 
 
 def link(place: Path) -> None:
-    """Make links to what mosquitto has elsewhere, relative so that they mean the same below another root."""
+    """Link mosquitto's places to the folder, by relative links, which are also valid below another root."""
     for name, target in LINKS.items():
         if not (place / name).is_symlink():
             (place / name).symlink_to(target)
 
 
 def knows(place: Path, wanted: Fleet, passwords: dict[str, str]) -> bool:
-    """Return True if these accounts are there as they should be, with these passwords."""
+    """True if the broker's files have these accounts, with their rules and these passwords."""
     with as_owner(place):
         fleet = folder.load(place)
         stored = applying.passwords_of(place)
@@ -52,7 +52,7 @@ def knows(place: Path, wanted: Fleet, passwords: dict[str, str]) -> bool:
 
 
 def change(place: Path, wanted: Fleet, passwords: dict[str, str]) -> None:
-    """Let the broker know these accounts, at once where it runs."""
+    """Add these accounts to the broker, which reads them at once if it runs."""
     with as_owner(place), folder.locked(place):
         fleet = folder.load(place)
         for name, account in wanted.accounts.items():

@@ -1,4 +1,4 @@
-"""The questions of ``pebble setup`` in a terminal. What the robot has already is offered as the answer of each."""
+"""The questions of ``pebble setup`` in a terminal. The robot's present value is each question's default."""
 
 import os
 import shutil
@@ -21,7 +21,7 @@ _Given = dict[str, Any]
 
 
 def say(text: str, indent: int = 0) -> None:
-    """Print a text, broken between its words where the terminal's line ends."""
+    """Print a text, with line breaks between words."""
     width = shutil.get_terminal_size().columns
     lines = textwrap.wrap(
         text,
@@ -35,7 +35,7 @@ def say(text: str, indent: int = 0) -> None:
 
 
 def asked(job: Job) -> Job:
-    """Return the job with the answers of the person at the terminal; a wrong one is asked again."""
+    """Return the job with the answers from the terminal; a wrong answer is asked for again."""
     first = [] if job.config is not None else [_ask_name]
     for number, ask in enumerate([*first, _ask_board, _ask_camera, _ask_broker, _ask_page], start=1):
         job = _answered(job, number, ask)
@@ -57,7 +57,7 @@ def _ask(question: str) -> None:
 
 
 def _choose(question: str, choices: Sequence[tuple[str, str]], default: str, other: str = "another answer") -> str:
-    """Return one of the values, chosen by its number, or another text."""
+    """Return one of the values, chosen by its number, or another text that was typed."""
     _ask(question)
     for place, (value, label) in enumerate(choices, start=1):
         say(f"{place}  {value}{f'  ({label})' if label else ''}", 5)
@@ -122,7 +122,7 @@ def _ask_page(job: Job, number: str) -> _Given:
 
 
 def _with_passwords(job: Job) -> Job:
-    """Ask for those that are needed."""
+    """Return the job with the passwords that are still needed, asked for."""
     answers, secrets = job.answers, job.secrets
     if needs_login(answers):
         text, default = f"   Password of {answers.account} at the broker", None

@@ -37,9 +37,9 @@ _OWN = ("/etc/pebble/", "/var/lib/pebble/", "/dev/")  # what a robot may name wi
 def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) -> str:
     """Write the files of a backup, the config last, and return the robot's name.
 
-    Before anything is written, raises BackupError for what is no whole backup, and SetupError for one that would write
-    elsewhere, and for a machine that has other files in these places. ``agree`` is called with what its config runs
-    and names beyond its own files, and with its scripts, and raises if that should not be.
+    Before anything is written it raises BackupError for an incomplete backup, and SetupError for one that would write
+    elsewhere or for a machine with other files in these places. ``agree`` is called with the programs that its config
+    runs, the files beyond its own, and its scripts; it raises to prevent the restore.
     """
     backup, places = backups.read(file), system.places
     config, manifest = (str(file.relative_to(places.root)) for file in (places.config, places.manifest))
@@ -86,7 +86,7 @@ def _content(file: Path) -> bytes:
 
 
 def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
-    """Return the files without those of mosquitto that setup makes itself, or that are not the robot's."""
+    """Return the backup's files without foreign ones and without mosquitto's, which setup makes itself."""
     folder = f"{places.broker_folder.relative_to(places.root)}/"
     made = [f"{folder}{name}" for name in own_broker.LINKS]
     broker = str(places.broker.relative_to(places.root))
@@ -103,7 +103,7 @@ def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
 
 
 def _beyond(value: Any, *keys: str) -> Iterator[str]:
-    """Yield the programs in a config, but setup's own, and files beyond the robot's, each with its key."""
+    """Yield the programs in a config except setup's, and the files beyond the robot's, each with its key."""
     key = keys[-1] if keys else ""
     is_run = key in _RUNS or key.endswith(("_command", "_env"))
     if (value and value not in COMMANDS) if is_run else (isinstance(value, str) and _is_beyond(value)):

@@ -1,4 +1,4 @@
-"""The config that follows from answers, and the answers that follow from a config."""
+"""Conversion between the answers of ``pebble setup`` and a robot's config."""
 
 import os
 from pathlib import Path
@@ -26,7 +26,7 @@ COMMANDS = (
 
 
 def answers_of(config: Config, places: Places) -> Answers:
-    """Return the answers with which setup would write what this config says of them."""
+    """Return the answers for which setup would write this config."""
     services, devices = config.services, config.section(AvDaemon)
     line, video, remote = services.serial_mcu_bridge, devices.video, services.mqtt_bridge.remote_mqtt
     has_board = line.enabled and line.serial.port is not None
@@ -52,7 +52,7 @@ def answers_of(config: Config, places: Places) -> Answers:
 
 
 def changed(current: dict[str, Any], before: dict[str, Any], after: dict[str, Any]) -> dict[str, Any]:
-    """Return the current config with what is different after the answers; what was written by hand stays."""
+    """Return the present config with the changes that the answers ask for; other hand-written keys stay."""
     result = dict(current)
     for key in {**before, **after}:
         here, old, new = (config.get(key) for config in (current, before, after))
@@ -127,5 +127,5 @@ def _own_login(account: str, password: str) -> dict[str, Any]:
 
 
 def _from_etc(places: Places, path: Path) -> str:
-    """Return the path from the config's folder, so that a config means the same below another root."""
+    """Return the path relative to the config's folder, so that the config is also valid below another root."""
     return os.path.relpath(path, places.etc)

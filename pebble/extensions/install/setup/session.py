@@ -1,4 +1,4 @@
-"""One run of ``pebble setup``: answers are completed, steps are shown and done, and it says what is next."""
+"""A run of ``pebble setup``: it completes the answers, shows and does the steps, and says what to do next."""
 
 import subprocess
 import sys
@@ -26,9 +26,9 @@ _SUDO = "sudo pebble setup"
 
 
 def set_up(system: System, answers_file: Path | None, backup_file: Path | None) -> int:
-    """Set up the machine: from a backup, from a file of answers, or from what a person answers.
+    """Set up the machine from a backup, from a file of answers, or from a person's answers.
 
-    Returns the exit code. Raises AnswersError before anything is written, and SetupError.
+    Returns the exit code. Raises SetupError, and AnswersError before anything is written.
     """
     places = system.places
     system.owner(ROBOTS)
@@ -66,7 +66,7 @@ def set_up(system: System, answers_file: Path | None, backup_file: Path | None) 
 
 
 def _agree(lines: Sequence[str]) -> None:
-    """Show what a restored config runs and names. Raises Abort."""
+    """Show the programs and files that a restored config names, and ask. Raises Abort."""
     say("The robot of this backup runs programs, or names what is not its own:")
     for line in lines:
         say(shown(line), 2)
@@ -74,7 +74,7 @@ def _agree(lines: Sequence[str]) -> None:
 
 
 def _failures(job: Job, *, is_started: bool) -> Iterator[str]:
-    """Yield what keeps the robot from being driven; a robot that was started tests itself."""
+    """Yield the problems that keep the robot from being driven, by its own test if it was started."""
     places = job.places
     if not job.system.has_systemd:
         yield f"systemd does not run here, so nothing starts the robot: pebble up {places.config}"
@@ -87,7 +87,7 @@ def _failures(job: Job, *, is_started: bool) -> Iterator[str]:
 
 
 def _refusal(places: Places) -> str:
-    """Return why the broker does not let the robot in; empty: it does."""
+    """Return why the broker refuses the robot; empty if it accepts it."""
     config = load_config(places)
     assert config is not None  # noqa: S101 - it has just been written
     remote = config.services.mqtt_bridge.remote_mqtt

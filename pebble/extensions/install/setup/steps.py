@@ -1,4 +1,4 @@
-"""The steps that make a robot of a machine, in order. Each is checked first, and done only if it is necessary."""
+"""The steps that set up a robot, in their order. Each is checked first, and done only if it is necessary."""
 
 import json
 import os
@@ -50,7 +50,7 @@ ROBOT_SERVICE, BROKER_SERVICE = UNIT, "mosquitto.service"
 
 
 class Step(NamedTuple):
-    """One thing that must be so. ``restarts``: the services that read what it writes."""
+    """A state of the machine to reach. ``restarts``: services that read what the step writes."""
 
     what: str
     is_done: Callable[[], bool]
@@ -59,7 +59,7 @@ class Step(NamedTuple):
 
 
 def load_config(places: Places) -> Config | None:
-    """Return the config that is there; None: there is none yet. Raises ConfigError."""
+    """Return the existing config; None if there is none. Raises ConfigError."""
     if not places.config.exists():
         return None
     return load(places.config, {**os.environ, "STATE_DIRECTORY": str(places.state)})
@@ -67,7 +67,7 @@ def load_config(places: Places) -> Config | None:
 
 @dataclass(frozen=True)
 class Job:
-    """All that the steps depend on. ``config`` is the one that is there already."""
+    """The data on which all steps depend. ``config``: the existing one."""
 
     system: System
     config: Config | None
@@ -89,7 +89,7 @@ class Job:
 
     @property
     def page(self) -> Config | None:
-        """The config, if the robot serves its page already."""
+        """Return the config if the robot already serves a page."""
         return self.config if self.config is not None and self.config.section(WebHandler).enabled else None
 
     @property
@@ -97,14 +97,14 @@ class Job:
         return self.places.people if self.page is None else people_of(self.page)
 
     def with_answers(self, given: Mapping[str, Any], secrets: Secrets | None = None) -> "Job":
-        """Return the same with further answers. Raises AnswersError with a line for each mistake."""
+        """Return the job with further answers. Raises AnswersError with a line for each mistake."""
         answers = combined(self.answers, given)
         if given.get("broker") == HERE and (why := no_broker(self.places)):
             raise AnswersError(f"broker: {why}")
         return replace(self, answers=answers, secrets=secrets or self.secrets)
 
     def require(self) -> None:
-        """Raise AnswersError with the keys that have no answer."""
+        """Raise AnswersError with the keys that still need an answer."""
         has_people = bool(self.answers.page) and has_user(self.people)
         is_known = self.answers.user is not None and has_user(self.people, self.answers.user)
         require(self.answers, self.secrets, has_login=self.has_login, has_people=has_people, has_user=is_known)
@@ -112,7 +112,7 @@ class Job:
     # -- the steps
 
     def steps(self) -> list[Step]:
-        """Return all of them, in their order: the config is written when all that it names is there."""
+        """Return all steps in their order; the config is written after all files that it names."""
         steps = [*self._passwords(), *(self._own_broker() if self.answers.broker == HERE else self._other_broker())]
         if self.answers.page:
             steps += [*self._certificate(), *self._first_user()]
@@ -136,7 +136,7 @@ class Job:
                 yield self._new_password("password of the page at the robot's broker", page)
 
     def _new_password(self, what: str, file: Path, *, known: bool = True) -> Step:
-        """Make a new password. ``known``: what is in the file is of this broker."""
+        """Return the step that writes a new password. ``known``: one in the file is of this broker, so it stays."""
         write = partial(self.system.write, file)
         return Step(what, lambda: known and file.exists(), lambda: write(f"{new_password()}\n".encode()))
 
@@ -233,7 +233,7 @@ class Job:
     # -- doing them
 
     def left(self) -> list[Step]:
-        """Return the steps that are not done yet. Raises PebbleError."""
+        """Return the steps that still have to be done. Raises PebbleError."""
         return [step for step in self.steps() if not step.is_done()]
 
     def do(self, steps: list[Step]) -> bool:

@@ -1,4 +1,4 @@
-"""The machine that setup changes: files with their owners, and programs of the system."""
+"""The machine that setup changes: its files with their owners, and its programs."""
 
 import grp
 import os
@@ -23,11 +23,11 @@ _PACKAGES = {"pebble": "./pebble-robot_….deb", "mosquitto": "mosquitto"}
 
 
 class SetupError(PebbleError):
-    """A machine cannot be set up as asked. Example: ``only root can do this: sudo pebble setup``."""
+    """A machine that cannot be set up as asked. Example: ``only root can do this: sudo pebble setup``."""
 
 
 def run_command(command: Sequence[str]) -> None:
-    """Run a program of the system. Raises SetupError with its first line of complaint."""
+    """Run a program of the machine. Raises SetupError with the first line of its error output."""
     line = " ".join(command)
     try:
         done = run(command, _COMMAND_S)
@@ -41,7 +41,7 @@ def run_command(command: Sequence[str]) -> None:
 
 
 def owner_of(names: str) -> tuple[int, int]:
-    """Return the ids of ``user:group``, which packages of Debian have made. Raises SetupError."""
+    """Return the ids of ``user:group``, which Debian packages have created. Raises SetupError."""
     if not is_root():
         raise SetupError("only root can do this: sudo pebble setup")
     user, _, group = names.partition(":")
@@ -54,7 +54,7 @@ def owner_of(names: str) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class System:
-    """One machine. Tests give it another root, and keep programs from being run and files from being given away."""
+    """A machine. Tests give it another root, and replace running programs and changing owners."""
 
     places: Places = field(default_factory=Places)
     run: Callable[[Sequence[str]], None] = run_command
@@ -65,13 +65,13 @@ class System:
         return (self.places.root / "run/systemd/system").is_dir()
 
     def write(self, file: Path, content: bytes, mode: int = 0o640, owner: str = ROBOTS) -> None:
-        """Replace a file at once. Raises SetupError."""
+        """Replace a file in one step. Raises SetupError."""
         ids = self.owner(owner)
         with as_owner(file.parent):
             write(file, content, mode, SetupError, ids if is_root() else None)
 
     def make_folder(self, folder: Path, mode: int, owner: str, fill: Callable[[Path], None] | None = None) -> None:
-        """Make a folder, filled beside its place, so that it is there whole or not at all. Raises SetupError."""
+        """Create a folder with its files in one step: it exists completely or not at all. Raises SetupError."""
         ids = self.owner(owner)
         new = folder.with_name(f".{folder.name}.new")
         try:

@@ -1,1 +1,1 @@
-"""Signed releases, which make a newer version safe to install."""
+"""Signed releases, by which a newer version can be installed safely."""

@@ -31,11 +31,11 @@ _WHEEL = re.compile(r"pebble_robot-[0-9A-Za-z.+]+-py3-none-any\.whl")
 
 
 class ReleaseError(PebbleError):
-    """A release is not what it should be; the message names the reason."""
+    """A release that is refused; the message says why."""
 
 
 class Release(msgspec.Struct, frozen=True):
-    """RELEASE.json. A later version may add fields."""
+    """The content of RELEASE.json. A later version may add fields."""
 
     version: str
     sequence: int
@@ -46,9 +46,10 @@ class Release(msgspec.Struct, frozen=True):
 
 
 def verify(folder: Path, keys: Iterable[str], *, above: int = 0, test_key: bool = False) -> Release:
-    """Return the release in ``folder``, if it and all files there are signed by one of ``keys``, and it is newer.
+    """Return the release in ``folder`` if it is newer, and it and all its files are signed by one of ``keys``.
 
-    ``above`` is the highest sequence that was accepted before. ``test_key`` is for tests only.
+    ``above`` is the highest sequence number that was accepted before. ``test_key`` is for tests only. Raises
+    ReleaseError.
     """
     manifest = _read(folder / MANIFEST)
     check_signature(manifest, _read(folder / SIGNATURE), keys, test_key=test_key)
@@ -67,7 +68,7 @@ def verify(folder: Path, keys: Iterable[str], *, above: int = 0, test_key: bool 
 
 
 def check_signature(data: bytes, signature: bytes, keys: Iterable[str], *, test_key: bool = False) -> str:
-    """Return the trusted comment of a signature, if one of ``keys`` made it over ``data``.
+    """Return the trusted comment of a signature that one of ``keys`` made over ``data``. Raises ReleaseError.
 
     The format: https://jedisct1.github.io/minisign/, signatures of hashes (``ED``) only.
     """
@@ -136,7 +137,7 @@ def _key(text: str) -> bytes:
 
 
 def _name(key_id: bytes) -> str:
-    """Name a key as minisign does."""
+    """Return a key's name in minisign's form."""
     return f"{int.from_bytes(key_id, 'little'):016X}"
 
 

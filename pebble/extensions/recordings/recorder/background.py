@@ -1,4 +1,4 @@
-"""The recorder's work beside writing: it makes files durable, and finishes them."""
+"""The recorder's threads beside the writer: they make files durable, and finish them."""
 
 import logging
 import os
@@ -17,7 +17,7 @@ SYNC_S: Final = 5.0  # a power cut loses as much
 
 
 class Background:
-    """One thread makes files durable every few seconds, and returns free memory; another one does what takes long."""
+    """Two threads: one makes files durable every few seconds and returns free memory, the other does long jobs."""
 
     def __init__(self) -> None:
         self._jobs = ThreadPoolExecutor(1, "pebble-recorder-finish")
@@ -33,7 +33,7 @@ class Background:
         self._thread.start()
 
     def stop(self) -> None:
-        """Wait until all jobs are done."""
+        """Wait until all jobs are done, and end the threads."""
         self._jobs.shutdown()
         self._stopping.set()
         self._thread.join()

@@ -11,17 +11,17 @@ _DAY_S = 86_400.0
 
 @dataclass(frozen=True, slots=True)
 class Disk:
-    """The file system of the folder."""
+    """The file system of the recordings' folder."""
 
     free_bytes: int
     has_inodes: bool = True
 
 
 def surplus(entries: Iterable[Entry], options: Options, disk: Disk) -> list[Entry]:
-    """Return what to delete now to keep the limits of space: the oldest first, pictures and sound before state.
+    """Return the files to delete now: the oldest first, pictures and sound before state.
 
-    Files that are being written are never among them, nor those that are damaged: these may hold what was
-    not read, and do not count. The newest file of each kind stays.
+    Files that are being written, and damaged ones, are never among them: damaged ones may hold what could not be read
+    yet, and do not count. The newest file of each kind stays.
     """
     listed = [entry for entry in entries if entry.is_active or entry.is_finished]
     used, free = sum(entry.size for entry in listed), disk.free_bytes
@@ -38,14 +38,17 @@ def surplus(entries: Iterable[Entry], options: Options, disk: Disk) -> list[Entr
 
 
 def outdated(entries: Iterable[Entry], options: Options, now: float) -> Entry | None:
-    """Return a file of pictures and sound that is too old; one at a time, because the clock may have been set wrong."""
+    """Return a file of pictures and sound that is too old.
+
+    Only one at a time, because the clock may have been set wrong.
+    """
     age_s = options.keep_media_days * _DAY_S
     old = (entry for entry in _deletable(list(entries)) if entry.is_media and now - entry.ended > age_s)
     return next(old, None) if age_s else None
 
 
 def _deletable(entries: list[Entry]) -> list[Entry]:
-    """Return the files in the order in which they go."""
+    """Return the files that may be deleted, in that order."""
     finished = sorted((entry for entry in entries if entry.is_finished), key=lambda entry: entry.number)
     media = [entry for entry in finished if entry.is_media]
     state = [entry for entry in finished if not entry.is_media]

@@ -1,10 +1,10 @@
-"""Tasks that are repeated after some time. Pure."""
+"""Tasks that are repeated at intervals. Pure."""
 
 from collections.abc import Callable
 
 
 class Due:
-    """The tasks that are repeated after some time."""
+    """Tasks that are repeated, each with its interval."""
 
     def __init__(self, boot_ns: Callable[[], int]) -> None:
         self._boot_ns = boot_ns
@@ -21,7 +21,7 @@ class Due:
         return True
 
     def suspended_s(self, awake_ns: int) -> float:
-        """Return seconds for which the machine was suspended since the last call."""
+        """Return for how many seconds the machine was suspended since the last call."""
         now = self._boot_ns()
         slept = 0 if self._awake is None else (now - self._awake_at) - (awake_ns - self._awake)
         self._awake, self._awake_at = awake_ns, now

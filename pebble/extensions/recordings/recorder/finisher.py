@@ -1,4 +1,4 @@
-"""Finishes files beside the writer: complete ones, and what a killed recorder or a full disk has left."""
+"""The finisher of files beside the writer: of complete ones, and of those that a kill or a full disk left."""
 
 import logging
 from collections.abc import Callable
@@ -17,9 +17,9 @@ log = logging.getLogger(__name__)
 
 
 def mend(path: Path) -> Rewritten:
-    """Make a finished file of one that a killed recorder has left.
+    """Finish a file that a killed recorder has left.
 
-    That one is deleted if nothing but the begin of a record is lost, else kept as ``….mcap.damaged``. Raises
+    The original is deleted if only an incomplete record is lost, else kept as ``….mcap.damaged``. Raises
     RecordingError, OSError.
     """
     target = finished_path(path)
@@ -39,7 +39,7 @@ def _damaged_path(path: Path) -> Path:
 
 
 class Finisher:
-    """Queues its work for ``background``. ``event`` writes down what became of a file that was left."""
+    """A queue of files to finish, for ``background``. ``event`` records what became of a file that was left."""
 
     def __init__(self, background: Background, event: Callable[..., None], on_finished: Callable[[], None]) -> None:
         self._background, self._event, self._on_finished = background, event, on_finished
@@ -49,15 +49,15 @@ class Finisher:
         self._background.do(partial(self._finish, file))
 
     def mend(self, path: Path) -> None:
-        """Finish a file as it was left."""
+        """Queue a file that was left unfinished."""
         self._background.do(partial(self._mend, path))
 
     def postpone(self, path: Path) -> None:
-        """Finish a file when there is room again."""
+        """Queue a file until there is room again."""
         self._unfinished.add(path)
 
     def retry(self) -> None:
-        """Try again what could not be finished."""
+        """Try the postponed files again."""
         for path in list(self._unfinished):
             self.mend(path)
 
@@ -100,7 +100,7 @@ class Finisher:
         self._event("damaged", file=path.name, why=why)
 
     def _later(self, path: Path, error: OSError) -> None:
-        """Leave it as it is, so that it can be read, until there is room; said once."""
+        """Keep a file readable as it is until there is room; log that once."""
         if path not in self._unfinished:
             log.warning("%s is not finished yet: %s", path.name, error.strerror or error)
         self._unfinished.add(path)

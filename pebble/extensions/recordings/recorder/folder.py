@@ -34,7 +34,7 @@ _DAY: Final = "%Y/%m/%d"
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One file of a recorder."""
+    """A file of a recorder."""
 
     path: Path
     number: int  # they grow: names alone do not say which is older, because clocks are set
@@ -56,7 +56,7 @@ class Entry:
 
 
 class Folder:
-    """``root`` holds ``2026/11/20/20261120T232921Z-000017.state.mcap`` and the like."""
+    """A recorder's folder. ``root`` holds ``2026/11/20/20261120T232921Z-000017.state.mcap`` and the like."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -66,7 +66,7 @@ class Folder:
         self._own = OwnFile(root / LOCK)
 
     def take(self) -> None:
-        """Make the folder, and lock it against a second recorder. Raises RecordingError."""
+        """Create the folder and lock it against a second recorder. Raises RecordingError."""
         try:
             self.root.mkdir(mode=0o750, parents=True, exist_ok=True)
         except OSError as error:
@@ -81,7 +81,7 @@ class Folder:
 
     @property
     def in_place(self) -> bool:
-        """True if the folder at the path is still the one taken; its disk may have been removed or brought back."""
+        """True if the path still leads to the folder that was taken; its disk may have been removed or brought back."""
         return self._own.in_place
 
     def release(self) -> None:
@@ -89,7 +89,7 @@ class Folder:
 
     @contextmanager
     def taken(self) -> Iterator[None]:
-        """Keep recorders away meanwhile. Raises RecordingError."""
+        """Hold the lock during the block, so that no recorder starts. Raises RecordingError."""
         self.take()
         try:
             yield
@@ -109,7 +109,7 @@ class Folder:
                 return True
 
     def create(self, lane: str, now_ns: int) -> tuple[BinaryIO, Path]:
-        """Return a new file that is being written. Raises OSError."""
+        """Create a file to write to. Raises OSError."""
         self._number += 1
         moment = time.gmtime(max(0, now_ns) // 10**9)
         day = self.root / time.strftime(_DAY, moment)
@@ -120,7 +120,7 @@ class Folder:
         return os.fdopen(descriptor, "r+b", buffering=0), path
 
     def entries(self) -> list[Entry]:
-        """Return the recorder's own files, the oldest first; links and what others have put there are left alone."""
+        """Return the recorder's files, the oldest first; links and foreign files are left out."""
         found = []
         for path in self._files():
             match = _NAME.fullmatch(path.name)
@@ -141,7 +141,10 @@ class Folder:
 
 @contextmanager
 def _locked(path: Path, used: str) -> Iterator[bool]:
-    """Yield False where the file system has no locks. Raises RecordingError(used) if another process holds it."""
+    """Lock the folder; yield False if the file system has no locks.
+
+    Raises RecordingError(used) if another process holds the lock.
+    """
     try:
         import fcntl
     except ImportError:  # Windows
@@ -164,7 +167,7 @@ def _locked(path: Path, used: str) -> Iterator[bool]:
 
 
 def finished_path(path: Path) -> Path:
-    """Return the name of a file that was ``.mcap.active``, once it is finished."""
+    """Return the path of a ``.mcap.active`` file once it is finished."""
     return path.with_name(path.name.removesuffix(ACTIVE) + SUFFIX)
 
 

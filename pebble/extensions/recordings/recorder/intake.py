@@ -1,4 +1,4 @@
-"""The queue of items to write into files."""
+"""The queue of items that wait to be written into files."""
 
 import json
 import threading
@@ -33,7 +33,7 @@ class Clocks(NamedTuple):
 
 
 class Intake:
-    """A bounded queue of items to write; pictures and sound never displace state. Any thread may add to it."""
+    """A bounded queue; pictures and sound never displace state. Any thread may add to it."""
 
     def __init__(self, limit: int, clocks: Clocks, clock: RecordingClock, counters: Counter[str]) -> None:
         self.robots: dict[str, float] = {}  # when each was received last, seconds since 1970
@@ -60,14 +60,14 @@ class Intake:
                 self.robots[robot] = self._wall_ns() / 1e9
 
     def note(self, event: str, **about: Any) -> None:
-        """Write down what happened to the recording itself; not dropped for messages, but beyond 1,000 of its own."""
+        """Add an event of the recording itself. Messages never displace it; only 1,000 events may wait."""
         boot_ns = self._boot_ns()
         payload = json.dumps({"t": self._clock.at(boot_ns) // 10**6, "event": event, **about}).encode()
         self._events.append(Item(boot_ns, EVENTS, payload, 1, False, ""))
         self._counters[f"event_{event}"] += 1
 
     def note_gap(self, since_ns: int, why: str, **about: Any) -> None:
-        """Write down that nothing was recorded since ``since_ns`` (since 1970)."""
+        """Add an event: nothing was recorded since ``since_ns`` (since 1970)."""
         now_ns = self._clock.now()
         self.note("gap", since=since_ns // 10**6, until=now_ns // 10**6, why=why, **about)
 
@@ -75,16 +75,16 @@ class Intake:
         self._events.append(event)
 
     def drop(self, messages: int) -> None:
-        """Count messages that were taken and could not be written."""
+        """Count messages that were taken from the queue and could not be written."""
         with self._lock:
             self._counters["dropped"] += messages
 
     def add_order(self, topic: str, source: str) -> None:
-        """Add something for the writer to do between the messages before and after: ``topic`` says what."""
+        """Add an order for the writer between the messages before and after it; ``topic`` names it."""
         self._events.append(Item(self._boot_ns(), topic, b"", None, None, "", source))
 
     def take(self) -> list[Item]:
-        """Return all that waits, in the order in which it came."""
+        """Return all waiting items, in the order in which they came."""
         items = [self._events.popleft() for _ in range(len(self._events))]
         with self._lock:
             for waiting in (self._state, self._media):

@@ -1,4 +1,4 @@
-"""One row of files: the state of all robots, or the pictures and sound of one."""
+"""A lane: a series of files, for the state of all robots, or for the pictures and sound of one."""
 
 import os
 import re
@@ -52,7 +52,7 @@ class OpenFile:
 
     @property
     def is_full(self) -> bool:
-        """True if the next message belongs into another file."""
+        """True if the next message must go into a new file."""
         return self.writer.channels >= _MOST_CHANNELS or self.writer.indexed >= _MOST_INDEXED
 
     def add(self, item: Item, at_ns: int) -> None:
@@ -70,24 +70,24 @@ class OpenFile:
         self.writer.add(channel, log_ns, item.payload, publish_ns)
 
     def flush(self) -> int:
-        """Give all that was added to the file; returns how many messages it has taken since the last call."""
+        """Write all that was added; return how many messages were written since the last call."""
         self.writer.flush()
         self.pending.clear()
         return self.take_written()
 
     def take_written(self) -> int:
-        """Return how many messages the file has taken since the last call."""
+        """Return how many messages were written since the last call."""
         since, self._taken = self._taken, self.writer.flushed
         return self._taken - since
 
     def take_lacking(self) -> list[Item]:
-        """Return, after an error, the messages that the file has not taken. They are not pending any more."""
+        """Return, after an error, the messages that were not written, and forget them."""
         lacking = self.writer.messages - self.writer.flushed
         items, self.pending = self.pending, []
         return items[max(0, len(items) - lacking) :] if lacking else []
 
     def finish(self) -> None:
-        """Write the summary, make all durable and give the file its final name. Raises OSError."""
+        """Write the summary, make the file durable and give it its final name. Raises OSError."""
         try:
             self.writer.finish()
             sync_file(self.file.fileno())
@@ -97,12 +97,12 @@ class OpenFile:
             self.file.close()
 
     def discard(self) -> None:
-        """Delete a file in which nothing is."""
+        """Delete a file without messages."""
         self.file.close()
         self.path.unlink(missing_ok=True)
 
     def is_there(self) -> bool:
-        """True if its name still leads to it: the folder may have been removed."""
+        """True if the file's name still leads to it: its folder may have been removed."""
         try:
             return os.path.samestat(self.path.stat(), os.fstat(self.file.fileno()))
         except OSError:
@@ -110,7 +110,10 @@ class OpenFile:
 
 
 def lane_of(topic: str, *, is_media: bool) -> str:
-    """Return the lane of a message. A robot's media have one if its identity makes a name for a file."""
+    """Return the lane of a message.
+
+    A robot's media have a lane if its identity can be part of a file name.
+    """
     if not is_media:
         return STATE
     levels = topic.split("/", 3)[:3]
@@ -119,7 +122,7 @@ def lane_of(topic: str, *, is_media: bool) -> str:
 
 
 class RawFile:
-    """A file whose ``write`` is one call."""
+    """A file whose ``write`` is one system call."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file

@@ -5,9 +5,9 @@ from contextlib import suppress
 
 
 def return_free_pages() -> None:
-    """Give pages of the heap that hold nothing back to the system, where the C library is glibc.
+    """Return unused pages of the heap to the system, with glibc.
 
-    It keeps them otherwise, unless they are the last ones: a process that passes on messages of many sizes takes
+    Glibc keeps them unless they are at the heap's end, so that a process which passes on messages of many sizes takes
     several megabytes more than it needs (measured: 7 of a recorder's 31 MB, once its files were rotated).
     """
     with suppress(AttributeError):  # musl

@@ -1,4 +1,4 @@
-"""The files that a recorder writes at present: one for each lane."""
+"""The files that a recorder writes at present, one for each lane."""
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -14,13 +14,16 @@ _TOPICS, _BYTES = 10_000, 16 << 20
 
 
 class RetainedValues:
-    """The retained values at this moment, by connection and topic: a new file begins with them."""
+    """The present retained values, by connection and topic. A new file begins with them."""
 
     def __init__(self) -> None:
         self._values = BoundedTable[Item](_TOPICS, _BYTES, lambda item: len(item.payload))
 
     def note(self, item: Item) -> None:
-        """Note a message. Where the broker hides how it was published, a topic known to be retained stays so."""
+        """Note a message.
+
+        If the broker does not tell how it was published, a topic known to be retained stays so.
+        """
         key = f"{item.source} {item.topic}"
         known = self._values.get(key)
         if item.retained and known is not None and not known.retained:
@@ -33,20 +36,20 @@ class RetainedValues:
             self._values.pop(key, None)
 
     def forget(self, source: str) -> None:
-        """Forget the values of a connection: they are fetched again."""
+        """Forget a connection's values, as they are fetched again."""
         for key in [key for key in self._values if key.startswith(f"{source} ")]:
             del self._values[key]
 
     def carried(self) -> Iterator[Item]:
-        """Yield what a new file begins with."""
+        """Yield the values with which a new file begins."""
         for item in list(self._values.values()):
             yield item._replace(retained=CARRIED)
 
 
 class OpenFiles:
-    """By lane; a file of the state begins with the retained values. Not thread-safe.
+    """The open files by lane; a state file begins with the retained values. Not thread-safe.
 
-    ``about`` is written into each file, and ``watch`` gets all of them whenever that changes.
+    ``about`` is written into each file. ``watch`` is called with all files when they change.
     """
 
     def __init__(self, folder: Folder, about: Mapping[str, str], watch: Callable[[list[OpenFile]], None]) -> None:
@@ -56,7 +59,7 @@ class OpenFiles:
 
     @property
     def by_lane(self) -> dict[str, OpenFile]:
-        """A copy, so that files may be opened and taken meanwhile."""
+        """Return a copy, so that files may be opened and taken while it is iterated."""
         return dict(self._files)
 
     @property
@@ -64,13 +67,13 @@ class OpenFiles:
         return {file.path for file in self._files.values()}
 
     def lane(self, item: Item) -> str:
-        """Return the lane of a message; media beyond those of so many robots share one."""
+        """Return the lane of a message. Beyond a number of robots, their media share a lane."""
         lane = lane_of(item.topic, is_media=is_media(item.payload))
         media = len(self._files) - (STATE in self._files)
         return lane if lane == STATE or lane in self._files or media < _MOST_MEDIA else OTHER_MEDIA
 
     def get(self, lane: str, *, now_ns: int, at_ns: int) -> OpenFile:
-        """Return the file of a lane, or a new one, begun now, with the values retained at ``at_ns``. Raises OSError."""
+        """Return a lane's file; a new one begins with the values retained at ``at_ns``. Raises OSError."""
         file = self._files.get(lane)
         if file is not None:
             return file
@@ -87,7 +90,7 @@ class OpenFiles:
         return file
 
     def take(self, lane: str) -> OpenFile:
-        """Return the file, which is not written any more."""
+        """Remove a file from the table, and return it."""
         file = self._files.pop(lane)
         self._watch(list(self._files.values()))
         return file

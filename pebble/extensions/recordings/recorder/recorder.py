@@ -1,7 +1,7 @@
-"""Records messages into files: receives at once, writes on one thread, makes durable on another.
+"""The recorder: receives at once, writes on one thread, makes files durable on another.
 
-Whatever happens to the disk, nothing here waits for it but those two threads: the queue is bounded, drops pictures and
-sound before state, and every message that is lost is counted, and written down as soon as there is room.
+Only those two threads ever wait for the disk. The queue is bounded and drops pictures and sound before state. Every
+lost message is counted, and the loss is recorded as soon as there is room.
 """
 
 import logging
@@ -33,7 +33,7 @@ _SUSPENDED_S: Final = 0.5
 
 
 class Recorder:
-    """One folder. :meth:`receive` may be called by any thread, and never waits."""
+    """A recorder into one folder. :meth:`receive` may be called by any thread, and never waits."""
 
     def __init__(
         self, root: Path, options: Options, about: Mapping[str, str] | None = None, clocks: Clocks | None = None
@@ -52,7 +52,7 @@ class Recorder:
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
 
     def start(self) -> None:
-        """Start. Raises RecordingError if the folder cannot be used, or the package ``mcap`` is not installed."""
+        """Start. Raises RecordingError if the folder cannot be used or the package ``mcap`` is not installed."""
         require_package()
         self.folder.take()
         left = self._writing.mend_leftovers()
@@ -80,9 +80,9 @@ class Recorder:
         retained: bool = False,
         source: str = "",
     ) -> None:
-        """Queue a message; ``retained``: an old value, which a broker sent after subscribing.
+        """Queue a message. ``retained``: it is an old value, which the broker sent for a new subscription.
 
-        ``qos``, ``retain``: as it was published; None where that is unknown.
+        ``qos``, ``retain``: as it was published; None if unknown.
         """
         if topic.startswith("$recorder/") or len(payload) > LARGEST_PAYLOAD:
             self.counters["refused"] += 1
@@ -90,12 +90,12 @@ class Recorder:
             self._intake.add(topic, payload, qos, retain, "1" if retained else "", source)
 
     def forget_retained(self, source: str) -> None:
-        """Forget the retained values of a connection: they are fetched again."""
+        """Forget the retained values of a connection, as they are fetched again."""
         self._intake.add_order(FORGET, source)
 
     @property
     def blocked(self) -> str:
-        """The reason why nothing is written now; empty while it is."""
+        """Return why nothing can be written now; empty if it can."""
         return self._writing.blocked
 
     @property
@@ -108,7 +108,7 @@ class Recorder:
 
     @property
     def robots(self) -> dict[str, float]:
-        """The time of each robot's last message, in seconds since 1970."""
+        """Return the time of each robot's last message, in seconds since 1970."""
         return dict(self._intake.robots)
 
     # -- the writer's thread

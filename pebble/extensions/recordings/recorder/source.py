@@ -21,11 +21,11 @@ _LOSSES: Final = ("too_long", "malformed")  # messages that a transport has drop
 
 
 class Source:
-    """One connection. What happens to it is written down as events.
+    """A connection whose messages are recorded, and whose changes are recorded as events.
 
-    A broker sends at most some 1,000 retained messages to a subscription of QoS 1, and none of them is marked on a
-    connection that shows how live messages were published. So each connection to a broker has a second one beside it,
-    which fetches the retained messages with QoS 0 and ends.
+    A broker sends only some 1,000 retained messages to a subscription of QoS 1, and does not mark them on a connection
+    that shows how live messages were published. So each connection to a broker has a second one, which fetches the
+    retained messages with QoS 0 and ends.
     """
 
     def __init__(self, recorder: Recorder, kind: str, settings: Any, filters: Iterable[str], name: str = "") -> None:
@@ -53,7 +53,10 @@ class Source:
         self.check()
 
     def check(self) -> None:
-        """Once a second: write down what the transport had to drop; begin and end the fetching of retained messages."""
+        """Record what the transport had to drop; begin and end fetching retained messages.
+
+        Called once a second.
+        """
         counted = self._transport.counters.snapshot()
         for name in _LOSSES:
             new = counted.get(name, 0) - self._losses.get(name, 0)
@@ -171,7 +174,7 @@ class _Copies:
 
 
 def _once(filters: list[str], receive: Callable[[Message], None]) -> Iterator[tuple[str, Callable[[Message], None]]]:
-    """Yield each filter with its handler, so that a message that several of them match is received once."""
+    """Yield each filter with a handler, such that a message that matches several filters is received once."""
     for number, filter_ in enumerate(filters):
         yield filter_, partial(_receive_unless, filters[:number], receive) if number else receive
 

@@ -1,4 +1,4 @@
-"""The work of the recorder's writer thread: messages into files, room for them, and the lack of room."""
+"""The work of the recorder's writer thread: messages into files, deletion for room, and what to do without room."""
 
 import errno
 import logging
@@ -34,7 +34,7 @@ _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 
 
 class _Blocked(NamedTuple):
-    """A time in which nothing is written, and its reason."""
+    """A time in which nothing can be written, and why."""
 
     why: str
     since_ns: int
@@ -53,7 +53,7 @@ class Context(NamedTuple):
 
 
 class Writing:
-    """Writes the messages of one recorder. Not thread-safe."""
+    """A writer of a recorder's messages. Not thread-safe."""
 
     def __init__(self, context: Context, intake: Intake, background: Background) -> None:
         self._folder, self._options, self._clock, self._counters, about = context
@@ -71,9 +71,9 @@ class Writing:
         return "" if self._blocked is None else self._blocked.why
 
     def mend_leftovers(self) -> int:
-        """Finish what a recorder before this one has left; returns how many files.
+        """Finish the files that an earlier recorder has left; return their number.
 
-        Without a lock they may be another recorder's, and stay as they are.
+        Without a lock they may be another recorder's; then they stay as they are.
         """
         ours = self._files.paths
         left = [entry.path for entry in self._folder.entries() if entry.is_active and entry.path not in ours]
@@ -84,7 +84,7 @@ class Writing:
     # -- messages
 
     def add(self, item: Item) -> None:
-        """Never raises."""
+        """Write a message, or carry out an order of the queue. Never raises."""
         try:
             self._add(item)
         except Exception:  # noqa: BLE001  one message must not take others with it
@@ -122,7 +122,7 @@ class Writing:
             self._fail(lane, error)
 
     def flush(self) -> None:
-        """Give what was added to the files."""
+        """Write out what was added to the files."""
         for lane, file in self._files.by_lane.items():
             self._flush(lane, file)
 
@@ -145,12 +145,12 @@ class Writing:
             self._forget_removed(lane)
 
     def _finish(self, lane: str) -> None:
-        """Finish the file of a lane, unless it has failed meanwhile."""
+        """Finish the file of a lane, unless it has failed in the meantime."""
         if lane in self._files.by_lane:
             self._finisher.finish(self._files.take(lane))
 
     def note_drops(self) -> None:
-        """Write down what was dropped because the queue was full."""
+        """Record as an event what was dropped because the queue was full."""
         total = self._counters["dropped"]
         if total > self._noted_drops and self._blocked is None:
             self._intake.note("dropped", messages=total - self._noted_drops, why="the disk is too slow")
@@ -159,7 +159,7 @@ class Writing:
     # -- when files cannot be written
 
     def _fail(self, lane: str, error: OSError) -> None:
-        """Leave a file as it is; what it has not taken is written into the next one."""
+        """Close a failed file as it is; its unwritten messages go into the next one."""
         file = self._files.take(lane)
         self._lacking += file.take_lacking()
         self._counters["written"] += file.take_written()
@@ -186,7 +186,7 @@ class Writing:
             self._blocked = _Blocked(why, self._clock.now(), self._counters["dropped"], full)
 
     def try_again(self) -> None:
-        """Write on, if that is possible now."""
+        """Resume writing if that is possible now."""
         blocked = self._blocked
         if blocked is None:
             return
@@ -210,7 +210,7 @@ class Writing:
         log.warning("recording again")
 
     def give_up(self) -> None:
-        """Count, at the end, what no file has taken."""
+        """Count, at the end, the messages that could not be written."""
         self._intake.drop(len(self._lacking))
         self._lacking = []
         self._finisher.retry()
@@ -218,7 +218,7 @@ class Writing:
     # -- room
 
     def check_space(self, due: Due, *, now_s: float) -> None:
-        """Make room, and stop or go on writing; a few times a minute."""
+        """Delete files for room, and block or resume writing. Called a few times a minute."""
         if not (due.every("space", _SPACE_S) or self._changed):
             return
         options = self._options
@@ -245,7 +245,7 @@ class Writing:
             self.try_again()
 
     def _follow_folder(self) -> None:
-        """Use the folder that is there now. Raises RecordingError and OSError."""
+        """Use the folder that is at the path now. Raises RecordingError and OSError."""
         if self._folder.in_place:
             return
         self.flush()  # forgets the files that are not there any more

@@ -1,1 +1,1 @@
-"""Publishes recordings again."""
+"""Replay: a recording, published again."""

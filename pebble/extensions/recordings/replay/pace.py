@@ -1,4 +1,4 @@
-"""The position in a recording that is played at some speed. Pure: the clock is passed in."""
+"""The position in a recording that is played at a certain speed. Pure: the clock is passed in."""
 
 from collections.abc import Callable
 
@@ -6,7 +6,7 @@ SLOWEST, FASTEST = 0.1, 100.0
 
 
 class Pace:
-    """Positions are in nanoseconds since 1970; ``now`` never goes back, in seconds."""
+    """A speed and a start. Positions are in nanoseconds since 1970; ``now``, in seconds, never goes back."""
 
     def __init__(self, now: Callable[[], float], *, speed: float, slowest: float) -> None:
         self._now, self._slowest = now, slowest
@@ -18,7 +18,7 @@ class Pace:
         return self._speed
 
     def change(self, speed: float, position_ns: int) -> None:
-        """Play at another speed from this position on."""
+        """Play at another speed, from this position."""
         self.go_on_from(position_ns)
         self._speed = min(max(speed, self._slowest), FASTEST)
 
@@ -27,9 +27,9 @@ class Pace:
 
     @property
     def reached_ns(self) -> int:
-        """The position at this moment, if nothing holds it up."""
+        """Return the present position, if nothing delays it."""
         return self.from_ns + int((self._now() - self._from) * self._speed * 1e9)
 
     def due_s(self, position_ns: int, now: float) -> float:
-        """Return how long after ``now`` a position is reached; negative if it was reached before."""
+        """Return in how many seconds a position is reached; negative if it was reached before."""
         return (position_ns - self.from_ns) / 1e9 / self._speed + self._from - now

@@ -1,4 +1,4 @@
-"""Publishes a recording again, in its order and at its pace. Pure: clocks, waiting and publishing are passed in."""
+"""The player of a recording: in its order and at its pace. Pure: clocks, waiting and publishing are passed in."""
 
 from collections.abc import Callable, Iterator
 from typing import Final, Protocol
@@ -19,41 +19,41 @@ _LATE_S: Final = 0.5
 
 
 class Source(Protocol):
-    """The source of a player."""
+    """The recording that a player plays."""
 
     def messages(self, since_ns: int, until_ns: int) -> Iterator[Recorded]:
-        """Yield those of a period by the time at which they were received."""
+        """Yield the messages of a period by the time at which they were received."""
         ...
 
     def state_before(self, at_ns: int, publishes: Chooses) -> list[Recorded]:
-        """Return what a subscriber would know at a time, the pictures that the next one builds on last."""
+        """Return what a subscriber would know at a time, ending with the pictures that the next one builds on."""
         ...
 
 
 class Output(Protocol):
-    """The output of a player."""
+    """The receiver of a player's messages."""
 
     sent: int
     skipped: int
 
     @property
     def moves(self) -> bool:
-        """True if something may be moving because of what was sent."""
+        """True if a sent message may have set something in motion."""
         ...
 
     def send(self, message: Recorded, position_ns: int) -> bool:
-        """Send the message; False: not sent now, and the caller tries again later."""
+        """Send a message; return False if it cannot be sent now, so that the caller tries again."""
         ...
 
     def halt(self) -> None:
-        """Stop what moves."""
+        """Stop what may be in motion."""
         ...
 
 
 class BusOutput:
-    """Publishes recorded messages again, and a zero after those that move something.
+    """An output that publishes on a bus, and a zero after commands that moved something.
 
-    ``publish`` returns False for what it cannot take now; ``wall_ns`` is the time since 1970.
+    ``publish`` returns False for a message that it cannot take now; ``wall_ns`` returns the time since 1970.
     """
 
     def __init__(self, rules: Rules, publish: Callable[[Message], bool], wall_ns: Callable[[], int]) -> None:
@@ -63,11 +63,14 @@ class BusOutput:
 
     @property
     def moves(self) -> bool:
-        """True if something may be moving because of what was published."""
+        """True if a published message may have set something in motion."""
         return bool(self._moved)
 
     def send(self, message: Recorded, position_ns: int) -> bool:
-        """True if it is done; a stamp was ``position_ns`` - stamp old then, and is as old now."""
+        """Publish a message; return True if it is done.
+
+        Its stamps are moved so that it seems as old now as it was at ``position_ns``.
+        """
         found = self._rules.outgoing(message, self._wall_ns() - position_ns)
         if found is None:
             self.skipped += 1
@@ -82,12 +85,15 @@ class BusOutput:
         return True
 
     def halt(self) -> None:
-        """Send a zero after each drive command that moves. Without a connection the robot's own deadline has to do."""
+        """Publish a zero for each drive command that may still move something.
+
+        Without a connection the robot's own deadline has to stop it.
+        """
         self._moved = {topic: None for topic in self._moved if not self._publish(zero(topic))}
 
 
 class Reading:
-    """The position of a replay in its recording, by published messages; ``skipped`` counts the others between."""
+    """A position in a recording, at the next message to publish; ``skipped`` counts those left out."""
 
     def __init__(self, source: Source, publishes: Chooses, until_ns: int) -> None:
         self.next: Recorded | None = None
@@ -97,13 +103,13 @@ class Reading:
         self._messages: Iterator[Recorded] = iter(())
 
     def open(self, since_ns: int) -> None:
-        """Go on from another time, with the state and the pictures that a decoder needs by then."""
+        """Continue at another time, beginning with the state and the pictures that a decoder needs there."""
         self._messages = self._source.messages(since_ns, self._until_ns)
         self.state = self._source.state_before(since_ns, self._publishes)[::-1] if since_ns else []
         self.advance()
 
     def advance(self) -> None:
-        """Find the next message that is published; those between take no time."""
+        """Find the next message to publish."""
         for message in self._messages:
             if self._publishes(message.channel):
                 self.next = message
@@ -113,7 +119,7 @@ class Reading:
 
 
 class Player:
-    """Plays until the end; between its calls of ``wait`` it may be paused, moved and stopped."""
+    """A player that plays to the end; within its calls of ``wait`` it may be paused, moved and stopped."""
 
     def __init__(
         self,
@@ -132,10 +138,10 @@ class Player:
         stays: bool = False,
         longest_gap_ns: int = FOREVER_NS,
     ) -> None:
-        """``wait`` waits for up to so many seconds; ``now`` never goes back, in seconds.
+        """Prepare to play. ``wait`` waits up to so many seconds; ``now`` returns seconds and never goes back.
 
-        With ``stays`` it is paused at the end, and each time is a position, also one before the first message. Of a
-        time without messages at most ``longest_gap_ns`` is played.
+        ``stays``: pause at the end instead of returning, and accept any time as a position, also before the first
+        message. A pause of the recording is shortened to ``longest_gap_ns``.
         """
         self.paused, self.ended = paused, False
         self.at_end = False  # it is paused there
@@ -162,7 +168,7 @@ class Player:
 
     @property
     def position_ns(self) -> int:
-        """The time in the recording, since 1970."""
+        """Return the time in the recording, since 1970."""
         from_ns, next_ = self._pace.from_ns, self._reading.next
         if self.paused or self.ended:
             return from_ns
@@ -178,7 +184,7 @@ class Player:
         self._pace.change(speed, self.position_ns)
 
     def run(self) -> None:
-        """Play to the end, or until :meth:`stop`; whatever moves is stopped then, also after an error."""
+        """Play to the end or until :meth:`stop`, then stop what moves, also after an error."""
         try:
             self._open(self._since_ns, self._since_ns if self._stays else 0)
             if self._reading.next is not None and not self._stays:
@@ -203,7 +209,7 @@ class Player:
         self._pace.go_on_from(self._pace.from_ns)
 
     def seek(self, to_ns: int) -> None:
-        """Go on from another time, with the state and the pictures that a decoder needs by then."""
+        """Continue at another time, beginning with the state and the pictures that a decoder needs there."""
         self._output.halt()
         self._open(max(to_ns, self._begins_ns), to_ns)
 
@@ -245,7 +251,7 @@ class Player:
             self._reading.advance()
 
     def _send(self, message: Recorded, position_ns: int) -> bool:
-        """Send the message; False: not sent now, and it is tried again later."""
+        """Send the message; return False if it has to be tried again."""
         done = self._output.send(message, position_ns)
         if not done:
             self._pass(_RETRY_S)

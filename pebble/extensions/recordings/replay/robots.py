@@ -1,4 +1,4 @@
-"""The connections of a replay: one for each robot, with its will."""
+"""The connections of a replay: one for each robot, with a will."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ Make = Callable[[str, Message | None], Transport]
 
 
 class ReplayedRobots:
-    """Publishes in the names of robots, which are offline at the end. ``wall_ms``: since 1970."""
+    """A publisher in the names of robots, which are published as offline at the end.
+
+    ``wall_ms``: returns the time since 1970.
+    """
 
     def __init__(self, make: Make, bases: Iterable[str], *, wall_ms: Callable[[], int]) -> None:
         self.problem = ""  # why nothing is published now
@@ -38,7 +41,7 @@ class ReplayedRobots:
         self._close()
 
     def publish(self, message: Message) -> bool:
-        """Publish in the name of the robot in the topic; False while that is not possible."""
+        """Publish in the name of the robot in the topic; return False if that is not possible now."""
         transport = self._robots["/".join(message.topic.split("/", 3)[:3])]
         if transport.state is not State.CONNECTED:
             self.problem = f"no connection: {transport.problem or 'it was lost'}"

@@ -1,8 +1,7 @@
-"""The rules by which a recording may be published again: harmless unless asked for more. Pure.
+"""The rules that make a replay harmless unless its user asks for more. Pure.
 
-The rules in their order: nothing of a broker's own; another base; nothing that is an order to a robot, but mild ones
-if asked for; nothing retained. Names of topics decide by the contract, so an unknown name counts as the worst of its
-direction.
+In their order: no topics of the broker itself; another base topic; no commands, except mild ones if asked for; nothing
+retained. The contract decides by a topic's name; an unknown name counts as the worst of its direction.
 """
 
 from collections.abc import Iterable
@@ -36,7 +35,7 @@ _ZERO: Final = codec.encode(c.DRIVE, Drive(valid_ms=0))  # final: no script resu
 
 
 class ReplayError(PebbleError):
-    """A replay that cannot be. Example: ``--base pebble is the base of pebble/robots/goob itself: …``."""
+    """A replay that cannot be done. Example: ``--base pebble is the base of pebble/robots/goob itself: …``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +55,7 @@ class Outgoing(NamedTuple):
 
 
 class _Address(NamedTuple):
-    """The target of the messages of one recorded channel."""
+    """The topic and the rule for a recorded channel's messages."""
 
     recorded: Identity
     base: str
@@ -66,10 +65,10 @@ class _Address(NamedTuple):
 
 
 class Rules:
-    """Decides about each message of a recording."""
+    """The decisions about a recording's messages."""
 
     def __init__(self, options: Options, channels: Iterable[Channel]) -> None:
-        """``channels``: those of the recording. Raises ReplayError, ConfigError or TransportError."""
+        """Check the options. ``channels``: the recording's. Raises ReplayError, ConfigError or TransportError."""
         self._options = options
         Identity(options.system, "robots", "any")
         for filter_ in options.only:
@@ -84,7 +83,7 @@ class Rules:
         return self._listed(channel) is not None
 
     def outgoing(self, recorded: Recorded, by_ns: int) -> Outgoing | None:
-        """Return the message to publish instead of a recorded one, with stamps moved by ``by_ns``; None: none."""
+        """Return the message to publish for a recorded one, with its stamps moved by ``by_ns``; None for none."""
         address = self._listed(recorded.channel)
         if address is None or _is_probe(recorded.payload):
             return None
@@ -100,7 +99,7 @@ class Rules:
         return Outgoing(Message(address.topic, shifted(payload, by_ns), address.qos), moves)
 
     def _listed(self, channel: Channel) -> _Address | None:
-        """Return None for robots that the files did not name at the start: they may be live."""
+        """Return the channel's address; None if no file named its robot at the start, as it may be a live one."""
         address = self._address(channel)
         return address if address is not None and address.base in self.robots else None
 
@@ -109,7 +108,7 @@ class Rules:
         return self._found(channel.topic, metadata.get("qos", "0"), metadata.get("retained") == "1")
 
     def _find(self, topic: str, qos: str, retained: bool) -> _Address | None:
-        """Return the address. ``retained``: the recorder received it as an old message."""
+        """Return the address. ``retained``: the recorder received the message as an old one."""
         parsed = None if topic.startswith("$") else parse_topic(topic)
         if parsed is None or parsed.identity.is_server or not self._wanted(topic):
             return None
@@ -137,7 +136,7 @@ class Rules:
         return self._options.incoming and declared in _MILD
 
     def _moves(self, payload: bytes) -> bool | None:
-        """Return None for a command that is not to be sent: one that cannot be read, or a script's."""
+        """Return whether a drive command moves; None if it is not to be sent: an unreadable one, or a script's."""
         try:
             command: Drive = codec.decode(c.DRIVE, payload)
         except PayloadError:
@@ -159,9 +158,10 @@ class Rules:
 
 
 def harmless(payload: bytes, recorded: str, base: str) -> bytes:
-    """Return capabilities with their topics below ``base``, and no offers of what is not there; b"" if unreadable.
+    """Return capabilities with their topics below ``base``, without offers that a replay cannot serve.
 
-    Pages publish to the topics that they find here: unchanged, they would drive the real robot.
+    Pages publish to the topics that they find here: unchanged, they would drive the real robot. Unreadable capabilities
+    become b"".
     """
     try:
         plain = codec.plain(c.CAPABILITIES, payload)
@@ -179,17 +179,17 @@ def _section(name: str, section: Any, recorded: str, base: str) -> Any:
 
 
 def zero(topic: str) -> Message:
-    """Return what stops a robot that a drive command on ``topic`` may have set in motion."""
+    """Return the message that stops a robot which a command on ``topic`` may have set in motion."""
     return Message(topic, _ZERO, QoS.DELIVERED)
 
 
 def _is_probe(payload: bytes) -> bool:
-    """True if a bridge looks for cycles by it; also white space alone."""
+    """True if the payload is a bridge's probe for cycles, or empty but for white space."""
     return bool(payload) and payload[-_PROBE:].isspace()
 
 
 def _rebased(plain: Any, old: str, new: str) -> Any:
-    """Return ``plain`` with all topics below ``old`` moved below ``new``; names of topics elsewhere are left out."""
+    """Return ``plain`` with all topics below ``old`` moved below ``new``; topics elsewhere are left out."""
     if isinstance(plain, dict):
         return {key: _rebased(value, old, new) for key, value in plain.items() if not _is_elsewhere(key, value, old)}
     if isinstance(plain, list):
@@ -198,14 +198,14 @@ def _rebased(plain: Any, old: str, new: str) -> Any:
 
 
 def _is_elsewhere(key: str, value: Any, old: str) -> bool:
-    """True if ``value`` of ``key`` names a topic outside the robot's base, which a config may do."""
+    """True if ``value`` of ``key`` is a topic outside the robot's base; a config may have such."""
     if not isinstance(value, str):
         return False
     return not value.startswith(old) and (key.endswith("topic") or parse_topic(value) is not None)
 
 
 def _without_controls(section: Any, *, drives: bool) -> Any:
-    """Return the section without controls: no part of a recording obeys a command."""
+    """Return the section without its controls, since a recording obeys no command."""
     if isinstance(section, list):
         return [_without_controls(value, drives=drives) for value in section]
     if not isinstance(section, dict):

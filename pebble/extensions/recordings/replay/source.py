@@ -20,10 +20,10 @@ _HEARTBEATS: Final = frozenset({ONLINE.suffix, HEARTBEAT.suffix})
 
 
 class ReplaySource:
-    """Recordings as one stream; a seek begins with what a subscriber would know by then."""
+    """Recordings as one stream; after a seek it begins with what a subscriber would know at that time."""
 
     def __init__(self, paths: Iterable[Path]) -> None:
-        """Reads the end of each file, or all of one that is not finished. Raises RecordingError."""
+        """Read the end of each file, or all of an unfinished one. Raises RecordingError."""
         self._files: dict[Path, list[Channel]] = {}
         self.damages = Damages()  # of what was read
         for path in paths:
@@ -41,9 +41,9 @@ class ReplaySource:
         return merged(self._files, since_ns=since_ns, until_ns=until_ns, damages=self.damages)
 
     def state_before(self, at_ns: int, publishes: Chooses = lambda _channel: True) -> list[Recorded]:
-        """Return the newest retained message of each topic, then all pictures since each topic's last key frame.
+        """Return each topic's newest retained message, then all pictures since each topic's last key frame.
 
-        Only of channels that ``publishes`` accepts. No heartbeats: an old one is no sign of life.
+        Only of channels that ``publishes`` accepts; no heartbeats, since an old one is no sign of life.
         """
         newest: dict[str, Recorded] = {}
 
@@ -73,13 +73,13 @@ class ReplaySource:
         return sorted(pictures, key=lambda message: message.log_ns)
 
     def _having(self, chooses: Callable[[Channel], bool], since_ns: int, until_ns: int) -> list[Path]:
-        """Return the files of that time with such channels: media must not be unpacked for a state."""
+        """Return the files of that time with such channels, so that no media are decompressed in vain."""
         having = [path for path, channels in self._files.items() if any(map(chooses, channels))]
         return [path for path in having if reaches_into(path, since_ns, until_ns)]
 
 
 def _is_state(channel: Channel) -> bool:
-    """True if a subscriber would be sent its newest message at once."""
+    """True if a new subscriber would get the topic's newest message at once."""
     suffix = _suffix(channel)
     if not suffix.startswith(f"{OUTGOING}/") or suffix in _HEARTBEATS:
         return False
@@ -95,6 +95,6 @@ def _may_be_pictures(channel: Channel) -> bool:
 
 
 def _suffix(channel: Channel) -> str:
-    """Return the topic below the identity; empty for topics outside the contract's form."""
+    """Return the topic below the identity; empty for topics in another form than the contract's."""
     levels = channel.topic.split("/", 3)
     return levels[3] if len(levels) > 3 else ""

@@ -1,1 +1,1 @@
-"""Looks into recordings at any moment: messages of a time, the state before it, pictures, days."""
+"""Random access to recordings: messages of a time, the state before it, pictures, days."""

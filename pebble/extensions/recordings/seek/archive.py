@@ -1,4 +1,4 @@
-"""A folder of recordings, asked about one robot at one time: what was, what came, which picture was seen."""
+"""A folder of recordings, queried for one robot at one time: its state, its messages, its picture."""
 
 import re
 import time
@@ -29,7 +29,7 @@ _NAME: Final = re.compile(r"(?P<stamp>\d{8}T\d{6}Z)-\d{6,}\.(?P<lane>.+?)\.mcap(
 
 
 class _Named(NamedTuple):
-    """The facts in a file's name; files of other programs have none."""
+    """The facts in the name of a recorder's file; files of other programs have none."""
 
     path: Path
     lane: str  # "": any
@@ -51,7 +51,7 @@ class Archive:
             self._open.popitem()[1].close()
 
     def messages(self, robot: str, since_ns: int, until_ns: int) -> list[Recorded]:
-        """Return what a robot published, and what was sent to it, from ``since_ns`` to before ``until_ns``."""
+        """Return what a robot published and was sent, from ``since_ns`` to before ``until_ns``."""
         found: list[Recorded] = []
         for file in self.files(robot, since_ns, until_ns):
             for chunk in _within(file, file.channels_of(robot), since_ns, until_ns):
@@ -66,7 +66,7 @@ class Archive:
         return found
 
     def state(self, robot: str, at_ns: int) -> list[Recorded]:
-        """Return the newest message of each topic of a robot before ``at_ns``, without media, the oldest first."""
+        """Return the newest message of each of a robot's topics before ``at_ns``, without media, oldest first."""
         files = self.files(robot, at_ns - _LONGEST_FILE_NS, at_ns, media=False)
         files = [file for file in files if file.first_ns < at_ns]
         if not files:
@@ -91,7 +91,7 @@ class Archive:
         )
 
     def log_lines(self, robot: str, at_ns: int) -> list[Recorded]:
-        """Return the last lines of its log before ``at_ns``, the oldest first."""
+        """Return the last lines of a robot's log before ``at_ns``, oldest first."""
         topic = LOGS.topic(robot)
         found: list[Recorded] = []
         for file in reversed(self.files(robot, at_ns - _LOG_NS, at_ns, media=False)):
@@ -108,7 +108,7 @@ class Archive:
         return sorted(found[:LOG_LINES], key=lambda message: message.log_ns)
 
     def pictures(self, robot: str, at_ns: int) -> list[Recorded]:
-        """Return the last picture before ``at_ns`` and those it needs, from its key frame on, oldest first; or none."""
+        """Return the last picture before ``at_ns``, preceded by those it needs; empty if there is none."""
         chain: list[Recorded] = []
         size = 0
         for message in self._pictures_before(robot, at_ns):
@@ -135,7 +135,7 @@ class Archive:
         return found
 
     def files(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[SeekableFile]:
-        """Return the files that may hold messages of a robot in a period, opened, in the order of time."""
+        """Return the opened files that may hold messages of a robot in a period, in the order of time."""
         lane = lane_of(f"{robot}/", is_media=True)
         found = []
         for named in self._list():
@@ -150,12 +150,12 @@ class Archive:
         return sorted(found, key=lambda file_: file_.first_ns)
 
     def all_files(self) -> Iterator[SeekableFile]:
-        """Yield all, opened one after the other."""
+        """Yield all files, each opened."""
         files = (self._opened(named.path) for named in self._list())
         yield from (file for file in files if file is not None)
 
     def unread(self) -> dict[Path, str]:
-        """Return what could not be read of each file, as far as that is known."""
+        """Return, for each file that was looked at, what could not be read."""
         return self._failed | {path: file.problem for path, file in self._open.items() if file.problem}
 
     # -- files
@@ -172,7 +172,7 @@ class Archive:
         return self._named
 
     def _opened(self, path: Path) -> SeekableFile | None:
-        """Return a file, opened; None if it has gone meanwhile, or is no recording."""
+        """Return a file, opened; None if it has gone or is no recording."""
         file = self._open.pop(path, None)
         try:
             if file is not None and file.is_replaced():
@@ -191,7 +191,7 @@ class Archive:
         return file
 
     def _pictures_before(self, robot: str, at_ns: int) -> Iterator[Recorded]:
-        """Yield the newest first."""
+        """Yield the pictures before a time, newest first."""
         since_ns = at_ns - _CHAIN_NS
         for file in reversed(self.files(robot, since_ns, at_ns)):
             for chunk in reversed(_within(file, file.channels_of(robot), since_ns, at_ns)):
@@ -202,7 +202,7 @@ class Archive:
 
 
 def metric_of(topic: str) -> tuple[str, bool]:
-    """Return what follows ``incoming/`` or ``outgoing/``, and whether it was sent to the robot."""
+    """Return the part of a topic after ``incoming/`` or ``outgoing/``, and whether it was sent to the robot."""
     parsed = parse_topic(topic)
     if parsed is None:
         return topic, False

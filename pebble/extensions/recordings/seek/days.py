@@ -1,4 +1,4 @@
-"""The days of an archive, and what each holds, by the summaries of its files."""
+"""The days of an archive, with their contents, from the summaries of its files."""
 
 import json
 from collections.abc import Iterator
@@ -21,10 +21,10 @@ _MOST_DAYS: Final = 31  # of one chunk
 
 
 class Day(Struct):
-    """One day of UTC; ``first`` and ``last`` in epoch milliseconds, ``gaps``: of the recording itself.
+    """A day (UTC). ``first``, ``last``: epoch milliseconds. ``gaps``: times that were not recorded.
 
-    ``driven``: about how many seconds each robot was sent commands to drive, in steps of the recording's chunks.
-    ``unread``: a line for each file that cannot be read completely, on the day when it was written last.
+    ``driven``: for about how many seconds each robot was sent drive commands, in steps of the recording's chunks.
+    ``unread``: a line for each file that cannot be read completely, on the day of its last change.
     """
 
     day: str
@@ -38,14 +38,17 @@ class Day(Struct):
 
 
 class Days:
-    """Remembers what was found of each file that does not change any more."""
+    """A table of days, which remembers the contents of files that do not change any more."""
 
     def __init__(self, archive: Archive) -> None:
         self._archive = archive
         self._known: dict[Path, list[Day]] = {}
 
     def all(self) -> list[Day]:
-        """Return the newest first. A file counts to each day that its messages reach into; its bytes to the first."""
+        """Return the days, newest first.
+
+        A file counts for each day that has messages of it; its bytes for the first.
+        """
         found: dict[str, Day] = {}
         for file in self._archive.all_files():
             days = self._known.get(file.path)
@@ -80,7 +83,7 @@ def _days(file: SeekableFile) -> list[Day]:
 
 
 def _driven(file: SeekableFile, begin: int, end: int) -> dict[str, float]:
-    """Return seconds within a day, by robot."""
+    """Return the driven seconds within a day, by robot."""
     drives = {number: robot_of(channel) for number, channel in file.channels.items() if _drives(channel.topic)}
     robots = {number: robot for number, robot in drives.items() if robot is not None}
     found: dict[str, float] = {}
@@ -100,7 +103,10 @@ def _day_of(seconds: int) -> str:
 
 
 def _day_numbers(chunk: Chunk) -> Iterator[int]:
-    """Yield the days that a chunk reaches into: of a clock that was set only the first ones, and the last."""
+    """Yield the days of a chunk.
+
+    If they are too many, as after a change of the clock, only the first ones and the last.
+    """
     first, last = chunk.start_ns // DAY_NS, chunk.end_ns // DAY_NS
     yield from range(first, min(last, first + _MOST_DAYS))
     yield last
@@ -116,7 +122,7 @@ def _merge(day: Day, other: Day) -> None:
 
 
 def _gaps(file: SeekableFile) -> list[int]:
-    """Return when the recorder wrote down gaps."""
+    """Return the gaps that the recorder noted."""
     numbers = {number for number, channel in file.channels.items() if channel.topic == EVENTS}
     found = []
     for chunk in file.chunks if numbers else []:

@@ -1,4 +1,4 @@
-"""One recording that is read in any place; the chunks that were read last stay unpacked."""
+"""A recording that is read at any place; the last used chunks stay decompressed."""
 
 import os
 from collections import OrderedDict
@@ -14,7 +14,7 @@ _CACHED: Final = 4  # chunks: the next question is mostly about the same time
 
 
 class SeekableFile(RecordingFile):
-    """One file, finished or being written."""
+    """A file, finished or still being written."""
 
     def __init__(self, path: Path) -> None:
         self._unpacked_chunks: OrderedDict[int, list[Recorded]] = OrderedDict()
@@ -22,11 +22,11 @@ class SeekableFile(RecordingFile):
         self._about = os.fstat(self._file.fileno())
 
     def robots(self) -> set[str]:
-        """Return all robots to which a channel belongs."""
+        """Return all robots that have a channel."""
         return {robot for channel in self.channels.values() if (robot := robot_of(channel)) is not None}
 
     def channels_of(self, robot: str) -> frozenset[int]:
-        """Return the channels of a robot, and in a file of the last version the channel of all other topics."""
+        """Return a robot's channels and, in files of the last version, the channel of all other topics."""
         return frozenset(
             number
             for number, channel in self.channels.items()
@@ -34,7 +34,7 @@ class SeekableFile(RecordingFile):
         )
 
     def is_replaced(self) -> bool:
-        """True if its name leads to another file now. Raises OSError."""
+        """True if the file's name leads to another file now. Raises OSError."""
         now, then = self.path.stat(), self._about
         grown = not self.path.name.endswith(ACTIVE) and now.st_size != then.st_size
         return grown or not os.path.samestat(now, then)
@@ -51,5 +51,5 @@ class SeekableFile(RecordingFile):
 
 
 def is_carried(channel: Channel) -> bool:
-    """True if its messages were written again at the begin of the file, and are not of that time."""
+    """True if the message was copied to the begin of the file, and is older than the file."""
     return channel.metadata.get("retained") == CARRIED

@@ -1,7 +1,7 @@
-"""The questions of a process to another about recordings: functions that take and return plain data.
+"""Functions that a second process runs to answer questions about recordings. They take and return plain data.
 
-The process that answers (:class:`pebble.extensions.page.recordings.archive_process.ArchiveProcess`) has one archive;
-unpacking files would otherwise delay the loop that passes on drive commands.
+That process (:class:`pebble.extensions.page.recordings.archive_process.ArchiveProcess`) has one archive. In the page
+server's own process, reading files would delay the loop that passes on drive commands.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _days: Days
 
 
 def begin(folder: Path) -> None:
-    """Prepare this process to answer questions about the recordings in ``folder``."""
+    """Prepare this process for questions about the recordings in ``folder``."""
     global _archive, _days
     _in_background(_NICE)
     _archive = Archive(folder)
@@ -57,12 +57,12 @@ def begin(folder: Path) -> None:
 
 
 def days() -> bytes:
-    """Return JSON."""
+    """Return the archive's days as JSON."""
     return msgspec.json.encode(_days.all())
 
 
 def files(robot: str, since_ns: int, until_ns: int) -> tuple[list[str], bool]:
-    """Return the recordings of a robot in a period, and whether one of them is still being written."""
+    """Return a robot's recordings in a period, and whether one is still being written."""
     found = [str(file.path) for file in _archive.files(robot, since_ns, until_ns)]
     return found, any(path.endswith(ACTIVE) for path in found)
 
@@ -71,7 +71,7 @@ def files(robot: str, since_ns: int, until_ns: int) -> tuple[list[str], bool]:
 
 
 def make_timeline_job(answer: Connection, paths: list[str], target: Path, robot: str, period: tuple[int, int]) -> None:
-    """Index what is not indexed, and write the timeline to ``target``, as JSON."""
+    """Index what is not indexed, and write the timeline to ``target`` as JSON."""
     _in_background(_NICE)
 
     def work() -> str:
@@ -87,7 +87,7 @@ def make_timeline_job(answer: Connection, paths: list[str], target: Path, robot:
 def export_job(
     answer: Connection, paths: list[str], target: Path, robot: str, period: tuple[int, int], form: str
 ) -> None:
-    """Write a film, or MCAP, of a stretch to ``target``."""
+    """Write a period as a film or as MCAP to ``target``."""
     _in_background(_NICE)
     since_ns, until_ns = period
 
@@ -118,7 +118,7 @@ def export_job(
 
 
 class _Progress:
-    """Sends the share of the work that is done: in steps of a percent, and as a sign of life."""
+    """A sender of the share of the work that is done: in steps of a percent, and as a sign of life."""
 
     def __init__(self, answer: Connection) -> None:
         self._answer, self._sent, self._sent_at = answer, -1, 0.0
@@ -131,7 +131,7 @@ class _Progress:
 
 
 def answer_with(answer: Connection, work: Callable[[], str]) -> None:
-    """Do the work of a job, and answer what came of it. ``work`` returns what it could not read."""
+    """Do the work of a job, and answer with its result. ``work`` returns what it could not read."""
     try:
         answer.send(("ready", work()[:_LONGEST_WHY]))
     except Exception as error:
@@ -141,7 +141,7 @@ def answer_with(answer: Connection, work: Callable[[], str]) -> None:
 
 
 def reason(error: Exception) -> str:
-    """Return what has failed and what helps, in one line."""
+    """Return what has failed and what to do, in one line."""
     match error:
         case PebbleError():
             words = str(error)

@@ -1,4 +1,4 @@
-"""The use of a robot that a message shows: it is driven, watched, plays a sound, runs a script. Pure."""
+"""The use of a robot that a message shows: driving, watching, a sound, a script. Pure."""
 
 import re
 from collections.abc import Callable
@@ -40,7 +40,7 @@ _BY_SUFFIX: Final = {
 
 
 def activity_of(suffix: str) -> Callable[[bytes], Activity]:
-    """Return what the payloads of a topic show, by its part below the base (``incoming/drive-values``).
+    """Return the activity that the payloads of a topic show, by its part below the base (``incoming/drive-values``).
 
     Not for media.
     """

@@ -1,4 +1,4 @@
-"""Analyses the traffic of recordings by their index, one robot after the other."""
+"""The analysis of recordings' traffic by their index, robot by robot."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -34,7 +34,7 @@ class RecorderEvents(Struct):
     dropped: int = 0
 
     def breaks(self) -> list[tuple[int, int]]:
-        """Return times that no heartbeat interval can be measured across."""
+        """Return the times across which no heartbeat interval can be measured."""
         return [*((gap.since_ns, gap.until_ns) for gap in self.gaps), *((ns, ns) for ns in self.starts)]
 
 
@@ -47,9 +47,9 @@ def analyse(
     robots: Collection[str] = (),
     progress: Progress = lambda _what, _share: None,
 ) -> Traffic:
-    """Return the traffic from ``since_ns`` to before ``until_ns``, of all robots unless some are named.
+    """Return the traffic from ``since_ns`` to before ``until_ns``, of the named robots or of all.
 
-    Files that do not fit into memory are made below ``scratch``. Raises RecordingError, also if there is no message.
+    Temporary files are made below ``scratch``. Raises RecordingError, also if there is no message.
     """
     with connected(scratch, memory_mb=_MEMORY_MB, threads=_THREADS) as connection:
         recorder = recorder_events(connection, sources.indexes, since_ns, until_ns)
@@ -82,7 +82,7 @@ def _robot(queries: RobotQueries, name: str, messages: int, size: int) -> RobotT
 
 
 def recorder_events(connection: Any, indexes: Sequence[Path], since_ns: int, until_ns: int) -> RecorderEvents:
-    """Return what recorders noted in a period; makes the table ``breaks`` that `RobotQueries` needs."""
+    """Return the recorders' events of a period; create the table ``breaks`` that `RobotQueries` needs."""
     found = RecorderEvents([], [])
     rows = connection.execute(_EVENTS.format(events=parquet(indexes))).fetchall() if indexes else []
     for event, ns, since, until, why, messages in rows:

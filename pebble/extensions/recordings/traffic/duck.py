@@ -19,7 +19,7 @@ _GLOB: Final = re.compile(r"([*?\[])")
 
 
 def require_packages(*names: str) -> None:
-    """Raise PebbleError that names those of the extra "archive" that are not installed."""
+    """Raise PebbleError with those packages of the extra "archive" that are not installed."""
     missing = [name for name in names if find_spec(name) is None]
     if missing:
         raise PebbleError(f'{" and ".join(missing)} missing: pip install "pebble-robot[archive]"')
@@ -27,9 +27,9 @@ def require_packages(*names: str) -> None:
 
 @contextmanager
 def connected(scratch: Path, *, memory_mb: int, threads: int = 1) -> Iterator[DuckDBPyConnection]:
-    """Give a database in memory; what does not fit goes to files below ``scratch``.
+    """Yield a database in memory, with overflow files below ``scratch``.
 
-    Raises PebbleError without DuckDB, and RecordingError for what fails in it.
+    Raises PebbleError without DuckDB, and RecordingError for errors of DuckDB.
     """
     require_packages("duckdb")
     import duckdb
@@ -47,11 +47,14 @@ def connected(scratch: Path, *, memory_mb: int, threads: int = 1) -> Iterator[Du
 
 
 def quoted(value: object) -> str:
-    """Return a text in SQL."""
+    """Return a text as an SQL literal."""
     return "'" + str(value).replace("'", "''") + "'"
 
 
 def parquet(paths: Iterable[Path]) -> str:
-    """Return the rows of Parquet files, as a table in SQL. Names are no patterns: a folder may be called ``[1]``."""
+    """Return an SQL table of the rows of Parquet files.
+
+    Names are not patterns: a folder may be called ``[1]``.
+    """
     names = (quoted(Path(_GLOB.sub(r"[\1]", str(path)))) for path in paths)
     return f"read_parquet([{', '.join(names)}], hive_partitioning = false)"

@@ -1,4 +1,4 @@
-"""The figures of an analysis as SVG for a page: Figures 4.1 to 4.6 of the paper, for every robot."""
+"""The figures of an analysis as SVG: Figures 4.1 to 4.6 of the paper, for every robot."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _TALL: Final = 30  # a highest bar of so many times the lowest makes the axis lo
 
 
 class Figure(Struct, frozen=True):
-    """A drawing, with what a reader who is new to it has to know."""
+    """A drawing, with the text that a new reader needs."""
 
     number: str  # in the paper
     title: str
@@ -62,7 +62,7 @@ def _outages(robot: RobotTraffic) -> Figure | None:
 
 
 def draw_outages(axes: Axes, robot: RobotTraffic) -> None:
-    """Draw how many outages of each length there were."""
+    """Draw the number of outages of each length."""
     if not robot.outages:
         axes.set_axis_off()
         axes.text(0.5, 0.5, "no outage", ha="center", va="center", transform=axes.transAxes, color="#555")
@@ -90,7 +90,7 @@ def _latency(robot: RobotTraffic) -> Figure | None:
 
 
 def draw_latency(axes: Axes, latency: Latency) -> None:
-    """Draw the histogram, with its median and 95th percentile."""
+    """Draw the histogram of latencies, with its median and 95th percentile."""
     bars = latency.histogram
     lefts = [bars.low + number * bars.width for number in range(len(bars.counts))]
     axes.bar(lefts, bars.counts, width=bars.width, align="edge", color=_BLUE)
@@ -144,7 +144,7 @@ def draw_bandwidth(axes: Axes, shown: Sequence[Bandwidth]) -> None:
 
 
 def _legend(axes: Axes) -> None:
-    """Draw the legend above the drawing, where it hides nothing."""
+    """Draw the legend above the drawing, so that it hides nothing."""
     axes.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.2)
 
 
@@ -163,7 +163,7 @@ def _short(value: float) -> str:
 
 
 def _svg(draw: Any, robot: RobotTraffic, name: str) -> str:
-    """Return SVG without ids that two figures of a page could share, and without names of other hosts."""
+    """Return SVG without ids, which two figures of a page could share, and without names of other hosts."""
     import matplotlib as mpl
     from matplotlib.figure import Figure as Drawing
 

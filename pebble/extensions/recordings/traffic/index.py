@@ -1,7 +1,7 @@
-"""The index of a recording: one row per message, without payloads, in ``NAME.parquet`` beside ``NAME.mcap``.
+"""The index of a recording: a row for each message, without payloads, in ``NAME.parquet`` beside ``NAME.mcap``.
 
-It may be deleted: it is made again when it is needed. :data:`COLUMNS` are its columns; its rows are in the order of
-robots and times. Its metadata (``parquet_kv_metadata``) name the state of the recording from which it was made.
+It may be deleted: it is made again when needed. :data:`COLUMNS` are its columns; its rows are ordered by robot and
+time. Its metadata (``parquet_kv_metadata``) hold the state of the recording from which it was made.
 """
 # ruff: noqa: S608  (what is put into queries are names of files and texts, in quotes)
 
@@ -92,7 +92,7 @@ def index_path(recording: Path) -> Path:
 
 
 def about(index: Path, connection: DuckDBPyConnection) -> About | None:
-    """None for a file that is no index. Raises RecordingError if it cannot be read."""
+    """Return the facts in an index; None for another file. Raises RecordingError if it cannot be read."""
     found = dict(connection.execute(f"SELECT key, value FROM parquet_kv_metadata({quoted(index)})").fetchall())
     try:
         texts = {key.decode(): value.decode() for key, value in found.items()}
@@ -104,7 +104,7 @@ def about(index: Path, connection: DuckDBPyConnection) -> About | None:
 
 
 def is_of(index: Path, recording: Path, connection: DuckDBPyConnection) -> bool:
-    """True if the index was made from the recording as it is now."""
+    """True if the index was made from the recording in its present state."""
     if not index.is_file():
         return False
     made, now = about(index, connection), recording.stat()
@@ -112,7 +112,7 @@ def is_of(index: Path, recording: Path, connection: DuckDBPyConnection) -> bool:
 
 
 def write_index(recording: Path, index: Path, scratch: Path, advance: Advance = lambda _share: None) -> None:
-    """Index a recording, in whatever state it is.
+    """Index a recording in any state.
 
     ``advance`` is called with the share of the file that is done. Raises RecordingError, OSError.
     """
@@ -131,7 +131,7 @@ def write_index(recording: Path, index: Path, scratch: Path, advance: Advance = 
 
 
 class _Rows:
-    """Collects the rows of one recording in tables of DuckDB."""
+    """The rows of a recording, collected in tables of DuckDB."""
 
     def __init__(self, connection: DuckDBPyConnection) -> None:
         connection.execute(_TABLES)
@@ -142,7 +142,7 @@ class _Rows:
         self._heartbeats: set[int] = set()
 
     def read(self, recording: Path, advance: Advance) -> tuple[int, str]:
-        """Returns how many messages are missing, and what could not be read. Raises RecordingError."""
+        """Read the recording; return the number of missing messages and the damage. Raises RecordingError."""
         with RecordingFile(recording) as file:
             damage, expected = file.damage, 0 if file.statistics is None else file.statistics.message_count
             for message in file.read():

@@ -1,4 +1,4 @@
-"""The questions of an analysis to the index of one robot, in SQL."""
+"""The SQL queries of an analysis, for one robot's rows of the index."""
 # ruff: noqa: S608  (what is put into queries are constants of this project, numbers, and names of files in quotes)
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ def _numbers(numbers: Iterable[int]) -> str:
 
 
 def _percentile(value: str, share: float) -> str:
-    """Return a quantile of rows with a ``place`` in their order, from 0 to ``last``; it interpolates linearly.
+    """Return SQL for a quantile of rows with a ``place`` in their order, from 0 to ``last``; interpolated linearly.
 
-    The same as ``quantile_cont``, which would hold all values in memory: sorting uses files if need be.
+    Equal to ``quantile_cont``, which would hold all values in memory; sorting can use files.
     """
     return f"sum({value} * greatest(0, 1 - abs(place - {share} * last)))"
 
@@ -140,14 +140,14 @@ _TOTALS: Final = """
 
 
 class RobotQueries:
-    """Tables of one robot; the table ``breaks`` (since_ns, until_ns) has to be there."""
+    """The queries on one robot's rows. They need the table ``breaks`` (since_ns, until_ns)."""
 
     def __init__(self, connection: DuckDBPyConnection, robot: str) -> None:
         self._connection, self._robot = connection, robot
         self.machine = ""
 
     def load(self, indexes: Sequence[Path], since_ns: int, until_ns: int) -> None:
-        """Make the tables of the messages in a period."""
+        """Create the tables of the messages in a period."""
         robot = f"SELECT * FROM {parquet(indexes)} WHERE robot = {quoted(self._robot)}"
         indexed = f"CREATE OR REPLACE TEMP VIEW indexed AS {robot}"
         inside = ["NOT retained"]
@@ -165,7 +165,7 @@ class RobotQueries:
         self._connection.execute(_SESSIONS)
 
     def totals(self) -> tuple[int, int, int, int]:
-        """Return the numbers of messages and bytes, and the times of the first and the last message."""
+        """Return the numbers of messages and bytes, and the first and last message's times."""
         messages, size, first, last = self._row(_TOTALS)
         return messages, size, first, last
 
@@ -179,7 +179,7 @@ class RobotQueries:
         return [traffic.Session(since, until) for since, until in self._rows("FROM sessions")]
 
     def interval_ms(self) -> float | None:
-        """Return the median between heartbeats."""
+        """Return the median interval between heartbeats."""
         (median,) = self._row(_INTERVAL)
         return None if median is None else float(median)
 
@@ -191,7 +191,10 @@ class RobotQueries:
         return traffic.Latency(count, median, p95, self._histogram(p1, p99)) if count else None
 
     def _histogram(self, p1_ms: float, p99_ms: float) -> traffic.Histogram:
-        """Count from 0, or from below if the robot's clock is ahead, to a little above the 99th percentile."""
+        """Return the counts up to a little above the 99th percentile.
+
+        The first bin begins at 0, or below if the robot's clock is ahead.
+        """
         margin = 0.1 * (p99_ms - p1_ms)
         low, high = min(0.0, p1_ms - margin), p99_ms + margin
         width = _round_up(max(_FINEST_MS, (high - low) / _BINS))
@@ -209,7 +212,7 @@ class RobotQueries:
 
 
 def _round_up(value: float) -> float:
-    """To 1, 2 or 5 times a power of ten."""
+    """Round up to 1, 2 or 5 times a power of ten."""
     power = 1e-3
     while True:
         for step in (1, 2, 5):

@@ -1,4 +1,4 @@
-"""The report of an analysis: one HTML file that needs no other, and its tables as CSV."""
+"""The report of an analysis: a single HTML file, and its tables as CSV."""
 
 import html
 from collections.abc import Callable, Iterable
@@ -55,7 +55,7 @@ def write_report(
     csv: bool = False,
     advance: Callable[[str, float], None] = lambda _what, _share: None,
 ) -> list[Path]:
-    """Write ``traffic.html``, and with ``csv`` each table; returns the files. Raises PebbleError."""
+    """Write ``traffic.html``, and with ``csv`` each table; return the files. Raises PebbleError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         page = folder / NAME
@@ -66,7 +66,7 @@ def write_report(
 
 
 def remarks(traffic: Traffic) -> list[str]:
-    """Return what stands out, one sentence each."""
+    """Return the remarkable facts, a sentence each."""
     found = []
     if traffic.gaps:
         found.append(f"Nothing was recorded {_times(len(traffic.gaps))}; these times are left out of outages.")

@@ -28,7 +28,7 @@ LARGEST_LATENCY_S: Final = 86_400  # stamps further away are of clocks that do n
 
 
 class Bandwidth(Struct, frozen=True):
-    """The messages of a family, in kbit/s of active seconds."""
+    """The kbit/s of a family's messages, in active seconds."""
 
     family: str
     time: str  # one of TIMES
@@ -47,14 +47,17 @@ class Session(Struct, frozen=True):
 
 
 class Outage(Struct, frozen=True):
-    """Heartbeats that were missing."""
+    """A time in which heartbeats were missing."""
 
     since_ns: int  # the last heartbeat before it
     length_ms: float  # by which the interval was longer than usual
 
 
 class Histogram(Struct, frozen=True):
-    """``counts[i]`` values from ``low + i * width`` on; the first and the last bin have those beyond, too."""
+    """Counts of equal bins.
+
+    ``counts[i]`` counts values from ``low + i * width`` on; the first and last bin also those beyond.
+    """
 
     low: float
     width: float
@@ -62,7 +65,7 @@ class Histogram(Struct, frozen=True):
 
 
 class Latency(Struct, frozen=True):
-    """From a heartbeat's stamp to its reception, as the two clocks had it."""
+    """The times from heartbeats' stamps to their reception, by the two clocks."""
 
     count: int
     median_ms: float
@@ -71,7 +74,7 @@ class Latency(Struct, frozen=True):
 
 
 class RobotTraffic(Struct, kw_only=True):
-    """All about one robot, or another component."""
+    """The results for one robot or another component."""
 
     robot: str  # system/type/id
     machine: str  # LINUX, MCU, or COMPONENT without heartbeats

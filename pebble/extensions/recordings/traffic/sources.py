@@ -1,4 +1,4 @@
-"""Finds the indexes of recordings for an analysis, and makes those that are missing."""
+"""The indexes that an analysis needs: existing ones, and new ones where they are missing."""
 # ruff: noqa: S608  (what is put into queries are names of files in quotes)
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _OLD: Final = "index"  # the folder in which the last version had its index
 
 
 class Sources(Struct):
-    """The indexes of recordings, and what they hold."""
+    """The indexes of recordings, and their contents."""
 
     indexes: list[Path] = field(default_factory=list)
     robots: list[str] = field(default_factory=list)
@@ -41,9 +41,9 @@ class Sources(Struct):
 def sources(places: Iterable[Path], scratch: Path, progress: Progress = lambda _what, _share: None) -> Sources:
     """Return the indexes of all recordings in ``places``, files or folders.
 
-    What is not indexed yet is indexed now: beside the recording if its folder can be written, else, as for files that
-    are still being written, below ``scratch``. In a folder, recordings count that were deleted after they had been
-    indexed. Raises RecordingError.
+    Missing indexes are made: beside the recording if its folder can be written, else, as for files that are still being
+    written, below ``scratch``. Recordings in a folder that were deleted after they had been indexed count. Raises
+    RecordingError.
     """
     found = Sources()
     scratch.mkdir(parents=True, exist_ok=True)
@@ -80,7 +80,7 @@ def _indexes(places: list[Path], scratch: Path, connection: DuckDBPyConnection, 
 
 
 def _of_deleted(place: Path) -> Iterator[Path]:
-    """Yield the indexes of recordings that are not there any more."""
+    """Yield the indexes of deleted recordings."""
     for index in sorted(place.rglob(f"*{INDEX}")):
         is_ours = _OLD not in index.relative_to(place).parts and not index.name.startswith(".")
         if is_ours and not index.with_suffix(SUFFIX).exists():
@@ -92,7 +92,7 @@ def _report(progress: Progress, name: str, before: float, part: float, share: fl
 
 
 def _index(path: Path, spare: Path, connection: DuckDBPyConnection, advance: Callable[[float], None]) -> Path | None:
-    """Return the index of a recording, ``spare`` if it has none beside it; None if it was deleted meanwhile."""
+    """Return a recording's index, or ``spare`` if there is none beside it; None if the recording has been deleted."""
     if path.name.endswith(ACTIVE) and not path.exists():
         path = finished_path(path)  # its recorder finished it a moment ago
     if not path.exists():

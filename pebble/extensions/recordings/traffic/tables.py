@@ -12,7 +12,7 @@ from pebble.extensions.recordings.traffic.results import AUDIO, VIDEO, Traffic
 
 
 class Table(Struct, frozen=True):
-    """``columns``: the name of each in CSV, and its heading."""
+    """A table. ``columns``: the name of each column in CSV, and its heading."""
 
     name: str
     title: str
@@ -21,7 +21,7 @@ class Table(Struct, frozen=True):
 
 
 def tables(traffic: Traffic) -> list[Table]:
-    """Return Table 4.1 of the paper, and what its figures show; each may have no rows."""
+    """Return Table 4.1 of the paper, and the data of the figures; each may be empty."""
     return [make(traffic) for make in (media_bandwidth, _bandwidth, _outages, _latency)]
 
 
@@ -78,7 +78,7 @@ def _outages(traffic: Traffic) -> Table:
 
 
 def moment(seconds: float) -> str:
-    """Return ``2026-11-20T10:00:00Z``; with milliseconds if it is no whole second."""
+    """Return a time as ``2026-11-20T10:00:00Z``, with milliseconds unless it is a whole second."""
     spec = "seconds" if seconds == int(seconds) else "milliseconds"
     return datetime.fromtimestamp(seconds, UTC).replace(tzinfo=None).isoformat(timespec=spec) + "Z"
 
@@ -94,5 +94,5 @@ def write_csv(table: Table, folder: Path) -> Path:
 
 
 def _cell(value: Any) -> Any:
-    """Return a cell that no spreadsheet takes for a formula; anyone may choose the names in topics."""
+    """Return a cell that no spreadsheet takes for a formula, since anyone may choose the names in topics."""
     return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value

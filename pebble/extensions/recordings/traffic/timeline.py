@@ -1,4 +1,4 @@
-"""One day of one robot, in steps: what it was used for, its sessions, outages and gaps."""
+"""A day of one robot, in steps: its activity, sessions, outages and gaps."""
 # ruff: noqa: S608  (what is put into queries are constants of this project and numbers)
 
 from pathlib import Path
@@ -43,7 +43,7 @@ _ACTIVITY: Final = f"""
 
 
 class Stretch(Struct, frozen=True):
-    """A time in epoch milliseconds; ``why``: of a gap."""
+    """A period in epoch milliseconds; ``why``: the cause of a gap."""
 
     since: float
     until: float
@@ -51,7 +51,7 @@ class Stretch(Struct, frozen=True):
 
 
 class Timeline(Struct, rename={"from_ms": "from"}):
-    """A day. ``activity`` has one number for each step from ``from_ms`` (epoch milliseconds) on."""
+    """A day. ``activity`` has a number for each step from ``from_ms`` (epoch milliseconds) on."""
 
     from_ms: int
     step: int = 1000 * STEP_S
@@ -69,10 +69,7 @@ def timeline(
     until_ns: int,
     progress: Progress = lambda _what, _share: None,
 ) -> Timeline:
-    """Return what the recordings ``paths`` hold of a robot; what is not indexed yet is indexed now.
-
-    Raises RecordingError.
-    """
+    """Return a robot's day from the recordings ``paths``; missing indexes are made. Raises RecordingError."""
     found = sources(paths, scratch, progress)
     with connected(scratch, memory_mb=_MEMORY_MB) as connection:
         recorder = recorder_events(connection, found.indexes, since_ns, until_ns)
