@@ -1,4 +1,4 @@
-"""The places of an installed robot's files, below ``/`` or below another root, and of a machine's mosquitto."""
+"""The paths of an installed robot's files, and of the machine's mosquitto."""
 
 import shutil
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ SBIN = "/usr/local/sbin:/usr/sbin:/sbin"  # where Debian puts brokers and networ
 
 @dataclass(frozen=True)
 class Places:
-    """The paths of an installed robot. ``root`` is ``/``, or a folder that stands for it in tests and reports."""
+    """The paths of an installed robot. ``root`` is ``/``, or another folder in tests and reports."""
 
     root: Path = Path("/")
 
@@ -74,10 +74,10 @@ class Places:
         return self.state / "people.sqlite"
 
     def named(self, path: Path) -> str:
-        """Return the path as it is on the machine whose root this is."""
+        """Return the path as it is called on the machine of this root."""
         return f"/{path.relative_to(self.root)}"
 
 
 def mosquitto_path() -> str | None:
-    """Return where mosquitto is; None if it is not installed."""
+    """Return the path of mosquitto; None if it is not installed."""
     return shutil.which("mosquitto") or shutil.which("mosquitto", path=SBIN)

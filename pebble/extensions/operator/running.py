@@ -8,7 +8,7 @@ from pebble.ownership import read_plain
 
 
 def launcher_runs(run_dir: Path) -> bool:
-    """True if the newest launcher of the robot with this run directory is still a running process."""
+    """True if the last started launcher of this run directory is still running."""
     try:
         pid = int(read_plain(run_dir / LAUNCHER_LOCK).partition(b"\n")[0])
         os.kill(pid, 0)

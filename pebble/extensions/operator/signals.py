@@ -11,7 +11,7 @@ from pebble.runtime.signals import ending_signals
 
 @contextmanager
 def handled_by(handler: Callable[[int, FrameType | None], Any], *more: int) -> Iterator[None]:
-    """Call ``handler`` for signals that end a program, and for ``more``, inside the block. Main thread only."""
+    """Call ``handler`` on the signals that end a program, and on ``more``, during the block. Main thread only."""
     before = {number: signal.signal(number, handler) for number in (*ending_signals(), *more)}
     try:
         yield
@@ -22,7 +22,10 @@ def handled_by(handler: Callable[[int, FrameType | None], Any], *more: int) -> I
 
 @contextmanager
 def interrupted_by_signals() -> Iterator[None]:
-    """Raise KeyboardInterrupt in the main thread also on SIGTERM and SIGHUP: a command cleans up as after Ctrl-C."""
+    """Raise KeyboardInterrupt on SIGTERM and SIGHUP too, so that a command cleans up as after Ctrl-C.
+
+    In the main thread only.
+    """
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""Programs that move a robot: their base, the shipped ones, and perception."""
+"""Scripts that drive a robot: their base class, the shipped ones, and perception."""
 
 from pebble.extension import Command, Extension
 

@@ -1,1 +1,1 @@
-"""The operator's side as a library: which robots there are, and how to request and receive their pictures and sound."""
+"""The client library of operators: it finds robots, requests their media, drives and stops them."""

@@ -1,4 +1,4 @@
-"""The offer of a robot without capabilities, by the subscriptions that its heartbeat or status lists. Pure."""
+"""Capabilities derived from the list of subscriptions in a robot's heartbeat or status. Pure."""
 
 from typing import Any
 
@@ -21,11 +21,10 @@ _decode = msgspec.json.Decoder().decode
 
 
 def announced(base: str, payload: bytes) -> dict[str, Any]:
-    """Return the value of capabilities for ``"subscribes": ["incoming/drive-values", …]``.
+    """Return the capabilities that follow from ``"subscribes": ["incoming/drive-values", …]``; empty without a list.
 
-    Empty where there is no such list.
-
-    It has ``announced``, so that people can be told what to publish. Whole topics and others' are not looked at.
+    They contain ``announced``, so that people can be told what to publish. Complete topics and those of other
+    components are ignored.
     """
     if len(payload) > _LARGEST or b'"subscribes"' not in payload:
         return {}

@@ -1,4 +1,4 @@
-"""The offer of a silent board, which obeys drive commands, as two of the original do, and never says so. Pure."""
+"""Capabilities assumed for a silent board: two of the original's boards obey drive commands and never say so. Pure."""
 
 from collections.abc import Collection
 from typing import Any, Final, Literal
@@ -22,10 +22,7 @@ _LIST = msgspec.json.encode({"subscribes": [DRIVE.suffix]})
 
 
 def assumed(base: str, axes: Collection[str], name: str = "") -> dict[str, Any]:
-    """Return the value of capabilities that is taken for its own.
-
-    That of its name, and of driving if it has any ``axes``.
-    """
+    """Return the capabilities that are assumed: a name, and driving if there are any ``axes``."""
     value = announced(base, _LIST) if axes else {}
     if axes:
         value["drive"]["axes"] = list(axes)
@@ -35,5 +32,5 @@ def assumed(base: str, axes: Collection[str], name: str = "") -> dict[str, Any]:
 
 
 def encode(drive: Drive, axes: Collection[str]) -> bytes:
-    """Return a drive command with these axes only: the board's MQTT client drops messages longer than 256 bytes."""
+    """Return a drive command with these axes only; the board's MQTT client drops messages above 256 bytes."""
     return msgspec.json.encode({axis: round(getattr(drive, axis), 3) for axis in axes})

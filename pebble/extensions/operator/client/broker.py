@@ -1,4 +1,4 @@
-"""A server's connection to the broker, for code on an event loop."""
+"""A server's connection to the broker, for use on an event loop."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _DELIVER_S: Final = 0.01  # for them at a time: whatever else is due must not wa
 
 
 def problem_of(transport: Transport) -> str:
-    """Return why nothing should be sent now, in one line; empty if all is well."""
+    """Return why nothing can be sent now, in one line; empty if it can."""
     if transport.state is not State.CONNECTED:
         return transport.problem or "not connected yet"
     return "it does not answer" if transport.outgoing.stalled_s > ANSWER_S else ""
 
 
 class Arrived:
-    """Messages on their way to the event loop, which alone gets them. Any thread puts, and never waits for room."""
+    """A bounded queue of messages for the event loop. Any thread may put, and never waits."""
 
     def __init__(self) -> None:
         self.dropped = 0
@@ -42,7 +42,7 @@ class Arrived:
         self._lock = threading.Lock()  # guards these
 
     def put(self, handler: Handler, message: Message, at: float) -> None:
-        """Queue a message; one for which there is no room is dropped."""
+        """Queue a message; drop it if there is no room."""
         size = len(message.payload)
         with self._lock:
             if len(self._waiting) < MAX_MESSAGES and self._bytes + size <= MAX_BYTES:
@@ -54,7 +54,7 @@ class Arrived:
             log.warning("%d messages dropped, the last on %s: too many at once", self.dropped, message.topic)
 
     def get(self) -> tuple[Handler, Message, float] | None:
-        """Return the oldest; None if there is none."""
+        """Return the oldest message; None if there is none."""
         with self._lock:
             if not self._waiting:
                 return None
@@ -64,10 +64,13 @@ class Arrived:
 
 
 class Broker:
-    """Handlers and watchers run on the event loop; subscribing waits for the broker, so it does not happen there."""
+    """A connection whose handlers and watchers run on the event loop.
+
+    Subscribing waits for the broker, so it happens on another thread.
+    """
 
     def __init__(self, settings: MqttSettings, name: str = "pebble-web") -> None:
-        """``name``: what the broker's log calls it."""
+        """Store the settings. ``name``: the client's name in the broker's log."""
         self.transport: Transport = create("mqtt", f"{name}-{secrets.token_hex(4)}", settings)
         self.transport.on_state(lambda _state: self._call(self._notify))
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -90,21 +93,21 @@ class Broker:
 
     @property
     def dropped(self) -> int:
-        """Messages for which there was no room, because too many came at once."""
+        """Return how many messages were dropped because too many came at once."""
         return self._arrived.dropped
 
     @property
     def problem(self) -> str:
-        """The reason why nothing should be sent now, in one line; empty if all is well."""
+        """Return why nothing can be sent now, in one line; empty if it can."""
         return problem_of(self.transport)
 
     @property
     def not_received(self) -> str:
-        """The line that says what is not heard although there is a connection, and why."""
+        """Return what cannot be received although the connection is open, and why; empty if nothing."""
         return self.transport.not_received if self.connected else ""
 
     async def open(self) -> None:
-        """Start connecting, and wait a moment for success. Raises TransportError for settings that can never work."""
+        """Start connecting, and wait briefly for success. Raises TransportError for settings that can never work."""
         self._loop = asyncio.get_running_loop()
         await asyncio.to_thread(self.transport.open, 2.0)
 
@@ -112,7 +115,7 @@ class Broker:
         await asyncio.to_thread(self.transport.close)
 
     def on_state(self, watcher: Callable[[], None]) -> None:
-        """Call ``watcher`` when the connection is made or lost."""
+        """Call ``watcher`` whenever the connection is made or lost."""
         self._watchers.append(watcher)
 
     def publish(
@@ -125,10 +128,11 @@ class Broker:
         qos: QoS = QoS.DELIVERED,
         by: str = "",
     ) -> bool:
-        """Publish now, ahead of streams; False if there is no connection, or no topic may be called so.
+        """Publish now, ahead of streams; return False without a connection or for an invalid topic.
 
-        ``remember`` False: what is retained belongs to whoever publishes it next; a broker that has lost it, has.
-        ``by``: the person who wants it. Robots that take commands only with a name learn of it.
+        ``remember`` False: do not publish it again if the broker loses it, since others may have published a newer
+        value. ``by``: the person on whose behalf it is sent; robots that take only commands with a sender's name read
+        it.
         """
         try:
             signed = self.names.signed(topic, payload, by)
@@ -138,10 +142,10 @@ class Broker:
             return False
 
     async def subscribe(self, filter_: str, handler: Handler, *, deferred: bool = False) -> Subscription:
-        """Deliver what matches ``filter_`` until it is unsubscribed.
+        """Deliver messages that match ``filter_`` until it is unsubscribed.
 
-        ``deferred``: with the next call of ``deliver``, or before the next message that is not. To wake the event loop
-        for each heartbeat of a hundred robots costs more than the heartbeats.
+        ``deferred``: deliver with the next call of ``deliver``, or before the next message that is not deferred. Waking
+        the event loop for each heartbeat of a hundred robots costs more than the heartbeats do.
         """
 
         def take(message: Message) -> None:
@@ -152,7 +156,7 @@ class Broker:
         return await asyncio.to_thread(self.transport.subscribe, filter_, take, qos=QoS.DELIVERED, direct=True)
 
     def deliver(self) -> None:
-        """Hand over what has arrived, in its order; the rest after whatever else is due, if that takes long."""
+        """Deliver the queued messages in order; if that takes long, let other tasks run in between."""
         self._woken = False
         end = time.monotonic() + _DELIVER_S
         while (arrived := self._arrived.get()) is not None:
@@ -171,7 +175,7 @@ class Broker:
             self._call(self.deliver)
 
     async def unsubscribe(self, subscription: Subscription) -> None:
-        """Stop delivery; a message that has arrived before may still be handled."""
+        """Stop delivery; a message that has already arrived may still be delivered."""
         await asyncio.to_thread(subscription.close)
 
     def _notify(self) -> None:
@@ -179,6 +183,6 @@ class Broker:
             watcher()
 
     def _call(self, function: Callable[..., None], *arguments: object) -> None:
-        """Call the loop from a thread of the transport; it may have ended meanwhile."""
+        """Schedule a call on the event loop from another thread; does nothing if the loop has ended."""
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(function, *arguments)

@@ -1,4 +1,4 @@
-"""A command's own short-lived connection to a robot's local transport or to a broker."""
+"""A command's short-lived connection to a robot's local transport or to a broker."""
 
 import logging
 import os
@@ -72,9 +72,9 @@ def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
 
 @contextmanager
 def listening(target: Target, sender: Transport) -> Iterator[Transport]:
-    """Open a second connection to where ``sender`` is, not waited for: it holds up nothing that is sent.
+    """Open a second connection to the same place as ``sender``, without waiting for it, so that it delays no command.
 
-    It is ``sender`` itself where each client needs an id of its own, and within a robot's Zenoh network.
+    It is ``sender`` itself where each client needs its own id, and within a robot's Zenoh network.
     """
     kind, settings, _, _ = resolve(target)
     if not isinstance(settings, MqttSettings) or settings.client_id is not None:
@@ -87,7 +87,7 @@ def listening(target: Target, sender: Transport) -> Iterator[Transport]:
 
 
 def in_small_segments(settings: Any) -> Any:
-    """Return the same settings for a way that may lose large packets."""
+    """Return the settings with small TCP segments, for a network that may lose large packets."""
     return replace(settings, max_segment=SMALL_SEGMENT) if isinstance(settings, MqttSettings) else settings
 
 
@@ -99,7 +99,7 @@ def _report_missing(transport: Transport, before: str = "") -> str:
 
 
 def resolve(target: Target) -> tuple[str, Any, Names, str]:
-    """Return the kind of transport and its settings, the names of topics there, and the place in words.
+    """Return the kind of transport, its settings, the names of its topics, and the place in words.
 
     Raises PebbleError.
     """
@@ -121,7 +121,7 @@ def _account(settings: Any) -> str | None:
 
 
 def put_names(transport: Transport, names: Names, is_named: Callable[[str], bool]) -> None:
-    """Put this client's name into the topics of commands, to robots that take them only so."""
+    """Put this client's account into the topics of commands to robots that require it."""
     if names.account is not None:
         transport.policy.forms = NamedTopics(names.account, is_named).forms
 
@@ -152,7 +152,7 @@ def _remote(config: Config, program: str) -> tuple[str, Any]:
 
 
 class Listener:
-    """Queues messages from the transport's threads for the thread that prints them."""
+    """A queue from the transport's threads to the thread that prints."""
 
     def __init__(self, transport: Transport, filters: Iterable[str]) -> None:
         self._waiting: queue.Queue[Message] = queue.Queue(_WAITING)
@@ -160,12 +160,12 @@ class Listener:
         self.subscribe(transport, filters)
 
     def subscribe(self, transport: Transport, filters: Iterable[str]) -> None:
-        """Queue further messages; on a slow network this takes seconds."""
+        """Subscribe to further topics; on a slow network this takes seconds."""
         for filter_ in filters:
             transport.subscribe(filter_, self._take, qos=QoS.DELIVERED)
 
     def next(self, timeout: float) -> Message | None:
-        """Return the next message, waiting up to ``timeout`` seconds for one."""
+        """Return the next message, waiting up to ``timeout`` seconds; None if none comes."""
         try:
             return self._waiting.get(timeout=max(timeout, 0.0))
         except queue.Empty:
@@ -179,7 +179,10 @@ class Listener:
 
 
 def subscribed_stop(transport: Transport, base: str) -> RobotEstop:
-    """Return a robot's emergency stop, with what is retained of it, also by a broker that sends it a moment later."""
+    """Return a robot's emergency stop after its retained states were read.
+
+    Some brokers send retained messages a moment after the subscription.
+    """
     robot = RobotEstop(base)
     robot.subscribe(transport)
     wait_for(lambda: robot.has_capabilities, _LATE_S)

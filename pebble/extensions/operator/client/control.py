@@ -1,8 +1,8 @@
-"""Control of a robot: who has it, as its motor owners publish it, and a client that asks for it. Pure.
+"""Control of a robot: its holder, as the motor owners publish it, and a client that requests it. Pure.
 
-The robot is the memory: a client repeats what it wants every second, over a thin link more rarely, and the state is
-the answer. Of several motor owners the first one by name decides, so that two clients never share a robot; who has
-control of another one only gives it back.
+The robot keeps the state: a client repeats its wish every second, more rarely over a thin link, and the published state
+is the answer. If a robot has several motor owners, the first by name decides, so that two clients never share a robot;
+a client that has control of another owner only releases it.
 """
 
 import secrets
@@ -34,7 +34,7 @@ _NAME, _DEVICE = 40, 20  # characters, as robots cut them
 
 
 class RobotControl:
-    """The control of one robot, by the states of its motor owners; ``estop`` knows which of them it lists."""
+    """The control of one robot, from the states of its motor owners. ``estop`` knows which owners it lists."""
 
     def __init__(self, estop: RobotEstop) -> None:
         self.base = estop.base
@@ -44,23 +44,23 @@ class RobotControl:
 
     @property
     def states(self) -> list[ControlState]:
-        """The states in the order of the owners' names; with capabilities only those that these list."""
+        """Return the owners' states, ordered by name; once capabilities are known, only of the listed owners."""
         names = self._estop.owners if self._estop.has_capabilities else self._states
         return [self._states[name] for name in sorted(names) if name in self._states]
 
     @property
     def state(self) -> ControlState | None:
-        """The state that decides; None: nothing is known."""
+        """Return the state that decides; None if nothing is known."""
         return next(iter(self.states), None)
 
     @property
     def who(self) -> str:
-        """The name of the one who has control, for people; "" if nobody has."""
+        """Return the name of the holder of control, for people; "" if there is none."""
         state = self.state
         return "" if state is None or not state.id else state.by or "somebody"
 
     def receive(self, message: Message) -> bool:
-        """Update from one message of this robot; False if it is about something else, or malformed."""
+        """Update from a message of this robot; return False if it is no state of control, or malformed."""
         owner = message.topic.removeprefix(self._prefix)
         if owner == message.topic or len(message.payload) > _STATE_BYTES:
             return False
@@ -80,9 +80,9 @@ class RobotControl:
 
 
 class ControlClient:
-    """One tab, or process, that asks for control of a robot. Call :meth:`update` after each state, :meth:`tick` often.
+    """A tab or process that requests control. Call :meth:`update` after each state, and :meth:`tick` often.
 
-    ``held``: the robot has answered that it has control. ``failed``: why it no longer asks for it, for people.
+    ``held``: the robot has confirmed that this client has control. ``failed``: why it gave up, for people.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class ControlClient:
     # -- what is wanted
 
     def ask(self, now: float, *, over: bool = False) -> None:
-        """Want control from now on: ask the person who drives for it, or (``over``) take it from them."""
+        """Request control from now on: ask its holder for it or, with ``over``, take it."""
         if not self.wanted:
             self.failed, self._out = "", []  # a release that was not sent yet is none
         self.wanted, self._take = True, over
@@ -110,21 +110,21 @@ class ControlClient:
         self.update(now)
 
     def release(self) -> None:
-        """Give it back, or do not ask any more; the next :meth:`tick` says so."""
+        """Release control, or stop asking, with the next :meth:`tick`."""
         if self.wanted:
             self._out.append(self._message(CONTROL, want="release"))
         self.wanted = self.held = False
         self.decided = ""
 
     def keep(self) -> None:
-        """Refuse the one who asks now."""
+        """Refuse the client that asks now."""
         state = self.robot.state
         self.passed_over = state.asks_id if state is not None else ""
 
     # -- what follows
 
     def update(self, now: float) -> None:
-        """Take note of the robot's states."""
+        """Update from the robot's states."""
         state = self.robot.state
         if not self.wanted or state is None:
             return
@@ -144,7 +144,7 @@ class ControlClient:
             self._due_at = max(self._due_at, now + APART * self._pace_of().control_s)
 
     def tick(self, now: float) -> list[Message]:
-        """Return what to publish now."""
+        """Return the messages to publish now."""
         self.update(now)
         if self.wanted and not self.held and (why := self._hopeless(now)):
             self._give_up(why)
@@ -159,18 +159,21 @@ class ControlClient:
 
     @property
     def done(self) -> bool:
-        """True if this client neither wants control nor has anything to publish."""
+        """True if this client neither wants control nor has anything left to publish."""
         return not self.wanted and not self._out
 
     @property
     def key(self) -> str:
-        """The keys for a drive command: of all motor owners that this client has control of."""
+        """Return the keys for a drive command, of all motor owners that this client has control of."""
         keys = [state.key for state in self.robot.states if state.id == self.id]
         return " ".join(keys[:_KEYS]) if self.held else ""
 
     @property
     def asked_by(self) -> str:
-        """The name of the one who asks for it and was not refused; "" if nobody does, or it is not held."""
+        """Return the name of a client that asks for control; "" if none does.
+
+        Also "" if it was refused, or if this client has no control.
+        """
         state = self.robot.state
         if not self.held or state is None or state.asks_id in ("", self.id, self.passed_over):
             return ""
@@ -184,7 +187,7 @@ class ControlClient:
         return any(state.id == self.id for state in self.robot.states)
 
     def _hopeless(self, now: float) -> str:
-        """Return why the request for control is given up; empty if it is not."""
+        """Return why to give up the request; empty to go on."""
         if now - self._answered_at > self._pace_of().answer_s:
             return f"{self.robot.base.rpartition('/')[2]} {UNANSWERED}"
         return f"{self.robot.who} drives on" if now - self._asked_at > ASKS_S else ""
@@ -201,6 +204,6 @@ class ControlClient:
 
 
 def _clean(state: ControlState) -> ControlState:
-    """Return the state with short, printable names."""
+    """Return the state with its names made short and printable."""
     by, asks = (lease.shown(text, _NAME) for text in (state.by, state.asks))
     return msgspec.structs.replace(state, by=by, asks=asks, device=lease.shown(state.device, _DEVICE))

@@ -1,4 +1,4 @@
-"""Discovers robots by their outgoing topics."""
+"""Discovery of robots by their outgoing topics."""
 
 from pebble.contract import OUTGOING, channel_of
 from pebble.contract.identity import parse_topic
@@ -21,13 +21,13 @@ class Discovery:
         return list(self.robots.values())  # a copy: robots may be added meanwhile
 
     def awaits_heartbeat(self, waited_s: float) -> bool:
-        """True if one of them, or the first of all, may be there although nothing was heard of it for so long."""
+        """True if a robot may exist although no heartbeat of it was received for so long."""
         robots = [robot.liveness for robot in self.all_robots()]
         awaited = [silent_after(link=liveness.link) for liveness in robots if liveness.received_at is None]
         return waited_s < max(awaited, default=0.0 if robots else silent_after())
 
     def receive(self, message: Message, now: float, wall: float) -> None:
-        """Update from one message that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds)."""
+        """Update from a message that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds)."""
         address = parse_topic(message.topic)
         if address is None or address.identity.is_server:
             return

@@ -1,7 +1,7 @@
-"""The reasons why a robot is not driven: their order, their words, and the limits they have in common. Pure.
+"""The reasons why a robot cannot be driven: their order, their sentences, and their limits. Pure.
 
-When the page's own reasons apply is in ``web/static/core/reasons.js``; ``tests/vectors/drive_reasons.json`` is run by
-both. `make docs` writes the table of words.
+The page's additional reasons are in ``static/core/reasons.js``; both run ``tests/vectors/drive_reasons.json``. `make
+docs` writes the table of sentences.
 """
 
 from collections import defaultdict
@@ -18,7 +18,7 @@ SLOW_S, SLOW_SPEED = 0.3, 0.4  # from this round trip on, the speed is limited
 
 
 class Code(StrEnum):
-    """A reason. Those that only the page has, for example that it is in the background, are not here."""
+    """A reason. Those that only a page has, such as being in the background, are not among them."""
 
     BROKER = "broker"
     SILENT = "silent"
@@ -35,7 +35,7 @@ class Code(StrEnum):
 
 
 class Situation(NamedTuple):
-    """The facts about one robot and the way to it, at one moment."""
+    """The facts about a robot and the connection to it at one moment."""
 
     problem: str = ""  # why there is no connection
     online: bool | None = None  # None: it is not known
@@ -75,7 +75,7 @@ _APPLIES: dict[Code, Callable[[Situation], bool]] = {
 
 
 def first_reason(situation: Situation, order: Sequence[Code] = ORDER) -> Code | None:
-    """Return the first reason that applies; None if nothing speaks against driving."""
+    """Return the first reason that applies; None if the robot can be driven."""
     return next((code for code in order if _APPLIES[code](situation)), None)
 
 
@@ -124,14 +124,17 @@ def words(
     problem: str = "",
     script: str = "",
 ) -> str:
-    """Return the sentence of a state for people; "" for none. ``driven``: by whom."""
+    """Return the sentence of a state for people; "" for none. ``driven``: the driver's name."""
     by = stopped.by if stopped is not None and stopped.by else "unknown"
     values = {"name": name, "by": person(by), "who": person(driven), "script": script or "A script", "problem": problem}
     return WORDS.get(code or "", "").format_map(defaultdict(str, values))
 
 
 def person(by: str, *, login: bool = True) -> str:
-    """Return ``by`` for people: who needs no login is called `local`, perhaps with a device. ``login``: one is here."""
+    """Return the sender ``by`` in words for people.
+
+    ``local`` is somebody without a login, perhaps with a device. ``login``: this server requires logins.
+    """
     if by.partition(" ")[0] != "local":
         return by
     return "somebody without a login" if login else "somebody at this computer"

@@ -1,4 +1,4 @@
-"""The facts in a robot's status: can it be driven, and stopped, and what waits while it is driven. Pure."""
+"""The part of a robot's status about driving: whether its motors obey, and what waits while it is driven. Pure."""
 
 from typing import Any, NamedTuple
 
@@ -10,14 +10,14 @@ _WHY = 300  # characters
 
 
 class Driveable(NamedTuple):
-    """``state`` is ``yes``, ``no`` or ``unknown``; ``why`` is the robot's text, perhaps not printable."""
+    """The robot's answer. ``state``: ``yes``, ``no`` or ``unknown``; ``why``: its text, possibly not printable."""
 
     state: str
     why: str = ""
 
     @property
     def doubt(self) -> str:
-        """The reason in words; empty if it can be driven."""
+        """Return why it cannot be driven, in words; empty if it can."""
         if self.state == "yes":
             return ""
         what = "CANNOT BE DRIVEN OR STOPPED" if self.state == "no" else "not known whether its motors obey"
@@ -25,9 +25,9 @@ class Driveable(NamedTuple):
 
 
 def driveable_of(status: bytes) -> Driveable | None:
-    """Return the value in an ``outgoing/status``.
+    """Return the answer in the value of an ``outgoing/status``.
 
-    None: it is not there, as for an older robot, or one without motors.
+    None: it has none, as that of an older robot or of one without motors.
     """
     section = _value(status).get("driveable")
     if not isinstance(section, dict) or section.get("state") not in ("yes", "no", "unknown"):
@@ -37,7 +37,7 @@ def driveable_of(status: bytes) -> Driveable | None:
 
 
 def is_held(status: bytes, program: str) -> bool:
-    """True if that program is requested, and waits while people drive over a thin link."""
+    """True if that program is requested and waits while a person drives over a thin link."""
     section: Any = _value(status)
     for level in ("services", program, "state"):
         section = section.get(level) if isinstance(section, dict) else None

@@ -1,7 +1,7 @@
-"""Sends an emergency stop until it is confirmed and saved. Pure: the caller publishes, receives and waits.
+"""The sender of an emergency stop, until it is confirmed and saved. Pure: the caller publishes, receives and waits.
 
-*Confirmed* means that each motor owner has published that it is stopped by this stop, *saved* that the owner would be
-so after a power cut. The sender repeats the stop until both hold, or an owner says that it cannot save.
+*Confirmed*: each motor owner has published that this stop holds it. *Saved*: the owner would also be stopped after a
+power cut. The sender repeats the stop until both hold, or until an owner says that it cannot save.
 """
 
 import json
@@ -38,7 +38,7 @@ def new_name() -> str:
 
 
 class Progress(Enum):
-    """The progress of the stop of one robot, as pages are told."""
+    """The progress of one robot's stop, as pages are told."""
 
     WAITING = "sent"
     CONFIRMED = "confirmed"
@@ -48,7 +48,7 @@ class Progress(Enum):
 
 
 class Order(NamedTuple):
-    """The part of a stop that is the same for every robot that it is sent to."""
+    """The part of a stop that is the same for all robots."""
 
     name: str
     payload: bytes
@@ -58,7 +58,7 @@ class Order(NamedTuple):
 
 
 class RobotStop:
-    """The stop of one robot: what is sent to it when, and whether it is confirmed."""
+    """The stop of one robot: when to send it, and whether it is confirmed."""
 
     def __init__(self, base: str, order: Order, now: float) -> None:
         self.estop = RobotEstop(base)
@@ -79,7 +79,7 @@ class RobotStop:
 
     @property
     def progress(self) -> Progress:
-        """The progress of its stop."""
+        """Return how far its stop has got."""
         if self.confirmed_s is not None:
             return Progress.CONFIRMED
         if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._order.named):
@@ -90,7 +90,7 @@ class RobotStop:
 
     @property
     def is_gone(self) -> bool:
-        """True if there is nothing of it but what its broker retains, which says that it is offline."""
+        """True if only its broker's retained messages are left, which say that it is offline."""
         return self._is_offline and not self.live
 
     @property
@@ -103,12 +103,12 @@ class RobotStop:
 
     @property
     def unconfirmed(self) -> dict[str, str]:
-        """The reasons by owner; owners that are confirmed are not among them."""
+        """Return the reasons by owner, for owners that have not confirmed."""
         return {owner: why for owner in self.estop.owners if (why := self._lacks(owner))}
 
     @property
     def why(self) -> str:
-        """The reason why it is not confirmed, in words; empty if it is. Names of owners in it come from the robot."""
+        """Return why it is not confirmed, in words; empty if it is. The owners' names in it come from the robot."""
         if self.progress in (Progress.CONFIRMED, Progress.SPARED):
             return ""
         if self.estop.old:
@@ -182,7 +182,7 @@ class RobotStop:
         ]
 
     def give_up(self) -> None:
-        """Send no more."""
+        """Stop sending."""
         self._given_up = True
 
     def _lacks(self, owner: str) -> str:
@@ -197,7 +197,7 @@ class RobotStop:
         return state is not None and self._order.name in state.recent
 
     def _has_taken_it(self, owner: str) -> bool:
-        """True if it has listed this stop since its start: later stops of others may have taken its place."""
+        """True if the owner has listed this stop since its start; later stops may be the present ones."""
         state = self.estop.states.get(owner)
         return state is not None and self._boots.get(owner) == state.boot
 
@@ -224,10 +224,10 @@ class StopSender:
         hold: bool = False,
         own_only: bool = False,
     ) -> None:
-        """``name`` is that of :func:`new_name`; ``robots`` are base topics, None: all robots that publish anything.
+        """Prepare the stop. ``name``: of :func:`new_name`; ``robots``: base topics, None: all that publish anything.
 
-        ``known``: with all robots, those that get it without having published anything. ``own_only``: topics that a
-        robot's capabilities name are used only if they are its own. Neither list is cut.
+        ``known``: with all robots, those to stop even if they have published nothing. ``own_only``: use topics named by
+        capabilities only if they are the robot's own. Neither list is truncated.
         """
         if not is_name(name):
             raise ValueError(f"{name!r} is not 16 hex digits")
@@ -264,7 +264,7 @@ class StopSender:
 
     @property
     def due(self) -> float | None:
-        """The time to call ``tick`` next; None: not before a message."""
+        """Return when to call ``tick`` next; None: only after a message."""
         if self.finished:
             return None
         times = [robot.next for robot in self.robots.values() if robot.sending]
@@ -273,7 +273,7 @@ class StopSender:
         return self._now if self._passing else min(times, default=None)
 
     def receive(self, message: Message, now: float) -> None:
-        """Update from any message of a robot, retained or not."""
+        """Update from a message of a robot, retained or not."""
         self._now = now
         address = parse_topic(message.topic)
         if address is None or address.direction is not Direction.OUTGOING:
@@ -286,9 +286,9 @@ class StopSender:
             self._receive_first(base, message, now)
 
     def tick(self, now: float, *, again: bool = True) -> list[Message]:
-        """Return what to publish now; some of it again in 0.5 s.
+        """Return the messages to publish now; some are repeated after 0.5 s.
 
-        ``again`` False: only to robots that it was not sent to yet, because what was sent still waits.
+        ``again`` False: only to robots that did not get the stop yet, because earlier messages still wait.
         """
         self._now = now
         if not self.order.hold and now >= self._began + GIVE_UP_S:
@@ -297,13 +297,13 @@ class StopSender:
         return [message for robot in self.robots.values() for message in robot.tick(now, again=again)] + passing
 
     def tick_robot(self, base: str, now: float, *, again: bool = True) -> list[Message]:
-        """Return what ``tick`` would return of this robot, from which a message was just received."""
+        """Return the messages of ``tick`` for this robot alone, after a message from it."""
         passing, self._passing = self._passing, []
         robot = self.robots.get(base)
         return passing if robot is None else robot.tick(now, again=again) + passing
 
     def end(self) -> None:
-        """Send no more. Robots that are stopped stay so."""
+        """Stop sending. Stopped robots stay stopped."""
         self._ended = True
         self._passing.clear()
         for robot in self.robots.values():
@@ -311,11 +311,11 @@ class StopSender:
 
     @property
     def _collect_s(self) -> float:
-        """The seconds for which further robots are stopped: a minute if some get it only when anything arrives."""
+        """Return for how many seconds newly heard robots are stopped: longer if some are reached only then."""
         return GIVE_UP_S if self.omitted else COLLECT_S
 
     def _receive_first(self, base: str, message: Message, now: float) -> None:
-        """Take a message of a robot that is not in ``robots``."""
+        """Handle the first message of a robot that is not in ``robots``."""
         robot = RobotStop(base, self.order, now)
         robot.receive(message, now)
         if len(self.robots) < MAX_ROBOTS:
@@ -330,14 +330,20 @@ class StopSender:
 
 
 def send(publish: Callable[..., bool], messages: Iterable[Message]) -> None:
-    """Publish messages of a stop; those that are refused because too many are not acknowledged, as LATEST ones."""
+    """Publish the messages of a stop.
+
+    If the transport refuses them because too many wait, they are published again without acknowledgement (LATEST).
+    """
     for message in messages:
         if not publish(message.topic, message.payload, qos=message.qos):
             publish(message.topic, message.payload, qos=QoS.LATEST)
 
 
 def _is_incoming(topic: str, base: str) -> bool:
-    """True for any incoming topic of the robot: a stop does no harm there, and it may be what drives this robot."""
+    """True for any incoming topic of the robot.
+
+    Publishing a stop there does no harm, and it may be the topic that drives this robot.
+    """
     return topic.startswith(f"{base}/{Direction.INCOMING}/") and not topic.endswith("/")
 
 

@@ -1,4 +1,4 @@
-"""The emergency stop of a robot as the robot publishes it, and resets of what was read there. Pure."""
+"""The reset of an emergency stop: exactly of the states that were read. Pure."""
 
 from pebble.contract import ESTOP_RESET, codec
 from pebble.contract.payloads import EstopReset
@@ -9,23 +9,23 @@ from pebble.transports import Message, QoS
 
 
 class Reset:
-    """Ends exactly the stops that a person was shown: a later stop is never ended by it."""
+    """A reset of exactly the stops that a person was shown; it never ends a later stop."""
 
     def __init__(self, robot: RobotEstop, by: str) -> None:
-        """``robot`` goes on receiving messages; what is reset is what it has published until now."""
+        """Store the states that are to be reset: those that ``robot`` has received until now."""
         self.robot = robot
         self.shown = robot.latched
         self._by = stop_of({"by": by})[1]
 
     def messages(self) -> list[Message]:
-        """Return what to publish, once: one message for each stopped owner."""
+        """Return the messages to publish, once: one for each stopped owner."""
         commands = [EstopReset(boot=state.boot, count=state.count, by=self._by) for state in self.shown.values()]
         topic, qos = ESTOP_RESET.topic(self.robot.base), QoS(ESTOP_RESET.default_qos)
         return [Message(topic, codec.encode(ESTOP_RESET, command), qos) for command in commands]
 
     @property
     def waiting(self) -> list[str]:
-        """The owners whose answers are missing."""
+        """Return the owners that have not answered yet."""
         return [owner for owner in self.shown if self._free(owner) is None]
 
     @property
@@ -34,11 +34,17 @@ class Reset:
         return all(self._free(owner) for owner in self.shown)
 
     def refusals(self) -> dict[str, str]:
-        """Return why owners are still stopped, in words; to be called when none is waiting, or after a timeout."""
+        """Return why owners are still stopped, in words.
+
+        Call it when no answer is missing, or after a timeout.
+        """
         return {owner: self._refusal(owner) for owner in self.shown if not self._free(owner)}
 
     def _free(self, owner: str) -> bool | None:
-        """True if the owner is free; None until its state shows it. ``reset_refused`` may be of another reset."""
+        """True if the owner is free; None until its state shows it.
+
+        ``reset_refused`` in the state may be about another reset.
+        """
         before, now = self.shown[owner], self.robot.states.get(owner)
         if now is None or (now.latched and (now.boot, now.count) == (before.boot, before.count)):
             return None

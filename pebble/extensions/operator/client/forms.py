@@ -1,6 +1,6 @@
-"""The settings of a script: what operators see of them, and which of their values are accepted. Pure.
+"""The form of a script: its settings, and which values they accept. Pure.
 
-The manager that starts scripts, scripts themselves and programs of operators use these forms (paper A.8.11).
+Used by the manager that starts scripts, by scripts, and by operators' programs (paper A.8.11).
 """
 
 import math
@@ -27,11 +27,11 @@ Value = str | int | float | bool | None
 
 
 class SettingError(ValueError):
-    """A value that a setting does not accept; the text is for the person who sent it."""
+    """A value that a setting does not accept. The text is for the sender of the value."""
 
 
 class Setting(Struct, frozen=True, kw_only=True):
-    """One setting: an entry of ``configs`` in `autonomy-files`, and an option of the script's command line."""
+    """A setting: an entry of ``configs`` in `autonomy-files`, and an option of the script's command line."""
 
     key: str
     label: str | None = None
@@ -48,7 +48,7 @@ class Setting(Struct, frozen=True, kw_only=True):
 
     @property
     def names_file(self) -> bool:
-        """True if its value is the name of a file or folder: a command must not choose one on the robot."""
+        """True if its value is a path, which a command must not choose on the robot."""
         words = re.split(r"[^a-z]+", f"{self.key} {self.arg or ''}".lower())
         free_text = self.type == "string" or (self.type == "enum" and not self.options)
         return free_text and not _FILE_WORDS.isdisjoint(words)
@@ -73,7 +73,10 @@ class Setting(Struct, frozen=True, kw_only=True):
 
 
 def listed(configs: object) -> list[Setting]:
-    """Return the settings that a robot lists of a script. What is none is left out; an unknown type is text."""
+    """Return the settings that a robot lists for a script.
+
+    Invalid entries are left out; an unknown type counts as text.
+    """
     settings = []
     for entry in configs if isinstance(configs, list) else ():
         with suppress(ValidationError, TypeError, KeyError):
@@ -82,14 +85,14 @@ def listed(configs: object) -> list[Setting]:
 
 
 def form(settings: Sequence[Setting]) -> list[dict[str, Any]]:
-    """Return the entries that operators may set."""
+    """Return the settings that operators may change."""
     return [setting.entry() for setting in settings if not setting.names_file]
 
 
 def effective(settings: Sequence[Setting], wanted: Mapping[str, Any]) -> dict[str, Value]:
-    """Return each setting's wanted value, else its default. Unknown keys are ignored, as are names of files.
+    """Return each setting's wanted value, or its default. Raises SettingError.
 
-    Raises SettingError.
+    Unknown keys and paths are ignored.
     """
     values: dict[str, Value] = {}
     for setting in settings:
@@ -102,7 +105,7 @@ def effective(settings: Sequence[Setting], wanted: Mapping[str, Any]) -> dict[st
 
 
 def arguments(settings: Sequence[Setting], values: Mapping[str, Value]) -> list[str]:
-    """Return the command line for the effective ``values``: an option and its value are two words."""
+    """Return the command line for the effective ``values``; option and value are separate words."""
     words: list[str] = []
     for setting in settings:
         value = values[setting.key]
@@ -116,7 +119,7 @@ def arguments(settings: Sequence[Setting], values: Mapping[str, Value]) -> list[
 
 
 def accepted(setting: Setting, raw: Any) -> Value:
-    """Return the value that ``raw``, of JSON or of a command line, gives this setting. Raises SettingError."""
+    """Return the setting's value for ``raw``, from JSON or from a command line. Raises SettingError."""
     match setting.type:
         case "bool":
             return _bool(setting.key, raw)
@@ -175,7 +178,7 @@ def _option(setting: Setting, raw: Any) -> str:
 
 
 def _text(key: str, raw: Any) -> str:
-    """Return a word of the command line: never an option of its own."""
+    """Return a word for the command line that cannot be taken for an option."""
     if isinstance(raw, bool) or not isinstance(raw, str | int | float):
         raise SettingError(f"{key} must be text")
     text = str(raw)
@@ -189,7 +192,7 @@ def _text(key: str, raw: Any) -> str:
 
 
 def shown(raw: object) -> str:
-    """Text of a command, fit for a status and a log."""
+    """Return a command's text, made fit for a status and a log."""
     return "".join(letter if letter.isprintable() else "?" for letter in str(raw)[:_SHOWN])
 
 

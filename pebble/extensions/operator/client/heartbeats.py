@@ -1,4 +1,4 @@
-"""Hears of every robot that is there, whatever its broker keeps, and however the way from it loses large packets."""
+"""A connection that receives heartbeats only, so that robots are found whatever else the broker delivers or loses."""
 
 import os
 import threading
@@ -15,9 +15,9 @@ _WAITING = 10_000  # heartbeats, of which the oldest goes: it comes again
 
 
 class Heartbeats:
-    """A connection that is subscribed to heartbeats alone: with MQTT 5 to those of now, else also to retained ones.
+    """A connection subscribed to heartbeats only: with MQTT 5 to live ones, else also to retained ones.
 
-    It is made on a thread, which nothing waits for.
+    It is made on a thread for which nothing waits.
     """
 
     def __init__(self, settings: MqttSettings) -> None:
@@ -28,7 +28,7 @@ class Heartbeats:
         threading.Thread(target=self._open, name="pebble-heartbeats", daemon=True).start()
 
     def take(self) -> list[Message]:
-        """Return the heartbeats since the last call."""
+        """Return the heartbeats that arrived since the last call."""
         return [self._heard.popleft() for _ in range(len(self._heard))]
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Receives one robot's pictures and sound, and measures their rate and age."""
+"""A receiver of one robot's pictures and sound, with their rate and age."""
 
 import threading
 import time
@@ -18,9 +18,9 @@ _STEP_S = 0.02  # until a request is sent
 
 
 class MediaReceiver:
-    """One robot's pictures and sound. The caller opens and closes ``transport``.
+    """A receiver on ``transport``, which the caller opens and closes.
 
-    The transport's threads decode; others may read ``newest``.
+    The transport's threads decode; other threads may read ``newest``.
     """
 
     def __init__(self, transport: Transport, base: str) -> None:
@@ -36,7 +36,7 @@ class MediaReceiver:
         self._subscriptions.append(transport.subscribe(CAPABILITIES.topic(base), self._on_capabilities))
 
     def wait_for_capabilities(self, timeout: float) -> None:
-        """Wait for the robot's capabilities; raises PebbleError on timeout."""
+        """Wait for the robot's capabilities. Raises PebbleError on timeout."""
         if not self._is_known.wait(timeout):
             raise PebbleError(f"{self.robot.base} publishes no capabilities: is the robot up, and is this its broker?")
 
@@ -53,7 +53,7 @@ class MediaReceiver:
             time.sleep(_STEP_S)
 
     def poll(self) -> None:
-        """Call this a few times a second: repeats unanswered requests, and requests a key frame if one is missing."""
+        """Repeat unanswered requests, and request a missing key frame. Call it a few times a second."""
         now = time.monotonic()
         for request in list(self.requests.values()):
             if request.settled:
@@ -62,7 +62,7 @@ class MediaReceiver:
             send(self._transport, self.requests["video"].keyframe(self.encoding.get("video"), now))
 
     def summary(self, medium: Medium, now: float) -> str:
-        """Return a line for display: ``h264 10/s 212 kbit/s, 45 ms``; empty while nothing arrives."""
+        """Return a line to show: ``h264 10/s 212 kbit/s, 45 ms``; empty while nothing arrives."""
         meter = self.pictures if medium == "video" else self.sounds
         rate, age_s = meter.rate(now), meter.age_s(now)
         if not rate or medium not in self.encoding:
@@ -71,17 +71,17 @@ class MediaReceiver:
         return f"{self.encoding[medium]} {rate:.0f}/s {meter.bitrate(now) / 1000:.0f} kbit/s{age}"
 
     def close(self) -> None:
-        """Withdraw what was requested."""
+        """Withdraw the requests."""
         for request in list(self.requests.values()):
             send(self._transport, request.end())
         for subscription in self._subscriptions:
             subscription.close()
 
     def on_picture(self, picture: Decoded) -> None:
-        """Override to get every picture, not only the newest; runs on a thread of the transport."""
+        """Handle a picture; override it to get all of them. Called on a thread of the transport."""
 
     def on_sound(self, received: ReceivedSound) -> None:
-        """Override to get every packet of sound; runs on a thread of the transport."""
+        """Handle a packet of sound; override it to get them. Called on a thread of the transport."""
 
     # -- the transport's threads
 

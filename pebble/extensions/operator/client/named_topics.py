@@ -1,7 +1,7 @@
-"""Puts a client's account into the topics of its commands, for robots that take commands only so. Pure.
+"""Accounts in the topics of commands, for robots that accept only such commands. Pure.
 
-A robot's capabilities say whether it does (``named``). Set :meth:`NamedTopics.forms` as those of a transport: then
-whatever is published there has the topic that its robot reads now.
+A robot's capabilities say whether it does (``named``). With :meth:`NamedTopics.forms` as a transport's forms, each
+command is published on the topic that its robot reads at present.
 """
 
 from collections.abc import Callable, Iterator
@@ -34,17 +34,17 @@ def why_not(name: str, account: str) -> str:
 
 
 class NamedTopics:
-    """The topics of one client. ``account``: its user name at the broker; ``is_named``: of a robot, by its base."""
+    """The topics of a client. ``account``: its user name at the broker; ``is_named``: by a robot's base topic."""
 
     def __init__(self, account: str, is_named: Callable[[str], bool]) -> None:
         self.account = account
         self._is_named = is_named
 
     def forms(self, message: Message) -> Iterator[Message]:
-        """Yield the messages that are published in place of this one. Raises NoNameError.
+        """Yield the messages to publish instead of this one. Raises NoNameError.
 
-        A stop goes out as ever, too, and before anything is asked: it needs no name. Nothing is retained at a topic
-        with a name, because the robot itself publishes its flags.
+        A stop is also published unchanged, and first: it needs no account. Nothing is retained on a topic with an
+        account, because the robot itself publishes its flags.
         """
         command = _command(message.topic)
         is_stop = command is not None and command.metric == ESTOP.metric
@@ -62,7 +62,7 @@ class NamedTopics:
             raise NoNameError(command.identity.id, self.account)
 
     def signed(self, topic: str, payload: bytes, person: str) -> bytes:
-        """Return the payload with the person for whom this client acts, if the robot puts the account before it."""
+        """Return the payload with the person for whom this client acts, if the robot adds the account itself."""
         command = _command(topic) if person else None
         if command is None or not self._is_named(command.identity.base):
             return payload
@@ -75,7 +75,7 @@ class NamedTopics:
 
 
 def _command(topic: str) -> ParsedTopic | None:
-    """Return the parts of a topic to a component, if it has no name yet."""
+    """Return the parts of a command's topic, if it has no account yet."""
     parsed = parse_topic(topic)
     incoming = parsed is not None and parsed.direction is Direction.INCOMING
     return parsed if parsed is not None and incoming and not parsed.metric.startswith(f"{BY}/") else None
@@ -89,7 +89,7 @@ def _moves(payload: bytes) -> bool:
 
 
 def _without_claim(payload: bytes, account: str) -> bytes:
-    """Return the payload without its own name: the account alone tells who it is."""
+    """Return the payload without a sender, as the account alone identifies the sender."""
     if f'"{account}'.encode() not in payload:
         return payload
     command = _object(payload)

@@ -1,4 +1,4 @@
-"""Resolves what a user types (``drive-values``, ``outgoing/online``, a whole topic) to topics and channels."""
+"""Resolution of what a user types (``drive-values``, ``outgoing/online``, a whole topic) to topics and channels."""
 
 import difflib
 from collections.abc import Iterator
@@ -18,10 +18,10 @@ class NamingError(PebbleError):
 
 
 class Names:
-    """Resolves names to the topics of one robot, including those its config renames, or of every robot."""
+    """The names of one robot's topics, including those its config renames, or of every robot's."""
 
     def __init__(self, base: str = ANY_ROBOT, addresses: Addresses | None = None, account: str | None = None) -> None:
-        """``account``: the user name at the broker, "" for none; None within a robot, where commands have no name."""
+        """Store the robot. ``account``: the user name at the broker, "" for none; None within a robot."""
         self.base, self.account = base, account
         self._addresses = addresses
 
@@ -33,7 +33,7 @@ class Names:
         return [self._place(synonym, name) for synonym in _with_synonyms(channel)]
 
     def topic(self, name: str) -> str:
-        """Return the topic to publish to for ``name``. Raises PebbleError if it is not exactly one."""
+        """Return the topic to publish to for ``name``. Raises PebbleError unless it is exactly one."""
         channel = self._find(name, (INCOMING, OUTGOING))
         topic = name if channel is None else self._place(channel, name)
         if is_pattern(topic):
@@ -51,7 +51,10 @@ class Names:
         return None if address is None else channel_of(f"{address.direction}/{address.metric}")
 
     def _find(self, name: str, directions: tuple[str, str]) -> Channel | None:
-        """Return the channel of a short name; None for a whole topic. The first direction that has the name wins."""
+        """Return the channel of a short name; None for a whole topic.
+
+        If both directions have the name, the first one that is asked for counts.
+        """
         if name.startswith((f"{INCOMING}/", f"{OUTGOING}/")):
             channel = channel_of(name)
         elif parse_topic(name) is not None or is_pattern(name):

@@ -1,6 +1,6 @@
-"""The pace of commands to a robot, over the link that it reports as ``outgoing/link``. Pure.
+"""The rate of commands to a robot, by the link that it reports as ``outgoing/link``. Pure.
 
-What brings something to rest has no pace: it is sent at once, with QoS 1, at every level.
+Commands that bring something to rest have no limit: they are sent at once, with QoS 1, at every level.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,10 @@ _USELESS_MS, _LONGEST_S = 500, 2.0
 
 
 class Pace(NamedTuple):
-    """Towards one robot. ``stamped``: what moves anything carries ``t`` and ``key``, a request of control ``t``."""
+    """The rate towards one robot.
+
+    ``stamped``: moving commands carry ``t`` and ``key``, requests for control ``t``.
+    """
 
     step_s: float = _LEAST_S  # at least, between two commands of one gesture
     qos: QoS = QoS(DRIVE.default_qos)  # of those that move anything
@@ -33,9 +36,9 @@ class Pace(NamedTuple):
     answer_s: float = LEVELS["wide"].answer_s  # a robot that has not answered by then will not
 
     def dated(self, drive: Drive, now: float, key: str) -> Drive:
-        """Return a command that moves something, dated, and valid for as long as commands on this link are.
+        """Return a moving command with its time, and with the validity for this link.
 
-        ``key``: where the robot has given none.
+        ``key``: used if the robot has given none.
         """
         if not self.stamped:
             return drive
@@ -46,7 +49,7 @@ WIDE = Pace()
 
 
 def pace_of(link: LinkState | None) -> Pace:
-    """Return the pace that a robot asks for; a robot without a link state is sent everything."""
+    """Return the pace that a robot's link state asks for; without one, everything is sent."""
     if link is None or link.level == "wide":
         return WIDE
     level = LEVELS[link.level]
@@ -68,10 +71,10 @@ def pace_of(link: LinkState | None) -> Pace:
 
 
 def way_s(link: LinkState) -> float:
-    """Return how long a command takes to the robot, roughly: half a round trip, and whatever waits before it."""
+    """Return roughly how long a command takes to reach the robot: half a round trip plus the queue."""
     return (link.rtt_ms / 2 + link.queue_ms) / 1000
 
 
 def ms(now: float) -> int:
-    """Return ``t`` of a command: milliseconds of the sender's clock, which goes on while the machine is suspended."""
+    """Return the sender's time for ``t``: milliseconds of a clock that goes on while the machine is suspended."""
     return round(1000 * now)

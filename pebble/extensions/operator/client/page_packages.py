@@ -1,4 +1,4 @@
-"""The packages of the operator page, which some commands need as well."""
+"""The packages of the operator page, which some commands need too."""
 
 from importlib.util import find_spec
 
@@ -8,7 +8,7 @@ _PACKAGES = ("cryptography", "starlette", "uvicorn", "websockets")  # an extra, 
 
 
 def require_packages(what: str = "the operator page") -> None:
-    """Raise PebbleError with the command that installs them, unless they are here."""
+    """Raise PebbleError, with the command that installs them, unless they are installed."""
     missing = [name for name in _PACKAGES if find_spec(name) is None]
     if missing:
         raise PebbleError(

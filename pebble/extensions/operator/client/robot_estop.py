@@ -25,10 +25,10 @@ _valid_level = re.compile(LEVEL).search
 
 
 class RobotEstop:
-    """One robot: which motor owners it lists, and the newest state of each.
+    """The stop of one robot: the motor owners that it lists, and the newest state of each.
 
-    ``by`` and ``why`` in the states are short printable ASCII, whatever was received. Names of owners are not: make
-    them printable before they reach a terminal.
+    ``by`` and ``why`` in the states are made short printable ASCII. The owners' names are not: make them printable
+    before they reach a terminal.
     """
 
     def __init__(self, base: str) -> None:
@@ -49,44 +49,47 @@ class RobotEstop:
 
     @property
     def states(self) -> dict[str, EstopState]:
-        """The stop states by motor owner. Once capabilities are known, only of the owners that they list."""
+        """Return the stop states by motor owner; once capabilities are known, only of the listed owners."""
         if not self.has_capabilities:
             return dict(self._states)
         return {owner: self._states[owner] for owner in self.owners if owner in self._states}
 
     @property
     def latched(self) -> dict[str, EstopState]:
-        """The states of the owners that are stopped."""
+        """Return the states of the stopped owners."""
         return {owner: state for owner, state in self.states.items() if state.latched}
 
     @property
     def stopped_by(self) -> EstopState | None:
-        """The newest stop among the latched owners; None: the robot is not stopped, as far as is known."""
+        """Return the newest stop among the stopped owners; None if the robot is not known to be stopped."""
         return max(self.latched.values(), key=lambda state: state.since, default=None)
 
     @property
     def lacks(self) -> bool:
-        """True if its capabilities, or a state that they list, have not come."""
+        """True if its capabilities, or a state of an owner that they list, are missing."""
         return not self.has_capabilities or bool(self.missing)
 
     @property
     def missing(self) -> list[str]:
-        """The topics of its listed owners' states that have not come."""
+        """Return the topics of missing states of listed owners."""
         return [ESTOP_STATE.topic(self.base, owner=owner) for owner in self.owners if owner not in self._states]
 
     @property
     def missing_control(self) -> list[str]:
-        """The topics of control of these owners, if the robot keeps it itself."""
+        """Return the topics of missing control states of these owners, if the robot publishes control."""
         owners = [owner for owner in self.owners if owner not in self._states] if self.keeps_control else []
         return [CONTROL_STATE.topic(self.base, owner=owner) for owner in owners]
 
     @property
     def old(self) -> bool:
-        """True if the robot is known to have no emergency stop; a robot that cannot receive its own is not old."""
+        """True if the robot is known to have no emergency stop.
+
+        A robot that cannot receive its own topics is not old.
+        """
         return self.has_capabilities and not self.announces
 
     def subscribe(self, transport: Transport) -> None:
-        """Receive from ``transport`` until that is closed; when this returns, what is retained has arrived."""
+        """Subscribe on ``transport`` until it is closed; return when the retained messages have arrived."""
 
         def take(message: Message) -> None:
             self.receive(message)
@@ -96,7 +99,7 @@ class RobotEstop:
         transport.ask(self.missing)
 
     def receive(self, message: Message) -> bool:
-        """Update from one message of this robot; False if it is about something else, or malformed."""
+        """Update from a message of this robot; return False if it is about something else, or malformed."""
         if message.topic == self._capabilities_topic:
             return self._receive_capabilities(message.payload)
         if message.topic.startswith(self._prefix):
@@ -155,7 +158,10 @@ def _section(value: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _owners(listed: object) -> tuple[str, ...]:
-    """Return the owners, without repetitions; none if the list is not valid, so such a robot is never confirmed."""
+    """Return the listed owners without repetitions.
+
+    An invalid list gives none, so that such a robot is never confirmed.
+    """
     if not isinstance(listed, list) or len(listed) > MAX_OWNERS:
         return ()
     if not all(isinstance(owner, str) and _valid_level(owner) for owner in listed):
@@ -164,17 +170,17 @@ def _owners(listed: object) -> tuple[str, ...]:
 
 
 def _clean(state: EstopState) -> EstopState:
-    """Return the state with bounded, printable texts."""
+    """Return the state with its texts made short and printable."""
     _, by, why = stop_of({"by": state.by, "why": state.why})
     since = state.since if 0 <= state.since < _LATEST_MS else 0
     return msgspec.structs.replace(state, by=by, why=why, since=since, recent=state.recent[:_NAMES])
 
 
 def is_of_another(topic: str, base: str) -> bool:
-    """True if ``topic`` begins as the topics of another component do.
+    """True if ``topic`` is a topic of another component.
 
-    Capabilities may name any topic, and whoever publishes them need not be allowed to publish on it: a client that
-    believed them would drive another robot.
+    Capabilities may contain any topic, and their publisher may lack the right to publish there: a client that believed
+    them would drive another robot.
     """
     levels = topic.split("/", 3)
     return len(levels) == 4 and "/".join(levels[:3]) != base

@@ -1,4 +1,4 @@
-"""The topics of robots that an operator's program subscribes to, and those that capabilities may name. Pure."""
+"""The robot topics to which operators' programs subscribe, and the topics that capabilities may name. Pure."""
 
 from typing import Any
 
@@ -61,7 +61,7 @@ PLACES: dict[c.Channel, tuple[str, str]] = {
 
 
 def named_topic(ref: str, capabilities: dict[str, Any], channel: c.Channel) -> str | None:
-    """Return the topic that capabilities name for this channel; None if they name none, or may not name it."""
+    """Return the topic that capabilities name for this channel; None if they name none or a forbidden one."""
     section, key = PLACES[channel]
     topic = section_of(capabilities, section).get(key)
     return str(topic) if names(ref, topic, channel) else None
@@ -73,7 +73,7 @@ def topic_of(ref: str, capabilities: dict[str, Any], channel: c.Channel) -> str:
 
 
 def section_of(capabilities: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return a section of capabilities, or one of a section: ``system.reboot``. Empty if there is none."""
+    """Return a section of capabilities, or a nested one: ``system.reboot``. Empty if there is none."""
     section: Any = capabilities
     for level in name.split("."):
         section = section.get(level) if isinstance(section, dict) else None
@@ -81,7 +81,7 @@ def section_of(capabilities: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def own_topic(ref: str, topic: object, direction: str) -> bool:
-    """True if this is a topic of ``ref`` in that direction. Capabilities may name others; they are not used."""
+    """True if this is a topic of ``ref`` in that direction. Other topics in capabilities are ignored."""
     if not isinstance(topic, str) or not topic.startswith(f"{ref}/{direction}/") or parse_topic(topic) is None:
         return False
     try:
@@ -91,7 +91,7 @@ def own_topic(ref: str, topic: object, direction: str) -> bool:
 
 
 def names(ref: str, topic: object, channel: c.Channel) -> bool:
-    """True if capabilities may name this topic for the channel: the component's own, and no other channel's."""
+    """True if capabilities may name this topic for the channel: it is the component's, and no other channel's."""
     if not own_topic(ref, topic, channel.direction):
         return False
     return channel_of(str(topic)[len(ref) + 1 :]) in (None, channel)

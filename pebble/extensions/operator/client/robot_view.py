@@ -1,4 +1,4 @@
-"""The robot as an operator's program sees it: whether it is there, what it can do, and what holds it. Pure."""
+"""A robot as an operator's program sees it: online or not, its capabilities, and who or what holds it. Pure."""
 
 from collections import deque
 from collections.abc import Collection
@@ -27,7 +27,7 @@ _STAMPS = 5  # heartbeats by which a clock of whole seconds is recognised
 
 
 class Liveness:
-    """The heartbeats of a component. As on the paper's operator page, its timeout follows their own interval."""
+    """The heartbeats of a component. As on the paper's operator page, the timeout follows their interval."""
 
     def __init__(self) -> None:
         self.received_at: float | None = None  # monotonic
@@ -40,7 +40,7 @@ class Liveness:
         self._returns: deque[float] = deque(maxlen=2)  # when a heartbeat came after people had been told of a silence
 
     def heartbeat(self, now: float, latency_s: float, *, online: bool = True, t: int = 1) -> None:
-        """Take note of a heartbeat with the time ``t``, in milliseconds of its own clock."""
+        """Note a heartbeat with the time ``t``, in milliseconds of the component's clock."""
         self._stamps.append(t)
         is_gap = self.received_at is not None and 0.05 <= now - self.received_at <= 10.0
         if is_gap and not self.reported_offline and self.online_to_people(now) is False:
@@ -54,24 +54,27 @@ class Liveness:
 
     @property
     def average_latency_s(self) -> float | None:
-        """The mean latency of the last ten heartbeats that tell it; correct only if both clocks are synchronised."""
+        """Return the mean latency of the last ten heartbeats; correct only if both clocks are synchronised."""
         return _mean(self._latencies)
 
     @property
     def interval_s(self) -> float | None:
-        """The mean time between the last ten heartbeats."""
+        """Return the mean interval of the last ten heartbeats."""
         return _mean(self._intervals)
 
     @property
     def whole_seconds(self) -> bool:
-        """True if its clock counts whole seconds: latency says nothing."""
+        """True if its clock counts whole seconds, so that latency cannot be measured."""
         return len(self._stamps) == _STAMPS and all(stamp % 1000 == 0 for stamp in self._stamps)
 
     def age_s(self, now: float) -> float | None:
         return None if self.received_at is None else now - self.received_at
 
     def online(self, now: float, at_least_s: float = 0.0) -> bool | None:
-        """True if the robot is there; None while heartbeats are too few. A silence below ``at_least_s`` is none."""
+        """True if the robot is online; None while there are too few heartbeats.
+
+        A silence below ``at_least_s`` does not count.
+        """
         if self.reported_offline:
             return False
         interval = self.interval_s
@@ -81,7 +84,10 @@ class Liveness:
         return age <= silent_after(interval, self.link, self.average_latency_s or 0.0) or age < at_least_s
 
     def online_to_people(self, now: float) -> bool | None:
-        """True if people see it as there: not silent before 1.5 s, or longer while its heartbeats come and go."""
+        """True if people are shown it as online.
+
+        A silence counts after 1.5 s, or later if its heartbeats are irregular.
+        """
         returns = sum(now - at < _COMES_AND_GOES_S for at in self._returns)
         return self.online(now, SILENT_S * (1 + returns))
 
@@ -91,7 +97,7 @@ def _mean(values: deque[float]) -> float | None:
 
 
 class RobotView:
-    """One robot, by the messages it publishes."""
+    """A robot, from the messages it publishes."""
 
     def __init__(self, base: str) -> None:
         self.base = base
@@ -111,7 +117,7 @@ class RobotView:
 
     @property
     def name(self) -> str:
-        """The last level of its base topic."""
+        """Return the last level of its base topic."""
         return self.base.rpartition("/")[2]
 
     # -- what arrives
@@ -155,13 +161,13 @@ class RobotView:
                 self.liveness.heartbeat(now, wall - payload.t / 1000, online=payload.online is not False, t=payload.t)
 
     def _take_announced(self, payload: bytes) -> None:
-        """Take what a heartbeat or status lists as capabilities, unless the robot publishes capabilities."""
+        """Use the subscriptions in a heartbeat or status, unless the robot publishes capabilities."""
         if not self.capabilities or "announced" in self.capabilities:
             value = announced(self.base, payload)
             self.capabilities = self.capabilities if value == self.capabilities else value or self.capabilities
 
     def _receive_stop(self, channel: c.Channel, message: Message, now: float) -> None:
-        """Take capabilities, or the state of a motor owner. Empty capabilities take nothing away."""
+        """Handle capabilities, or the state of a motor owner. Empty capabilities remove nothing."""
         latched = self.latched
         self.estop.receive(message)
         if latched and not self.latched:
@@ -172,14 +178,20 @@ class RobotView:
                 self.capabilities = codec.decode(c.CAPABILITIES, message.payload).value or before
 
     def _note_retained_drive(self, message: Message) -> None:
-        """Note whether a drive command that moves is retained; an empty message, not retained itself, removes it."""
+        """Note whether a moving drive command is retained.
+
+        A message that is empty and not retained itself removes it.
+        """
         if message.retain or not message.payload:
             self.parked = bool(message.payload)
             with suppress(PayloadError):
                 self.parked = self.parked and codec.decode(c.DRIVE, message.payload).moves
 
     def _keep_for_late_stop(self, message: Message) -> None:
-        """Keep the message for an emergency stop that begins later; invented owners keep no capabilities out."""
+        """Keep the message for a stop that begins later.
+
+        States of unlisted owners never displace capabilities.
+        """
         topics = (*self.remembered, c.CAPABILITIES.topic(self.base))
         if not message.payload:
             self.remembered.pop(message.topic, None)
@@ -190,23 +202,23 @@ class RobotView:
 
     @property
     def silent(self) -> bool:
-        """True if the robot has published neither capabilities nor a list of the topics it subscribes to."""
+        """True if the robot has published neither capabilities nor its subscriptions."""
         return not self.estop.has_capabilities and (not self.capabilities or self.is_assumed)
 
     @property
     def is_assumed(self) -> bool:
-        """True if what it can do is what people say of it, until it says so itself."""
+        """True if its capabilities are those that people assumed."""
         return "assumed" in self.capabilities
 
     def assume(self, axes: Collection[str], name: str = "") -> bool:
-        """Assume that a silent board drives by these axes, or by none; return True if that is new."""
+        """Assume that a silent board drives by these axes, or by none; return True if that is a change."""
         before = self.capabilities
         if self.silent:
             self.capabilities = assumed.assumed(self.base, axes, name)
         return self.capabilities != before
 
     def encode(self, drive: Drive) -> bytes:
-        """Return a drive command in the form for this robot."""
+        """Return a drive command in the form that this robot reads."""
         axes = section_of(self.capabilities, "drive").get("axes") if self.is_assumed else None
         return codec.encode(c.DRIVE, drive) if axes is None else assumed.encode(drive, axes)
 
@@ -228,12 +240,12 @@ class RobotView:
 
     @property
     def stopped_by(self) -> EstopState | None:
-        """The state that holds the newest stop, if it is stopped."""
+        """Return the state with the newest stop; None if it is not stopped."""
         return self.estop.stopped_by
 
     @property
     def drives(self) -> bool:
-        """True if the robot offers driving; without capabilities nothing is assumed (paper A.8.6)."""
+        """True if the robot offers driving; nothing is assumed without capabilities (paper A.8.6)."""
         drive = section_of(self.capabilities, "drive")
         return drive.get("available") is True and drive.get("controls") is not False
 
@@ -249,27 +261,27 @@ class RobotView:
 
     @property
     def driveable(self) -> Driveable | None:
-        """The answer of its status to whether its motors obey."""
+        """Return the part of its status that says whether its motors obey."""
         return driveable_of(self._status)
 
     def holds(self, program: str) -> bool:
-        """True if that program is requested, and waits while people drive over a thin link."""
+        """True if that program is requested and waits while a person drives over a thin link."""
         return is_held(self._status, program)
 
     @property
     def named(self) -> bool:
-        """True if the robot takes commands only with the name of their sender in the topic."""
+        """True if the robot takes only commands with the sender's account in the topic."""
         return self.estop.named
 
     @property
     def slow_s(self) -> float | None:
-        """The seconds that commands take over the robot's thin link; None if there is none, or the robot is gone."""
+        """Return how long commands take over the robot's thin link; None without one, or if it is offline."""
         link = self.link
         return None if link is None or link.level == "wide" or self.liveness.reported_offline else way_s(link)
 
     @property
     def pace(self) -> Pace:
-        """The pace of commands to it; also while it is gone, for when it is back over the same link."""
+        """Return the rate of commands to it, also while it is offline."""
         return pace_of(self.link)
 
     def topic(self, channel: c.Channel) -> str | None:
@@ -281,16 +293,16 @@ class RobotView:
         return section_of(self.capabilities, section).get("controls") is True
 
     def ready(self, now: float) -> bool:
-        """True if the robot is online, with a known drive topic."""
+        """True if the robot is online and its drive topic is known."""
         return self.topic(c.DRIVE) is not None and self.liveness.online(now) is True
 
     def online(self, now: float) -> bool | None:
-        """True if people are told that it is there."""
+        """True if people are shown it as online."""
         return self.liveness.online_to_people(now)
 
     @property
     def script(self) -> str:
-        """The name for people of the script that may move it; empty: none does."""
+        """Return the title of the script that may move it; empty if none."""
         status = self.autonomy
         if status is None or not status.running or status.drives is False:
             return ""
@@ -298,12 +310,12 @@ class RobotView:
 
     @property
     def itself(self) -> str:
-        """The sentence that says that it drives itself; empty: a person drives, or nobody."""
+        """Return the sentence that it drives itself; empty if a person drives, or nobody."""
         waits = self.latched or (self.autonomy is not None and self.autonomy.overridden is True)
         return words("itself", self.name, script=self.script) if self.script and not waits else ""
 
     def situation(self, now: float) -> Situation:
-        """Return what speaks for and against driving it, as far as it says so itself."""
+        """Return the facts for and against driving it that the robot itself publishes."""
         return Situation(
             online=self.online(now),
             latched=self.latched,

@@ -1,4 +1,4 @@
-"""The scripts of a robot as its autonomy_manager publishes them, and commands that start and stop them."""
+"""The scripts of a robot, as its autonomy_manager publishes them, and the commands that start and stop them."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -20,7 +20,7 @@ Entry = dict[str, Any]
 
 
 class RobotScripts:
-    """The scripts that one robot offers, and the one that runs. Other threads may read while it receives."""
+    """The scripts that a robot offers, and the running one. Other threads may read while it receives."""
 
     def __init__(self, names: Names) -> None:
         self.robot = RobotView(names.base)
@@ -31,21 +31,21 @@ class RobotScripts:
 
     @property
     def status(self) -> AutonomyStatus | None:
-        """The newest status; None: the robot has not published any."""
+        """Return the newest status; None if there is none."""
         return self.robot.autonomy
 
     @property
     def answer_s(self) -> float:
-        """The seconds to wait for a changed status before a command counts as ignored."""
+        """Return how long to wait for a changed status before a command counts as ignored."""
         return max(_STARTS_S, self.robot.pace.answer_s)
 
     def subscribe(self, transport: Transport) -> None:
-        """Receive from ``transport``; when this returns, what is retained has arrived."""
+        """Subscribe on ``transport``; return when the retained messages have arrived."""
         for topic in self._channels:
             transport.subscribe(topic, self.receive, direct=True)
 
     def receive(self, message: Message) -> None:
-        """Update from a message of this robot; what is malformed is ignored."""
+        """Update from a message of this robot; malformed ones are ignored."""
         channel, before = self._channels.get(message.topic), self.status
         if channel is not AUTONOMY_FILES:
             self.robot.receive(channel, message, 0.0, 0.0)
@@ -56,7 +56,7 @@ class RobotScripts:
                 self.files = {entry["file"]: entry for entry in listed if isinstance(entry.get("file"), str)}
 
     def start(self, transport: Transport, file: str, words: Sequence[str]) -> bool:
-        """Command a start with the options in ``words``; False: it was not sent. Raises PebbleError."""
+        """Publish a start with the options in ``words``; return False if it was not sent. Raises PebbleError."""
         if self.files is None:
             raise PebbleError(
                 "the robot has published no scripts: is services.autonomy_manager.enabled true, is it up?"
@@ -78,7 +78,7 @@ class RobotScripts:
 
 
 def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
-    """Return the settings that words such as ``--tag-id 5 --no-search`` select in a script's form.
+    """Return the values that words such as ``--tag-id 5 --no-search`` give to a script's form.
 
     Raises PebbleError.
     """
@@ -105,7 +105,10 @@ def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
 
 
 def options_of(setting: forms.Setting) -> list[tuple[str, bool | None]]:
-    """Return a setting's options, a flag's with their values: first the script's own, then those made of its key."""
+    """Return the option names of a setting, the script's before those made from its key.
+
+    For a flag: each option with its value.
+    """
     key = setting.key.replace("_", "-")
     on = _distinct(setting.arg, f"--{key}")
     if setting.type != "bool":

@@ -1,4 +1,4 @@
-"""The time stamps in payloads. Pure."""
+"""Time stamps in payloads. Pure."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ _LATEST_STAMP = 253_402_300_800_000  # the year 10000 in ms: later times are inv
 
 
 def stamp_of(plain: Any) -> float | None:
-    """Return a JSON payload's time stamp in epoch seconds, from ``t`` or ``timestamp``; None: it has none.
+    """Return a JSON payload's stamp in epoch seconds, from ``t`` or ``timestamp``; None if it has none.
 
     Numbers of 1e11 and more are milliseconds, of 1e9 and more seconds (paper A.4.2).
     """

@@ -1,4 +1,4 @@
-"""Parses the address of a connection: ``mqtt://host:port``, ``mqtts://host:port`` or ``zenoh:<run_dir>``."""
+"""The address of a connection: ``mqtt://host:port``, ``mqtts://host:port`` or ``zenoh:<run_dir>``."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ _PORTS = {"mqtt": 1883, "mqtts": 8883}
 
 
 class UrlError(PebbleError):
-    """A URL without a usable address. Example: ``--url http://x: use mqtt://HOST[:PORT], …``."""
+    """A URL that is no usable address. Example: ``--url http://x: use mqtt://HOST[:PORT], …``."""
 
 
 def settings_of(

@@ -1,4 +1,4 @@
-"""Values that Tab completes: files and robots of this machine, without a network."""
+"""Completions for Tab: files and robots of this machine, found without a network."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LONGEST = 1_000_000  # bytes of a config
 
 
 def configs(context: Context) -> list[str]:
-    """Return the JSON files of this folder; the shell itself completes those of others."""
+    """Return the JSON files of this folder; the shell completes other paths itself."""
     commands = ["user", "audit"] if context.command.name == "serve" else []  # of `pebble web [CONFIG]`
     return [*commands, *sorted(str(path) for path in Path().glob("*.json"))]
 
@@ -28,7 +28,7 @@ def robots(context: Context) -> list[str]:
 
 
 def stops(context: Context) -> list[str]:
-    """Return the robots, and what may be done besides stopping one."""
+    """Return the robots, and the verbs of ``pebble estop``."""
     return ["reset", "status", *robots(context)]
 
 

@@ -1,4 +1,4 @@
-"""A message to be published by hand, completed and checked by the contract."""
+"""A message to publish by hand, completed and checked by the contract."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ _NEVER_RETAINED = (Kind.COMMAND, Kind.ACTION, Kind.FEED)
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """A message to publish, and warnings about it for the user."""
+    """A message to publish, with warnings for the user."""
 
     topic: str
     payload: bytes

@@ -102,7 +102,7 @@ def estop(
 
 
 def _parse(words: list[str]) -> tuple[str, str | None]:
-    """Return such as ``("reset", "goob.json")``; the verb is empty for a stop."""
+    """Return verb and robot, as in ``("reset", "goob.json")``; the verb is empty for a stop."""
     verb = words[0] if words and words[0] in _VERBS else ""
     robots = words[1:] if verb else words
     near = difflib.get_close_matches(words[0], _VERBS, n=1) if len(words) > 1 and not verb else []
@@ -116,7 +116,7 @@ def _parse(words: list[str]) -> tuple[str, str | None]:
 
 
 def me(account: str | None = None) -> str:
-    """Return who gives this command, at the broker or else on this machine, and from which machine: ``ann@desk``."""
+    """Return the sender of this command: the account, or else the user, and the machine: ``ann@desk``."""
     try:
         user = account or getpass.getuser()
     except (ImportError, KeyError, OSError):  # no name for this user id, or no such ids
@@ -128,7 +128,7 @@ def me(account: str | None = None) -> str:
 
 
 def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
-    """Send stops over a connection of their own, on which nothing arrives."""
+    """Send stops over a connection that receives nothing."""
     with interrupted_by_signals(), connected(target) as (transport, names):
         robots = None if every else [names.base]
         sender = StopSender(new_name(), by=me(names.account), why=why, now=time.monotonic(), robots=robots, hold=hold)
@@ -160,7 +160,7 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
 
 @contextmanager
 def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
-    """Listen to the heartbeats of all robots, for a stop of all; within a robot there are none."""
+    """Open a connection for the heartbeats of all robots, for a stop of all; not within a robot."""
     _, settings, _, _ = resolve(target)
     if not every or not isinstance(settings, MqttSettings) or settings.client_id is not None:
         yield None
@@ -170,7 +170,7 @@ def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
 
 
 def _listen(transport: Transport, filters: list[str]) -> tuple[Listener, threading.Thread]:
-    """Subscribe on a thread, which is returned, too: what the network takes for it must not delay a stop."""
+    """Subscribe on a thread, so that a slow network does not delay the stop; return the thread."""
     listener = Listener(transport, ())
 
     def subscribe() -> None:
@@ -192,7 +192,7 @@ def _until_due(sender: StopSender, *, hears: bool) -> float:
 
 
 def _receive(listener: Listener, sender: StopSender, left: float) -> None:
-    """Handle what has arrived; wait for something if nothing has, for ``left`` seconds."""
+    """Handle what has arrived; if nothing has, wait for a message for up to ``left`` seconds."""
     for _ in range(_BATCH):
         message = listener.next(left)
         if message is None:
@@ -202,7 +202,7 @@ def _receive(listener: Listener, sender: StopSender, left: float) -> None:
 
 
 class _Outbox:
-    """Publishes a stop, and knows to which robots it has left."""
+    """A publisher of a stop, which knows which robots it was sent to."""
 
     def __init__(self, transport: Transport, sender: StopSender) -> None:
         self._transport, self._sender = transport, sender
@@ -213,7 +213,7 @@ class _Outbox:
         send(self._accepts, self._sender.tick(time.monotonic()))  # waits for no acknowledgement
 
     def has_sent(self, base: str) -> bool:
-        """True if a stop of this robot has arrived at the other end of the connection."""
+        """True if a stop of this robot has reached the other end of the connection."""
         if self._transport.state is State.CONNECTED and not self._transport.outgoing.waiting:
             self._left |= self._waiting
             self._waiting.clear()
@@ -227,7 +227,7 @@ class _Outbox:
 
 
 class _Report:
-    """Prints a line whenever the stop of a robot has got further."""
+    """A printer of a line whenever the stop of a robot makes progress."""
 
     def __init__(self, sender: StopSender, outbox: _Outbox) -> None:
         self._sender, self._outbox = sender, outbox
@@ -238,7 +238,7 @@ class _Report:
             _echo(f"stop {sender.order.name} is held until Ctrl-C; robots stay stopped after it")
 
     def connection(self, problem: str) -> None:
-        """Warn once of each outage."""
+        """Warn of an outage, once."""
         if problem and not self._problem:
             _echo(f"pebble: warning: nothing is sent until there is a connection again: {problem}", err=True)
         self._problem = problem
@@ -267,7 +267,10 @@ class _Report:
 
 
 def _echo(line: str, *, err: bool = False) -> None:
-    """Print ``line``; a stop is sent on if that fails, because the reader has ended or a disk is full."""
+    """Print ``line``.
+
+    If that fails, because the reader has ended or a disk is full, sending the stop goes on.
+    """
     try:
         typer.echo(line, err=err)
     except OSError:
@@ -363,9 +366,9 @@ def _status(target: Target, *, every: bool) -> int:
 
 
 def _print_states(robot: RobotEstop, driveable: Driveable | None = None, *, silent: bool = False) -> None:
-    """Print one line for a robot that is free or has no emergency stop, else one for each stopped owner.
+    """Print a line for a robot that is free or has no emergency stop, else one for each stopped owner.
 
-    ``silent``: it sends no heartbeat now.
+    ``silent``: it sends no heartbeat at present.
     """
     name, now = f"{id_of(robot.base)}{': no heartbeat; its last state' if silent else ''}", time.time()
     lines = [

@@ -1,4 +1,4 @@
-"""The output of ``pebble topic``: messages, rates and lists, without characters that control the terminal."""
+"""The output of ``pebble topic``: messages, rates and lists, without terminal control characters."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def print_table(
     whole: Container[str] = ("time",),
     right: Container[str] = (),
 ) -> None:
-    """Print rows of text that may come from anybody; columns in ``whole`` and ``right`` are never folded."""
+    """Print rows of untrusted text; the columns ``whole`` and ``right`` are never wrapped."""
     from rich.table import Table
     from rich.text import Text
 
@@ -56,7 +56,7 @@ def print_table(
 
 
 def body(payload: bytes, width: int) -> str:
-    """Return JSON on one line where it fits and indented where not; text as it is; the rest as a hex dump."""
+    """Return a payload as text: JSON on one line if it fits, else indented; binary data as a hex dump."""
     if not payload:
         return "(empty: removes the retained message)"
     plain = parsed(payload)
@@ -71,7 +71,7 @@ def body(payload: bytes, width: int) -> str:
 
 
 def parsed(payload: bytes) -> Any:
-    """Return the JSON value; None if it is not JSON (or is ``null``)."""
+    """Return the JSON value; None if it is no JSON, or ``null``."""
     try:
         return json.loads(payload)
     except (ValueError, RecursionError):
@@ -79,12 +79,12 @@ def parsed(payload: bytes) -> Any:
 
 
 def recognised(payload: bytes) -> str | None:
-    """Return the name of a binary format, by its first bytes."""
+    """Return the name of a binary format, by its first bytes; empty if unknown."""
     return next((name for start, name in RECOGNISERS.items() if payload.startswith(start)), None)
 
 
 def hex_dump(raw: bytes, width: int) -> str:
-    """Return lines of offset, bytes and their ASCII, with as many bytes as fit."""
+    """Return lines of offset, bytes and ASCII, as long as the width allows."""
     per_line = 16 if width >= 76 else 8
     lines = []
     for start in range(0, len(raw), per_line):
@@ -108,12 +108,12 @@ def headline(message: Message, now: float) -> str:
 
 
 def age(seconds: float) -> str:
-    """Return such as ``12 ms ago``, ``3.2 s ago``, ``2 h ago``; clocks that differ show as ``… ahead``."""
+    """Return an age: ``12 ms ago``, ``3.2 s ago``, ``2 h ago``; or ``… ahead`` if the other clock is ahead."""
     return f"{duration(abs(seconds))} {'ago' if seconds >= 0 else 'ahead'}"
 
 
 def duration(seconds: float) -> str:
-    """Return seconds with a unit: ``12 ms``, ``3.2 s``, ``2 h``."""
+    """Return a duration: ``12 ms``, ``3.2 s``, ``2 h``."""
     if seconds < 1:
         return f"{seconds * 1000:.0f} ms"
     if seconds < 100:
@@ -125,14 +125,14 @@ def duration(seconds: float) -> str:
 
 
 def size(count: float) -> str:
-    """Return bytes: ``19 B``, ``1.2 kB``, ``3.4 MB``."""
+    """Return a size: ``19 B``, ``1.2 kB``, ``3.4 MB``."""
     if count < 1000:
         return f"{count:.0f} B"
     return f"{count / 1e3:.1f} kB" if count < 1e6 else f"{count / 1e6:.1f} MB"
 
 
 def rate_line(meter: RateMeter, now: float) -> str | None:
-    """Return how often messages and how many bits of payload come; None before the second message."""
+    """Return the rates of messages and of payload bits in a line; None before the second message."""
     hz, arrivals = meter.rate(now), meter.arrivals(now)
     if not hz:
         return None
@@ -203,7 +203,7 @@ def print_listing(listing: Listing, now: float, wall: float) -> None:
 
 
 def remarks(listing: Listing, wall: float) -> list[str]:
-    """Return which robots are stopped, and which have a thin link."""
+    """Return a line for each stopped robot and for each with a thin link."""
     discovery = Discovery()
     for record in listing.records.values():
         if record.last is not None:
@@ -218,7 +218,7 @@ def remarks(listing: Listing, wall: float) -> list[str]:
 
 
 def stopped_line(robot: RobotEstop, wall: float) -> str:
-    """Return such as ``goob is stopped by ann@desk, 3 min ago: a dog``; empty if it is not stopped."""
+    """Return a line such as ``goob is stopped by ann@desk, 3 min ago: a dog``; empty if it is not stopped."""
     state = robot.stopped_by
     return "" if state is None else f"{shown(id_of(robot.base))} is {stopped(state, wall)}"
 

@@ -32,10 +32,10 @@ _CREDENTIALS = (_option("password_file", PasswordFile), _option("ca_cert", CaCer
 
 
 def with_target(*, program: str = "tool", robot: bool = False) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Give a command the options that select where to connect, and pass them to it as its keyword ``target``.
+    """Decorate a command with the options that select where to connect; it gets them as ``target``.
 
-    They take the place of this parameter; the password and the certificate authority come last. ``robot``: there is an
-    option --robot, too, where no argument of the command names a robot.
+    They replace this parameter; the password and the certificate authority come last. ``robot``: add an option --robot,
+    for a command without an argument that is a robot.
     """
     options = (*_CONNECTION, *(_ROBOT if robot else ()), *_REMOTE)
 

@@ -66,7 +66,7 @@ def watch(
 
 
 def _received(target: Target, encoding: str | None) -> Picture:
-    """Return the first picture that comes from the operators' broker. Raises PebbleError if none does."""
+    """Return the first picture from the operators' broker. Raises PebbleError if none comes."""
     from pebble.extensions.operator.client.media_receiver import MediaReceiver
 
     with connected(target) as (transport, names), closing(MediaReceiver(transport, names.base)) as receiver:

@@ -21,7 +21,7 @@ _LEVELS: Final = {
 
 
 def document() -> str:
-    """Return the whole of asyncapi.yaml. Needs PyYAML."""
+    """Return the text of asyncapi.yaml. Needs PyYAML."""
     all_schemas = schemas()
     described: dict[str, Any] = {
         "asyncapi": "3.0.0",
@@ -39,7 +39,7 @@ def document() -> str:
 
 
 def _name(channel: Channel) -> str:
-    """Return such as ``incoming.drive-values``; the names of a family are its parameters."""
+    """Return a channel's name, such as ``incoming.drive-values``; a family's parameters are its variables."""
     return channel.suffix.replace("/", ".").translate({ord("{"): None, ord("}"): None})
 
 

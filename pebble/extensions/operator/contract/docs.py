@@ -1,4 +1,4 @@
-"""Writes tables of all topics, payloads.schema.json and asyncapi.yaml into the folder that its argument names."""
+"""The generator of the topic tables, payloads.schema.json and asyncapi.yaml."""
 
 import inspect
 import json
@@ -45,7 +45,7 @@ def travels(channel: Channel) -> str:
 
 
 def authority(channel: Channel) -> str:
-    """Return which side is right when the two sides of the bridge differ."""
+    """Return which side of the bridge is right when the two differ."""
     if channel.direction == OUTGOING:
         return "robot"
     if channel.kind is Kind.FLAG:
@@ -85,7 +85,7 @@ def _travel_row(channel: Channel) -> tuple[str, ...]:
 
 
 def rate(channel: Channel) -> str:
-    """Return the nominal rate in words."""
+    """Return a channel's nominal rate in words."""
     if channel.rate_hz:
         return f"{channel.rate_hz:g} Hz"
     return {Kind.STATE: "on change", Kind.STREAM: "varies", Kind.FEED: "varies"}.get(channel.kind, "on demand")
@@ -130,7 +130,7 @@ def _payload(struct: type[Payload]) -> str:
 
 
 def _type_name(kind: Any) -> str:
-    """Return a field's type as a reader of JSON calls it; a field that may be absent shows it in its default."""
+    """Return a field's type in JSON's terms; an optional field's default shows that it may be absent."""
     origin, inner = get_origin(kind), [argument for argument in get_args(kind) if argument is not UnsetType]
     if origin in (Union, UnionType):
         return " or ".join(map(_type_name, inner))

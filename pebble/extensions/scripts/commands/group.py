@@ -125,7 +125,7 @@ def register(app: typer.Typer) -> None:
 
 @contextmanager
 def _scripts(robot: str, target: Target) -> Iterator[tuple[Transport, RobotScripts, str]]:
-    """Give the connection, what the robot has published about its scripts, and its name."""
+    """Yield the connection, the robot's published scripts, and its name."""
     with connected(target_of(robot, target)) as (transport, names):
         scripts = RobotScripts(names)
         put_names(transport, names, lambda base: base == names.base and scripts.robot.named)
@@ -141,7 +141,7 @@ def _answered(before: AutonomyStatus | None, now: AutonomyStatus | None, file: s
 
 
 def _runs(before: AutonomyStatus | None, now: AutonomyStatus, file: str) -> bool:
-    """True if the script runs, as another process than before."""
+    """True if the script runs in another process than before."""
     as_before = before is not None and before.running and now.pid == before.pid
     return now.running and now.file == file and not as_before
 
@@ -170,7 +170,7 @@ def _print_status(status: AutonomyStatus) -> None:
 
 
 def _option(setting: forms.Setting) -> str:
-    """Return such as ``--tag-id INT  Tag ID (default: 13)``."""
+    """Return an option's line, such as ``--tag-id INT  Tag ID (default: 13)``."""
     first = {value: option for option, value in reversed(options_of(setting))}
     flag = setting.type == "bool"
     shown = f"[{first[True]} | {first[False]}]" if flag else f"{first[None]} {setting.type.upper()}"

@@ -1,4 +1,4 @@
-"""Writes a first script: one that follows a tag, its test, and a robot in a simulated room."""
+"""A first script for a new user: it follows a tag, and has a test and a robot in a simulated room."""
 
 import re
 import tempfile
@@ -13,7 +13,7 @@ _name = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,62}").fullmatch
 
 
 def write(name: str, folder: Path) -> Iterator[Path]:
-    """Make ``folder/name`` with its files, and yield their paths. Raises PebbleError, also if it exists already."""
+    """Create ``folder/name`` with its files; yield their paths. Raises PebbleError if it exists."""
     if not _name(name):
         raise PebbleError(f"{name!r}: a script's name is letters, digits, - and _, beginning with a letter")
     target = folder / name
@@ -39,7 +39,7 @@ def write(name: str, folder: Path) -> Iterator[Path]:
 
 
 def _alike(target: Path) -> Path | None:
-    """Return what exists with this name, whatever its case: many file systems make no difference."""
+    """Return an existing name that differs only in case, as many file systems ignore case; else empty."""
     if not target.parent.is_dir():
         return None
     return next((path for path in target.parent.iterdir() if path.name.lower() == target.name.lower()), None)
@@ -54,6 +54,6 @@ def _room() -> str:
 
 
 def _robot(target: Path) -> str:
-    """Return the robot's config; it names absolute paths, so that `pebble up` finds them from everywhere."""
+    """Return the robot's config, with absolute paths so that `pebble up` works in every folder."""
     world = Path(tempfile.gettempdir(), "pebble-world-room")
     return _text("goob.json").replace("{folder}", str(target.absolute())).replace("{world}", str(world))

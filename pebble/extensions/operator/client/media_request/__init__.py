@@ -1,1 +1,1 @@
-"""One request for pictures or sound of a robot, however many look and listen."""
+"""A single request for a robot's pictures or sound on behalf of all viewers."""

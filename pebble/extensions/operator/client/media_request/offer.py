@@ -1,4 +1,4 @@
-"""The pictures and sound that may be requested of a robot, by its capabilities. Pure."""
+"""The media that may be requested of a robot, by its capabilities. Pure."""
 
 from collections.abc import Collection, Sequence
 from typing import Any, Final, Literal, NamedTuple
@@ -33,16 +33,19 @@ WORDS: Final[dict[Medium, Words]] = {
 
 
 def offered(capabilities: dict[str, Any], medium: Medium) -> tuple[str, ...]:
-    """Return the encodings that may be requested; empty for robots that do not list any, whose requests name none."""
+    """Return the encodings that may be requested.
+
+    Empty for robots that list none; requests to them name no encoding.
+    """
     section = capabilities.get(medium)
     listed = section.get("encodings") if isinstance(section, dict) else None
     return tuple(name for name in listed if isinstance(name, str)) if isinstance(listed, list) else ()
 
 
 def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
-    """Return why this robot's pictures, or its sound, are not requested; empty if they may be.
+    """Return why this robot's pictures, or its sound, cannot be requested; empty if they can.
 
-    Capabilities come from the network: one that names topics of another component, or channel, is not believed at all.
+    Capabilities come from the network: if they name topics of another component or channel, they are ignored.
     """
     if not capabilities:
         return "it has published no capabilities yet"
@@ -59,6 +62,6 @@ def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
 
 
 def best(medium: Medium, encodings: Collection[str], viewers: Sequence[frozenset[str]]) -> str | None:
-    """Return the best of what most viewers can show or play; None: whatever the robot sends, as it lists none."""
+    """Return the best encoding that most viewers can show; None if the robot lists none."""
     readable = [encoding for encoding in BEST_FIRST[medium] if encoding in encodings]
     return max(readable, key=lambda encoding: sum(encoding in can for can in viewers), default=None)

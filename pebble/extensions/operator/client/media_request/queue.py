@@ -30,7 +30,7 @@ _RETRY_S: Final = 60.0  # in the rescue stream, before the robot's own pictures 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One message to pages; all of them share its bytes."""
+    """A message to pages, whose bytes all of them share."""
 
     seq: int
     data: bytes
@@ -39,7 +39,7 @@ class Frame:
 
 
 class ViewerQueue:
-    """The frames that wait for one page, and those under way.
+    """The frames that wait for one page, and those sent and not yet acknowledged.
 
     They are the robot's own pictures or, if the page cannot use them, those of the rescue stream.
     """
@@ -75,7 +75,7 @@ class ViewerQueue:
             self.wait_for_keyframe()
 
     def take(self, now: float) -> Frame | None:
-        """Return the frame to send now; None if there is none, or too many are under way."""
+        """Return the frame to send now; None if there is none, or too many are unacknowledged."""
         if not self._queue or not self._may_send(len(self._queue[0].data)):
             return None
         frame = self._queue.popleft()
@@ -83,7 +83,7 @@ class ViewerQueue:
         return frame
 
     def acknowledge(self, seq: int, now: float) -> Frame | None:
-        """Take note that the page is done with this frame, and return it if it was under way."""
+        """Note that the page has handled this frame; return it if it was unacknowledged."""
         sent_at, frame = self._under_way.pop(seq, (0.0, None))
         if frame is not None:
             self.ack_s = now - sent_at
@@ -102,7 +102,7 @@ class ViewerQueue:
             self._late_at = now
 
     def forget_lateness(self, now: float) -> None:
-        """Forget that frames were late: those under way say nothing of those that follow."""
+        """Forget that frames were late, as those sent earlier say nothing about later ones."""
         self.late_acks, self._late_at = 0, now
 
     def wait_for_keyframe(self) -> None:
@@ -111,7 +111,7 @@ class ViewerQueue:
         self.waiting = True
 
     def not_drawn(self) -> None:
-        """Note that the page could not draw a frame: unless a key frame is on its way, it waits for one."""
+        """Note that the page could not draw a frame; unless a key frame is on its way, it waits for one."""
         under_way = [frame for _, frame in self._under_way.values()]
         if not any(frame.keyframe for frame in (*under_way, *self._queue)):
             self.wait_for_keyframe()
@@ -131,7 +131,7 @@ class ViewerQueue:
         return self.window < WINDOW and frame.encoding != "h264"
 
     def _begin_at(self, frame: Frame) -> None:
-        """Begin so that a page that keeps up receives what came before as well, another one only what is newest."""
+        """Choose where a page begins: one that keeps up gets the earlier frames too, a slow one only the newest."""
         late = self.window < WINDOW or len(self._queue) > _FRESH_FRAMES
         if self.waiting or late or self._queued_bytes() + len(frame.data) > MAX_QUEUED_BYTES:
             self.wait_for_keyframe()
@@ -147,11 +147,11 @@ class ViewerQueue:
         return encoding in self.can and encoding not in self._undecodable
 
     def cannot_decode(self, encoding: str) -> None:
-        """Note that the page has tried this encoding in vain."""
+        """Note that the page cannot decode this encoding."""
         self._undecodable.add(encoding)
 
     def offer_direct(self, frame: Frame, now: float) -> None:
-        """Offer one of the robot's own pictures; a page in the rescue stream returns at a key frame."""
+        """Offer one of the robot's own pictures. A page in the rescue stream returns at a key frame."""
         if self.rescued:
             if not (frame.keyframe and now >= self._retry_at and self.decodes(frame.encoding)):
                 return
@@ -165,30 +165,30 @@ class ViewerQueue:
             self._waiting_since = now
 
     def offer_rescue(self, frame: Frame) -> None:
-        """Offer a picture of the rescue stream: only the newest counts."""
+        """Offer a picture of the rescue stream; it replaces a waiting one."""
         if self.rescued:
             self.wait_for_keyframe()
             self.offer(frame)
 
     def lost(self, now: float) -> None:
-        """Note that a picture is missing on the way from the robot: the differences after it are of no use."""
+        """Note that a picture from the robot is missing, so that the following differences cannot be used."""
         if not self.rescued:
             self._note_waiting(now)
             self.wait_for_keyframe()
 
     def refuse(self, now: float) -> None:
-        """Note that the page asked for a key frame."""
+        """Note that the page requested a key frame."""
         if not self.rescued:
             self._note_waiting(now)
             self.not_drawn()
 
     @property
     def is_thin(self) -> bool:
-        """True if its connection carries no large frames."""
+        """True if the page's connection is too slow for large frames."""
         return self.late_acks >= THIN_FRAMES
 
     def rescue(self, now: float) -> None:
-        """Change to the rescue stream: because the page is slow, for a while; else until the next key frame."""
+        """Move the page to the rescue stream: for a while if it is slow, else until the next key frame."""
         if self.overflowed or self.is_thin:
             self._retry_at = now + _RETRY_S
         self.rescued = True
@@ -197,7 +197,7 @@ class ViewerQueue:
         self.forget_lateness(now)
 
     def waiting_s(self, now: float) -> float:
-        """Return for how long the page has waited for a key frame of the robot's own pictures."""
+        """Return how long the page has waited for a key frame of the robot's own pictures."""
         return now - self._waiting_since if self.waiting and not self.rescued else 0.0
 
     def _note_waiting(self, now: float) -> None:

@@ -1,4 +1,4 @@
-"""The request for a robot's pictures or sound: what it is sent for them, and what is taken back afterwards. Pure."""
+"""A request for a robot's pictures or sound: what to send to begin it, to keep it, and to end it. Pure."""
 
 from collections import deque
 from contextlib import suppress
@@ -44,7 +44,7 @@ class ViewerRequest:
         self._began_at = self._sent_at = self._received_at = self._keyframe_at = float("-inf")
 
     def want(self, encoding: str | None, now: float) -> None:
-        """Want the medium in ``encoding``, or as configured. Raises PebbleError if the robot does not offer it."""
+        """Request the medium in ``encoding``, or as configured. Raises PebbleError if the robot does not offer it."""
         if not (self.section.get("available") and self.section.get("controls")):
             raise PebbleError(f"{self._base} offers no {self._medium}")
         listed = self._encodings()
@@ -53,7 +53,7 @@ class ViewerRequest:
         self._encoding, self._began_at, self.settled = encoding, now, False
 
     def receive(self, message: Message, now: float) -> bool:
-        """Take a message of one of its topics; True if it is a payload of the medium."""
+        """Handle a message of its topics; return True if it is a payload of the medium."""
         if message.topic == self.control_topic:
             self._receive_request(message)
             return False
@@ -69,7 +69,10 @@ class ViewerRequest:
         return False
 
     def _receive_request(self, message: Message) -> None:
-        """Take a request: one's own, or the newest of others. One of a key frame is of who looks on, as this does."""
+        """Note a request: this client's, or the newest of others.
+
+        A request for a key frame is by a viewer, as this client is.
+        """
         if message.payload in self.sent:
             self.sent.remove(message.payload)
         elif not message.retain:
@@ -79,7 +82,7 @@ class ViewerRequest:
                     self._others = request if request.enabled else None
 
     def tick(self, now: float) -> list[Message]:
-        """Return what to send now; without a payload the request is repeated."""
+        """Return the messages to send now; a request without an answer is repeated."""
         if self.settled:
             is_quiet = now - max(self._sent_at, self._received_at) > _REPEAT_S
             return [self._ask(now)] if is_quiet else []
@@ -97,7 +100,7 @@ class ViewerRequest:
         return asked
 
     def _waits_s(self) -> float:
-        """Return how long a payload is awaited that shows that the medium is running."""
+        """Return how long to wait for a payload, which shows that the medium is running."""
         if self._encoding is None:
             return _JOIN_S
         if self._is_up is None:
@@ -105,7 +108,7 @@ class ViewerRequest:
         return _SLOW_S[self._medium] if self._shares and self._is_up and not self._requested else 0.0
 
     def keyframe(self, encoding: str | None, now: float) -> list[Message]:
-        """Request a full picture in the encoding that arrives, at most once a second."""
+        """Request a key frame in the encoding that arrives, at most once a second."""
         if now - self._keyframe_at < _KEYFRAME_S:
             return []
         self._keyframe_at = now
@@ -113,11 +116,11 @@ class ViewerRequest:
         return [self._message(MediaRequest(enabled=True, encoding=known, keyframe=True))]
 
     def leave(self) -> None:
-        """Leave the medium to another operator, who has requested it, too."""
+        """Leave the medium running for another operator who has requested it too."""
         self._requested = self._raised = False
 
     def end(self) -> list[Message]:
-        """Withdraw the request, and lower the flag that was down before, unless others use the medium."""
+        """Withdraw the request, and clear the flag if it was clear before, unless others use the medium."""
         if self._others is not None:
             self.leave()
         messages = [self._message(MediaRequest(enabled=False))] if self._requested else []
@@ -144,7 +147,7 @@ class ViewerRequest:
 
 
 def send(transport: Transport, messages: list[Message]) -> None:
-    """Publish what a request returns. Raises TransportError."""
+    """Publish the messages of a request. Raises TransportError."""
     for message in messages:
         transport.publish(
             message.topic, message.payload, qos=message.qos, retain=message.retain, shared=message.retain, urgent=True

@@ -1,4 +1,4 @@
-"""One robot's pictures or sound, requested while they are wanted and a while longer, however many want them."""
+"""A robot's pictures or sound, requested while anybody wants them and a little longer."""
 
 import asyncio
 import contextlib
@@ -25,10 +25,10 @@ _WAITS: Final[dict[Medium, str]] = {"video": "Pictures wait for driving", "audio
 
 
 class SharedRequest:
-    """The request for one medium of one robot. Only the event loop calls it, its coroutines only in :meth:`run`."""
+    """The request for a robot's medium. Used on the event loop only; its coroutines only in :meth:`run`."""
 
     def __init__(self, broker: Broker, ref: str, medium: Medium, receive: Callable[[bytes], None]) -> None:
-        """``receive`` gets each payload."""
+        """Store the settings. ``receive`` gets each payload."""
         self.ref, self.medium = ref, medium
         self.problem = ""  # why it is not requested
         self.encoding: str | None = None  # as requested; None: as configured, or nothing is requested
@@ -43,18 +43,18 @@ class SharedRequest:
         self._wakeup = asyncio.Event()
 
     def want(self, wanted: bool) -> None:
-        """Say whether anything shows or plays it now."""
+        """Set whether anything shows or plays the medium now."""
         if wanted or self._wanted:
             self._wanted_at = time.monotonic()
         self._wanted = wanted
         self.wake()
 
     def wake(self) -> None:
-        """Take the next step soon."""
+        """Have the next step done soon."""
         self._wakeup.set()
 
     def close(self) -> None:
-        """Let :meth:`run` end now."""
+        """End :meth:`run` soon."""
         self._closing = True
         self.wake()
 
@@ -64,7 +64,7 @@ class SharedRequest:
             await self._wakeup.wait()
 
     async def run(self, step: Callable[[], Awaitable[None]]) -> None:
-        """Await ``step`` twice a second, and soon if it is woken, until nothing has wanted the request for a while.
+        """Await ``step`` twice a second, and soon after a wake, until the medium was not wanted for a while.
 
         At the end, also if it is cancelled, the request is withdrawn.
         """
@@ -82,7 +82,7 @@ class SharedRequest:
             await self._withdraw()
 
     async def follow(self, robot: RobotView, encoding: str | None) -> None:
-        """Request it if it is wanted, as the robot allows it; call it with each step."""
+        """Request the medium if it is wanted and the robot allows it; to be called in each step."""
         capabilities = robot.capabilities
         self.waits = _WAITS[self.medium] if robot.holds(_PROGRAMS[self.medium]) else ""
         self.problem = refusal(self.ref, capabilities, self.medium)
@@ -139,12 +139,12 @@ class SharedRequest:
             await self._broker.unsubscribe(subscription)
 
     def _is_over(self) -> bool:
-        """True if the request was withdrawn, and the broker is there: otherwise the robot would go on sending."""
+        """True if the request was withdrawn while the broker was connected; otherwise the robot would go on sending."""
         idle = not self._wanted and time.monotonic() - self._wanted_at >= LINGER_S
         return idle and (self._broker.connected or self._request is None)
 
     async def _pause(self, began: float) -> None:
-        """Pause until the next step; one that is needed earlier comes a tenth of a second after the last one."""
+        """Pause until the next step; after a wake, only until 0.1 s after the last one."""
         await asyncio.sleep(max(0.0, began + TICK_S / 5 - time.monotonic()))
         with contextlib.suppress(TimeoutError):  # wait_for of Python 3.11 loses a cancellation that meets a wakeup
             async with asyncio.timeout(max(0.001, began + TICK_S - time.monotonic())):

@@ -1,4 +1,4 @@
-"""Turns the bytes of a terminal into the names of keys. Pure: times are passed in."""
+"""A decoder from the bytes of a terminal to names of keys. Pure: times are passed in."""
 
 import re
 
@@ -19,7 +19,7 @@ _NAMED |= {begin + end: arrow for begin in (b"\x1b[", b"\x1bO") for end, arrow i
 
 
 class KeyDecoder:
-    """A decoder of what was read: arrow keys, function keys and the Escape key all begin with the same byte."""
+    """A decoder that keeps an incomplete key: arrow keys, function keys and Escape begin with the same byte."""
 
     def __init__(self) -> None:
         self._waiting = b""  # the beginning of a sequence
@@ -27,7 +27,7 @@ class KeyDecoder:
 
     @property
     def due(self) -> float | None:
-        """The time to call :meth:`feed` even if no byte has arrived, so that a lone Escape is reported.
+        """Return when to call :meth:`feed` without new bytes, to report a lone Escape.
 
         None: nothing is pending.
         """
@@ -48,7 +48,7 @@ class KeyDecoder:
 
 
 def _names(key: bytes) -> list[str]:
-    """Return the name of a key; none of one without a meaning."""
+    """Yield the name of a key; nothing for a key without a meaning."""
     if key in _NAMED:
         return [_NAMED[key]]
     text = "" if key[0] == 0x1B else key.decode(errors="ignore").lower()

@@ -1,4 +1,4 @@
-"""A terminal that passes on each key at once, and notices when it is lost. Linux and macOS only."""
+"""A terminal that reports each key at once, and notices its own end. Linux and macOS only."""
 
 import os
 import select
@@ -21,7 +21,7 @@ _HIDE_CURSOR, _SHOW_CURSOR, _ERASE_REST = "\x1b[?25l", "\x1b[?25h", "\x1b[K"
 
 
 class Terminal:
-    """Standard input as keys, and one status line below the shell's lines; see :func:`opened`."""
+    """Keys from standard input, and a status line below the shell's lines; see :func:`opened`."""
 
     def __init__(self) -> None:
         import termios
@@ -33,7 +33,7 @@ class Terminal:
         self._line, self._shown_at = "", float("-inf")
 
     def start(self) -> None:
-        """Turn off echo and lines; Ctrl-C stays a signal, Ctrl-Z is a key, and Ctrl-S holds nothing back."""
+        """Turn off echo and line input. Ctrl-C stays a signal; Ctrl-Z is a key; Ctrl-S has no effect."""
         import tty
 
         tty.setcbreak(self._fd, self._termios.TCSAFLUSH)
@@ -44,7 +44,7 @@ class Terminal:
         _write(_HIDE_CURSOR)
 
     def restore(self) -> None:
-        """Restore the terminal; keys that were not read are forgotten, so that no shell gets them."""
+        """Restore the terminal; discard unread keys, so that no shell gets them."""
         _write("\r\n" + _SHOW_CURSOR)
         with suppress(self._termios.error, OSError):
             self._termios.tcsetattr(self._fd, self._termios.TCSAFLUSH, self._before)
@@ -96,7 +96,7 @@ def has_terminal() -> bool:
 
 @contextmanager
 def opened() -> Iterator[Terminal]:
-    """Give the terminal of this process, restored at the end."""
+    """Yield this process's terminal; restore it at the end."""
     terminal = Terminal()
     with handled_by(terminal.on_signal, signal.SIGQUIT):
         try:
