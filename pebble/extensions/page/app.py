@@ -47,7 +47,7 @@ _estop_decoder = msgspec.json.Decoder(EstopOp)
 
 @cache
 def page_files() -> StaticFiles:
-    """Return the page's files, packed: the same for each server of a process."""
+    """Return the page's compressed files, shared by all servers of a process."""
     return StaticFiles(files("pebble.extensions.page") / "static")
 
 
@@ -127,7 +127,7 @@ def _static_of(request: Request) -> StaticFiles:
 
 
 async def _authority(request: Request) -> Response:
-    """Return the certificate of our authority, which phones are asked to trust; it is public."""
+    """Answer with the certificate of our authority, which phones are asked to trust; it is public."""
     path = request.app.state.settings.authority
     content = b"" if path is None or not path.is_file() else certificates.only_certificates(path.read_bytes())
     if not content:
@@ -136,7 +136,7 @@ async def _authority(request: Request) -> Response:
 
 
 async def _health(request: Request) -> Response:
-    """Answer 200 while there is a broker, and say nothing else, because it needs no login."""
+    """Answer 200 while the broker is connected. It tells nothing else, because it needs no login."""
     connected = request.app.state.broker.connected
     return PlainTextResponse("ok" if connected else "no broker", 200 if connected else 503, headers=NO_STORE)
 
@@ -156,7 +156,7 @@ async def _snapshot(request: Request) -> Response:
 
 
 async def _estop(request: Request) -> Response:
-    """Stop robots for a page whose control socket is down, or, as a plain form, for one that does not start."""
+    """Stop robots for a page whose control socket is closed or, as a plain form, for a page that does not start."""
     answer = _stopped_page if content_type(request.headers) == FORM else _plain
     session = login.session_of(request)
     if session is None:
@@ -205,7 +205,7 @@ def _stopped_page(request: Request, status: int, text: str) -> Response:
 
 
 async def _audit(request: Request) -> Response:
-    """Return the newest rows of this server's audit about one robot, for those who look after robots."""
+    """Answer with the newest rows of this server's audit about one robot, for those who maintain robots."""
     session, server = login.session_of(request), _server_of(request)
     if session is None:
         return PlainTextResponse("log in first", 401)
@@ -245,7 +245,7 @@ async def _sound(websocket: WebSocket) -> None:
 
 
 async def _replay(websocket: WebSocket) -> None:
-    """Play a recording for one page, as long as its session is what it was. Nothing is sent to a robot."""
+    """Play a recording for one page, while its session is valid. Nothing is sent to a robot."""
     archive: Recordings | None = websocket.app.state.recordings
     session = login.session_of(websocket)
     if session is None or archive is None:
@@ -263,7 +263,7 @@ async def _replay(websocket: WebSocket) -> None:
 async def _serve(
     websocket: WebSocket, serve: Callable[[str, frozenset[str], Session], Coroutine[Any, Any, None]]
 ) -> None:
-    """Serve one component's pictures or sound, as long as the session is what it was."""
+    """Serve a component's pictures or sound, while the session is valid."""
     ref, session = websocket.query_params.get("ref", ""), login.session_of(websocket)
     if session is None or ref not in websocket.app.state.robots.components:
         await websocket.close(4401)
@@ -274,7 +274,7 @@ async def _serve(
 
 
 async def _while_allowed(websocket: WebSocket, session: Session, work: Coroutine[Any, Any, None]) -> None:
-    """Do the work for a socket until it is done, or its session is revoked."""
+    """Run the work of a socket until it is done or the session is revoked."""
     server: Server = websocket.app.state.server
     people, check_at = server.people_version, time.monotonic() + CHECK_S
     serving = asyncio.ensure_future(work)

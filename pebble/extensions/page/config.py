@@ -1,4 +1,4 @@
-"""The config sections of the operator page: where it listens, who may use it, and the robot's service that runs it."""
+"""The config sections of the operator page: its address, its access, and the robot's service that serves it."""
 
 from collections.abc import Iterator
 from typing import Annotated, ClassVar
@@ -39,7 +39,7 @@ class WebTls(Section, frozen=True, kw_only=True):
 
 
 class ListedRobot(Section, frozen=True, kw_only=True):
-    """A robot that the page knows before it says what it can do; a board of the original never does."""
+    """A robot that the page knows before the robot publishes anything; boards of the original never do."""
 
     retired: ClassVar = dict.fromkeys(
         ("model", "video", "audio", "autonomy", "reboot", "service_restart", "git_pull"), "robots say what they have"
@@ -62,7 +62,7 @@ class ListedRobot(Section, frozen=True, kw_only=True):
 
 
 class WebInterface(Section, frozen=True, kw_only=True):
-    """The operator page, of `pebble web CONFIG` and of `services.web_handler`."""
+    """The operator page, as served by `pebble web CONFIG` and `services.web_handler`."""
 
     retired: ClassVar = {
         "robot_discovery": "robots are found by their messages",
@@ -96,7 +96,7 @@ class WebInterface(Section, frozen=True, kw_only=True):
 
     @property
     def local(self) -> bool:
-        """True if only this machine can reach it."""
+        """True if only this machine can reach the page."""
         return is_loopback(self.host)
 
     def connections(self) -> Iterator[tuple[tuple[str, ...], Section]]:
@@ -105,7 +105,7 @@ class WebInterface(Section, frozen=True, kw_only=True):
 
 
 def _check(reader: Reader, web: WebInterface, path: Path) -> WebInterface:
-    """Warn of what keeps the page from starting: without a page the robot still drives."""
+    """Warn of what keeps the page from starting. It is no error, as the robot drives without a page."""
     if not web.local and web.tls.certificate is None and not web.plain_http:
         reader.notes.warning(
             (*path, "host"),

@@ -1,4 +1,4 @@
-"""The control socket of one page: what it asks for, and the state that it is sent."""
+"""The control socket of one page: its commands, and the states sent to it."""
 
 import asyncio
 import secrets
@@ -38,16 +38,16 @@ _decoder = msgspec.json.Decoder(m.FromPage)
 
 
 class Leave(Exception):  # noqa: N818 - not an error
-    """An end of this connection by the server; the page may connect again."""
+    """The end of a connection by the server, after which the page may connect again."""
 
 
 class Control:
-    """One connection, accepted and with a session; ``serve`` returns when it has ended."""
+    """A connection that was accepted and has a session; ``serve`` returns at its end."""
 
     def __init__(
         self, server: Server, websocket: WebSocket, session: Session, check: Callable[[], Session | None]
     ) -> None:
-        """``check`` returns the session as it is now; None: it was revoked."""
+        """Store the connection. ``check`` returns the present session; None: it was revoked."""
         self._server, self._websocket, self._session, self._check = server, websocket, session, check
         self._tab = Tab(secrets.token_urlsafe(12), session.user, "")
         self._interest = Interest(lambda: self._wake.set())
@@ -60,7 +60,7 @@ class Control:
         self._moved: set[str] = set()  # robots moved since this page has control, for the audit
 
     async def serve(self) -> None:
-        """Serve until the page or the server ends it. What the page moved has been stopped then."""
+        """Serve until the page or the server ends the connection; then what the page moved has been stopped."""
         sender: asyncio.Task[None] | None = None
         try:
             self._begin(await asyncio.wait_for(self._receive(), HELLO_S))
@@ -206,7 +206,7 @@ class Control:
         self._wake.set()
 
     def _command(self, op: m.RobotOp) -> None:
-        """Publish what is asked of a robot, once: nothing repeats it, and the robot's states tell what came of it."""
+        """Publish a command for a robot, once. It is not repeated; the robot's states show its effect."""
         if not self._may(robot_commands.right(op), op):
             return
         if why := (self._why_not if robot_commands.moves(op) else "") or self._server.drivers.refusals.of_op(op):
@@ -242,7 +242,7 @@ class Control:
             self._audit("drive", op.ref)
 
     def _end_stop(self, op: m.EstopEndOp) -> None:
-        """End one's own stop, or any with the right to reset: a viewer must not end the stop of another person."""
+        """End a stop of this person, or any stop with the right to reset: a viewer must not end another's stop."""
         user = self._server.stops.user(op.stop)
         if user is not None and (user == self._session.user or self._may("reset", op)):
             self._server.stops.end(op.stop)
@@ -331,7 +331,7 @@ class Control:
         self._wake.set()
 
     async def _send_all(self) -> None:
-        """Send states at most every 50 ms, and pings twice a second."""
+        """Send changed states at most every 50 ms, and pings twice a second."""
         ping_at, check_at = time.monotonic() + PING_S, time.monotonic() + CHECK_S
         people = self._server.people_version
         while self._websocket.application_state is WebSocketState.CONNECTED:
@@ -369,7 +369,7 @@ class Control:
         return replace(view, by=by, device=view.device if by == view.by else "", asks=person(view.asks, login=login))
 
     async def _send_logs(self) -> None:
-        """Send one part at each echo: on a slow connection pings never wait behind more than that."""
+        """Send a part of the log at each echo, so that on a slow connection pings wait behind no more than that."""
         ref = self._interest.watched
         lines = self._server.robots.logs.get(ref)
         if lines is not None and (run := self._logs.take(lines)) is not None:

@@ -20,14 +20,14 @@ _SYNONYMS = {"WARN": "WARNING", "ERR": "ERROR", "FATAL": "CRITICAL", "TRACE": "D
 
 
 class Run(NamedTuple):
-    """Lines that follow each other; ``first`` is the number of the first one."""
+    """Consecutive lines; ``first`` is the number of the first one."""
 
     first: int
     lines: tuple[msgspec.Raw, ...]
 
 
 class LogLines:
-    """Numbered log lines. ``origin`` changes when numbering restarts, as the component is opened again."""
+    """Numbered log lines. ``origin`` changes when numbering restarts, as when a component is opened again."""
 
     def __init__(self) -> None:
         self.origin = secrets.token_hex(4)
@@ -36,7 +36,7 @@ class LogLines:
         self._number = 0  # of the newest line, with those that were dropped
 
     def add(self, payload: bytes) -> None:
-        """Take a payload of the log topic; one that cannot be shown counts as dropped."""
+        """Add a payload of the log topic; a line that cannot be shown counts as dropped."""
         self._number += 1
         line = line_of(payload)
         if line is None:
@@ -47,7 +47,7 @@ class LogLines:
             self._bytes -= len(bytes(self._lines.popleft()[1]))
 
     def after(self, number: int) -> Run | None:
-        """Return the oldest lines behind this number, as many as one message may have; None if there are none."""
+        """Return the oldest lines after this number, as many as one message may have; None if there are none."""
         run: list[msgspec.Raw] = []
         first = size = 0
         for at, line in self._lines:
@@ -62,14 +62,14 @@ class LogLines:
 
 
 class LogReader:
-    """The place up to which one page has read the lines of the component that it watches: one part at each echo."""
+    """A page's position in the lines of the component that it watches; it gets one part at each echo."""
 
     def __init__(self) -> None:
         self._on = self._due = False  # due: the page has received the part before
         self._sent = "", 0  # the origin and number of the last line
 
     def begin(self, origin: str, number: int, *, on: bool) -> None:
-        """Note that the page has lines until this one; ``on`` False: it wants no more."""
+        """Note that the page has the lines up to this one; ``on`` False: it wants no more."""
         self._on, self._sent, self._due = on, (origin, number), True
 
     def end(self) -> None:
@@ -79,7 +79,7 @@ class LogReader:
         self._due = True
 
     def take(self, lines: LogLines) -> Run | None:
-        """Return what to send now; it counts as received from now on."""
+        """Return the lines to send now; they count as received from now on."""
         if not (self._on and self._due):
             return None
         origin, number = self._sent
@@ -90,7 +90,10 @@ class LogReader:
 
 
 class Line(msgspec.Struct, omit_defaults=True):
-    """A line as pages get it: some robots send text, or other names; ``t`` is in epoch milliseconds."""
+    """A line as pages get it. ``t``: epoch milliseconds.
+
+    Some robots send plain text, or fields with other names.
+    """
 
     message: str
     t: float | None = None

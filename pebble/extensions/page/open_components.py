@@ -1,4 +1,4 @@
-"""The components that pages have open, and the subscriptions for them besides those for all."""
+"""The components that pages have open, and the subscriptions that only those need."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _FLAG_FIELDS = {flag: flag.metric.removeprefix("flags/").replace("-", "_") for f
 
 
 class OpenComponents:
-    """The subscriptions for components that at least one page has open. Only the event loop calls it."""
+    """The subscriptions for components that at least one page has open. Used on the event loop only."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class OpenComponents:
         keep_s: float = KEEP_S,
         step_s: float = STEP_S,
     ) -> None:
-        """``spawn`` runs a coroutine in the background."""
+        """Store the connection. ``spawn`` runs a coroutine in the background."""
         self._broker, self._robots, self._spawn = broker, robots, spawn
         self._keep_s, self._step_s = keep_s, step_s
         self._pages: Counter[str] = Counter()
@@ -64,7 +64,7 @@ class OpenComponents:
 
     @property
     def known(self) -> set[str]:
-        """The components for which anything is received or remembered here."""
+        """Return the components about which anything is received or remembered here."""
         return {*self._pages, *self._subscriptions, *self._wanted, *self._flags}
 
     def __contains__(self, ref: object) -> bool:
@@ -79,14 +79,14 @@ class OpenComponents:
         self._broker.loop.call_later(self._keep_s, self._closed, ref)
 
     def _closed(self, ref: str) -> None:
-        """Note, some time later, that a page was closed: one that is reloaded finds everything."""
+        """Note, after a delay, that a page was closed, so that a reloaded page still finds everything."""
         self._pages[ref] -= 1
         if not self._pages[ref]:
             del self._pages[ref]
             self.update(ref)
 
     def update(self, ref: str) -> None:
-        """Note that its capabilities, or the pages that have it open, may have changed."""
+        """Note that a component's capabilities, or the pages that have it open, may have changed."""
         wanted = set(self._filters(ref)) if ref in self._pages else None
         received = set(self._subscriptions[ref]) if ref in self._subscriptions else None
         if ref not in self._following and wanted != received:
@@ -94,7 +94,7 @@ class OpenComponents:
             self._spawn(self._follow(ref))
 
     async def _follow(self, ref: str) -> None:
-        """Subscribe and unsubscribe until what is received is what is wanted."""
+        """Subscribe and unsubscribe until the subscriptions are those that are needed."""
         failed: set[str] = set()  # they are tried again, but logged once
         try:
             done = self._subscriptions.setdefault(ref, {})
@@ -123,7 +123,7 @@ class OpenComponents:
             self._following.discard(ref)
 
     def _forget(self, ref: str) -> None:
-        """Receive nothing of it any more. Pages may open what is no component at all."""
+        """Unsubscribe from a component and forget it. Pages may open addresses that are no component."""
         self._subscriptions.pop(ref, None)
         self._wanted.pop(ref, None)
         self._flags.pop(ref, None)
@@ -148,7 +148,7 @@ class OpenComponents:
         return take
 
     def _receive_flag(self, ref: str, channel: c.Channel, message: Message) -> None:
-        """Take a flag's newest value; an empty message removes what was retained."""
+        """Store a flag's newest value; an empty message removes it."""
         try:
             value = codec.decode(channel, message.payload) if message.payload else None
         except PayloadError:
@@ -161,7 +161,7 @@ class OpenComponents:
         self._robots.set_server_metric(ref, _FLAGS_METRIC, view)
 
     def _filters(self, ref: str) -> dict[str, _Carried]:
-        """Return the topics of channels, flags, overlays of its picture, and those that it names itself."""
+        """Return the topics that an open component needs: channels, flags, overlays, and those that it names."""
         filters: dict[str, _Carried] = {channel.filter(ref): None for channel in WATCHED}
         for channel in _NAMED:
             self._add(filters, ref, channel)

@@ -1,4 +1,4 @@
-"""Bounds the work that one page can ask of the server: a page beyond it is read more slowly. Pure."""
+"""A bound on the work that one page can ask of the server; a page beyond it is read more slowly. Pure."""
 
 PER_S = 100.0  # a page that drives sends 25 messages a second
 BURST = 200.0
@@ -6,13 +6,13 @@ STOP_WAITS_S = 0.05  # a stop at most, however much was sent
 
 
 class Pace:
-    """A bucket of BURST that fills by PER_S."""
+    """A token bucket of BURST tokens that refills by PER_S a second."""
 
     def __init__(self, now: float) -> None:
         self._left, self._at = BURST, now
 
     def take(self, cost: float, now: float) -> float:
-        """Return how many seconds to wait before this is done."""
+        """Take a token; return how many seconds to wait before the request is handled."""
         self._left = min(BURST, self._left + PER_S * (now - self._at)) - cost
         self._at = now
         return max(0.0, -self._left / PER_S)

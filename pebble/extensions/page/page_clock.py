@@ -20,11 +20,11 @@ _JUDGED = 4  # answers by which people are told that a connection is slow
 
 
 class ClockJumpError(PebbleError):
-    """A jump of the page's clock, or the server's: one of them was suspended. The page has to connect again."""
+    """A jump of the page's or the server's clock: one was suspended. The page has to connect again."""
 
 
 class PageClock:
-    """The clock of one connection. Times are seconds of the server's clock; ``t_ms`` is the page's own."""
+    """The clock of one connection. Times are seconds of the server's clock; ``t_ms`` is the page's."""
 
     def __init__(self) -> None:
         self.round_trip_s: float | None = None
@@ -35,7 +35,10 @@ class PageClock:
 
     @property
     def shown_round_trip_s(self) -> float | None:
-        """The second longest of the newest four: one slow answer is no slow connection. The last one if it is late."""
+        """Return the second longest of the last four round trips, as one slow answer is no slow connection.
+
+        The last one if it is late.
+        """
         if self.round_trip_s is None or self.round_trip_s >= LATE_S:
             return self.round_trip_s
         newest = sorted(round_trip for _, _, round_trip in list(self._bounds)[-_JUDGED:])
@@ -49,7 +52,7 @@ class PageClock:
         return number
 
     def echo(self, number: int, t_ms: float, now: float) -> None:
-        """Take the answer to a ping; one that was never sent is ignored. Raises ClockJumpError."""
+        """Handle the answer to a ping; one that was never sent is ignored. Raises ClockJumpError."""
         sent = self._sent.pop(number, None)
         if sent is None:
             return
@@ -62,7 +65,7 @@ class PageClock:
         self._echoed_at = now
 
     def problem(self, now: float) -> str:
-        """Return why no command of this page may move anything now; empty if it may."""
+        """Return why commands of this page may move nothing now; empty if they may."""
         if now - self._echoed_at > _ECHO_S:
             return "the connection to the page is stalled"
         waiting = max((now - sent for sent in self._sent.values()), default=0.0)
@@ -70,7 +73,7 @@ class PageClock:
         return f"commands are late ({1000 * late:.0f} ms)" if late >= LATE_S else ""
 
     def late(self, t_ms: float, now: float) -> bool:
-        """True if a message that the page stamped ``t_ms`` may be too old to move anything. Raises ClockJumpError."""
+        """True if a message stamped ``t_ms`` by the page may be too old to move anything. Raises ClockJumpError."""
         if not self._bounds:
             return True
         low = t_ms / 1000 - now

@@ -1,4 +1,4 @@
-"""Requests of pages to robots, besides driving: the right that each needs, and what is then published. Pure."""
+"""Pages' requests to robots besides driving: the right that each needs, and the message to publish. Pure."""
 
 from typing import Any, NamedTuple
 
@@ -25,12 +25,12 @@ _FLAGS = {flag.metric.removeprefix("flags/"): flag for flag in FLAGS.values()}
 
 
 def right(op: m.RobotOp) -> str:
-    """Return the right that a person needs to ask this."""
+    """Return the right that a person needs for this request."""
     return right_of(_command(op).channel)
 
 
 def ends(op: m.RobotOp) -> bool:
-    """True if it ends something: then it is passed on whatever the component is and reports."""
+    """True if the request ends something; then it is sent whatever state the component is in."""
     match op:
         case m.SoundboardOp(file="") | m.AutonomyOp(file="") | m.FlagOp(on=False) | m.OutletOp(on=False):
             return True
@@ -40,14 +40,14 @@ def ends(op: m.RobotOp) -> bool:
 
 
 def moves(op: m.RobotOp) -> bool:
-    """True if something may move, or be switched on, because of it: not over a connection that may not drive."""
+    """True if the request may move something or switch it on; then it needs a connection that may drive."""
     return isinstance(op, m.AutonomyOp | m.McuOp | m.OutletOp) and not ends(op)
 
 
 def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
-    """Return why a component with these capabilities is not asked this.
+    """Return why a component with these capabilities does not get this request; empty if it does.
 
-    Empty if it is, also where they do not mention it.
+    Empty too if the capabilities do not mention it.
     """
     if isinstance(op, m.McuOp) and op.name == _DESCRIBE:
         return f"{op.name} is no command of a microcontroller"
@@ -80,14 +80,14 @@ def publication(op: m.RobotOp, capabilities: dict[str, Any]) -> Message:
 
 
 def _action_topic(op: m.ActionOp, channel: Channel, capabilities: dict[str, Any]) -> str:
-    """Return the first that the capabilities name."""
+    """Return the topic of an action, the first one that the capabilities name."""
     sections = (section_of(capabilities, section) for section in _sections(op))
     topics = (section.get(key) for section in sections for key in ("flag_topic", "topic"))
     return next((str(topic) for topic in topics if names(op.ref, topic, channel)), channel.topic(op.ref))
 
 
 def _sections(op: m.ActionOp) -> list[str]:
-    """Return the commands in the capabilities, in all spellings that the original page understands."""
+    """Return the commands in the capabilities, in all spellings that the original page accepts."""
     names = (op.name.replace("-", "_"), op.name)
     return [f"system.{name}" for name in names] + list(names)
 

@@ -1,6 +1,6 @@
-"""The newest value of every component and metric, and what of it each page has not received yet.
+"""The newest value of every metric of every component, and which values each page has not received yet.
 
-No queue forms: a slow page receives the newest value less often. A page that connects again receives everything.
+There is no queue: a slow page receives newest values less often. A page that connects again receives all.
 """
 
 import logging
@@ -44,7 +44,7 @@ class _Value(NamedTuple):
 
 
 class Component:
-    """One component, by the messages it publishes."""
+    """A component, from the messages it publishes."""
 
     def __init__(self, ref: str) -> None:
         self.ref = ref
@@ -61,7 +61,7 @@ class Component:
 
 
 def liveness_of(robot: RobotView, now: float) -> m.Liveness:
-    """Return whether it is there, as pages are shown it."""
+    """Return whether it is online, as pages are shown it."""
     liveness = robot.liveness
     return m.Liveness(
         online=robot.online(now),
@@ -78,7 +78,7 @@ def _ms(seconds: float | None) -> float | None:
 
 
 class Interest:
-    """One page's view: what it has not received yet, and which component it has open."""
+    """A page's view: the values that it has not received yet, and the component it has open."""
 
     def __init__(self, changed: Callable[[], None]) -> None:
         self.watched = ""
@@ -89,7 +89,7 @@ class Interest:
 
 
 class Robots:
-    """The table of all components. Only the event loop calls it."""
+    """The table of all components. Used on the event loop only."""
 
     def __init__(self) -> None:
         self.components: dict[str, Component] = {}
@@ -121,13 +121,13 @@ class Robots:
         return topic_of(ref, self.capabilities(ref), channel)
 
     def aliases(self, ref: str) -> list[str]:
-        """Return the metrics, none of the contract's, under which its microcontrollers say that they publish."""
+        """Return the metrics beyond the contract under which its microcontrollers publish, by their manifests."""
         component = self.components.get(ref)
         declared = () if component is None else component.aliases.values()
         return list(dict.fromkeys(chain.from_iterable(declared)))[:MAX_ALIASES]
 
     def value(self, ref: str, metric: str) -> msgspec.Raw | None:
-        """Return the newest value; that of a server's metric as well."""
+        """Return the newest value, also of a server's metric."""
         value = self._find(ref, metric)
         return None if value is None else value.raw
 
@@ -162,7 +162,7 @@ class Robots:
     # -- pages
 
     def join(self, interest: Interest) -> None:
-        """Send everything to this page."""
+        """Send all values to this page."""
         self.interests.add(interest)
         interest.dirty |= set(self._all(FLEET)) | set(self._server)
 
@@ -185,7 +185,7 @@ class Robots:
     # -- changes
 
     def set_server_metric(self, ref: str, metric: str, value: Any) -> None:
-        """Set one of the server's own metrics for all pages; unchanged values are not sent again."""
+        """Set a metric of the server itself for all pages; unchanged values are not sent again."""
         raw = msgspec.Raw(msgspec.json.encode(value))
         old = self._server.get((ref, metric))
         if old is None or bytes(old.raw) != bytes(raw):
@@ -193,20 +193,20 @@ class Robots:
             self._mark(ref, metric, everybody=True)
 
     def remove_server_metric(self, ref: str, metric: str) -> None:
-        """Remove one of the server's own metrics; pages have its last value until they receive another one."""
+        """Remove a metric of the server itself; pages keep its value until they receive another."""
         self._server.pop((ref, metric), None)
 
     def receive(self, message: Message, now: float) -> None:
-        """Take a message of any component."""
+        """Handle a message of any component."""
         address = parse_topic(message.topic)
         if address is None or address.direction is not Direction.OUTGOING or address.identity.is_server:
             return
         self.receive_as(address.identity.base, address.metric, message, now)
 
     def receive_as(self, ref: str, metric: str, message: Message, now: float, channel: c.Channel | None = None) -> None:
-        """Take a message as the metric that it carries, whatever its topic is called.
+        """Handle a message as this metric, whatever its topic is called.
 
-        ``channel``: how it is read, if the contract does not have it.
+        ``channel``: how to decode it, if the contract does not have it.
         """
         component = self.components.get(ref) or self._add(ref)
         channel = channel or _channel(metric)
@@ -223,7 +223,7 @@ class Robots:
             self._interpret(component, metric, channel, message, now)
 
     def forget(self, ref: str) -> None:
-        """Remove a component, also one that was never there; it comes back with its next message."""
+        """Remove a component, if it is there; it comes back with its next message."""
         component = self.components.pop(ref, None)
         if component is not None:
             self._bytes -= sum(len(bytes(value.raw)) for value in component.values.values())
@@ -235,10 +235,10 @@ class Robots:
             interest.notify()
 
     def refresh(self, now: float) -> None:
-        """Send what changes with time; to be called every 0.25 s.
+        """Send what changes with time; call it every 0.25 s.
 
-        Whether a component is there is sent at once. What is merely older than before is sent of what is open, and of a
-        third of the others, or fewer: no page has to draw all of them at once, and a thousand robots are no flood.
+        Whether a component is online is sent at once. Ages are sent for open components, and for at most a third of the
+        others, so that no page has to draw all of them at once and a thousand robots are no flood.
         """
         older: list[Component] = []
         opened = {interest.watched for interest in self.interests}
@@ -285,7 +285,7 @@ class Robots:
         return self._bytes + grows <= MAX_BYTES or self.is_kept(component.ref)
 
     def _store(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> bool:
-        """Check and store the value; False if it is refused."""
+        """Check and store the value; return False if it is refused."""
         old = component.values.get(metric)
         if len(message.payload) > (_MAX_CLIPS_BYTES if channel is c.SOUNDBOARD_FILES else MAX_VALUE_BYTES):
             self.omitted += 1
@@ -307,7 +307,7 @@ class Robots:
         return True
 
     def _remove_value(self, component: Component, metric: str) -> None:
-        """Remove what was retained: an empty message says so."""
+        """Remove a retained value after an empty message."""
         old = component.values.pop(metric, None)
         if old is not None:
             self._bytes -= len(bytes(old.raw))
@@ -325,7 +325,7 @@ class Robots:
             self._refresh(component, now)  # it may be back before the next round
 
     def show_offer(self, component: Component, now: float) -> None:
-        """Let pages have what it announces, or is assumed to offer, as its capabilities, until it publishes them."""
+        """Show pages the capabilities that it announces or is assumed to have, until it publishes its own."""
         if not component.robot.capabilities:
             self._remove_value(component, c.CAPABILITIES.metric)
             return
@@ -343,7 +343,7 @@ class Robots:
                 interest.notify()
 
     def mark_drivers(self, refs: Collection[str]) -> None:
-        """Let all pages see who drives these."""
+        """Update who drives these robots for all pages."""
         for interest in self.interests if refs else ():
             interest.dirty |= {(ref, "web/driver") for ref in refs}
             interest.notify()
@@ -363,7 +363,7 @@ def _channel(metric: str) -> c.Channel | None:
 
 
 def _aliases(payload: bytes) -> tuple[str, ...]:
-    """Return what a manifest declares besides the contract's metrics, however strange the rest of it is."""
+    """Return the metrics that a manifest declares beyond the contract; the rest of it may be invalid."""
     manifest = codec.plain(c.MCU_DESCRIBE, payload)
     interfaces = manifest.get("interfaces") if isinstance(manifest, dict) else None
     outgoing = [
@@ -375,7 +375,7 @@ def _aliases(payload: bytes) -> tuple[str, ...]:
 
 
 def _may_be_alias(metric: str) -> bool:
-    """True if this is a metric that nothing else defines: neither the contract nor the server itself."""
+    """True if neither the contract nor the server itself defines this metric."""
     family = metric.partition("/")[0]
     return (
         _channel(metric) is None

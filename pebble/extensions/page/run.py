@@ -38,7 +38,7 @@ def main(arguments: list[str]) -> int:
 def settings_or_all_problems(config: Config) -> WebSettings:
     """Return the settings of the page.
 
-    The error also says whether a user is missing: it is not found only after the rest.
+    The error names all problems at once, also a missing user.
     """
     try:
         return settings_of(config)
@@ -51,7 +51,7 @@ def settings_or_all_problems(config: Config) -> WebSettings:
 
 
 def _settings_of_process(path: str) -> WebSettings:
-    """Return the settings of a page that people can use. Raises ConfigError with everything that is missing."""
+    """Return the settings of a usable page. Raises ConfigError with everything that is missing."""
     config = config_of_process(path)
     set_log_level(config.log_level)
     settings = settings_or_all_problems(config)
@@ -61,7 +61,7 @@ def _settings_of_process(path: str) -> WebSettings:
 
 
 def _without_user(config: Config) -> list[str]:
-    """Return the problem that a login is needed and there is no user; empty if all is well."""
+    """Return the problem that a login is needed and no user exists; empty if there is none."""
     file = people_of(config)
     if not has_login(config.section(WebInterface)) or has_user(file):
         return []
@@ -72,7 +72,7 @@ def _without_user(config: Config) -> list[str]:
 
 
 class _Page:
-    """Serves the page until SIGTERM, and notifies the launcher while its event loop is alive."""
+    """A server of the page until SIGTERM; it notifies the launcher while its event loop runs."""
 
     def __init__(self, settings: WebSettings) -> None:
         self._settings, self._notify = settings, Notifier()
@@ -88,7 +88,7 @@ class _Page:
         return code if self._served else 1
 
     def _end(self, _signal: int, _frame: object) -> None:
-        """End the server, by a signal before the server has its own handlers, or by the server when it has ended."""
+        """End the server, whichever stage of its start or end it has reached."""
         self._ended = True
         exit_at_the_latest()
 

@@ -1,4 +1,4 @@
-"""Runs the server of the operator page until a signal ends it."""
+"""The program that serves the operator page until a signal ends it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _ALL_ADDRESSES = ("0.0.0.0", "::")  # noqa: S104 - compared, not listened on
 
 
 def run(settings: WebSettings, *, on_ready: Callable[[str], None] | None = None) -> int:
-    """Serve until SIGINT or SIGTERM; ``on_ready`` gets the address once it can be opened. Raises PebbleError."""
+    """Serve until SIGINT or SIGTERM; ``on_ready`` gets the address once pages can open it. Raises PebbleError."""
     _raise_limit_of_descriptors()
     with listen(settings) as listener:
         asyncio.run(_serve(settings, listener, on_ready))
@@ -65,7 +65,7 @@ async def _report(
 
 
 def _server_context(certificate: Path, key: Path | None) -> ssl.SSLContext:
-    """Return the context of a server with this certificate. Raises TransportError that names the file."""
+    """Return a TLS context for this certificate. Raises TransportError that names the file."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_cert_chain(certificate, key, no_password)
@@ -75,7 +75,7 @@ def _server_context(certificate: Path, key: Path | None) -> ssl.SSLContext:
 
 
 def renew_certificate(listening: ssl.SSLContext, certificate: Path, key: Path | None) -> None:
-    """Have each new connection to ``listening`` use the certificate that the files hold then."""
+    """Make ``listening`` use the certificate files' present content for each new connection."""
     files = [certificate] if key is None else [certificate, key]
     newest = Renewed(files, lambda: _server_context(certificate, key), listening)
 
@@ -86,7 +86,7 @@ def renew_certificate(listening: ssl.SSLContext, certificate: Path, key: Path | 
 
 
 class HttpProtocol(H11Protocol):
-    """A connection that is aborted if no request comes, for which uvicorn has no limit."""
+    """An HTTP connection that is closed if no request comes, for which uvicorn has no limit."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -98,7 +98,10 @@ class HttpProtocol(H11Protocol):
 
 
 class WebSocketProtocol(WebSocketsSansIOProtocol):
-    """A connection that ends at once if no ping is answered: what still waits to be sent holds up no end of control."""
+    """A WebSocket that is closed at once if a ping is not answered, without sending what waits.
+
+    Otherwise a full connection would delay the end of control.
+    """
 
     def keepalive_timeout(self) -> None:
         self.transport.abort()
@@ -145,7 +148,7 @@ def listen(settings: WebSettings) -> socket.socket:
 
 
 def url_of(settings: WebSettings, listener: socket.socket) -> str:
-    """Return the address that a browser on this machine opens, or the name by which others reach it."""
+    """Return the address for a browser on this machine, or the name by which others reach it."""
     host = settings.names[0] if settings.names else settings.host
     if host in _ALL_ADDRESSES:  # no browser can open these
         names = certificates.show(settings.certificate).names if settings.certificate else ()
@@ -158,7 +161,7 @@ def url_of(settings: WebSettings, listener: socket.socket) -> str:
 def _raise_limit_of_descriptors() -> None:
     """Raise the limit of open files as far as the system allows.
 
-    Otherwise many idle connections of strangers could keep a stop from being received.
+    Otherwise many idle connections of strangers could prevent a stop from being received.
     """
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource

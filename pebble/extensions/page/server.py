@@ -1,4 +1,4 @@
-"""Ties the parts of the server together: what arrives from the broker, what pages ask for, and what is due."""
+"""The state of one server: messages from the broker, requests of pages, and what is due."""
 
 import asyncio
 import logging
@@ -48,7 +48,7 @@ _ESTOP_METRIC = "web/estop"
 
 
 class Server:
-    """All state of one server. Everything runs on one event loop."""
+    """All state of one server. Used on one event loop."""
 
     def __init__(self, settings: WebSettings, people: People, audit: Audit) -> None:
         self.settings, self.people, self.audit = settings, people, audit
@@ -105,7 +105,7 @@ class Server:
             await asyncio.gather(self.media.close(), self.stop_broker.close(), self.broker.close())
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> None:
-        """Run it until it ends or the server does."""
+        """Run a coroutine until it ends or the server does."""
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -130,7 +130,7 @@ class Server:
                 self.open_components.update(page_ref)
 
     def _ask_anew(self, _ref: str) -> None:
-        """Ask again for what this robot has published, although it has been delivered."""
+        """Subscribe again to get this robot's retained messages once more."""
         for subscription in self._of_all:
             subscription.renew()
 
@@ -147,14 +147,14 @@ class Server:
     # -- to the broker
 
     def _send(self, messages: list[Message]) -> None:
-        """Publish messages of stops: on a connection on which nothing arrives, for which they would wait."""
+        """Publish messages of stops, on a connection that receives nothing and so delays nothing."""
         send(self._publish_stop, messages)
 
     def _publish_stop(self, topic: str, payload: bytes, *, qos: QoS) -> bool:
         return any(broker.publish(topic, payload, qos=qos) for broker in (self.stop_broker, self.broker))
 
     def _hear(self, now: float) -> None:
-        """Stop further robots while a stop of all goes to them, by heartbeats that wait for nothing else."""
+        """Stop further robots during a stop of all, when their heartbeats arrive on a connection of their own."""
         if self._heartbeats is None:
             if self.stops.collecting:
                 self._heartbeats = Heartbeats(in_small_segments(self.settings.broker))
@@ -166,11 +166,14 @@ class Server:
             self.spawn(asyncio.to_thread(heartbeats.close))
 
     def _has_sent(self) -> bool:
-        """True if little waits to be sent. To repeat the stop of a thousand robots before would only delay its end."""
+        """True if little waits to be sent.
+
+        Repeating the stop of a thousand robots before that would only delay it.
+        """
         return self.stop_broker.transport.outgoing.waiting < _MANY_WAIT
 
     def stop(self, ref: str, name: str, session: Session, device: str, why: str, address: str = "") -> None:
-        """Stop one component, or all (""): sent at once, and repeated until it is confirmed."""
+        """Stop one component, or all (""): sent at once, and repeated until confirmed."""
         by = f"{session.user} on {device}" if device else session.user
         if ref and not _is_base(ref):
             return
@@ -180,16 +183,13 @@ class Server:
         self.audit.write("stop", ref=ref or "all", user=session.user, device=device, address=address, detail=why)
 
     def _is_wanted(self, ref: str) -> bool:
-        """True if a page has it open, drives it or has stopped it."""
+        """True if a page has the component open, drives it or has stopped it."""
         return ref in self.open_components or self.drivers.drives(ref) or self.stops.names(ref)
 
     # -- names
 
     def level(self, ref: str) -> SecurityLevel:
-        """Return how strictly that robot checks names, as far as it tells.
-
-        Of others it is as in the server's config.
-        """
+        """Return how strictly that robot checks accounts: as it publishes, else as the server's config says."""
         robot = self.robots.view(ref)
         if robot is None or not robot.estop.has_capabilities:
             return self.settings.level
@@ -238,14 +238,14 @@ class Server:
                 log.exception("a round of the server failed")
 
     async def _watch_people(self) -> None:
-        """Put out soon who is removed, though each page looks after its session rarely."""
+        """Notice removed people soon; each page checks its session only rarely."""
         while True:
             with suppress(DatabaseError):  # which the looks at sessions report
                 self.people_version = await asyncio.to_thread(self.people.version)
             await asyncio.sleep(PEOPLE_S)
 
     def show_stops(self) -> None:
-        """Let pages see what has changed of emergency stops."""
+        """Show pages the changed states of emergency stops."""
         changed, self.stops.changed = self.stops.changed, set()
         for ref in changed:
             if (robot := self.robots.view(ref)) is not None:
@@ -264,5 +264,5 @@ def _is_base(ref: str) -> bool:
 
 
 def encode(message: m.ToPage) -> str:
-    """Return the text that a page receives."""
+    """Return the JSON text of a message to a page."""
     return msgspec.json.encode(message).decode()

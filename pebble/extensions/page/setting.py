@@ -1,4 +1,4 @@
-"""The settings of an operator page, and how a robot's config gives them; ``pebble.extensions.page`` serves the page."""
+"""The settings of an operator page, from options or from a robot's config."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ class WebSettings:
 
     @property
     def name(self) -> str:
-        """The name of this server on pages and for other servers."""
+        """Return the name of this server on pages and for other servers."""
         return self.server or socket.gethostname().partition(".")[0] or "server"
 
 
 def settings_of(config: Config) -> WebSettings:
-    """Return how ``config`` sets up the operator page. Raises ConfigError with the key and what to do.
+    """Return the settings of the page in ``config``. Raises ConfigError with the key and what to do.
 
-    Whether there is a user, where ``login`` is true, is seen only in a database: ``pebble.extensions.page.run``.
+    Whether there is a user, where ``login`` is true, is known only from a database: ``pebble.extensions.page.run``.
     """
     web = config.section(WebInterface)
     if not web.local and web.tls.certificate is None and not web.plain_http:
@@ -101,7 +101,7 @@ def _recordings(config: Config) -> Path | None:
 
 
 def _broker(config: Config) -> Mqtt:
-    """Return the broker of ``web_interface.mqtt``, else the one that the robot's bridge connects to."""
+    """Return the broker of ``web_interface.mqtt``, or else that of the robot's bridge."""
     bridge = config.services.mqtt_bridge
     if config.section(WebInterface).mqtt.host:
         return config.section(WebInterface).mqtt

@@ -1,4 +1,4 @@
-"""The part of robots' payloads on which the cards of a page rely: checked here, and not again in the page. Pure."""
+"""The parts of robots' payloads on which the page's cards rely, checked here so that the page need not. Pure."""
 
 from collections.abc import Callable
 from functools import partial
@@ -127,7 +127,7 @@ _INSIDE = msgspec.json.Decoder(_Wrapped)
 
 
 def shown(channel: c.Channel | None, raw: bytes, payload: Any) -> bytes:
-    """Return the JSON that pages get of ``payload``: ``raw``, which it was, unless a card relies on more than that."""
+    """Return the JSON that pages get of ``payload``: ``raw`` itself, unless a card relies on certain fields."""
     show = None if channel is None else _SHOWN.get(channel.metric)
     relied = payload if show is None else show(payload)
     if relied is payload:
@@ -138,7 +138,7 @@ def shown(channel: c.Channel | None, raw: bytes, payload: Any) -> bytes:
 
 
 def with_name(raw: bytes, name: str) -> bytes:
-    """Return capabilities, as ``shown`` returns them, with this name of the robot if they have none."""
+    """Return capabilities, as ``shown`` returns them, with this name if the robot has none."""
     payload = msgspec.json.decode(raw)
     value = _inner(payload)
     if not isinstance(value, dict) or value.get("identity", {}).get("name"):
@@ -151,7 +151,7 @@ def _inner(payload: Any) -> Any:
 
 
 def _is(kind: Any, payload: object) -> bool:
-    """True if it is of this kind."""
+    """True if the value is of this type."""
     try:
         convert(payload, kind)
     except ValidationError:
@@ -160,7 +160,7 @@ def _is(kind: Any, payload: object) -> bool:
 
 
 def _object(kind: Any, payload: Any) -> Any:
-    """Return an object if it is of this kind, and nothing of any other."""
+    """Return the object if it is of this type, else an empty one."""
     return payload if _is(kind, payload) else {}
 
 
@@ -169,18 +169,21 @@ def _inner_object(kind: Any, payload: Any) -> Any:
 
 
 def _readable(kind: Any, entries: object) -> list[Any]:
-    """Return the entries of a list that are of this kind, as they are."""
+    """Return the entries of a list that are of this type."""
     return [entry for entry in entries if _is(kind, entry)] if isinstance(entries, list) else []
 
 
 def _media(payload: Any) -> Any:
-    """Return the reports if all can be read, each by itself: msgspec learns a dict's type again with each call."""
+    """Return the reports if all are valid.
+
+    Each is checked by itself, as msgspec builds a dict's decoder anew with each call.
+    """
     reports = _inner(payload)
     return reports if isinstance(reports, dict) and all(_is(_Medium, report) for report in reports.values()) else {}
 
 
 def _scripts(payload: Any) -> Any:
-    """Return the scripts that can be read, with the settings that can be."""
+    """Return the valid scripts, with their valid settings."""
     listed = _object(_Scripts, _inner(payload))
     if not listed:
         return {}
@@ -193,7 +196,7 @@ def _settings(configs: object) -> list[dict[str, Any]]:
 
 
 def _manifest(payload: Any) -> Any:
-    """Return the interfaces that can be read."""
+    """Return the valid interfaces."""
     manifest = _object(dict[str, Any], _inner(payload))
     texts = _object(_Texts, manifest)
     return {
@@ -209,7 +212,7 @@ _SECTIONS: dict[str, Any] = dict.fromkeys(_OFFERS, dict[str, Any]) | {"identity"
 
 
 def _capabilities(payload: Any) -> Any:
-    """Return the sections that can be read."""
+    """Return the valid sections."""
     value = _inner(payload)
     if not isinstance(value, dict):
         return {}

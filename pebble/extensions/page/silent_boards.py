@@ -1,7 +1,7 @@
-"""Boards that send heartbeats and never say what they can do, as the original's: whether pages drive them.
+"""Boards that send heartbeats and no capabilities, as the original's do, and who lets pages drive them.
 
-The config says so, or a person with the right; that is remembered until it is withdrawn, or the board says itself what
-it can do.
+The config allows it, or a person with the right; that is stored until it is withdrawn, or until the board publishes
+capabilities.
 """
 
 import logging
@@ -35,7 +35,7 @@ _NAMED = f'At level named it is driven only with "plain": true, in fleet.json an
 
 
 class Permission(Struct, frozen=True):
-    """Permission for pages to drive a board: by whom, and by which axes; no axes: none."""
+    """A permission for pages to drive a board: by whom, and along which axes; no axes: a refusal."""
 
     by: str = ""
     axes: tuple[str, ...] = ()
@@ -43,7 +43,7 @@ class Permission(Struct, frozen=True):
 
 
 class _Board(Struct):
-    """A silent one. Its drive topic is received before anything is sent there: what is retained there moves it."""
+    """A silent board. Its drive topic is read before anything is sent there, as a retained command would move it."""
 
     heard_at: float
     permission: Permission | None = None  # it has not been heard for long enough
@@ -51,7 +51,7 @@ class _Board(Struct):
 
 
 class SilentBoards:
-    """The silent boards of one server. Only the event loop calls it."""
+    """The silent boards of one server. Used on the event loop only."""
 
     def __init__(self, broker: Broker, robots: Robots, drivers: Drivers, people: People, settings: WebSettings) -> None:
         self._broker, self._robots, self._drivers, self._people = broker, robots, drivers, people
@@ -60,7 +60,7 @@ class SilentBoards:
         self._boards: dict[str, _Board] = {}
 
     def refresh(self, now: float, spawn: Spawn) -> None:
-        """Look for boards that are silent, or no longer; to be called a few times a second."""
+        """Find boards that have become silent, or no longer are; call it a few times a second."""
         silent = {ref: component for ref, component in self._robots.components.items() if component.robot.silent}
         for ref in self._boards.keys() - silent:
             if (subscription := self._boards.pop(ref).subscription) is not None:
@@ -75,7 +75,7 @@ class SilentBoards:
                 self._follow(component, self._boards[ref], now, spawn)
 
     def ask(self, op: m.BoardOp, user: str) -> str:
-        """Do what a page asks; return why not. Raises DatabaseError."""
+        """Apply a page's request; return why it is refused. Raises DatabaseError."""
         board = self._boards.get(op.ref)
         if board is None or board.permission is None:
             return "It is no board that does not say what it can do"
@@ -108,7 +108,7 @@ class SilentBoards:
             self._robots.set_server_metric(ref, _METRIC, view)
 
     def _permission(self, ref: str) -> Permission:
-        """Return what the config says, else what a person has said."""
+        """Return the permission by the config, or else by a person."""
         listed = self._listed.get(ref, ListedRobot())
         if self._refusal(ref):
             is_allowed = listed.drive and (listed.plain or not self._is_named)
@@ -120,7 +120,7 @@ class SilentBoards:
             return Permission()
 
     def _refusal(self, ref: str) -> str:
-        """Return why a person cannot change what counts."""
+        """Return why a person cannot change the permission; empty if they can."""
         listed = self._listed.get(ref, ListedRobot())
         if self._is_named and not listed.plain:
             return _NAMED

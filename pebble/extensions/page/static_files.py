@@ -1,4 +1,4 @@
-"""The files of the page, read once: what is not among them cannot be requested."""
+"""The files of the page, read once at the start; no other file can be requested."""
 
 import base64
 import gzip
@@ -44,7 +44,7 @@ _INDENTATION = re.compile(r"^\s+", re.MULTILINE)
 
 
 class StaticFiles:
-    """All files below one folder. ``version`` is another one after any change; it is part of their addresses."""
+    """All files below one folder. ``version`` changes with any of them, and is part of their addresses."""
 
     def __init__(self, root: Traversable) -> None:
         self.files = dict(sorted(_read(root, "")))
@@ -69,7 +69,7 @@ class StaticFiles:
         self._packed = {name: _packed(name, content) for name, content in self.files.items()}
 
     def _imported(self, *names: str) -> list[str]:
-        """Return what these modules import before they run, and what that imports."""
+        """Return the modules that these import before they run, directly or not."""
         modules = dict.fromkeys(names)
         for name in (waiting := list(names)):
             for path in _IMPORT.findall(self.files.get(name, b"")):
@@ -80,7 +80,7 @@ class StaticFiles:
         return [name for name in modules if name not in names]
 
     def page(self, request: Request) -> Response:
-        """Return the operator page; which screen it shows is up to its address."""
+        """Return the operator page; its address decides which screen it shows."""
         # with no-referrer, browsers do not say where a form comes from
         headers = {**NO_STORE, "content-security-policy": self._policy, "referrer-policy": "same-origin"}
         name = "robot.html" if request.url.path.startswith("/r/") else "fleet.html"
@@ -88,14 +88,14 @@ class StaticFiles:
         return _response(request, name, content, _packed(name, content), headers)
 
     def is_current(self, version: str) -> bool:
-        """True if this version, of an address, is that of the files."""
+        """True if the version in an address is that of the files."""
         return _AGAIN.sub("", version) == self.version
 
     def answer(self, request: Request, name: str, headers: dict[str, str]) -> Response:
-        """Return the file ``name``, compressed if the browser takes that; 404 if there is none.
+        """Return the file ``name``, compressed if the browser accepts that; 404 if there is none.
 
-        With a number as query it is a module that is fetched again because one that it imports was lost: those have the
-        query, too, but for the ones that run since the start.
+        A number as query marks a module that is fetched again because one of its imports was lost: its imports get the
+        query too, except those that have run since the start.
         """
         if name not in self.files:
             return PlainTextResponse("not found", 404)
@@ -111,7 +111,7 @@ class StaticFiles:
 
 
 def root_of(request: Request) -> str:
-    """Return the way from the address of ``request`` to where the server begins: ``./``, ``../../``."""
+    """Return the relative path from a request's address to the server's root: ``./``, ``../../``."""
     path: bytes = request.scope["raw_path"]
     return "../" * (path.count(b"/") - 1) or "./"
 
@@ -142,7 +142,7 @@ def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
 
 
 def stripped(source: bytes, suffix: str) -> bytes:
-    """Return a file without indentation, comments and empty lines: a sixth less to send."""
+    """Return a file without indentation, comments and empty lines, which is a sixth smaller."""
     text = source.decode()
     if suffix in ("css", "js", "mjs"):
         text = _COMMENTS.sub("", text)

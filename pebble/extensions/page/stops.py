@@ -1,6 +1,6 @@
-"""The emergency stops that pages have asked for, sent until they are confirmed, and what pages see of them. Pure.
+"""The emergency stops that pages have sent, repeated until they are confirmed, and how pages see them. Pure.
 
-The robot remembers the stop; see docs/emergency-stop.md.
+The robot keeps the stop; see docs/emergency-stop.md.
 """
 
 import logging
@@ -21,10 +21,10 @@ _SHOWN_S = 60.0  # so long pages see how a finished stop ended
 
 
 class Stops:
-    """Publish what its methods return, and pass every message of the robots to ``receive``."""
+    """The stops of a server. Publish what its methods return, and pass robots' messages to ``receive``."""
 
     def __init__(self, again: Callable[[], bool] = lambda: True) -> None:
-        """``again``: whether what was sent may be sent again; not while that still waits, behind which it would be."""
+        """Prepare an empty table. ``again``: called; False while sent messages still wait, so that none is repeated."""
         self._again, self._repeats = again, True
         self.changed: set[str] = set()  # robots whose view may be another one now
         self._senders: dict[str, tuple[StopSender, float]] = {}  # by name, the newest last
@@ -46,7 +46,7 @@ class Stops:
         known: Iterable[RobotView],
         user: str = "",
     ) -> list[Message]:
-        """Stop one robot, or all if ``ref`` is "": it takes the place of the stop that was sent to the same.
+        """Stop one robot, or all if ``ref`` is ""; the new stop replaces an earlier one of the same.
 
         ``known`` are the robots from which messages were received.
         """
@@ -64,20 +64,20 @@ class Stops:
         return self.tick(now)
 
     def end(self, name: str) -> None:
-        """Send this stop no more."""
+        """Stop repeating this stop."""
         if name in self._senders:
             sender = self._senders[name][0]
             sender.end()
             self.changed |= set(sender.robots)
 
     def robots_of(self, name: str) -> tuple[list[str], list[str]]:
-        """Return the robots that have confirmed this stop, or have no motors, and those that have not."""
+        """Return the robots that have confirmed this stop or have no motors, and the others."""
         robots = self._senders[name][0].robots if name in self._senders else {}
         done = {ref: stop.progress in (Progress.CONFIRMED, Progress.SPARED) for ref, stop in robots.items()}
         return [ref for ref in done if done[ref]], [ref for ref in done if not done[ref]]
 
     def user(self, name: str) -> str | None:
-        """Return who has pressed this stop; None: not known here, or it stands for another person as well."""
+        """Return the user of this stop; None if it is unknown here, or stands for several users."""
         return self._users.get(name)
 
     def names(self, ref: str) -> bool:
@@ -85,25 +85,25 @@ class Stops:
         return ref in self._names
 
     def sends_to(self, ref: str) -> bool:
-        """True if there is a stop of this robot, or one of all that has a place for it."""
+        """True if there is a stop of this robot, or a stop of all with room for it."""
         return any(ref in sender.robots for sender, _ in self._senders.values())
 
     def holds(self, ref: str) -> bool:
-        """True if a stop is being repeated to a robot that cannot latch it: what drives it would end that."""
+        """True if a stop is being repeated to a robot that cannot latch it, so that driving would end it."""
         stop = self._newest(ref)[1]
         return stop is not None and stop.sending and not stop.estop.available
 
     @property
     def collecting(self) -> bool:
-        """True if a stop of all still goes to further robots."""
+        """True if a stop of all still goes to newly heard robots."""
         return "" in self._names and self._senders[self._names[""]][0].collecting
 
     def omitted(self, now: float) -> bool:
-        """True if a stop was sent to robots that cannot confirm it, because there is no room for more."""
+        """True if there was no room to await the confirmation of some stopped robots."""
         return now - self._crowded_at < _SHOWN_S or any(sender.omitted for sender, _ in self._senders.values())
 
     def receive(self, message: Message, now: float) -> list[Message]:
-        """Take a message of a robot; returns what to publish to this robot now."""
+        """Handle a robot's message; return the messages to publish to it now."""
         address = parse_topic(message.topic)
         if address is None:
             return []
@@ -117,7 +117,7 @@ class Stops:
         return messages
 
     def tick(self, now: float) -> list[Message]:
-        """Return what to publish now; to be called every 50 ms."""
+        """Return the messages to publish now; call it every 50 ms."""
         messages, self._repeats = [], self._again()
         for name, (sender, began) in list(self._senders.items()):
             if name not in self._over:
@@ -153,7 +153,10 @@ class Stops:
             self.changed.add(ref)
 
     def _replaced(self, ref: str, user: str, now: float) -> bool:
-        """Make room for a stop, first that of an older one of the same; True if the new one is this user's alone."""
+        """Make room for a stop, by removing an older one of the same robots first.
+
+        Return True if the new one is this user's alone.
+        """
         is_own = True
         if (older := self._names.get(ref)) is not None:
             is_own = older in self._over or self._users[older] == user
@@ -167,7 +170,7 @@ class Stops:
         return is_own
 
     def _worth(self, name: str) -> tuple[bool, bool, bool]:
-        """Return how much a stop is worth, smallest first: one that is over, unheard of, of one robot alone."""
+        """Return a stop's rank: those that are over, unheard of, or of one robot alone are removed first."""
         robots = self._senders[name][0].robots.values()
         heard = not self._refs[name] or any(robot.live or robot.estop.has_capabilities for robot in robots)
         return name not in self._over, heard, not self._refs[name]

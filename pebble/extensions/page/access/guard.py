@@ -1,4 +1,4 @@
-"""A check of each request: which host it names, where it comes from, and how large it is."""
+"""A check of each request: its host name, its origin, and its size."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Guard:
                 await _refuse(scope, receive, send, 503, "the server ends")
 
     def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str] | None:
-        """Return status and text if this request must not go on."""
+        """Return the status and text of a refusal; None if the request is allowed."""
         if not self._is_known(headers):
             return 421, "this server has another name; start `pebble web` with --name for each name that it may have"
         if scope["method"] not in _METHODS:
@@ -112,7 +112,7 @@ class Guard:
 
 
 def content_type(headers: Headers) -> str:
-    """Return the kind of a request's body, without its parameters."""
+    """Return the content type of a request, without its parameters."""
     return headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
@@ -137,7 +137,7 @@ def is_address(name: str) -> bool:
 
 
 def canonical(name: str) -> str:
-    """Return one spelling of a host name or address."""
+    """Return the canonical spelling of a host name or address."""
     try:
         address = ipaddress.ip_address(name.strip("[]").partition("%")[0])
     except ValueError:
@@ -147,13 +147,13 @@ def canonical(name: str) -> str:
 
 
 def _is_own_origin(scope: Scope, headers: Headers) -> bool:
-    """True if Origin, which browsers send with each WebSocket and POST, is this request's scheme and host."""
+    """True if Origin, which browsers send with each WebSocket and POST, is this server's scheme and host."""
     scheme = {"ws": "http", "wss": "https"}.get(scope["scheme"], scope["scheme"])
     return headers.getlist("origin") == [f"{scheme}://{headers.get('host', '')}".lower()]
 
 
 async def _body(receive: Receive) -> bytes | None:
-    """Return the whole body; None if it is too large."""
+    """Return the complete body; None if it is too large."""
     body = bytearray()
     while True:
         message = await receive()
@@ -165,7 +165,7 @@ async def _body(receive: Receive) -> bytes | None:
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:
-    """Return a ``receive`` that returns the body once, then what comes after it."""
+    """Return a ``receive`` that first returns the body, then what follows it."""
     waiting: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def next_message() -> Message:
@@ -186,5 +186,5 @@ def _with_headers(send: Send) -> Send:
 
 
 async def _refuse(scope: Scope, receive: Receive, send: Send, status: int, text: str) -> None:
-    """Answer, and close the connection: what remains of the request is not read."""
+    """Answer with a refusal and close the connection, without reading the rest of the request."""
     await PlainTextResponse(f"{text}\n", status, headers={"connection": "close"})(scope, receive, send)

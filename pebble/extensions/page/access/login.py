@@ -1,4 +1,4 @@
-"""Log in, log out, and the session of a request."""
+"""Login, logout, and the session of a request."""
 
 import asyncio
 import dataclasses
@@ -37,7 +37,7 @@ _decoder = msgspec.json.Decoder(Login)
 
 
 class _Hashing:
-    """One thread for password hashes: others must not wait for them."""
+    """A thread for password hashes, so that other requests do not wait for them."""
 
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(1, "login")
@@ -69,9 +69,9 @@ def routes() -> list[Route]:
 
 
 def session_of(connection: HTTPConnection) -> Session | None:
-    """Return the session of a request, read from the database each time.
+    """Return the session of a request, read from the database each time; None without one.
 
-    Where there is no login, LOCAL with its ``name``.
+    On a server without a login: LOCAL with its ``name``.
     """
     settings: WebSettings = connection.app.state.settings
     session: Session | None = None
@@ -83,18 +83,18 @@ def session_of(connection: HTTPConnection) -> Session | None:
 
 
 def named(session: Session, name: str) -> Session:
-    """Take the name that a person goes by; "" changes nothing. Used only where there is no login."""
+    """Set the name by which a person is shown; "" changes nothing. Used only on a server without a login."""
     user = printable(name).strip()
     return dataclasses.replace(session, user=user) if user else session
 
 
 def printable(text: str) -> str:
-    """Return what a page says of itself, as others may be shown it."""
+    """Return what a page says about itself, made fit to be shown to others."""
     return "".join(char if " " <= char <= "~" else "?" for char in text[:32])
 
 
 def _cookie(settings: WebSettings) -> str:
-    """Return the cookie's name; with the prefix, browsers take it only from this host, over https, for all paths."""
+    """Return the cookie's name. With the prefix, browsers accept it only from this host, over https, for all paths."""
     return "__Host-pebble" if settings.certificate else "pebble"
 
 

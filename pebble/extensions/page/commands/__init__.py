@@ -1,1 +1,1 @@
-"""``pebble web``, and the people who may log in there."""
+"""``pebble web`` and the management of the people who may log in."""

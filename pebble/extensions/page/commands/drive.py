@@ -64,7 +64,7 @@ def drive(
 
 
 def _drive(transport: Transport, driver: TerminalDriver, terminal: Terminal) -> None:
-    """Pass keys and messages to the driver, and what it returns to the transport, until the terminal ends."""
+    """Pass keys and messages to the driver, and its commands to the transport, until the terminal ends."""
     arrived = deque[tuple[Message, float, float]](maxlen=_ARRIVED)
 
     def receive(message: Message) -> None:

@@ -101,14 +101,14 @@ def serve(
 
 
 class _Group(TyperGroup):
-    """``pebble web CONFIG`` is ``pebble web serve CONFIG``."""
+    """A group in which ``pebble web CONFIG`` means ``pebble web serve CONFIG``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         return super().parse_args(ctx, args if args and args[0] in self.commands else ["serve", *args])
 
 
 class _Serve(TyperCommand):
-    """Its help shows the command line without ``serve``."""
+    """The command ``serve``, whose help shows the command line without ``serve``."""
 
     def format_usage(self, ctx: Any, formatter: Any) -> None:
         formatter.write_usage(ctx.parent.command_path, " ".join(self.collect_usage_pieces(ctx)))
@@ -166,7 +166,10 @@ def _default_tls_folder(host: str) -> Path | None:
 
 
 def _missing(settings: WebSettings, *, plain: bool, empty: bool) -> list[str]:
-    """Return which of "certificate" and "user" are needed and missing; ``empty``: --tls names an empty folder."""
+    """Return which of "certificate" and "user" are needed and missing.
+
+    ``empty``: the folder that --tls names is empty.
+    """
     if not settings.login and not empty:
         return []
     missing = [] if (settings.certificate is not None or plain) and not empty else ["certificate"]

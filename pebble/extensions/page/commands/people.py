@@ -133,12 +133,12 @@ def register_people(group: typer.Typer) -> None:
 
 
 def default_folder() -> Path:
-    """Return where certificates, users and the audit log are unless an option names another place."""
+    """Return the default folder of certificates, users and the audit log."""
     return default_state_folder("web", os.environ)
 
 
 def _file(config: Path | None, people: Path | None) -> Path:
-    """Return the database that is named, else that of the page which the robot of this machine serves, else our own."""
+    """Return the named database, or that of the page served by this machine's robot, or the user's own."""
     if people is None and config is None:
         config = _of_machine()
     if people is not None or config is None:
@@ -150,7 +150,7 @@ def _file(config: Path | None, people: Path | None) -> Path:
 def _of_machine() -> Path | None:
     """Return the config that `pebble setup` wrote, if its robot serves a page.
 
-    Raises PebbleError if we may not read it.
+    Raises PebbleError if it may not be read.
     """
     file = PLACES.config
     try:
@@ -166,13 +166,16 @@ def _of_machine() -> Path | None:
 
 @contextmanager
 def opened(file: Path | None) -> Iterator[People]:
-    """Open a database of people; by root as the owner of its folder, whose file it is."""
+    """Open a database of people; root opens it as the owner of its folder."""
     with as_owner(Path() if file is None else file.parent), closing(People(file)) as people:
         yield people
 
 
 def _read_password() -> str:
-    """Read a password, never from the command line, which every user of the machine can read. Raises PebbleError."""
+    """Read a password, never from the command line, which all users of the machine can read.
+
+    Raises PebbleError.
+    """
     if sys.stdin.isatty():
         return str(typer.prompt("Password", hide_input=True, confirmation_prompt=True, err=True))
     line = sys.stdin.readline().rstrip("\r\n")

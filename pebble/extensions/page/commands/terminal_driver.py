@@ -1,7 +1,7 @@
-"""Drives one robot with the keys of a terminal: what is sent, and what is shown. Pure.
+"""A driver of one robot by the keys of a terminal: commands to send, and the status line. Pure.
 
-A person at a terminal drives by the rules of a page, `DrivenRobot`: a key that is held is a gesture. A terminal repeats
-it and does not report its release: it counts as held for HELD_S after its last repetition.
+It follows the rules of a page, `DrivenRobot`: a held key is a gesture. A terminal repeats a held key and does not
+report its release: it counts as held for HELD_S after the last repetition.
 """
 
 from collections.abc import Sequence
@@ -62,7 +62,7 @@ class TerminalDriver:
             self.stop.receive(message, now)
 
     def press(self, keys: Sequence[str], now: float) -> None:
-        """Take the keys that were read; the newest one of an axis counts."""
+        """Handle the keys that were read; the newest of an axis counts."""
         for key in keys:
             if key == "!" or (key == ESCAPE and now - self._escape_at <= _TWICE_S):
                 self._begin_stop(now)
@@ -81,7 +81,7 @@ class TerminalDriver:
             self.end(now)
 
     def tick(self, now: float, problem: str = "") -> list[Message]:
-        """Return what to publish now; to be called every PERIOD_S. ``problem``: why there is no connection."""
+        """Return the messages to publish now; call it every PERIOD_S. ``problem``: why there is no connection."""
         if now - self._ticked_at > SILENCE_S:  # this process stood still
             self.end(now)
         self._ticked_at = now
@@ -100,7 +100,7 @@ class TerminalDriver:
         return [*(self.stop.tick(now) if self.stop else []), *drives, *([] if problem else requests)]
 
     def end(self, now: float, *, leave: bool = False) -> None:
-        """End the gesture for good, and with ``leave`` control; the pause before the next one begins now."""
+        """End the gesture for good, and with ``leave`` release control. The pause before the next gesture begins."""
         self._out += self._tab.interrupt(self._gesture, now)
         self._pressed, self._key_at = True, now
         if leave:
@@ -109,11 +109,11 @@ class TerminalDriver:
 
     @property
     def unconfirmed(self) -> str:
-        """The reason why an emergency stop from here is not confirmed; empty if none is pending."""
+        """Return why an emergency stop from here is not confirmed; empty if none is pending."""
         return "" if self.stop is None or self.stop.confirmed else self.stop.robots[self.robot.base].why
 
     def status(self) -> str:
-        """Return one line: what is sent, or why nothing is, and what is known. Parts of it come from others."""
+        """Return the status line: the command sent, or why none is. Parts of it come from others."""
         view, robot = self._driven.shown(self._tab, self._ticked_at), self.robot
         x, z, _ = self._wanted(self._ticked_at)
         idle = self._reason or ("let go first" if self._pressed else "ready")
@@ -131,7 +131,7 @@ class TerminalDriver:
         return " · ".join(filter(None, parts))
 
     def _assume(self, now: float) -> None:
-        """Take it for a board that drives, if it is there for a while and has not said what it can do."""
+        """Assume that it is a board that drives, if it is online for a while without capabilities."""
         if self._assumes:
             self._heard_at = min(self._heard_at, now) if self.robot.online(now) else float("inf")
             if now - self._heard_at >= HEARD_S:
@@ -152,7 +152,7 @@ class TerminalDriver:
             self._out += self._driven.drive(self._tab, op, now, self._reason)[0]
 
     def _why_not(self, now: float) -> str:
-        """Return the reason against driving; empty if there is none."""
+        """Return why the robot cannot be driven; empty if it can."""
         view, sends = self._driven.shown(self._tab, now), self.stop is not None and not self.stop.finished
         situation = self.robot.situation(now)._replace(driven=view.by != "" and not view.you, listening=not view.you)
         situation = situation._replace(stopping=sends, online=situation.online if self._heartbeat else True)
@@ -162,7 +162,7 @@ class TerminalDriver:
         return why or (PARKED if self.robot.parked else "")
 
     def _wanted(self, now: float) -> tuple[float, float, float]:
-        """Return x, z and y by the keys that are held."""
+        """Return x, z and y from the held keys."""
         held = {axis: direction for axis, (direction, at) in self._held.items() if now - at < HELD_S}
         turn, speed, up = self._turn * held.get("x", 0), self._speed * held.get("z", 0), self._speed * held.get("y", 0)
         most = max(1.0, abs(speed + turn), abs(speed - turn))  # no wheel is faster than 1

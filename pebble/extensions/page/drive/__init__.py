@@ -1,1 +1,1 @@
-"""Driving from one server: the pages that have control, those that ask for it, and why it is refused."""
+"""Driving by the pages of one server: who has control, who asks for it, and why it is refused."""

@@ -1,7 +1,7 @@
-"""One robot as pages of this server drive it: who has control, and which commands reach it. Pure.
+"""A robot as the pages of this server drive it: who has control, and which commands reach it. Pure.
 
-Motion belongs to a numbered gesture: from the moment the inputs leave neutral until they are released. What interrupts
-a gesture ends it for good, so a key that is held down never moves anything again before it was released.
+Motion belongs to a numbered gesture, from the moment the inputs leave neutral until they are released. An interrupted
+gesture has ended for good: a key that is held down moves nothing again before it was released.
 """
 
 import secrets
@@ -32,7 +32,7 @@ ZERO, FINAL_ZERO = Drive(), Drive(valid_ms=0)
 
 
 class State(Enum):
-    """The state of one robot at this server."""
+    """The state of a robot at this server."""
 
     FREE = "no page of this server has control"
     HELD = "a page has control, and its inputs rest"
@@ -51,7 +51,7 @@ class Event(Enum):
 
 
 class Step(NamedTuple):
-    """The consequence of an event."""
+    """The effect of an event: the next state, and what to do."""
 
     state: State
     halts: bool = False  # by a final zero, which is repeated
@@ -74,7 +74,7 @@ TABLE = {
 
 
 class Command(NamedTuple):
-    """A drive command to be published."""
+    """A drive command to publish."""
 
     ref: str
     drive: Drive
@@ -83,7 +83,7 @@ class Command(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Tab:
-    """One control connection of a page. It moves one robot at a time."""
+    """A page's control connection. It moves one robot at a time."""
 
     token: str
     user: str
@@ -101,7 +101,7 @@ class Tab:
 
 @dataclass(slots=True, eq=False)
 class Wish:
-    """A request of one page for control of a robot that keeps it; its answer calls ``granted`` or ``failed``."""
+    """A page's request for control, where the robot decides about it; its answer calls ``granted`` or ``failed``."""
 
     client: ControlClient
     granted: Callable[[], None]
@@ -110,7 +110,7 @@ class Wish:
 
 
 class DrivenRobot:
-    """One robot. ``changed`` collects robots that pages have to be shown again."""
+    """The driving of one robot. ``changed`` collects the robots that pages have to be shown again."""
 
     def __init__(self, ref: str, view: Callable[[], RobotView | None], changed: set[str]) -> None:
         self.ref = ref
@@ -126,32 +126,35 @@ class DrivenRobot:
         self.renew_key()
 
     def renew_key(self) -> None:
-        """Take another key: robots without control compare ages per key, and what was on its way must not count."""
+        """Choose a new key.
+
+        Robots without control compare the ages of commands per key, and commands of the old connection must not count.
+        """
         self._key = secrets.token_hex(4)
 
     # -- what is known
 
     @property
     def keeps(self) -> bool:
-        """True if the robot decides itself who drives it; else this server does, for its own pages."""
+        """True if the robot itself decides who drives it; else this server does, for its own pages."""
         robot = self._view()
         return robot is not None and robot.controlled
 
     @property
     def published(self) -> ControlState | None:
-        """The robot's own state of control; None if it keeps none."""
+        """Return the robot's own state of control; None if it publishes none."""
         robot = self._view()
         return robot.control.state if robot is not None and robot.controlled else None
 
     @property
     def pace(self) -> Pace:
-        """The pace of commands to the robot."""
+        """Return the rate of commands to the robot."""
         robot = self._view()
         return WIDE if robot is None else robot.pace
 
     @property
     def moved_by(self) -> str:
-        """The user who moves the robot now: while a gesture lasts, or as the robot says. Empty: no page does."""
+        """Return the user who moves the robot now, by a gesture or by the robot's state; empty if nobody does."""
         if other := self._elsewhere():
             return other.by
         return self.tab.user if self.tab is not None and self.state is State.MOVING else ""
@@ -161,7 +164,7 @@ class DrivenRobot:
         return self.tab is tab or tab in self._wishes
 
     def awaits(self, token: str, now: float) -> bool:
-        """Return True, once, if a page with this token has just had control, and still nobody else has it."""
+        """True, once, if a page with this token has just had control and nobody else has it."""
         awaited, until = self._awaited
         if awaited != token:
             return False
@@ -169,11 +172,11 @@ class DrivenRobot:
         return now <= until and self.state is State.FREE and self._elsewhere() is None
 
     def at_rest(self, now: float) -> bool:
-        """True if nothing has to be remembered of it."""
+        """True if nothing about the robot has to be remembered."""
         return self.state is State.FREE and not self._wishes and not self._repeats and now > self._awaited[1]
 
     def shown(self, tab: Tab, now: float) -> DriverView:
-        """Return what this page is shown of who drives."""
+        """Return what this page is shown about the driver."""
         wish, state = self._wishes.get(tab), self.published
         view = DriverView(keeps=self.keeps, asking=wish is not None and wish.client.wanted and not wish.client.held)
         if state is not None:
@@ -191,7 +194,7 @@ class DrivenRobot:
     def take(
         self, tab: Tab, now: float, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool
     ) -> list[Command]:
-        """Want control for this page; ``over``: also from who drives."""
+        """Request control for this page; ``over``: even from its present holder."""
         robot = self._view()
         if robot is not None and robot.controlled:
             wish = self._wishes.get(tab)
@@ -208,7 +211,7 @@ class DrivenRobot:
         return commands
 
     def release(self, tab: Tab, now: float) -> list[Command]:
-        """Give control back, or do not ask for it any more."""
+        """Release control, or withdraw the request for it."""
         if self.tab is tab:
             return self._on(Event.ENDED, now)
         if (wish := self._wishes.get(tab)) is not None:
@@ -217,13 +220,13 @@ class DrivenRobot:
         return []
 
     def closed(self, tab: Tab, now: float, *, for_good: bool) -> list[Command]:
-        """Take note that the connection has ended; ``for_good``: the user may no longer drive, so nothing is kept."""
+        """Note that the connection has ended; ``for_good``: the user may no longer drive, so nothing is kept."""
         if self.tab is tab and not for_good:
             self._awaited = (tab.token, now + AWAITED_S)
         return self.release(tab, now)
 
     def update(self, now: float) -> list[Command]:
-        """Take note that the robot has answered, or is another one than before."""
+        """Note that the robot has answered, or has been replaced by another."""
         commands: list[Command] = []
         for tab, wish in list(self._wishes.items()):
             commands += self._answered(tab, wish, now)
@@ -235,7 +238,7 @@ class DrivenRobot:
     # -- commands
 
     def drive(self, tab: Tab, op: DriveOp, now: float, blocked: str) -> tuple[list[Command], str]:
-        """Judge a command of a gesture: what is to be published, and why it was refused, if it was.
+        """Check a command of a gesture; return what to publish, and why it was refused (empty: it was not).
 
         ``blocked``: why this robot may not be moved. Raises ClockJumpError.
         """
@@ -258,16 +261,16 @@ class DrivenRobot:
         return [Command(self.ref, pace.dated(drive, now, self._key), pace.qos)], ""
 
     def stop(self, now: float) -> list[Command]:
-        """Halt it for anybody; the gesture that moves it is over."""
+        """Halt the robot for anybody; the present gesture ends."""
         self.interrupt(now)
         return self._final_zero(now)
 
     def interrupt(self, now: float) -> list[Command]:
-        """End the gesture that moves it."""
+        """End the present gesture."""
         return self._on(Event.INTERRUPTED, now)
 
     def tick(self, now: float) -> tuple[list[Command], list[Message]]:
-        """End what is silent or idle; what is to be published, in this order. To be called every 50 ms."""
+        """End silent gestures and idle control; return what to publish, in order. Call it every 50 ms."""
         commands: list[Command] = []
         if self.state is State.MOVING and now - self._received_at > SILENCE_S:
             commands += self.interrupt(now)
@@ -288,7 +291,7 @@ class DrivenRobot:
     # -- inside
 
     def _on(self, event: Event, now: float) -> list[Command]:
-        """Go one step of the table."""
+        """Apply an event by the table of states."""
         step = TABLE.get((self.state, event))
         if step is None:
             return []
@@ -330,7 +333,7 @@ class DrivenRobot:
         return commands
 
     def _is_over(self, wish: Wish, now: float) -> bool:
-        """True if the robot has taken note of the end: until then it is this server that has control, and no other."""
+        """True if the robot has confirmed the end of control; until then this server has it."""
         if not wish.client.done:
             wish.ended_at = float("inf")
             return False
@@ -339,14 +342,14 @@ class DrivenRobot:
         return state is None or state.id != wish.client.id or now - wish.ended_at > self.pace.answer_s
 
     def _elsewhere(self) -> ControlState | None:
-        """Return what the robot says if it has given control, but not to this server."""
+        """Return the robot's state if it has given control, but to another than this server."""
         state = self.published
         if state is None or not state.id or any(wish.client.id == state.id for wish in self._wishes.values()):
             return None
         return replace(state, by=state.by or "somebody")
 
     def _active(self, now: float) -> str:
-        """Return the user who drives it now and has to be asked; empty: it can be taken."""
+        """Return the user who drives now and has to be asked; empty if control can be taken."""
         if other := self._elsewhere():
             return other.by
         if self.tab is None or (self.state is State.HELD and now - self._idle_from >= TAKEN_FROM_IDLE_S):
@@ -366,7 +369,7 @@ class DrivenRobot:
         return words(Code.LATE) if tab.clock.late(op.t, now) else ""
 
     def _zero(self, tab: Tab, op: DriveOp, now: float) -> list[Command]:
-        """Forward a zero, always. At the end of a gesture it is the release."""
+        """Forward a zero, in every state. At the end of a gesture it is the release."""
         tab.over = max(tab.over, op.g)
         if tab.moves is self and op.g >= tab.gesture:
             self._on(Event.LETS_GO, now)

@@ -1,4 +1,4 @@
-"""The driven robots of one server: requests of pages, answers of robots, and what is published for them."""
+"""The driven robots of one server: pages' requests, robots' answers, and what is published."""
 
 from collections.abc import Callable
 from functools import partial
@@ -17,7 +17,7 @@ MOST_WISHES = 16  # of one tab: robots of which it has control, or asks for it
 
 
 class Drivers:
-    """The driven robots of one server. What a method decides is published at once."""
+    """The driven robots of one server. Methods publish their results at once."""
 
     def __init__(self, broker: Broker, robots: Robots) -> None:
         self._broker, self._robots = broker, robots
@@ -26,7 +26,7 @@ class Drivers:
         self.refusals = Refusals(broker, lambda ref: self.robot(ref).moved_by, robots.view)
 
     def robot(self, ref: str) -> DrivenRobot:
-        """Return that robot; nothing is remembered of one that rests."""
+        """Return that robot; robots at rest are not remembered."""
         robot = self._driven.get(ref)
         if robot is None:
             robot = self._driven[ref] = DrivenRobot(ref, partial(self._robots.view, ref), self._changed)
@@ -37,7 +37,7 @@ class Drivers:
     def take(
         self, tab: Tab, view: RobotView, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool
     ) -> None:
-        """Take control for a page; ``granted``, or ``failed`` with the reason, is called as soon as that is known."""
+        """Request control for a page; ``granted``, or ``failed`` with the reason, is called with the result."""
         now, robot = clock(), self.robot(view.base)
         wanted = sum(robot.wanted_by(tab) for robot in self._driven.values())
         if why := self.refusals.nameless(view):
@@ -49,7 +49,7 @@ class Drivers:
             self._turn(robot, now)
 
     def release(self, tab: Tab, ref: str) -> bool:
-        """Take control back from a page, or its wish for it; True if it had it."""
+        """Release a page's control, or withdraw its request; return True if it had control."""
         now, robot = clock(), self.robot(ref)
         had = robot.tab is tab
         self._publish(robot.release(tab, now))
@@ -61,9 +61,9 @@ class Drivers:
         return ref in self._driven and self._driven[ref].tab is not None
 
     def restore(self, token: str, tab: Tab) -> None:
-        """Note that a page has connected again: it asks for what it had, but no gesture goes on.
+        """Give a page that has connected again the control that it had; no gesture goes on.
 
-        Its old connection may still be open, if nothing comes from it any more.
+        Its old connection may still be open, though nothing arrives on it any more.
         """
         now = clock()
         old = {robot.tab for robot in self._driven.values() if robot.tab is not None and robot.tab.token == token}
@@ -74,7 +74,7 @@ class Drivers:
                 self.take(tab, view, lambda: None, lambda _why: None, over=False)
 
     def closed(self, tab: Tab, *, for_good: bool = False) -> None:
-        """Note that the connection of a page has ended; ``for_good``: its user may no longer drive."""
+        """Note that a page's connection has ended; ``for_good``: its user may no longer drive."""
         now, wanted = clock(), [robot for robot in self._driven.values() if robot.wanted_by(tab)]
         try:
             self._publish([zero for robot in wanted for zero in robot.closed(tab, now, for_good=for_good)])
@@ -102,18 +102,18 @@ class Drivers:
         return bool(commands) and commands[0].drive.moves, ""
 
     def stop(self, ref: str, by: str) -> None:
-        """Send a zero from anybody, who need not drive."""
+        """Publish a zero for anybody, who need not have control."""
         if self._robots.view(ref) is not None:
             self._publish(self.robot(ref).stop(clock()), by)
 
     # -- of robots
 
     def updated(self, ref: str) -> None:
-        """Note that a robot has published what it can do, or who has control."""
+        """Note that a robot has published capabilities or a state of control."""
         self._publish(self.robot(ref).update(clock()))
 
     def renew_keys(self) -> None:
-        """Note that the connection to the broker is another one."""
+        """Note that there is a new connection to the broker."""
         for robot in self._driven.values():
             robot.renew_key()
 
@@ -128,13 +128,13 @@ class Drivers:
     # -- inside
 
     def _turn(self, robot: DrivenRobot, now: float) -> None:
-        """Publish what is due; requests of control come after the zeros of who has had it."""
+        """Publish what is due; requests for control come after the zeros of the former driver."""
         commands, messages = robot.tick(now)
         self._publish(commands)
         send(self._broker.publish, messages)
 
     def _publish(self, commands: list[Command], by: str = "") -> bool:
-        """Publish drive commands of a person, each to the robot's own topic; False if one was not accepted."""
+        """Publish a person's drive commands to the robot's own topic; return False if one was not accepted."""
         accepted = True
         for ref, drive, qos in commands:
             topic, view = self._robots.topic(ref, DRIVE), self._robots.view(ref) or RobotView(ref)

@@ -1,4 +1,4 @@
-"""The reasons why a page may not ask something of a robot now, in words for people. Each is "" where it may."""
+"""The reasons why a page's request to a robot is refused now, in words for people; "" if it is not."""
 
 import time
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from pebble.extensions.page import robot_commands
 
 
 class Refusals:
-    """The refusals of one server; ``moved_by`` tells who moves a component, ``robot_of`` finds it."""
+    """The refusals of one server. ``moved_by`` returns who moves a component; ``robot_of`` finds its view."""
 
     def __init__(
         self, broker: Broker, moved_by: Callable[[str], str], robot_of: Callable[[str], RobotView | None]
@@ -30,17 +30,17 @@ class Refusals:
         self.is_stopping: Callable[[str], bool] = lambda _ref: False
 
     def of_driving(self, ref: str) -> str:
-        """Return why this component may not be moved by any page."""
+        """Return why no page may move this component."""
         robot = self._robot_of(ref) or RobotView(ref)
         why = self._words(robot, first_reason(self._situation(robot), SERVER_ORDER)) or self.nameless(robot)
         return why or (PARKED if robot.parked else "")
 
     def nameless(self, robot: RobotView) -> str:
-        """Return why it takes no commands of this server, which has no name."""
+        """Return why it takes no commands of this server, which has no account."""
         return why_not(robot.name, self._broker.names.account) if robot.named else ""
 
     def of_op(self, op: m.RobotOp) -> str:
-        """Return why this is not asked of a robot now. What ends something is always asked."""
+        """Return why this request is not sent to a robot now. Requests that end something are always sent."""
         robot = self._robot_of(op.ref)
         if robot is None:
             return "unknown component"
@@ -52,7 +52,7 @@ class Refusals:
         return self._of_script(robot) if isinstance(op, m.AutonomyOp) and not why else why
 
     def _of_script(self, robot: RobotView) -> str:
-        """Return why no script may begin now."""
+        """Return why no script may be started now."""
         by = self._moved_by(robot.base)
         situation = self._situation(robot)._replace(driven=bool(by) and not robot.arbitrates)
         code = first_reason(situation, SCRIPT_ORDER)

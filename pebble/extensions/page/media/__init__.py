@@ -1,1 +1,1 @@
-"""Pictures and sound between robots and pages: one request per robot, however many pages use it."""
+"""Pictures and sound between robots and pages: one request for each robot, however many pages use it."""

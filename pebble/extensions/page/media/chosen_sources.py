@@ -1,4 +1,4 @@
-"""The sources of pictures on robots' pages that people have chosen: for everybody, and remembered."""
+"""The picture sources that people have chosen for robots' pages; they hold for everybody, and are stored."""
 
 import logging
 from collections.abc import Callable
@@ -14,19 +14,19 @@ _PICTURE = "picture-from "  # what a setting of the server begins with; then the
 
 
 class ChosenSources:
-    """The chosen sources; ``on_change`` is called with the component whose page shows another one's picture."""
+    """The chosen sources. ``on_change`` is called with the component whose page shows another source."""
 
     def __init__(self, people: People, robots: Robots, on_change: Callable[[str], None]) -> None:
         self._people, self._robots, self._on_change = people, robots, on_change
 
     def choose(self, ref: str, source: str) -> None:
-        """Show the picture of ``source`` on the page of ``ref``; "" is its own."""
+        """Show the picture of ``source`` on the page of ``ref``; "" means its own picture."""
         if ref in self._robots.components and (not source or source in self._robots.components):
             self._people.set(_PICTURE + ref, "" if source == ref else source)
             self.show(ref)
 
     def show(self, ref: str) -> None:
-        """Send pages what was chosen for this component."""
+        """Send pages the chosen source of this component."""
         try:
             source = self._people.get(_PICTURE + ref)
         except DatabaseError as error:

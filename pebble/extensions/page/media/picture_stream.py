@@ -1,4 +1,4 @@
-"""One robot's pictures on their way to the pages that show them."""
+"""A robot's pictures on their way to the pages that show them."""
 
 import asyncio
 import struct
@@ -24,7 +24,7 @@ _AT_REST: Final = PictureView(state="rest", why="", encoding="", per_second=0, k
 
 
 class PageViewer:
-    """One page's queue, and how its sender is woken."""
+    """A page's queue, and the event that wakes its sender."""
 
     def __init__(self, can: frozenset[str]) -> None:
         self.queue = ViewerQueue(can, time.monotonic())
@@ -32,7 +32,7 @@ class PageViewer:
 
 
 class PictureStream(MediaStream[PageViewer, PictureView]):
-    """Gives the pictures of one robot to each viewer's queue."""
+    """The pictures of one robot for the queues of its viewers."""
 
     def __init__(self, broker: Broker, robots: Robots, ref: str) -> None:
         super().__init__(broker, robots, ref, "video", "web/picture", _AT_REST)
@@ -46,7 +46,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
     # -- pages
 
     def acknowledge(self, viewer: PageViewer, seq: int, what: int) -> None:
-        """Take a page's answer: 0 drawn, 1 a key frame is wanted, 2 this encoding cannot be decoded there."""
+        """Handle a page's answer: 0 drawn, 1 key frame wanted, 2 encoding cannot be decoded."""
         now = time.monotonic()
         frame = viewer.queue.acknowledge(seq, now)
         if what == 1 and (frame is not None or seq == NO_FRAME):
@@ -97,7 +97,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
             self._request.wake()
 
     def _skip(self, now: float) -> None:
-        """Note that a picture is missing before this one: it and what follows wait for a key frame."""
+        """Note that a picture is missing before this one, so that a key frame is needed."""
         for viewer in self.viewers:
             viewer.queue.lost(now)
         self._request.wake()
@@ -123,13 +123,13 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
             await self._help_viewers()
 
     def _can(self) -> list[frozenset[str]]:
-        """Return what each viewer decodes. For one that decodes nothing, what this server converts counts."""
+        """Return the encodings that each viewer decodes; for one that decodes none, those that this server converts."""
         encodings = frozenset(BEST_FIRST["video"])
         converted = frozenset(name for name in encodings if not rescue.unavailable(name))
         return [viewer.queue.can & encodings or converted for viewer in self.viewers]
 
     async def _help_viewers(self) -> None:
-        """Request a key frame, or begin the rescue stream, if viewers need it."""
+        """Request a key frame, or start the rescue stream, if viewers need it."""
         now = time.monotonic()
         if not self._arrivals.encoding:
             return

@@ -1,4 +1,4 @@
-"""Robots' pictures for pages: one request per robot, however many pages show it, and a still of each."""
+"""Robots' pictures for pages: one request for each robot, however many pages show it, and stills."""
 
 import asyncio
 import struct
@@ -24,7 +24,7 @@ _TURN_S: Final = 5.0  # until the next camera's turn
 
 
 class MediaHub(Streams[PictureStream]):
-    """All streams of pictures. Only the event loop calls it."""
+    """All picture streams. Used on the event loop only."""
 
     def __init__(self, broker: Broker, robots: Robots) -> None:
         super().__init__(CAMERA, lambda ref: PictureStream(broker, robots, ref))
@@ -44,9 +44,10 @@ class MediaHub(Streams[PictureStream]):
         )
 
     async def snapshot(self, ref: str) -> tuple[bytes, float] | None:
-        """Return the newest key frame as a JPEG, of a camera that rests its last one, and when it came, monotonic.
+        """Return a JPEG of the newest key frame, or of a resting camera's last one, with its time (monotonic).
 
-        It starts no camera. Of one that is on for others a picture is fetched meanwhile: who asks waits for nothing.
+        It starts no camera, and never waits: from a camera that is on for others, a picture is fetched for the next
+        call.
         """
         reports = self._robots.value(ref, MEDIA_STATUS.metric)
         is_on = reports is not None and msgspec.json.decode(reports).get("camera_publisher", {}).get("running", False)
@@ -57,7 +58,7 @@ class MediaHub(Streams[PictureStream]):
         return None if key is None or jpeg is None else (jpeg, key[1])
 
     async def look_in_turn(self) -> None:
-        """Switch on one camera after another for a moment, while a page has no component open."""
+        """Turn on one camera after another for a moment, while a page shows the fleet."""
         while True:
             await asyncio.sleep(1.0)
             for ref in list(self._robots.components):
@@ -75,7 +76,7 @@ class MediaHub(Streams[PictureStream]):
         return key is not None and time.monotonic() - key[1] < _FRESH_S
 
     async def _glimpse(self, ref: str) -> None:
-        """Look at a robot's camera, as a page would, until there is a picture."""
+        """Request a robot's pictures, as a page would, until there is one."""
         viewer = PageViewer(frozenset(name for name in BEST_FIRST["video"] if not rescue.unavailable(name)))
         stream, end = self._open(ref), time.monotonic() + _GLIMPSE_S
         stream.join(viewer)
@@ -109,7 +110,7 @@ async def _send(websocket: WebSocket, viewer: PageViewer) -> None:
 
 
 async def _receive(websocket: WebSocket, stream: PictureStream, viewer: PageViewer) -> None:
-    """Take the page's answers until it leaves, or sends what is none."""
+    """Read the page's answers until it closes the socket, or sends an invalid one."""
     while True:
         message = await websocket.receive()
         answer = message.get("bytes")

@@ -33,13 +33,13 @@ def unavailable(encoding: str) -> str:
 
 
 def newest_jpeg(payloads: Sequence[bytes]) -> bytes | None:
-    """Return the last picture of a key frame and the differences after it, as large as it is. Call it on a thread."""
+    """Return the last picture of a key frame and its differences, in full size. Call it on a thread."""
     decoded = _newest(_make_decoder(), payloads)
     return None if decoded is None else _encode(decoded.picture)
 
 
 class RescueStream:
-    """Converts the pictures of one robot while it is started. All methods run on the event loop."""
+    """A converter of one robot's pictures while it is started. Used on the event loop only."""
 
     def __init__(self, ready: Callable[[RescuedPicture], None]) -> None:
         self._ready = ready
@@ -52,14 +52,14 @@ class RescueStream:
         return self._task is not None
 
     def start(self, chain: Sequence[bytes]) -> None:
-        """Begin with ``chain``: the newest key frame and all pictures since."""
+        """Start with ``chain``: the newest key frame and all pictures since."""
         if self._task is None:
             self._pending = list(chain)
             self._fed.set()
             self._task = asyncio.create_task(self._run())
 
     def feed(self, payload: bytes, *, keyframe: bool) -> None:
-        """Give it every payload: a difference needs all before it."""
+        """Add a payload. It needs all of them, as a difference builds on those before it."""
         if self._task is None:
             return
         if keyframe or sum(map(len, self._pending)) > _MAX_WAITING_BYTES:

@@ -1,4 +1,4 @@
-"""Robots' sound for pages, and pages' voices for robots: one request per robot, however many pages listen."""
+"""Robots' sound for pages, and people's voices for robots: one request for each robot."""
 
 import asyncio
 import struct
@@ -37,7 +37,7 @@ NoteTalk = Callable[[str, Session, str, str], None]  # component, session, devic
 
 
 class SoundQueue:
-    """The packets that wait for one page: the oldest is dropped for the newest. Pure."""
+    """The packets that wait for one page; a new one displaces the oldest. Pure."""
 
     def __init__(self) -> None:
         self._queue: deque[bytes] = deque()
@@ -50,7 +50,7 @@ class SoundQueue:
             self._bytes -= len(self._queue.popleft())
 
     def take(self) -> bytes | None:
-        """Return the packet to send now; None if there is none, or too many are under way."""
+        """Return the packet to send now; None if there is none, or too many are unacknowledged."""
         if not self._queue or self._sent - self._received >= WINDOW:
             return None
         payload = self._queue.popleft()
@@ -64,7 +64,7 @@ class SoundQueue:
 
 
 class SoundPage:
-    """One page at a robot's sound. ``can`` empty: it only talks."""
+    """A page that plays a robot's sound or talks to it. ``can`` empty: it only talks."""
 
     def __init__(self, can: frozenset[str], session: Session, device: str = "", address: str = "") -> None:
         self.can, self.session, self.device, self.address = can, session, device, address
@@ -81,7 +81,7 @@ class SoundPage:
 
 
 class SoundStream(MediaStream[SoundPage, SoundView]):
-    """Gives the sound of one robot to each listener's queue, and one talker's voice to the robot."""
+    """The sound of one robot for its listeners, and the voice of one talker for the robot."""
 
     def __init__(self, broker: Broker, robots: Robots, ref: str, note: NoteTalk) -> None:
         super().__init__(broker, robots, ref, "audio", "web/sound", _AT_REST)
@@ -107,7 +107,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
     # -- talking
 
     def receive_voice(self, page: SoundPage, talk: int, piece: int, sound: bytes) -> None:
-        """Take 20 ms of a page's voice. The first piece of a talk begins it, if nothing speaks against it."""
+        """Handle 20 ms of a page's voice. The first piece begins a talk, if it is allowed."""
         now = time.monotonic()
         if talk <= page.over:
             return
@@ -146,7 +146,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         return self._unheard() or refusal(self.ref, self.robot.capabilities, "audio")
 
     def _unheard(self) -> str:
-        """Return why the robot would not hear it now; empty if it does."""
+        """Return why the robot would not play a voice now; empty if it would."""
         if problem := self._broker.problem:
             return f"The server cannot reach the broker: {problem}"
         robot = self.robot
@@ -157,7 +157,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         return ""
 
     def _release(self, now: float) -> None:
-        """End a talk from which nothing comes any more."""
+        """End a talk whose page has stopped sending."""
         if self._talk is not None and self._talk.is_over(now):
             self._interrupt(f"No sound came in time for {SILENT_S:g} s")
 
@@ -201,7 +201,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
 
 
 class SoundHub(Streams[SoundStream]):
-    """All streams of sound. Only the event loop calls it."""
+    """All sound streams. Used on the event loop only."""
 
     def __init__(self, broker: Broker, robots: Robots, note: NoteTalk) -> None:
         super().__init__(AUDIO, lambda ref: SoundStream(broker, robots, ref, note))
@@ -241,7 +241,7 @@ async def _send(websocket: WebSocket, page: SoundPage) -> None:
 
 
 async def _receive(websocket: WebSocket, stream: SoundStream, page: SoundPage) -> None:
-    """Take what the page sends until it leaves, or sends what is not understood."""
+    """Read a page's messages until it closes the socket, or sends an invalid one."""
     pace = Pace(time.monotonic())
     while True:
         message = await websocket.receive()

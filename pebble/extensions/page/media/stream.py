@@ -1,4 +1,4 @@
-"""One medium of each robot on its way to pages: the request while pages use it, and what is shown about it."""
+"""A medium of each robot on its way to pages: the request while pages use it, and what pages are shown about it."""
 
 import asyncio
 import contextlib
@@ -32,7 +32,7 @@ ViewT = TypeVar("ViewT")
 
 
 class Arrivals:
-    """The arrivals of one medium: their encoding, their rate, and whether they go on. Pure: times are passed in."""
+    """The arrivals of a medium: encoding, rate, and whether they continue. Pure: times are passed in."""
 
     def __init__(self) -> None:
         self.encoding = ""  # of the newest payload
@@ -40,14 +40,14 @@ class Arrivals:
         self._newest_at: float | None = None
 
     def add(self, encoding: str, size: int, now: float) -> bool:
-        """Note a payload; return whether an encoding begins with it."""
+        """Note a payload; return True if its encoding differs from the previous one."""
         begins = self._newest_at is None or encoding != self.encoding
         self.meter.add(now, size)
         self._newest_at, self.encoding = now, encoding
         return begins
 
     def quiet_s(self, now: float) -> float | None:
-        """Return how long nothing has come; None: nothing ever has."""
+        """Return for how long nothing has arrived; None if nothing ever has."""
         return None if self._newest_at is None else now - self._newest_at
 
     def flowing(self, now: float) -> bool:
@@ -58,7 +58,7 @@ class Arrivals:
 
 
 class MediaStream(ABC, Generic[ViewerT, ViewT]):
-    """Requests one medium of one robot while it has viewers.
+    """The request for a robot's medium while it has viewers.
 
     ``task`` ends once the request is withdrawn; until then viewers may join again.
     """
@@ -89,14 +89,14 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
 
     @property
     def robot(self) -> RobotView:
-        """The robot, as far as it is known."""
+        """Return the view of the robot, if it is known."""
         return self._robots.view(self.ref) or RobotView(self.ref)
 
     # -- of each medium
 
     @abstractmethod
     def receive(self, payload: bytes) -> None:
-        """Give a payload of the robot to all viewers. On the event loop."""
+        """Pass a payload to all viewers. On the event loop."""
 
     @abstractmethod
     async def _follow(self) -> None:
@@ -104,10 +104,10 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
 
     @abstractmethod
     def _make_view(self, state: str, why: str, rate: float, kbits: float) -> ViewT:
-        """Return what pages are shown."""
+        """Return what pages are shown about the medium."""
 
     def _end(self) -> None:
-        """Take note that the request has ended."""
+        """Note that the request has ended."""
 
     # -- the task
 
@@ -130,7 +130,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
     # -- what pages are shown
 
     def _report(self) -> None:
-        """Show what has changed, at most twice a second."""
+        """Show changes to pages, at most twice a second."""
         now = time.monotonic()
         if now - self._shown_at < TICK_S:
             return
@@ -163,7 +163,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
         return "silent", f"no {_WHAT[self._request.medium]} for {int(quiet_s)} s"
 
     def _problem(self) -> str:
-        """Return what is wrong although it flows."""
+        """Return what is wrong although payloads arrive; empty if nothing."""
         return ""
 
 
@@ -171,7 +171,7 @@ StreamT = TypeVar("StreamT", bound=MediaStream[Any, Any])
 
 
 class Streams(Generic[StreamT]):
-    """The streams of one medium, by robot; one that has ended is forgotten."""
+    """The streams of one medium, by robot; an ended one is forgotten."""
 
     def __init__(self, channel: Channel, make: Callable[[str], StreamT]) -> None:
         self._channel, self._make = channel, make
@@ -179,13 +179,13 @@ class Streams(Generic[StreamT]):
         self._streams: dict[str, StreamT] = {}
 
     def get(self, ref: str) -> StreamT | None:
-        """Return the stream of that robot, if pages use it."""
+        """Return that robot's stream, if pages use it."""
         return self._streams.get(ref)
 
     async def let_view(
         self, websocket: WebSocket, ref: str, viewer: Any, *work: Callable[[StreamT], Coroutine[Any, Any, None]]
     ) -> None:
-        """Let the page view that robot until one part of the ``work`` for its socket ends; close the socket."""
+        """Serve a page's socket while it views that robot, until one part of ``work`` ends; then close the socket."""
         if self._closed or not own_topic(ref, self._channel.topic(ref), Direction.OUTGOING):
             await websocket.close(_BAD_REQUEST, "no such component")
             return
@@ -201,7 +201,7 @@ class Streams(Generic[StreamT]):
                 await websocket.close(_GONE)
 
     async def close(self) -> None:
-        """Withdraw all requests; for good."""
+        """Withdraw all requests for good."""
         self._closed = True
         await asyncio.gather(*(stream.close() for stream in self._streams.values()), return_exceptions=True)
 

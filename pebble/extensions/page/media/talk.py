@@ -1,4 +1,4 @@
-"""A person's voice on its way to a robot: one talk at a time, nothing that is old, and the robot's packets. Pure."""
+"""A person's voice on its way to a robot: one talk at a time, nothing late, as the robot's packets. Pure."""
 
 from typing import Final
 
@@ -14,7 +14,7 @@ _DRIFT_S: Final = 2e-5  # a piece: the clock of a page's microphone may be slow 
 
 
 class Talk:
-    """One talk of one page. It never goes on after its end: the page begins another one."""
+    """A talk of one page. After its end the page has to begin another one."""
 
     def __init__(self, number: int, now: float) -> None:
         self.number = number  # of that page's connection
@@ -22,7 +22,7 @@ class Talk:
         self._least = float("inf")  # the smallest lateness of its pieces
 
     def takes(self, piece: int, now: float) -> bool:
-        """True if this piece, counted from 0 by the page's microphone, is in time."""
+        """True if this piece, counted from 0 by the page's microphone, arrives in time."""
         late = now - piece / PIECES_PER_S
         self._least = min(self._least + _DRIFT_S, late)
         if late - self._least > LATE_S:

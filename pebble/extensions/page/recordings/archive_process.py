@@ -23,17 +23,17 @@ AnswerT = TypeVar("AnswerT")
 
 
 def _spawn() -> SpawnContext:
-    """Return how to start a process that imports nothing of the folder that we are in."""
+    """Return a way to start a process that imports nothing from the current folder."""
     os.environ["PYTHONSAFEPATH"] = "1"
     return multiprocessing.get_context("spawn")
 
 
 class BusyError(PebbleError):
-    """There are too many questions."""
+    """Too many questions at once."""
 
 
 class ArchiveProcess:
-    """Answers questions about one folder, one after the other; it is started by the first."""
+    """A process that answers questions about one folder, in turn; the first question starts it."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -42,7 +42,7 @@ class ArchiveProcess:
 
     @property
     def pids(self) -> list[int]:
-        """The process that answers, if it runs."""
+        """Return the id of the running process, if any."""
         return [] if self._pool is None else list(self._pool._processes or ())  # those of a pool are not public
 
     async def ask(self, question: Callable[..., AnswerT], *arguments: Any) -> AnswerT:
@@ -77,10 +77,10 @@ class ArchiveProcess:
 
 
 class Job:
-    """One long job in a process of its own; what it makes is in a file."""
+    """A long job in a process of its own; its result is a file."""
 
     def __init__(self, function: Callable[..., None], *arguments: Any) -> None:
-        """``function`` takes a Connection, then ``arguments``. Call it on the event loop."""
+        """Start the process. ``function`` takes a Connection, then ``arguments``. Call it on the event loop."""
         self.done = 0.0  # the share of the work
         self.ready = False
         self.why = ""  # it failed
@@ -133,7 +133,7 @@ class Job:
 
 
 def _ended(code: int | None) -> str:
-    """Return why a process said nothing more; ``code`` is what it ended with."""
+    """Return why a process stopped answering, from its exit code."""
     if code == -signal.SIGKILL:
         return "its process was killed, as it is where memory runs out: end other programs, or choose less"
     return f"its process has ended ({code}): the log of the server says why"

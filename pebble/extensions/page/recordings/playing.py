@@ -54,7 +54,7 @@ _ops = msgspec.json.Decoder(m.FromReplay)
 
 
 def main(number: str, folder: str, ref: str, at_ms: str) -> None:
-    """Play for the page at the other end of the socket of that number, until it closes it."""
+    """Play for the page at the other end of socket number SOCKET, until the page closes it."""
     end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in a terminal reaches the whole group: the parent ends this
     os.nice(_NICE)
@@ -68,7 +68,7 @@ def main(number: str, folder: str, ref: str, at_ms: str) -> None:
 
 
 class Link:
-    """The socket to the server. A page that reads slowly holds the player up."""
+    """The socket to the server. A page that reads slowly slows the player."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection
@@ -81,7 +81,7 @@ class Link:
         self._write(BINARY, MEDIUM.pack(what, at_ms) + payload)
 
     def read(self, seconds: float) -> list[m.FromReplay]:
-        """Return what comes within a time. Raises EOFError once the page has gone."""
+        """Return the page's messages that arrive in time. Raises EOFError once the page has gone."""
         if not select.select([self._connection], [], [], seconds)[0]:
             return []
         data = self._connection.recv(1 << 16)
@@ -102,16 +102,16 @@ class Link:
 
 
 class RobotSource:
-    """One robot in an archive; ``begins`` is called with a time, and the picture that was seen then.
+    """A robot in an archive. ``begins`` is called with a time, and the picture seen at that time.
 
-    What was received at a time belongs to the state at that time.
+    Messages received exactly at a time belong to the state at that time.
     """
 
     def __init__(self, archive: Archive, ref: str, begins: Callable[[int, Recorded | None], None]) -> None:
         self._archive, self._ref, self._begins = archive, ref, begins
 
     def messages(self, since_ns: int, until_ns: int) -> Iterator[Recorded]:
-        """Yield what was published and sent from a time on."""
+        """Yield the messages from a time on."""
         next_ns: int | None = since_ns + 1
         while next_ns is not None and next_ns < until_ns:
             messages = self._archive.messages(self._ref, next_ns, next_ns + _STEP_NS)
@@ -121,7 +121,7 @@ class RobotSource:
                 next_ns = self._archive.next_ns(self._ref, next_ns)
 
     def state_before(self, at_ns: int, _publishes: object) -> list[Recorded]:
-        """Return the newest value of each topic, the last lines of the log, and the pictures since a key frame."""
+        """Return each topic's newest value, the last log lines, and the pictures since a key frame."""
         archive, log = self._archive, LOGS.topic(self._ref)
         state = [message for message in archive.state(self._ref, at_ns + 1) if message.channel.topic != log]
         pictures = archive.pictures(self._ref, at_ns + 1)
@@ -130,7 +130,7 @@ class RobotSource:
 
 
 class PlayedRobot:
-    """One robot of a recording, as a page sees it: the output of its player."""
+    """A recorded robot as a page sees it: the output of its player."""
 
     def __init__(self, link: Link, archive: Archive, ref: str, at_ns: int) -> None:
         self.sent = self.skipped = 0
@@ -171,7 +171,7 @@ class PlayedRobot:
         return True
 
     def halt(self) -> None:
-        """Do nothing: what a page is shown moves nothing."""
+        """Do nothing, as a shown recording moves nothing."""
 
     # -- what the page asks for
 
@@ -192,7 +192,7 @@ class PlayedRobot:
     # -- what the page is sent
 
     def _begin(self, at_ns: int, picture: Recorded | None) -> None:
-        """Start again at another time: a seek has arrived."""
+        """Start again at another time after a seek."""
         self._picture, self._newest_ns = picture, at_ns
         self._values: dict[str, tuple[Any, float]] = {}
         self._lines: list[msgspec.Raw] = []
@@ -203,7 +203,7 @@ class PlayedRobot:
         self._link.write(m.Played(at=at_ns / 1e6, on=not player.paused, speed=player.speed, begins=True))
 
     def _show(self, skipped: tuple[float, float] | None = None) -> None:
-        """Tell where it is, and what it does."""
+        """Send the position and the player's state."""
         player, self._played_at = self.player, time.monotonic()
         at_ms = player.position_ns / 1e6
         self._link.write(
@@ -211,7 +211,7 @@ class PlayedRobot:
         )
 
     def _flush(self, now: float) -> None:
-        """Send the changed values and log lines and, a few times a second, the position in the recording."""
+        """Send changed values and log lines, and a few times a second the position."""
         if now - self._flushed_at < _FLUSH_S or self.player.restores:
             return
         self._flushed_at = now

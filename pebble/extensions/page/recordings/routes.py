@@ -1,4 +1,4 @@
-"""The routes of recordings: days, timelines, films. Nothing is sent."""
+"""The routes of recordings: days, timelines, films. They send nothing to a robot."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _export_decoder = msgspec.json.Decoder(ExportRequest)
 
 @dataclass(slots=True)
 class _Timeline:
-    """A timeline that is being made, or was made; ``made``: JSON, that of before while a newer one is made."""
+    """A timeline, or its making. ``made``: JSON; that of before while a newer one is being made."""
 
     paths: list[str]
     active: bool
@@ -66,7 +66,7 @@ class _Timeline:
 
 @dataclass(slots=True)
 class _Export:
-    """The export that runs or is ready; there is one at most."""
+    """The running or finished export; there is at most one."""
 
     id: str
     name: str
@@ -75,11 +75,11 @@ class _Export:
 
 
 class BadQuestionError(PebbleError):
-    """A parameter that is missing or no such value. Example: ``at: a number of milliseconds is needed``."""
+    """A missing or invalid parameter. Example: ``at: a number of milliseconds is needed``."""
 
 
 class Recordings:
-    """A folder of recordings at one server. Everything runs on the event loop."""
+    """A folder of recordings at one server. Used on the event loop only."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -91,7 +91,7 @@ class Recordings:
 
     @property
     def scratch(self) -> Path:
-        """The folder in which jobs write."""
+        """Return the folder in which jobs write."""
         return Path(self._scratch.name)
 
     async def close(self) -> None:
@@ -103,9 +103,9 @@ class Recordings:
         self._scratch.cleanup()
 
     async def timeline(self, day: str, robot: str, *, again: bool = False) -> bytes | float:
-        """Return JSON, or the share of the work that is done. Raises PebbleError.
+        """Return the timeline as JSON, or the share of the work that is done. Raises PebbleError.
 
-        What has failed is done anew only ``again``, or for other recordings.
+        After a failure the work is done again only with ``again``, or for other recordings.
         """
         key, period = (day, robot), _period_of(day)
         paths, active = await self.process.ask(questions.files, robot, *period)
@@ -121,7 +121,7 @@ class Recordings:
         return timeline.job.done if made is None else made
 
     async def export(self, wanted: ExportRequest) -> str:
-        """Begin an export; returns its id. Raises PebbleError, BusyError while one runs."""
+        """Start an export; return its id. Raises PebbleError, and BusyError while another one runs."""
         if self._export is not None and self._export.job.running:
             raise BusyError("another export runs: wait for it, or end it")
         if not 0 <= wanted.since < wanted.until <= wanted.since + _LONGEST_EXPORT_MS:
@@ -156,7 +156,7 @@ class Recordings:
         return _Timeline(paths, active, target, job, clock(), before)
 
     def _target(self, name: str) -> Path:
-        """Return where a job writes; systems may have cleaned the folder away."""
+        """Return the path for a job's result, in a new folder if the system has removed the old one."""
         try:
             self.scratch.mkdir(mode=0o700, exist_ok=True)
         except OSError as error:
@@ -204,7 +204,7 @@ def routes() -> list[Route]:
 
 
 def _answered(answers: _Answers) -> Callable[[Request], Awaitable[Response]]:
-    """Answer only with a session, and with one line for everything that is wrong."""
+    """Answer only with a session, and answer every error in one line."""
 
     async def endpoint(request: Request) -> Response:
         if login.session_of(request) is None:
@@ -276,7 +276,7 @@ def _json(data: bytes) -> Response:
 
 
 def robot_and_time(connection: HTTPConnection) -> tuple[str, float]:
-    """Return whose recording a page wants to look at, and from when on. Raises BadQuestionError."""
+    """Return the robot and the time that a page asks for. Raises BadQuestionError."""
     return _robot(connection), _number(connection, "at", _LATEST_MS)
 
 

@@ -1,4 +1,4 @@
-"""The pages that look at recordings: each has a process that plays for it, which ends with its socket."""
+"""The pages that show recordings: each has a process that plays for it and ends with its socket."""
 
 import asyncio
 import socket
@@ -19,14 +19,14 @@ _decoder = msgspec.json.Decoder(m.FromReplay)
 
 
 class Viewers:
-    """All that look at one folder. Only the event loop calls it."""
+    """All pages that show recordings of one folder. Used on the event loop only."""
 
     def __init__(self, folder: Path) -> None:
         self.processes: set[subprocess.Popen[bytes]] = set()
         self._folder = folder
 
     async def serve(self, websocket: WebSocket, ref: str, at_ms: float) -> None:
-        """Play what was recorded of ``ref`` until the page closes the socket, or asks for anything else."""
+        """Play the recording of ``ref`` until the page closes the socket, or sends an invalid request."""
         if len(self.processes) >= MOST:
             await _close(websocket, f"{MOST} pages look at recordings already: close one, then reload")
             return
@@ -49,7 +49,7 @@ class Viewers:
 
 
 async def _relay(websocket: WebSocket, link: socket.socket) -> None:
-    """Pass messages on, both ways, until one side ends."""
+    """Pass messages on in both directions until one side ends."""
     reader, writer = await asyncio.open_unix_connection(sock=link)
     tasks = {asyncio.create_task(_send(websocket, reader)), asyncio.create_task(_receive(websocket, writer))}
     try:
@@ -63,7 +63,7 @@ async def _relay(websocket: WebSocket, link: socket.socket) -> None:
 
 
 async def _send(websocket: WebSocket, reader: asyncio.StreamReader) -> str:
-    """Pass on what is played; returns why nothing follows."""
+    """Pass on the player's messages; return why they ended."""
     with suppress(WebSocketDisconnect, RuntimeError):
         try:
             while True:
@@ -79,7 +79,7 @@ async def _send(websocket: WebSocket, reader: asyncio.StreamReader) -> str:
 
 
 async def _receive(websocket: WebSocket, writer: asyncio.StreamWriter) -> str:
-    """Pass on what the page asks for; returns why it is refused, or "" once the page has gone."""
+    """Pass on the page's requests; return why one is refused, or "" once the page has gone."""
     while True:
         message = await websocket.receive()
         if message["type"] != "websocket.receive":
