@@ -1,4 +1,4 @@
-"""Sends sound to operators, in the encoding they request and never old, over a connection of its own."""
+"""Sound for operators: sent in the encoding that they request, never late, over a connection of its own."""
 
 from pebble.extension import Extension
 

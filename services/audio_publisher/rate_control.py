@@ -31,7 +31,7 @@ _LIMIT = 256  # packets in flight that are remembered; far more than may wait
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One way to encode Opus; ``reduced`` is for display."""
+    """A way to encode Opus. ``reduced`` describes it on the display."""
 
     bundle: int
     bitrate: int
@@ -41,7 +41,7 @@ class Step:
 def steps(bundle: int, bitrate: int) -> tuple[Step, ...]:
     """Return the steps of quality, from the configured one down to the lowest useful one.
 
-    A step that would save nothing is left out.
+    Steps that would save nothing are left out.
     """
     steps = [Step(bundle, bitrate)]
     if bundle < BUNDLE_LIMIT:
@@ -73,11 +73,11 @@ class RateController:
 
     @property
     def configured(self) -> Step:
-        """The settings with nothing reduced."""
+        """Return the settings of full quality."""
         return self._steps[0]
 
     def poll(self, now: float, encoding: str) -> Step | None:
-        """Measure how long packets wait; returns the new step if it changes, which it does for Opus only."""
+        """Measure how long packets wait; return the new step if it changes, as only Opus can."""
         outgoing = self._outgoing()
         for packet in self._in_flight.acknowledge(outgoing.waiting):
             self._rests.note(now - packet.at - outgoing.round_trip_s, now)

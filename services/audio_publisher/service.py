@@ -1,4 +1,4 @@
-"""The sender of the microphone's sound: as few late packets as possible."""
+"""The service that sends the microphone's sound, with as little delay as possible."""
 
 import threading
 from typing import Any
@@ -74,7 +74,7 @@ class AudioPublisher(Service):
 
     @property
     def encoding(self) -> str:
-        """The encoding of what is sent."""
+        """Return the present encoding."""
         return self._options.encoding if self._encoder is None else self._encoder.name
 
     # -- the microphone's thread
@@ -93,7 +93,7 @@ class AudioPublisher(Service):
             raise DeviceError("the thread that reads the microphone has ended")  # the launcher restarts this process
 
     def take(self, info: FrameInfo, pcm: bytes, now: float) -> None:
-        """Send one chunk as the microphone gave it, at the monotonic time ``now``."""
+        """Send one chunk of the microphone's sound, received at the monotonic time ``now``."""
         if info.format != "s16le" or not (0 < info.rate <= 384_000 and 0 < info.channels <= 8):
             self.counters.add("refused")
             return
@@ -118,9 +118,9 @@ class AudioPublisher(Service):
         self.counters.add("bytes", len(packet))
 
     def _encoder_for(self, rate: int, channels: int) -> SoundEncoder:
-        """Return the present one, or a new one if anything about it has to change.
+        """Return the encoder; a new one if its settings have to change.
 
-        Another step waits for a packet's end.
+        A change of the step waits for the end of a packet.
         """
         step = self._rate.step if self._requested == "opus" else self._rate.configured
         needed = (self._requested, rate, channels, step)
@@ -136,7 +136,7 @@ class AudioPublisher(Service):
     def _make(self, name: str, rate: int, channels: int, step: Step) -> SoundEncoder:
         """Return the encoder called ``name``.
 
-        Where it cannot be made, the one that every robot has and every client reads.
+        If it cannot be made, the one that every robot has and every client reads.
         """
         options = self._options
         self._problem = ""

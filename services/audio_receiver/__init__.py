@@ -1,4 +1,4 @@
-"""Plays an operator's voice: a jitter buffer, and a program that writes to the loudspeaker."""
+"""An operator's voice on the robot: a jitter buffer, and a program that writes to the loudspeaker."""
 
 from pebble.extension import Extension
 

@@ -30,7 +30,10 @@ _DRAIN_S = 1.0  # for a program to play what is left in its buffer
 
 
 class Player:
-    """One thread uses it, apart from ``problem`` and ``stopping``. Writes wait for the program, but for 2 s at most."""
+    """A program that plays sound. Writes wait for the program, at most 2 s.
+
+    One thread uses it, except ``problem`` and ``stopping``.
+    """
 
     def __init__(self, options: AudioReceiver, stopping: threading.Event) -> None:
         self.problem = ""  # why nothing is played; empty while sound is played
@@ -47,7 +50,7 @@ class Player:
             self._failed(f"{self._name} is not installed", time.monotonic())
 
     def play(self, chunk: Chunk) -> None:
-        """Write it to the program; drop it if there is none."""
+        """Write samples to the program; drop them if there is none."""
         now = self._played_at = time.monotonic()
         if self._child is not None and (chunk.rate, chunk.channels) != self._format:
             if now - self._started_at < _CHANGE_S:
@@ -62,7 +65,7 @@ class Player:
             self._write(self._child, chunk.pcm)
 
     def idle(self) -> None:
-        """Call this while nothing is to be played: ends the program after SILENCE_S."""
+        """End the program after SILENCE_S. Call it while there is nothing to play."""
         if self._child is not None and time.monotonic() - self._played_at > SILENCE_S:
             self._end(_DRAIN_S)
 
@@ -122,7 +125,7 @@ class Player:
         self._back_off_s = min(2 * self._back_off_s, _LONGEST_BACK_OFF_S)
 
     def _end(self, drain_s: float) -> None:
-        """Close its input, which ends it once it has played everything; terminate it after ``drain_s``."""
+        """Close the program's input, so that it ends after playing everything; terminate it after ``drain_s``."""
         child, self._child, self.doing = self._child, None, ""
         if child is None:
             return

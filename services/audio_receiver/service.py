@@ -23,7 +23,10 @@ _WAITING_PACKETS = 48  # that wait to be played
 
 
 class AudioReceiver(Service):
-    """The player of voices: a connection receives packets, a thread plays them, the service's thread only reports."""
+    """The service that plays voices.
+
+    A connection receives packets, a thread plays them, and the service's thread only reports.
+    """
 
     name = "audio_receiver"
     publishes = (MEDIA_REPORT,)

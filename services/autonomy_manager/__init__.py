@@ -1,4 +1,4 @@
-"""Runs autonomy scripts, at most one at a time."""
+"""The manager of autonomy scripts: it runs one at a time."""
 
 from pebble.extension import Extension, Program
 

@@ -61,7 +61,7 @@ def roots(config: Config, own: Path = _OWN_SCRIPTS) -> tuple[Path, ...]:
 
 
 class _Answer(NamedTuple):
-    """The description of a script, and why it has no settings or cannot be started."""
+    """A script's description, and why it has no settings or cannot be started."""
 
     description: Description
     ours: bool = False
@@ -72,10 +72,10 @@ class _Answer(NamedTuple):
 
 
 class Catalogue:
-    """The scripts in the folders. It belongs to one thread, because to ask a script takes up to 20 s."""
+    """The scripts in the folders. Used by one thread, because asking a script takes up to 20 s."""
 
     def __init__(self, config: Config, *, asks: bool = True, clock: Callable[[], float] = time.monotonic) -> None:
-        """``asks`` is False for a list of scripts without the settings of ours."""
+        """Store the folders. ``asks`` False: list our scripts without asking them for their settings."""
         self._config, self._section, self._asks = config, config.section(AutonomyManager), asks
         self._roots, self._login = roots(config), local_login(config)
         self._clock = clock
@@ -84,7 +84,7 @@ class Catalogue:
         self._complained: set[str] = set()  # names with a warning in the log
 
     def scan(self, found: Callable[[dict[str, Script]], object]) -> None:
-        """Call ``found`` with all scripts: at once, and again when those that have to be asked have answered."""
+        """Call ``found`` with all scripts: at once, and again when scripts that had to be asked have answered."""
         folders = dict(self._folders())
         scripts = self._scripts(folders, asks=False)
         if self._asks:
@@ -154,7 +154,7 @@ class Catalogue:
         )
 
     def _answer(self, name: str, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
-        """Return what its files say; remembered until they change, a failure for a minute."""
+        """Return a script's description by its files; stored until they change, a failure for a minute."""
         version = entry, stamp(entry), stamp(folder / MANIFEST)
         command, before, until = self._answers.get(name, (None, _Answer(Description()), 0.0))
         if (command == version and self._clock() < until) or (command is not None and not asks):
@@ -169,7 +169,7 @@ class Catalogue:
         return answer
 
     def _asked(self, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
-        """Read the files, and ask the script if ``asks`` and it is one of ours: that takes up to 20 s."""
+        """Read the script's files, and ask the script itself if ``asks`` and it is one of ours (up to 20 s)."""
         described, problem = Description(), ""
         try:
             if folder.parent != _OWN_SCRIPTS:
@@ -202,7 +202,7 @@ class Catalogue:
     def _command(
         self, folder: Path, entry: Path, section: ScriptSection, described: Description, *, ours: bool
     ) -> tuple[str, ...]:
-        """Return the command line without options."""
+        """Return the script's command line without options."""
         python = section.python
         if python is not None and "/" in python:
             python = str(self._config.folder / in_home(python))
@@ -218,7 +218,10 @@ class Catalogue:
     def _settings(
         self, name: str, section: ScriptSection, described: Description, *, ours: bool
     ) -> tuple[Setting, ...]:
-        """Return the config's settings, then the script's own, each key once. One of ours knows its options best."""
+        """Return the config's settings, then the script's others.
+
+        A script of ours describes its options itself, which counts more.
+        """
         configured = [Setting(**asdict(argument)) for argument in section.args]
         options = {setting.key: setting for setting in described.configs}
         if ours and options:
@@ -245,7 +248,7 @@ class Catalogue:
 
 
 def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
-    """Return the ``files`` of `autonomy-files`; without a form where all would be too long."""
+    """Return the ``files`` of `autonomy-files`; without forms if it would be too long with them."""
     entries: list[dict[str, object]] = []
     left = _LONGEST_FILES
     for script in scripts:
@@ -257,9 +260,9 @@ def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
 
 
 def _first_seen(script: Script, configs: Iterable[Mapping[str, object]]) -> dict[str, object]:
-    """Return what operators read of it before its settings, and which of these they see first.
+    """Return the script's summary, and the keys of the settings that operators see first.
 
-    Only what it says itself.
+    Only those that the script itself gives.
     """
     keys = {setting["key"] for setting in configs}
     first = {"summary": script.summary, "main": [key for key in script.main if key in keys]}
@@ -275,7 +278,7 @@ def _inside(root: Path) -> list[Path]:
 
 
 def _merged(first: Description, second: Description) -> Description:
-    """Return ``first``, with what it leaves open taken from ``second``."""
+    """Return ``first`` with missing fields taken from ``second``."""
     keys = {setting.key for setting in first.configs}
     return Description(
         label=first.label or second.label,
@@ -291,7 +294,7 @@ def _with_option(configured: Setting, option: Setting) -> Setting:
 
 
 def _dependencies(name: str, section: ScriptSection, described: Description) -> tuple[Dependency, ...]:
-    """Return the config's, else the script's own; each script once, and never itself."""
+    """Return the config's dependencies, or else the script's; each script once, and never itself."""
     chosen: Iterable[tuple[str, Mapping[str, object]]]
     if section.dependencies:
         chosen = ((dependency.file, dependency.config) for dependency in section.dependencies if dependency.enabled)

@@ -1,4 +1,4 @@
-"""One process of a script: started, read, signalled, and watched to its end."""
+"""A process of a script: started, read, signalled, and watched until it ends."""
 
 import logging
 import os
@@ -84,7 +84,7 @@ class Process:
         self._thread: threading.Thread | None = None
 
     def watch(self, ended: Callable[[int], None]) -> None:
-        """Begin to read its output, and call ``ended`` with its exit code once it has ended."""
+        """Start to read its output, and to wait for its end; ``ended`` gets its exit code."""
         self._thread = threading.Thread(target=self._watch, args=(ended,), name=f"script {self._file}", daemon=True)
         self._thread.start()
 
@@ -110,7 +110,7 @@ class Process:
         ended(self._child.finish(0.0))
 
     def _read_until_exit(self) -> None:
-        """Return when the process has ended and its output is read; it is not reaped yet."""
+        """Read the output until the process has ended; it is not reaped yet."""
         pipe = self._child.pipe("stdout").fileno()
         output = BoundedOutput(self._write, _LONGEST_LINE, time.monotonic())
         os.set_blocking(pipe, False)
@@ -145,7 +145,7 @@ class Process:
 
 
 def _check_program(path: Path) -> None:
-    """Raise PebbleError for what the kernel reports as a missing file, although it is there."""
+    """Raise PebbleError for an interpreter line that the kernel would report as a missing file."""
     if not path.is_file():
         return
     if not os.access(path, os.X_OK):
@@ -158,7 +158,7 @@ def _check_program(path: Path) -> None:
 
 
 def _read(pipe: int, output: BoundedOutput) -> bool:
-    """Read what there is; False: nothing, or the end."""
+    """Read the available output; return False at its end, or if there is none."""
     try:
         data = os.read(pipe, _READ_BYTES)
     except BlockingIOError:

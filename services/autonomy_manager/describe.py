@@ -1,4 +1,4 @@
-"""The description of a script: by its `script.json`, or by the script itself with `--describe` if it is ours."""
+"""The description of a script, from its `script.json` or, for our scripts, from the script with `--describe`."""
 
 import ast
 from collections.abc import Iterator, Mapping, Sequence
@@ -53,7 +53,7 @@ class Description(Struct, frozen=True):
 
 
 def _texts(description: Description) -> Iterator[str]:
-    """Yield what operators see of it, also in a terminal."""
+    """Yield the texts that operators see, also in a terminal."""
     yield description.label or ""
     yield description.summary
     for setting in description.configs:
@@ -62,17 +62,18 @@ def _texts(description: Description) -> Iterator[str]:
 
 
 class DescribeError(Exception):
-    """The reason why a script has no form."""
+    """A script without a form; the text says why."""
 
 
 class BrokenScriptError(DescribeError):
-    """The reason why a script cannot be started either."""
+    """A script that cannot be started either; the text says why."""
 
 
 def is_ours(entry: Path) -> bool:
-    """True if a Python file imports ``run`` from pebble, or pebble.script. It is read, never run.
+    """True if a Python file imports ``run`` from pebble, or pebble.script. It is parsed, not run.
 
-    A pipe or a device is not opened: that would wait, or never end. Raises BrokenScriptError for what is no Python.
+    Pipes and devices are not opened, as that could wait for ever. Raises BrokenScriptError for a file that is no
+    Python.
     """
     if entry.suffix != ".py" or not entry.is_file():
         return False
@@ -116,7 +117,7 @@ def ask(command: Sequence[str], folder: Path, environment: Mapping[str, str]) ->
 
 
 def answer_of(command: Sequence[str], folder: Path, environment: Mapping[str, str], name: str = "it") -> bytes:
-    """Run ``command``, and return what it prints. Raises DescribeError; takes at most 20 s."""
+    """Run ``command``; return its output. Raises DescribeError; takes at most 20 s."""
     limited = ["nice", "-n", _NICE, "prlimit", f"--fsize={_LONGEST + 1}", *command]
     with TemporaryFile() as output, TemporaryFile() as errors:
         try:
@@ -135,7 +136,7 @@ def answer_of(command: Sequence[str], folder: Path, environment: Mapping[str, st
 
 
 def _shown(text: str) -> str:
-    """Return a text that is fit for a log: what a terminal would obey is left out."""
+    """Return a text without terminal control characters, fit for a log."""
     return "".join(letter for letter in text if letter.isprintable())
 
 
@@ -145,7 +146,7 @@ def _content(file: IO[bytes]) -> bytes:
 
 
 def _parse(raw: bytes, source: str) -> Description:
-    """Return what the last line of a script's output says: modules may print while they are imported."""
+    """Return the JSON in the last line of a script's output; imported modules may print lines before it."""
     if len(raw) > _LONGEST:
         raise DescribeError(f"{source} is longer than {_LONGEST} bytes")
     try:
@@ -156,7 +157,7 @@ def _parse(raw: bytes, source: str) -> Description:
 
 
 def stamp(file: Path) -> tuple[int, int] | None:
-    """Return what differs when the file has changed; None if there is none."""
+    """Return a value that differs after the file has changed; None if there is no file."""
     try:
         status = file.stat()
     except OSError:

@@ -12,9 +12,9 @@ from pebble.services.autonomy_manager.interpreter import SYSTEM
 
 
 def environment(*more: Mapping[str, str], ours: bool = True) -> dict[str, str]:
-    """Return this process's variables and ``more`` of them; later ones replace earlier ones.
+    """Return this process's variables updated with ``more``.
 
-    For scripts of others, with ``ours`` False, ``python3`` is the system's, also where Pebble's is in its place.
+    For foreign scripts (``ours`` False) ``python3`` is the system's, even if Pebble's comes first in PATH.
     """
     merged = {"PYTHONUNBUFFERED": "1", **child_environment()}  # else what it prints comes in blocks, long after
     for name in (RUN, CONFIG):

@@ -1,4 +1,4 @@
-"""Facts about a robot's scripts, for its capabilities, for ``pebble check`` and for what Tab completes."""
+"""Facts about a robot's scripts, for its capabilities, for ``pebble check`` and for Tab completion."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
-    """Return ``value`` with the robot's scripts; one of them computes odometry from its touch sensors."""
+    """Return ``value`` with the robot's scripts added; a shipped one computes odometry from its touch sensors."""
     enabled = config.section(AutonomyManager).enabled
     telemetry: Any = value.telemetry
     telemetry = replace(telemetry, wheel_odometry=enabled and telemetry.touch_sensors)
@@ -34,7 +34,7 @@ def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
 
 
 def facts(config: Config) -> Facts:
-    """Return the scripts that would be offered, each with whether it can run here."""
+    """Return the scripts on offer, each with whether it can run here."""
     if config.robot.platform != "linux" or not config.section(AutonomyManager).enabled:
         return Facts()
     try:
@@ -58,7 +58,10 @@ def _fitness(config: Config, script: Script) -> str:
 
 
 def _may_run(config: Config, script: Script) -> bool:
-    """True for a Python of this machine, without variables of the config: that may be a stranger's, and run its own."""
+    """True if the script may be asked: with this machine's Python and without variables of the config.
+
+    Otherwise a stranger's config could run its own program.
+    """
     from pebble.services.autonomy_manager.environment import local_login
 
     program = Path(shutil.which(script.command[0]) or "/")
@@ -71,7 +74,7 @@ def _may_run(config: Config, script: Script) -> bool:
 
 
 def complete_scripts(context: Any) -> list[str]:
-    """Return the scripts of the robot whose config was given, else those of Pebble."""
+    """Return the names of the given robot's scripts, or else of those of Pebble."""
     file = Path(str(context.params.get("robot")))
     folders: tuple[Path, ...] = (Path(pebble.__file__).with_name("extensions") / "scripts" / "shipped",)
     if file.is_file():

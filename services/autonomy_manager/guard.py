@@ -1,4 +1,4 @@
-"""A guard that ends all processes of all scripts when this process has ended, before the next one begins."""
+"""A guard that ends all processes of scripts when this process has ended, before another manager starts."""
 
 import fcntl
 import logging
@@ -77,7 +77,7 @@ class Guard:
         return call_off
 
     def close(self) -> None:
-        """Let the next manager begin, once no script is left."""
+        """Let the next manager start once no script is left."""
         if self._locked >= 0:
             os.close(self._locked)
             self._locked = -1

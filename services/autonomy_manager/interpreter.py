@@ -1,4 +1,4 @@
-"""The Python that runs a script, and what a script that does not import pebble lacks there."""
+"""The Python that runs a script, and the modules that are missing there."""
 
 import ast
 import re
@@ -40,7 +40,7 @@ for want in sys.argv[1:]:
 
 
 def interpreter(configured: str | None, *, ours: bool) -> str:
-    """Return the Python of a script: the configured one, else ours for one of ours, and the system's for others."""
+    """Return the Python of a script: the configured one, else ours for our scripts, the system's for others."""
     return configured or (sys.executable if ours or not SYSTEM.is_file() else str(SYSTEM))
 
 
@@ -74,7 +74,7 @@ def lacking(command: Sequence[str], folder: Path, variables: Mapping[str, str]) 
 
 
 def _sources(entry: Path) -> Iterator[bytes]:
-    """Yield the text of a script, and of the files beside it that it names."""
+    """Yield the text of a script, and of the files beside it that it imports."""
     try:
         text = _read(entry)
         yield text
@@ -89,7 +89,7 @@ def _read(path: Path) -> bytes:
 
 
 def _needs(tree: ast.Module, text: bytes) -> Iterator[str]:
-    """Yield what it needs of OpenCV and NumPy beyond that they are there."""
+    """Yield the script's requirements on OpenCV and NumPy beyond being installed."""
     if b"shmsrc" in text:
         yield _GSTREAMER
     if re.search(rb"\bfloat\((?!\s*[\"'\d])|\bmap\(float\b", text):

@@ -1,4 +1,4 @@
-"""The scripts that operators may start now: listed again and again, because people add and change them."""
+"""The list of scripts on offer, repeated because people add and change scripts."""
 
 import logging
 import threading
@@ -12,7 +12,10 @@ log = logging.getLogger(__name__)
 
 
 class Offer:
-    """The scripts on offer. All but their listing runs on the service's thread; ``on_change`` gets `autonomy-files`."""
+    """The scripts on offer. ``on_change`` gets `autonomy-files`.
+
+    Only the listing itself runs on another thread than the service's.
+    """
 
     def __init__(
         self,
@@ -21,7 +24,7 @@ class Offer:
         on_change: Callable[[list[dict[str, object]]], None],
         fixed: Mapping[str, Script] | None,
     ) -> None:
-        """``fixed`` replaces the folders in tests."""
+        """Store the catalogue. ``fixed`` replaces the folders in tests."""
         self.scripts = dict(fixed or {})
         self.complete = self._fixed = fixed is not None  # whether every folder was looked at once
         self._config, self._post, self._on_change = config, post, on_change
@@ -29,7 +32,7 @@ class Offer:
         self._wanted, self._ended = threading.Event(), False
 
     def begin(self) -> bool:
-        """True if :meth:`scan` is to be called from now on."""
+        """True if :meth:`scan` has to be called from now on."""
         if self._fixed:
             self._found(self.scripts)
         else:
@@ -37,7 +40,7 @@ class Offer:
         return not self._fixed
 
     def scan(self) -> None:
-        """List them again, soon."""
+        """List the scripts again soon."""
         self._wanted.set()
 
     def close(self) -> None:
@@ -45,7 +48,7 @@ class Offer:
         self._wanted.set()
 
     def _scan(self) -> None:
-        """Ask scripts what they are, on a thread of its own: that takes long."""
+        """List the scripts on a thread, since asking them takes long."""
         catalogue = Catalogue(self._config)
         while self._wanted.wait() and not self._ended:
             self._wanted.clear()

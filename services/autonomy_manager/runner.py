@@ -1,4 +1,4 @@
-"""The run of a script with the scripts it needs: start, stop, and what follows when one of them ends."""
+"""A run of a script with the scripts it needs: its start, its stop, and what follows when a process ends."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Part:
 
 @dataclass
 class Run:
-    """One start of a script, until its last process has ended."""
+    """A start of a script, until its last process has ended."""
 
     number: int
     plan: Plan
@@ -51,7 +51,7 @@ class Run:
 
 
 class Runner:
-    """The runner of scripts, one at a time. All methods belong to the service's thread."""
+    """A runner of scripts, one at a time. Used on the service's thread only."""
 
     def __init__(self, service: AutonomyManager, spawn: Spawn, stop_timeout_s: float) -> None:
         self.error: str | None = None
@@ -62,22 +62,22 @@ class Runner:
 
     @property
     def run(self) -> Run | None:
-        """The present run, also while its processes end."""
+        """Return the present run, also while its processes are ending."""
         return self._run
 
     @property
     def active(self) -> Run | None:
-        """The present run unless it is being ended."""
+        """Return the present run unless it is being ended."""
         return None if self._run is None or self._run.ending else self._run
 
     @property
     def switching(self) -> bool:
-        """True if a start waits for the end of what runs."""
+        """True if a start waits for the end of the present run."""
         return self._next is not None
 
     @property
     def stoppable(self) -> Run | None:
-        """The present run, unless it is being ended and no other follows, or nothing of it may move the robot."""
+        """Return the present run; None if it is being ended with no successor, or cannot move the robot."""
         return (self._run if self._next is not None else self.active) if self.drives else None
 
     @property
@@ -86,23 +86,23 @@ class Runner:
 
     @property
     def drives(self) -> bool:
-        """True if what runs, or is to follow, may move the robot."""
+        """True if the present run, or its successor, may move the robot."""
         plans = (self._next, None if self._run is None else self._run.plan)
         return any(plan is not None and plan.drives for plan in plans)
 
     def refuse(self, error: str | None, *, stopped: bool = False) -> None:
-        """Note that a start is not possible, or, with None, it is again; what runs goes on."""
+        """Set why no start is possible; None: starts are possible again. The present run goes on."""
         self.error, self.stopped = error, stopped
         self._service.changed()
 
     def start(self, plan: Plan) -> None:
-        """Start ``plan`` once what runs has ended; only the newest one counts."""
+        """Start ``plan`` once the present run has ended; a newer plan replaces a waiting one."""
         self.error, self.stopped, self._next = None, False, plan
         self._end()
         self._go_on()
 
     def stop(self, error: str | None = None, *, stopped: bool = False) -> None:
-        """End what runs, because of ``error``; None: on request. ``stopped``: by an emergency stop."""
+        """End the present run, because of ``error``, or None on request. ``stopped``: by an emergency stop."""
         if error is not None:
             log.warning("%s", error)
         self.error, self.stopped, self._next = error, stopped, None
@@ -110,7 +110,7 @@ class Runner:
         self._go_on()
 
     def close(self, wait_s: float) -> None:
-        """End everything, and wait for it: this process ends."""
+        """End everything and wait for it, because this process ends."""
         self._next = None
         run = self._run
         if run is None:
@@ -174,7 +174,7 @@ class Runner:
     # -- ending
 
     def _end(self) -> None:
-        """Begin to end what runs: wheels first, then the script, then what it needed."""
+        """Start to end the present run: wheels first, then the script, then those that it needed."""
         run = self._run
         if run is None or run.ending:
             return

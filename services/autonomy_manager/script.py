@@ -1,4 +1,4 @@
-"""A script of the catalogue, and the plan of its start."""
+"""A script of the catalogue, and the plan for starting it."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,26 +12,26 @@ from pebble.extensions.operator.client.forms import Setting, SettingError, Value
 
 
 class StartError(PebbleError):
-    """A start that is refused; the text is for the person who asked for it."""
+    """A refused start; the text is for the person who asked for it."""
 
 
 class StoppedError(StartError):
-    """A start that an emergency stop refuses, until the reset."""
+    """A start that is refused until the reset of an emergency stop."""
 
 
 class UnknownScriptError(StartError):
-    """A start of a script that is not listed, or whose needs are not known yet."""
+    """A start of a script that is not listed, or whose dependencies are not known yet."""
 
 
 class Dependency(Struct, frozen=True, forbid_unknown_fields=True):
-    """Another script that runs while a script runs, and its settings."""
+    """A script that has to run while another one runs, and its settings."""
 
     file: str
     config: dict[str, Any] = {}
 
 
 class Script(Struct, frozen=True, kw_only=True):
-    """One script of the catalogue. ``command`` is followed by ``--config PATH`` and the options."""
+    """A script of the catalogue. ``command`` is followed by ``--config PATH`` and the options."""
 
     file: str  # the name of its folder
     label: str
@@ -50,14 +50,14 @@ class Script(Struct, frozen=True, kw_only=True):
 
 
 class Step(Struct, frozen=True):
-    """One process of a plan."""
+    """A process of a plan."""
 
     script: Script
     options: tuple[str, ...]
 
 
 class Plan(Struct, frozen=True):
-    """A start that was checked: the script, what it needs in that order, and its effective settings."""
+    """A checked start: the script, the scripts it needs in their order, and the effective settings."""
 
     main: Step
     dependencies: tuple[Step, ...]
@@ -70,7 +70,7 @@ class Plan(Struct, frozen=True):
 
 
 def plan(scripts: Mapping[str, Script], file: str, config: Mapping[str, Any]) -> Plan:
-    """Check a start. Raises StartError."""
+    """Check a start; return its plan. Raises StartError."""
     script = scripts.get(meant(scripts, file))
     if script is None:
         raise UnknownScriptError(f"Unknown autonomy file: {shown(file)}")

@@ -45,7 +45,7 @@ _CLOSE_S = 1.0  # for scripts to end after SIGTERM when this process ends; it is
 
 
 class AutonomyManager(Service):
-    """The manager of scripts. ``spawn`` and ``scripts`` replace processes and folders in tests."""
+    """The service that manages scripts. ``spawn`` and ``scripts`` replace processes and folders in tests."""
 
     name = "autonomy_manager"
     publishes = (AUTONOMY_FILES, AUTONOMY_STATUS, DRIVE)
@@ -106,7 +106,10 @@ class AutonomyManager(Service):
             self._runner.stop()
 
     def _start_script(self, file: str, config: Mapping[str, Any], by: str | None, until: float) -> None:
-        """Start it, if that is possible before ``until``. ``by`` None: a program of the robot asks, without control."""
+        """Start the script if that becomes possible before ``until``.
+
+        ``by`` None: a program of the robot asks, without control.
+        """
         try:
             if by is not None and self.config.security.named and (holder := self._owners.holder_beside(by)):
                 raise StartError(f"{holder} has control, and starts scripts")
@@ -161,7 +164,10 @@ class AutonomyManager(Service):
 
     @on(DRIVE, direct=True)
     def drive(self, drive: Drive, _arrived: float) -> None:
-        """Take a drive command, on the transport's thread. Unsigned scripts and people without a key are alike."""
+        """Handle a drive command, on the transport's thread.
+
+        Commands of unsigned scripts and of people without a key look alike.
+        """
         if drive.signed:
             if isinstance(drive.run, int):
                 self._owners.note_run(drive.run)
@@ -185,7 +191,7 @@ class AutonomyManager(Service):
         self.changed()
 
     def _person_stops(self) -> None:
-        """End what runs, and refuse starts as the arbiter does during the hold of such a zero: they may be older."""
+        """End unsigned scripts, and refuse starts while the arbiter holds a person's zero, as they may be older."""
         self._refused_until = self.clock() + _HOLD_S
         self._end_unsigned()
 
@@ -198,7 +204,7 @@ class AutonomyManager(Service):
         self.changed()
 
     def _end_unsigned(self) -> None:
-        """End a script that does not sign; one that does, the arbiter ends."""
+        """End a script that does not sign its commands; others are ended by the motor owner's arbiter."""
         if self._runner.active is not None and not self._signs:
             self._runner.stop(OVERRIDDEN)
 
