@@ -1,13 +1,13 @@
-"""The Zenoh hub as a process: ``python -m pebble.runtime.hub SETTINGS``.
+"""The Zenoh hub: a part of a robot's announcer, or a process by ``python -m pebble.runtime.hub SETTINGS``.
 
-SETTINGS is JSON with the fields of :class:`pebble.transports.ZenohSettings`; only ``run_dir`` is required. The launcher
-starts the hub of a robot with this command; on another machine a hub runs the same way. It does not import
-pebble.runtime.process, which would be a good part of this small process.
+SETTINGS is JSON with the fields of :class:`pebble.transports.ZenohSettings`; only ``run_dir`` is required.
 """
 
 import logging
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -35,9 +35,6 @@ WILLS: Final = (
 #: Nothing is retained where the sender's account stands in the topic.
 UNRETAINED: Final = (f"{_ANY}/{INCOMING}/{BY}/#",)
 
-# Made when the launcher imports this module: its memory is then shared with the launcher.
-_decoder = msgspec.json.Decoder(ZenohSettings, dec_hook=lambda _kind, text: Path(text))
-
 
 def main(arguments: list[str]) -> int:
     """Run a hub with the settings in the arguments; return the exit code."""
@@ -54,13 +51,20 @@ def main(arguments: list[str]) -> int:
 def run_hub(settings: ZenohSettings, stop: EndSignal | threading.Event) -> None:
     """Run a hub until ``stop`` is set. Raises TransportError if it cannot open."""
     notify = Notifier()
-    settings = replace(settings, wills=(*WILLS, *settings.wills), unretained=UNRETAINED)
-    hub = ZenohHub(settings, _accounts(settings)).open()
-    try:
+    with open_hub(settings) as hub:
         notify.ready()
         while not stop.wait(ALIVE_PERIOD_S):
             notify.alive()
             hub.look()
+
+
+@contextmanager
+def open_hub(settings: ZenohSettings) -> Iterator[ZenohHub]:
+    """Give a hub that is open during the ``with`` block. Raises TransportError if it cannot open."""
+    settings = replace(settings, wills=(*WILLS, *settings.wills), unretained=UNRETAINED)
+    hub = ZenohHub(settings, _accounts(settings)).open()
+    try:
+        yield hub
     finally:
         if hub.refused or hub.refused_wills:
             log.info("refused in all: %d retained messages, %d wills", hub.refused, hub.refused_wills)
@@ -84,7 +88,7 @@ def _settings(arguments: list[str]) -> ZenohSettings:
     if len(arguments) != 1:
         raise PebbleError("usage: python -m pebble.runtime.hub SETTINGS (JSON: the fields of ZenohSettings)")
     try:
-        return _decoder.decode(arguments[0])
+        return msgspec.json.decode(arguments[0], type=ZenohSettings, dec_hook=lambda _kind, text: Path(text))
     except msgspec.DecodeError as error:
         raise PebbleError(f"settings of the hub: {error}") from None
 

@@ -299,7 +299,7 @@ def test_of_a_refused_config_it_says_what_is_missing(tmp_path: Path) -> None:
 def test_the_core_alone_reads_a_config_with_sections_of_extensions() -> None:
     config = load(ROOT / "configs" / "goob.json", core_only=True)
     names = [program.name for program in programs(config)]
-    assert names == ["zenoh_hub", "announcer", "serial_mcu_bridge", "mqtt_bridge"]
+    assert names == ["zenoh_hub", "serial_mcu_bridge", "mqtt_bridge"]
 
 
 def test_a_robot_starts_though_a_section_of_what_is_missing_is_there(tmp_path: Path) -> None:
