@@ -89,7 +89,7 @@ class Announcer:
     def _publish(self, message: Message) -> None:
         try:
             self._transport.publish(message.topic, message.payload, qos=message.qos, retain=message.retain)
-        except Exception:
+        except Exception:  # noqa: BLE001 - no message may end the hub
             self._log.exception(message.topic, "could not publish on %s", message.topic)
 
     def _on_state(self, state: State) -> None:

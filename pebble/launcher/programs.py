@@ -56,6 +56,7 @@ def preload(modules: Iterable[str]) -> None:
             log.debug("%s cannot be imported", name, exc_info=True)
     gc.collect()
     gc.freeze()  # a collection writes into every object, and a written page is no longer shared
+    gc.enable()
 
 
 def _transport_modules(config: Config) -> tuple[str, ...]:
