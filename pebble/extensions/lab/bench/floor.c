@@ -2,13 +2,15 @@
 // floor bridge LOCAL_PORT REMOTE_PORT BASE DEVICE, floor serial …: `cc floor.c -lmosquitto`.
 #include <fcntl.h>
 #include <mosquitto.h>
+#include <poll.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <termios.h>
+#include <time.h>
 #include <unistd.h>
 
-enum { HEARTBEAT_US = 250000, STATUS_EVERY = 4, TEXT = 256 };
+enum { HEARTBEAT_MS = 250, STATUS_EVERY = 4, TEXT = 256 };
 
 typedef void (*receive_t)(struct mosquitto *, void *, const struct mosquitto_message *);
 
@@ -25,6 +27,26 @@ static void say(struct mosquitto *client, const char *base, const char *metric, 
   char topic[TEXT];
   snprintf(topic, sizeof topic, "%s/outgoing/%s", base, metric);
   mosquitto_publish(client, NULL, topic, (int)strlen(text), text, 1, true);
+}
+
+static long now_ms(void) {
+  struct timespec now;
+  clock_gettime(CLOCK_MONOTONIC, &now);
+  return now.tv_sec * 1000 + now.tv_nsec / 1000000;
+}
+
+// Serves two clients, or one and a device, for at most `wait_ms`, on this thread alone; true if the device has said more.
+static bool serve(struct mosquitto *first, struct mosquitto *second, int device, int wait_ms) {
+  struct mosquitto *clients[] = {first, second};
+  struct pollfd sources[] = {{mosquitto_socket(first), POLLIN, 0},
+                             {second ? mosquitto_socket(second) : device, POLLIN, 0}};
+  poll(sources, 2, wait_ms);
+  for (int at = 0; at < 2 && clients[at]; at++) {
+    if (sources[at].revents && mosquitto_loop_read(clients[at], 1) != MOSQ_ERR_SUCCESS) exit(1);
+    if (mosquitto_want_write(clients[at])) mosquitto_loop_write(clients[at], 1);
+    mosquitto_loop_misc(clients[at]);
+  }
+  return !second && sources[1].revents;
 }
 
 static void forward(struct mosquitto *from, void *to, const struct mosquitto_message *message) {
@@ -55,12 +77,10 @@ _Noreturn static void bridge(const char *local_port, const char *remote_port, co
   snprintf(outgoing, sizeof outgoing, "%s/outgoing/#", base);
   remote = open_client(remote_port, forward, &local, incoming);
   local = open_client(local_port, forward, &remote, outgoing);
-  mosquitto_loop_start(local);
-  mosquitto_loop_start(remote);
   for (int number = 0;; number++) {
     if (number % STATUS_EVERY == 0) say(remote, base, "status", "{\"value\":{\"services\":{\"c\":{\"state\":\"ready\"}}}}");
     say(remote, base, "online", "{\"t\":1}");
-    usleep(HEARTBEAT_US);
+    for (long due = now_ms() + HEARTBEAT_MS, left; (left = due - now_ms()) > 0;) serve(local, remote, -1, (int)left);
   }
 }
 
@@ -74,15 +94,21 @@ static int serial(const char *local_port, const char *base, const char *path) {
   char topic[TEXT], text[TEXT];
   snprintf(topic, sizeof topic, "%s/incoming/drive-values", base);
   struct mosquitto *local = open_client(local_port, drive, &device, topic);
-  mosquitto_loop_start(local);
-  FILE *said = fdopen(dup(device), "r");
   snprintf(topic, sizeof topic, "%s/outgoing/touch-sensors", base);
-  for (int a, b, c; fgets(text, sizeof text, said) != NULL;) {
-    if (sscanf(text, "T a0=%d a1=%d a2=%d", &a, &b, &c) != 3) continue;
-    int size = snprintf(text, sizeof text, "{\"value\":{\"a0\":%d,\"a1\":%d,\"a2\":%d}}", a, b, c);
-    mosquitto_publish(local, NULL, topic, size, text, 1, false);
+  for (int used = 0, a, b, c;;) {
+    if (!serve(local, NULL, device, HEARTBEAT_MS)) continue;
+    char piece[TEXT];
+    ssize_t size = read(device, piece, sizeof piece);
+    if (size <= 0) return 1;
+    for (ssize_t at = 0; at < size; at++) {
+      text[used] = piece[at] == '\n' ? 0 : piece[at];
+      used = text[used] && used < TEXT - 2 ? used + 1 : 0;
+      if (used > 0 || sscanf(text, "T a0=%d a1=%d a2=%d", &a, &b, &c) != 3) continue;
+      char report[TEXT];
+      int length = snprintf(report, sizeof report, "{\"value\":{\"a0\":%d,\"a1\":%d,\"a2\":%d}}", a, b, c);
+      mosquitto_publish(local, NULL, topic, length, report, 1, false);
+    }
   }
-  return 0;
 }
 
 int main(int count, char **words) {
