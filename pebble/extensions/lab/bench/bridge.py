@@ -1,11 +1,11 @@
 """Measures the latency of drive commands to the wheels and of MCU reports to the operator, with whole robots.
 
 A robot of each kind, with a stock broker between it and the operator, and ``stand-in``, two programs of plain paho in
-place of the original; ``C floor``: such two in C (floor.c), if gcc is there. ``down``: from the operator's publish call
-to the last byte of the command's line at the MCU's pty; ``up``: from the MCU's report to the operator. Under
-``commands`` robots forward no reports. CPU is that of the process that bridges and of the one that owns the serial
-line, for each command and report that they forwarded. Each round starts fresh robots and drives them in turns of a
-second, backwards every other time. Commands and reports that take longer than a second are lost, and commands that a
+place of the original; ``C floor``: such two in C (floor.c), which carry commands alone. ``down``: from the operator's
+publish call to the last byte of the command's line at the MCU's pty; ``up``: from the MCU's report to the operator.
+Under ``commands`` robots forward no reports. CPU is that of the process that bridges and of the one that owns the
+serial line, for each command and report that they forwarded. Each round starts fresh robots and drives them in turns of
+a second, backwards every other time. Commands and reports that take longer than a second are lost, and commands that a
 newer one overtook.
 """
 
@@ -51,15 +51,13 @@ QUICK: Final = Settings(seconds=0.5, rounds=2)
 
 def run(settings: Settings, console: Console) -> Shown:
     """Measure all variants. Raises PebbleError."""
+    results = begin("bridge", settings)
     try:
         with tempfile.TemporaryDirectory() as folder:
             compiled(Path(folder, "floor"))
-        left_out = ""
     except PebbleError as error:
-        left_out = str(error)
+        results.notes.append(str(error))
         settings = replace(settings, variants=[name for name in settings.variants if name != FLOOR])
-    results = begin("bridge", settings)
-    results.notes += [left_out] if left_out else []
     measure_rounds(results, settings.rounds, lambda number, progress: measure(settings, number, progress), console)
     results.cells.sort(key=lambda cell: MEASURES.index(cell.measure))
     latencies, cpu = ([cell for cell in results.cells if (cell.measure == CPU) == is_cpu] for is_cpu in (False, True))
@@ -87,7 +85,7 @@ def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cel
     for load in in_turn((UNLOADED, COMMANDS), number):
         reports, turns = load == UNLOADED, list[tuple[str, Turn]]()
         progress("starting the robots")
-        with running(settings.variants, reports=reports) as driven:
+        with running([name for name in settings.variants if name != FLOOR or not reports], reports=reports) as driven:
             for pass_ in range(passes):
                 for variant in in_turn(list(driven), number + pass_):
                     progress(f"{variant}, {load}")

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from rich.console import Console
 from rich.table import Table
@@ -51,25 +51,16 @@ class Floor(Robot):
         self.start(f"the {self.kind} floor", [*program, str(place), str(self.remote_port), self.base])
 
     def processes(self) -> dict[str, int]:
-        return {"floor": self.launcher.pid} | (
-            {} if self.local_broker is None else {"mosquitto": self.local_broker.pid}
-        )
+        return {program.name: program.pid for program in (self.launcher, self.local_broker) if program is not None}
 
 
-class Variant(NamedTuple):
-    """A robot that is launched."""
-
-    kind: str
-    make: type[Robot] = Robot
-    services: Mapping[str, Config] = {}
-
-
-_MINIMAL: Final = {"serial_mcu_bridge": {"enabled": False}}
-VARIANTS: Final = {
-    **{kind: Variant(kind) for kind in KINDS},
-    **{f"{kind} minimal": Variant(kind, services=_MINIMAL) for kind in KINDS},
-    **{f"{kind} floor": Variant(kind, Floor) for kind in KINDS},
+#: What is launched, of each kind: a robot, one without motors, and a floor.
+PARTS: Final[Mapping[str, tuple[type[Robot], Mapping[str, Config]]]] = {
+    "": (Robot, {}),
+    "minimal": (Robot, {"serial_mcu_bridge": {"enabled": False}}),
+    "floor": (Floor, {}),
 }
+VARIANTS: Final = [f"{kind} {part}".rstrip() for part in PARTS for kind in KINDS]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +80,7 @@ def run(settings: Settings, console: Console) -> Shown:
     results = begin("startup", settings)
 
     def measure_round(number: int, progress: Progress) -> Iterator[Cell]:
-        for variant in in_turn(list(VARIANTS), number):
+        for variant in in_turn(VARIANTS, number):
             progress(variant)
             yield from launch(variant, settings.joins)
 
@@ -123,38 +114,28 @@ def floor_table(results: Results) -> Table:
 
 def launch(variant: str, joins: int) -> Iterator[Cell]:
     """Launch a fresh robot. Seconds count from just before the launcher is started. Raises PebbleError with its log."""
-    kind, make, services = VARIANTS[variant]
-    if kind != variant:
-        yield from _small(variant, kind, make, services)
-        return
-    with one_robot(kind) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
+    kind, _, part = variant.partition(" ")
+    make, services = PARTS[part]
+    with (
+        one_robot(kind, make, services=services) as robot,
+        closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber,
+    ):
         subscriber.wait()
         with driving(robot.remote_port, BASE):
             began_ns = time.monotonic_ns()
             robot.launch()
             robot.expect(lambda: subscriber.first_heartbeat_ns is not None, "no heartbeat", UP_S)
             robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", UP_S)
-            robot.expect(lambda: bool(_obeyed(robot, began_ns)), "no drive command was obeyed", UP_S)
-        times = (subscriber.first_heartbeat_ns or 0, subscriber.ready_ns or 0, _obeyed(robot, began_ns)[0])
-        for name, at_ns in zip(STARTED, times, strict=True):
+            robot.expect(lambda: bool(part or _obeyed(robot, began_ns)), "no drive command was obeyed", UP_S)
+        times = (subscriber.first_heartbeat_ns or 0, subscriber.ready_ns or 0, *_obeyed(robot, began_ns)[:1])
+        for name, at_ns in zip(STARTED, times, strict=False):
             yield round_cell(variant, name, "s", [(at_ns - began_ns) / 1e9])
-        yield from _late(robot, joins)
-
-
-def _small(variant: str, kind: str, make: type[Robot], services: Mapping[str, Config]) -> Iterator[Cell]:
-    """Measure the first heartbeat, memory and threads of a robot without motors, or of a floor."""
-    with one_robot(kind, make, services=services) as robot:
-        with closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
-            subscriber.wait()
-            began_ns = time.monotonic_ns()
-            robot.launch()
-            robot.expect(lambda: subscriber.first_heartbeat_ns is not None, "no heartbeat", UP_S)
-            robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", UP_S)
-        yield round_cell(variant, STARTED[0], "s", [((subscriber.first_heartbeat_ns or 0) - began_ns) / 1e9])
         time.sleep(_SETTLED_S)
         pids = robot.processes().values()
         yield round_cell(variant, MEMORY, "MB", [sum(map(pss_mb, pids))])
         yield round_cell(variant, THREADS, "", [sum(map(threads, pids))])
+        if not part:
+            yield from _late(robot, joins)
 
 
 def _obeyed(robot: Robot, since_ns: int) -> list[int]:

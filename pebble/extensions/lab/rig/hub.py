@@ -21,20 +21,13 @@ log = logging.getLogger(__name__)
 def main(arguments: list[str]) -> int:
     """Run a hub with the settings in the arguments; return the exit code."""
     set_up_logging("INFO")
-    stop = EndSignal()
+    settings = msgspec.json.decode(arguments[0], type=ZenohSettings, dec_hook=lambda _kind, text: Path(text))
     try:
-        run_hub(_settings(arguments), stop)
+        run_hub(settings, EndSignal())
     except PebbleError as error:
         log.error("%s", error)
         return 1
     return 0
-
-
-def _settings(arguments: list[str]) -> ZenohSettings:
-    try:
-        return msgspec.json.decode(arguments[0], type=ZenohSettings, dec_hook=lambda _kind, text: Path(text))
-    except msgspec.DecodeError as error:
-        raise PebbleError(f"settings of the hub: {error}") from None
 
 
 if __name__ == "__main__":
