@@ -116,7 +116,7 @@ def test_the_first_extension_and_its_test_run_as_they_stand(tmp_path: Path) -> N
 
     assert "1 passed" in run("pytest", "--quiet", "test_battery_alarm.py")
     (tmp_path / "robot.json").write_text(config)
-    assert "announcer, battery_alarm" in run("pebble.cli", "check", "robot.json")
+    assert "zenoh_hub, battery_alarm" in run("pebble.cli", "check", "robot.json")
     points = tomllib.loads(metadata)["project"]["entry-points"]["pebble.extensions"]
     (tmp_path / "pebble_alarm-1.dist-info").mkdir()
     lines = [f"{name} = {place}" for name, place in points.items()]

@@ -10,9 +10,10 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
+
+from msgspec import Struct
 
 from pebble.errors import TransportError
 from pebble.transports.bounds import BoundedQueue, BoundedTable
@@ -37,8 +38,7 @@ _NAMED = 3  # subscriptions in one line
 _WARNING_PERIOD_S = 5.0  # between two log lines about the same overflowing subscription
 
 
-@dataclass(frozen=True, slots=True)
-class Outgoing:
+class Outgoing(Struct, frozen=True):
     """Messages that a transport has accepted and not delivered yet; not the contract's direction ``outgoing``.
 
     All zero from a backend that cannot measure them (T20).
@@ -49,8 +49,7 @@ class Outgoing:
     stalled_s: float = 0.0  # how long DELIVERED messages wait and none was acknowledged, beyond two usual round trips
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
+class Answer(Struct, frozen=True):
     """The newest answer of the other end to a ping, or the oldest ping that it has not answered."""
 
     number: int  # of answers on this connection
@@ -212,8 +211,7 @@ class Subscriptions:
             return matching
 
 
-@dataclass(slots=True)
-class TopicPolicy:
+class TopicPolicy(Struct):
     """Rules about topics and retained messages, which the owner of a transport sets before it opens it."""
 
     #: True for topics of stops: where a backend refuses messages because too many wait, it still takes these.

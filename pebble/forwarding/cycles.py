@@ -10,9 +10,10 @@ import logging
 import secrets
 import threading
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Final
+
+from msgspec import Struct
 
 from pebble.contract import OUTGOING, Kind
 from pebble.forwarding.routing import Side
@@ -50,12 +51,11 @@ class Finding(Enum):
     PROBE = "one of ours, or forwarded already"
 
 
-@dataclass(slots=True)
-class _Way:
+class _Way(Struct):
     """Our way from one side to the other, on one topic."""
 
     began: float
-    counts: dict[int, int] = field(default_factory=dict)  # of payloads, by their hash, since then
+    counts: dict[int, int] = {}  # of payloads, by their hash, since then
     probed_at: float = float("-inf")
     unanswered: int = 0
     closed: bool = False  # something else leads back

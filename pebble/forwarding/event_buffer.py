@@ -4,7 +4,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+
+from msgspec import Struct
 
 from pebble.transports import Message, State, Transport
 from pebble.transports.counters import Counters
@@ -15,8 +16,7 @@ LIMIT = 256  # events of an outage; the oldest is dropped
 RESEND_S = 3.0
 
 
-@dataclass(eq=False, slots=True)
-class _Event:
+class _Event(Struct, eq=False):
     message: Message
     sent_at: float = 0.0
 

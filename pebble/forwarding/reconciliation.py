@@ -8,9 +8,10 @@ not mean that a side has no value: one of the winner may arrive after it was sen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
+
+from msgspec import Struct
 
 from pebble.forwarding.routing import Side
 from pebble.transports.bounds import BoundedTable
@@ -29,8 +30,7 @@ class Resolution(Enum):
     OVERTAKEN = "changed on the other side while this one was away"
 
 
-@dataclass(frozen=True, slots=True)
-class LastValue:
+class LastValue(Struct, frozen=True):
     """The newest value of a topic, and the side that published it."""
 
     payload: bytes

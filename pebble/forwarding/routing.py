@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
@@ -68,12 +67,11 @@ class Forward(Struct, frozen=True):
     stamped: bool = False  # it may tell its own age (see .command_ages)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rules:
+class Rules(Struct, frozen=True, kw_only=True):
     """A routing table: the kinds of messages forwarded from each side, and the kinds that need mirroring to be on."""
 
     passes: Mapping[Side, frozenset[Kind]]
-    mirrored: Mapping[Side, frozenset[Kind]] = field(default_factory=dict)
+    mirrored: Mapping[Side, frozenset[Kind]] = {}
     leaves_robot: bool  # the other side is not on the robot
     media: bool = False  # pictures and sound pass, too, which have no connection of their own here
     stored: bool = True  # what is retained is sent again after an outage, because no other program forwards it

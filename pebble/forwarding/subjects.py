@@ -1,8 +1,9 @@
 """The meaning of topics to one robot: a channel, renamed or not, or the family of an unknown metric."""
 
-from dataclasses import dataclass
 from functools import cache, cached_property
 from math import inf
+
+from msgspec import Struct
 
 from pebble.config import Config
 from pebble.contract import CHANNELS, INCOMING, OUTGOING, WAITS_S, Channel, Kind
@@ -23,8 +24,7 @@ _FAMILIES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Subject:
+class Subject(Struct, frozen=True, eq=False, dict=True):
     """The meaning of all topics of a channel, or of a family; ``channel`` is None for metrics beyond the contract.
 
     There is one object for each, so that tables by subject are bounded, and fast.

@@ -1,6 +1,7 @@
 """The process that publishes the launcher's messages: ``python -m pebble.launcher.announcer CONFIG``.
 
-The launcher itself never opens a transport: it could not fork any more, and it might wait for a broker.
+The launcher itself never opens a transport: it could not fork any more, and it might wait for a broker. On a Zenoh
+robot this is the process of the hub as well, which no failure to publish may end.
 """
 
 from __future__ import annotations
@@ -10,19 +11,25 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
+from typing import TYPE_CHECKING
 
-from pebble.config import config_of_process
+from pebble.config import Config, config_of_process
 from pebble.errors import PebbleError
 from pebble.launcher.announcer_pipe import Envelope, next_envelope
 from pebble.launcher.reactor import Reactor
-from pebble.runtime.connections import local_transport
+from pebble.runtime.connections import hub_settings, local_transport
 from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_log_level, set_up_logging
 from pebble.runtime.process import exit_at_the_latest
+from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports import Message, State, Transport
 from pebble.transports.wakeup import WakeupPipe
 
+if TYPE_CHECKING:
+    from pebble.transports.zenoh.hub import ZenohHub
+
 _STDIN = 0
+_NO_HUB = nullcontext()
 
 log = logging.getLogger(__name__)
 
@@ -36,13 +43,16 @@ class Announcer:
         self._reactor = Reactor()
         self._wake = WakeupPipe()
         self._stopping = False
+        self._log = RateLimitedLog(log)  # its lines are published, too
         os.set_blocking(pipe, False)
 
-    def run(self, notify: Notifier) -> None:
+    def run(self, notify: Notifier, hub: ZenohHub | None = None) -> None:
         """Run until :meth:`stop` or the end of the pipe; then publish what is left in the pipe, and the will."""
         self._reactor.watch(self._pipe, self._receive)
         self._reactor.watch(self._wake.fileno(), self._publish_states)
         self._reactor.every(ALIVE_PERIOD_S, notify.alive)
+        if hub is not None:
+            self._reactor.every(ALIVE_PERIOD_S, hub.look)
         self._transport.on_state(self._on_state)
         notify.ready()
         try:
@@ -77,15 +87,18 @@ class Announcer:
             self._publish(message)
 
     def _publish(self, message: Message) -> None:
-        self._transport.publish(message.topic, message.payload, qos=message.qos, retain=message.retain)
+        try:
+            self._transport.publish(message.topic, message.payload, qos=message.qos, retain=message.retain)
+        except Exception:  # noqa: BLE001 - no message may end the hub
+            self._log.exception(message.topic, "could not publish on %s", message.topic)
 
     def _on_state(self, state: State) -> None:
         if state is State.CONNECTED:
             self._wake.set()
 
 
-def run(make_transport: Callable[[Message], Transport]) -> int:
-    """Publish the envelopes on stdin through ``make_transport(will)``; return the exit code."""
+def run(make_transport: Callable[[Message], Transport], hub: AbstractContextManager[ZenohHub | None] = _NO_HUB) -> int:
+    """Publish the envelopes on stdin through ``make_transport(will)``, beside the hub; return the exit code."""
     try:
         will = next_envelope(_STDIN)
         if will is None:  # the launcher has ended already
@@ -101,7 +114,12 @@ def run(make_transport: Callable[[Message], Transport]) -> int:
 
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
-    announcer.run(Notifier())
+    try:
+        with hub as opened:
+            announcer.run(Notifier(), opened)
+    except PebbleError as error:
+        log.error("%s", error)
+        return 1
     return 0
 
 
@@ -117,7 +135,16 @@ def main(arguments: list[str]) -> int:
         log.error("%s", error)
         return 1
     set_log_level(config.log_level)
-    return run(lambda will: local_transport(config, "launcher", will=will))
+    return run(lambda will: local_transport(config, "launcher", will=will), _hub(config))
+
+
+def _hub(config: Config) -> AbstractContextManager[ZenohHub | None]:
+    """Return the hub of a Zenoh robot, not yet open."""
+    if config.transport.kind != "zenoh":
+        return _NO_HUB
+    from pebble.runtime.hub import open_hub  # only who needs it pays for it
+
+    return open_hub(hub_settings(config))
 
 
 if __name__ == "__main__":

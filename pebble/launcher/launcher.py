@@ -131,7 +131,7 @@ class Launcher:
         if program.runs_scripts:
             self._logs.tagged_line(program.name, pid, line)
         else:
-            self._logs.child_line(program.name, pid, line, published=not program.reads_announcer_pipe)
+            self._logs.child_line(program.name, pid, line, published=program.stage is not Stage.ANNOUNCER)
 
     def _ended(self, program: Program) -> None:
         self._features.ended(program.name)

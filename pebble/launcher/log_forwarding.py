@@ -33,7 +33,7 @@ class LogForwarder:
         self._readers: dict[str, tuple[int, LevelReader]] = {}  # with the process id, by service
 
     def child_line(self, service: str, pid: int, line: str, *, published: bool = True) -> None:
-        """Forward a line of a child. Lines of the announcer are not published, because each would cause another."""
+        """Forward a line of a child. Lines of an announcer alone are not published, because each may cause another."""
         last_pid, reader = self._readers.get(service, (pid, None))
         if reader is None or last_pid != pid:  # the level of the last line belongs to the previous process
             reader = LevelReader()

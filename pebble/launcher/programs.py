@@ -7,12 +7,9 @@ from collections.abc import Iterable, Iterator
 from importlib import import_module
 from typing import Any
 
-from msgspec.json import encode
-
 from pebble.config import Config, SerialBridge
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.extension import Program, Stage, programs_of
-from pebble.runtime.connections import hub_settings
 from pebble.transports import module_of
 
 log = logging.getLogger(__name__)
@@ -30,7 +27,6 @@ def programs(config: Config) -> tuple[Program, ...]:
 
 def _core(config: Config) -> Iterator[tuple[bool, Program]]:
     bridge, mirror = config.services.mqtt_bridge, config.transport.mqtt_mirror
-    yield config.transport.kind == "zenoh", _hub(config)
     yield True, _announcer(config)
     yield from ((True, _serial_line(config, *line)) for line in config.serial_instances().items())
     seams = ((one.observer, one.step, one.private, *one.requests) for one in config.installed)
@@ -58,8 +54,8 @@ def preload(modules: Iterable[str]) -> None:
             import_module(name)
         except Exception:
             log.debug("%s cannot be imported", name, exc_info=True)
-    gc.collect()
     gc.freeze()  # a collection writes into every object, and a written page is no longer shared
+    gc.enable()  # pebble.cli has disabled it: the garbage of imports is small, and finding it takes a tenth as long
 
 
 def _transport_modules(config: Config) -> tuple[str, ...]:
@@ -91,10 +87,9 @@ def _serial_line(config: Config, instance: str, line: SerialBridge) -> Program:
 
 
 def _announcer(config: Config) -> Program:
+    """Return the program of the announcer, which on a Zenoh robot is the hub as well."""
+    has_hub = config.transport.kind == "zenoh"
+    name, stage = ("zenoh_hub", Stage.LOCAL_TRANSPORT) if has_hub else ("announcer", Stage.ANNOUNCER)
+    hub = ("pebble.runtime.hub",) if has_hub else ()
     arguments = (str(config.path),)
-    return Program("announcer", "pebble.launcher.announcer", arguments, Stage.ANNOUNCER, reads_announcer_pipe=True)
-
-
-def _hub(config: Config) -> Program:
-    settings = encode(hub_settings(config), enc_hook=str).decode()  # paths and numbers: nothing secret is in them
-    return Program("zenoh_hub", "pebble.runtime.hub", (settings,), Stage.LOCAL_TRANSPORT)
+    return Program(name, "pebble.launcher.announcer", arguments, stage, reads_announcer_pipe=True, shares=hub)

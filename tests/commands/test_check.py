@@ -87,7 +87,7 @@ def test_check_shows_links_processes_and_effective_topics_but_no_secret(run: Run
     )
     assert run("check", path, columns=120) == 0
     for expected in ("broker.example:1883", "user goob, password ***", "/dev/ttyACM7", "else/where",
-                     "zenoh_hub, announcer, serial_mcu_bridge, mqtt_bridge",
+                     "zenoh_hub, serial_mcu_bridge, mqtt_bridge",
                      "incoming/drive-values", "incoming/flags/reboot"):  # fmt: skip
         assert expected in run.out
     assert "outgoing/online" not in run.out

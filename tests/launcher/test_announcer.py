@@ -91,6 +91,18 @@ def test_records_are_published_only_once(connected: ConnectedAnnouncer) -> None:
     assert becomes(lambda: connected.sent("logs"), [1, 3])
 
 
+def test_a_failure_to_publish_does_not_end_it(
+    connected: ConnectedAnnouncer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with monkeypatch.context() as broken:
+        broken.setattr(connected.transport, "publish", lambda *_, **__: 1 // 0)
+        connected.record(1)
+        connected.state(2)
+        assert until(lambda: [record.args for record in caplog.records] == [("logs", 1), ("status", 1)])
+    connected.record(3)
+    assert becomes(lambda: connected.sent("logs"), [3])
+
+
 def test_it_ends_with_the_launcher(connected: ConnectedAnnouncer) -> None:
     connected.state(7)
     connected.pipe.close()

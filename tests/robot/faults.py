@@ -99,6 +99,11 @@ def _killed(program: str, rig: Rig) -> Iterator[None]:
     yield
 
 
+def _announcer(rig: Rig) -> str:
+    """Return the process that publishes for the launcher: on Zenoh that of the hub."""
+    return "zenoh_hub" if rig.local is None else "announcer"
+
+
 @contextmanager
 def _launcher_killed(rig: Rig) -> Iterator[None]:
     """Kill the launcher, and start it again, as systemd does."""
@@ -197,7 +202,8 @@ class Fault:
 FAULTS = {
     "the serial bridge is killed": Fault(partial(_killed, _OWNER), turns_s=_MCU_TURNS_S),
     "the mqtt bridge is killed": Fault(partial(_killed, "mqtt_bridge")),
-    "the announcer is killed": Fault(partial(_killed, "announcer")),
+    "the announcer is killed": Fault(lambda rig: _killed(_announcer(rig), rig)),
+    "the announcer stands still": Fault(lambda rig: frozen(rig.processes()[_announcer(rig)]), 2.8),
     "the launcher is killed": Fault(_launcher_killed, turns_s=_MCU_TURNS_S),
     "the run directory is removed": Fault(_run_directory_removed, turns_s=_MCU_TURNS_S),
     "the local transport is killed": Fault(_local_transport_killed),

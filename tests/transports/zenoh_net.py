@@ -17,7 +17,7 @@ from tests.transports.net import Net
 
 
 class HubProcess:
-    """`python -m pebble.runtime.hub` in `run_dir`; `start` waits until it serves."""
+    """`python -m pebble.extensions.lab.rig.hub` in `run_dir`; `start` waits until it serves."""
 
     def __init__(self, run_dir: Path, journal: Path | None = None) -> None:
         self.settings = ZenohSettings(run_dir=run_dir, journal=journal)
@@ -25,7 +25,7 @@ class HubProcess:
 
     def start(self) -> HubProcess:
         settings = msgspec.json.encode(self.settings, enc_hook=str).decode()
-        self._process = Forked("pebble.runtime.hub", [settings])
+        self._process = Forked("pebble.extensions.lab.rig.hub", [settings])
         probe = create("zenoh", "probe", dataclasses.replace(self.settings, client=True, listen=())).open(10)
         assert probe.state is State.CONNECTED, probe.problem
         probe.close()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from pebble.transports.base import Message, QoS
 from pebble.transports.mqtt.bridge_mode import Result
@@ -12,8 +14,7 @@ from pebble.transports.mqtt.bridge_mode import Result
 _VALID_S: Final = 600.0  # after which the next connection is made with everything again
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
+class Limits(Struct, frozen=True):
     """Limits within which a broker is used."""
 
     retain: bool = True

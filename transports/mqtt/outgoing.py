@@ -11,7 +11,8 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+
+from msgspec import Struct
 
 from pebble.transports.base import Message, QoS
 
@@ -115,8 +116,7 @@ class PendingAck:
         self._answered.set()
 
 
-@dataclass(slots=True)
-class _Unconfirmed:
+class _Unconfirmed(Struct):
     """A retained message that the broker may not have, until a PUBACK or the answer to a later ping confirms it."""
 
     message: Message

@@ -5,8 +5,9 @@ Sources are MQTT 3.1.1 and MQTT 5.0 (OASIS), chapters 2 and 3 of each. ``modern`
 
 import struct
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Final, Protocol
+
+from msgspec import Struct
 
 from pebble.transports.base import Message
 
@@ -42,8 +43,7 @@ class MalformedError(Exception):
 # -- what a client writes
 
 
-@dataclass(frozen=True, slots=True)
-class Filter:
+class Filter(Struct, frozen=True):
     """One filter of a SUBSCRIBE; the options but ``qos`` are of MQTT 5."""
 
     text: str
@@ -142,8 +142,7 @@ def _variable(size: int) -> bytes:
 # -- what it reads
 
 
-@dataclass(frozen=True, slots=True)
-class Accepted:
+class Accepted(Struct, frozen=True):
     """The properties of a CONNACK without an error; None: not given."""
 
     max_packet: int | None = None  # bytes that the broker takes

@@ -6,9 +6,10 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
+
+from msgspec import Struct
 
 from pebble.config import MqttBridge, SystemControl
 from pebble.contract import GIT_PULL, REBOOT, SERVICE_RESTART, Channel
@@ -27,8 +28,7 @@ _MOST, _KEPT = 1 << 20, 1 << 16  # bytes of output: with more the file begins an
 _LOOK_S = 0.2
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
+class Row(Struct, frozen=True):
     """One action: its channel, the section of services.mqtt_bridge with its command, and the time between two runs."""
 
     channel: Channel

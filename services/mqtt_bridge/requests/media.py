@@ -1,8 +1,9 @@
 """Requests for media programs: a flag of the operators allows them, a request starts and stops them."""
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar, Final
+
+from msgspec import Struct
 
 from pebble.contract import AUDIO_CONTROL, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel, Kind
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
@@ -12,8 +13,7 @@ from pebble.runtime.service import Service
 from pebble.services.mqtt_bridge.own_requests import Requests
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Row:
+class Row(Struct, frozen=True, eq=False):
     """One medium: the flag that allows it, the channel that requests it, its encodings and its programs."""
 
     flag: Channel

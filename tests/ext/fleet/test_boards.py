@@ -42,7 +42,7 @@ class Lan:
             stack.callback(ends)
         self._hub = f"tcp/127.0.0.1:{free_port()}"
         settings = ZenohSettings(run_dir=folder / "hub", listen=(self._hub,))
-        hub = Forked("pebble.runtime.hub", [msgspec.json.encode(settings, enc_hook=str).decode()])
+        hub = Forked("pebble.extensions.lab.rig.hub", [msgspec.json.encode(settings, enc_hook=str).decode()])
         stack.callback(hub.kill)
         file = folder / "gate-1.json"
         sides = {

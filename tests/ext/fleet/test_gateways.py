@@ -39,7 +39,7 @@ class Hall:
         self.hub_port = free_port()
         endpoint = (f"tcp/127.0.0.1:{self.hub_port}",)
         settings = ZenohSettings(run_dir=folder / "hub", listen=endpoint)
-        hub = Forked("pebble.runtime.hub", [msgspec.json.encode(settings, enc_hook=str).decode()])
+        hub = Forked("pebble.extensions.lab.rig.hub", [msgspec.json.encode(settings, enc_hook=str).decode()])
         stack.callback(hub.kill)
         at_hub = ZenohSettings(run_dir=folder / "r0", connect=endpoint, client=True)
         self.robot = stack.enter_context(create("zenoh", "r0", at_hub))

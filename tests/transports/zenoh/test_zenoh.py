@@ -544,7 +544,7 @@ def test_a_fork_ends_whatever_its_parent_was_doing(robot: Robot) -> None:
 def test_a_second_hub_is_refused(robot: Robot) -> None:
     with pytest.raises(TransportError, match=r"there is a hub .* already"):
         ZenohHub(robot.settings).open()
-    second = Forked("pebble.runtime.hub", [json.dumps({"run_dir": str(robot.run_dir)})])
+    second = Forked("pebble.extensions.lab.rig.hub", [json.dumps({"run_dir": str(robot.run_dir)})])
     assert second.wait(20) == 1
     assert "there is a hub for " in second.printed
     assert robot.client("client").state is State.CONNECTED

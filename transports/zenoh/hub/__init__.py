@@ -1,7 +1,7 @@
 """The hub: the process of a Zenoh robot that connects the others and stores retained messages and wills.
 
 It stores the newest message of every retained topic, and the wills of running clients. Live messages between the
-robot's processes do not pass through it. ``python -m pebble.runtime.hub`` runs one.
+robot's processes do not pass through it. `pebble.runtime.hub` runs one.
 """
 
 from __future__ import annotations

@@ -1,33 +1,37 @@
 """Measures the latency of drive commands to the wheels and of MCU reports to the operator, with whole robots.
 
 A robot of each kind, with a stock broker between it and the operator, and ``stand-in``, two programs of plain paho in
-place of the original. ``down``: from the operator's publish call to the last byte of the command's line at the MCU's
-pty; ``up``: from the MCU's report to the operator. Under ``commands`` robots forward no reports. CPU is that of the
-process that bridges and of the one that owns the serial line, for each command and report that they forwarded. Each
-round starts fresh robots and drives them in turns of a second, backwards every other time. Commands and reports that
-take longer than a second are lost, and commands that a newer one overtook.
+place of the original; ``C floor``: such two in C (floor.c), which carry commands alone. ``down``: from the operator's
+publish call to the last byte of the command's line at the MCU's pty; ``up``: from the MCU's report to the operator.
+Under ``commands`` robots forward no reports. CPU is that of the process that bridges and of the one that owns the
+serial line, for each command and report that they forwarded. Each round starts fresh robots and drives them in turns of
+a second, backwards every other time. Commands and reports that take longer than a second are lost, and commands that a
+newer one overtook.
 """
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 from rich.console import Console
 from rich.table import Table
 
+from pebble.errors import PebbleError
 from pebble.extensions.lab.bench import plots
-from pebble.extensions.lab.bench.bridge_operator import ALL, Arrived, DrivenRobot, Turn, driven_robot
-from pebble.extensions.lab.bench.results import STAND_IN, Cell, Results, begin, grouped, round_cell
+from pebble.extensions.lab.bench.bridge_operator import ALL, Arrived, DrivenRobot, Turn, compiled, driven_robot
+from pebble.extensions.lab.bench.results import FLOOR, STAND_IN, Cell, Results, begin, grouped, round_cell
 from pebble.extensions.lab.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.extensions.lab.bench.show import RATIOS, Picture, Shown, compared, percentiles, plain_table, spread
 from pebble.extensions.lab.rig.robot import KINDS
 
 UNLOADED, COMMANDS = "none", "commands"  # unloaded: 20 commands and 50 reports a second
-VARIANTS = (STAND_IN, *KINDS)
+VARIANTS = (STAND_IN, FLOOR, *KINDS)
 DOWN, UP, CPU = MEASURES = ("down", "up", "CPU per message")
 STARTUP_S = 1.0  # for start-up work to finish
 
@@ -38,6 +42,7 @@ class Settings:
 
     seconds: float = 12.5
     rounds: int = 20
+    variants: Sequence[str] = VARIANTS
 
 
 FULL: Final = Settings()
@@ -47,6 +52,12 @@ QUICK: Final = Settings(seconds=0.5, rounds=2)
 def run(settings: Settings, console: Console) -> Shown:
     """Measure all variants. Raises PebbleError."""
     results = begin("bridge", settings)
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            compiled(Path(folder, "floor"))
+    except PebbleError as error:
+        results.notes.append(str(error))
+        settings = replace(settings, variants=[name for name in settings.variants if name != FLOOR])
     measure_rounds(results, settings.rounds, lambda number, progress: measure(settings, number, progress), console)
     results.cells.sort(key=lambda cell: MEASURES.index(cell.measure))
     latencies, cpu = ([cell for cell in results.cells if (cell.measure == CPU) == is_cpu] for is_cpu in (False, True))
@@ -58,10 +69,10 @@ def run(settings: Settings, console: Console) -> Shown:
 
 
 @contextmanager
-def running(*, reports: bool) -> Iterator[dict[str, DrivenRobot]]:
+def running(variants: Sequence[str], *, reports: bool) -> Iterator[dict[str, DrivenRobot]]:
     """Start fresh robots, which are ready; with ``reports`` they forward those of their MCUs."""
     with ExitStack() as stack:
-        driven = {kind: stack.enter_context(driven_robot(kind, reports=reports)) for kind in VARIANTS}
+        driven = {kind: stack.enter_context(driven_robot(kind, reports=reports)) for kind in variants}
         for robot in driven.values():
             robot.wait_until_ready()
         time.sleep(STARTUP_S)
@@ -74,7 +85,7 @@ def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cel
     for load in in_turn((UNLOADED, COMMANDS), number):
         reports, turns = load == UNLOADED, list[tuple[str, Turn]]()
         progress("starting the robots")
-        with running(reports=reports) as driven:
+        with running([name for name in settings.variants if name != FLOOR or not reports], reports=reports) as driven:
             for pass_ in range(passes):
                 for variant in in_turn(list(driven), number + pass_):
                     progress(f"{variant}, {load}")
@@ -106,14 +117,14 @@ def latency_table(results: Results, cells: Sequence[Cell]) -> Table:
     """Return latencies of commands and reports, and the CPU of the whole robot."""
     grid = plain_table(
         "Commands down, reports up, ms; CPU of the whole robot, % of a core",
-        ["way", "load", "variant", "p50", "p95", "p99", "max", "n", "lost", "CPU", f"p50 to {STAND_IN}",
-         f"p99 to {STAND_IN}"],
+        ["way", "load", "variant", "p50", "p95", "p99", "max", "n", "lost", "CPU",
+         *(f"p{percent} to {base}" for base in (STAND_IN, FLOOR) for percent in (50, 99))],
         left=3, caption=f"{STAND_IN}: plain paho in place of the original. {RATIOS}",
     )  # fmt: skip
     for (way, load), some in grouped(cells, lambda cell: (cell.measure, str(cell.params["load"]))).items():
         grid.add_section()
         for ours in some:
-            base = results.find(STAND_IN, way, load=load)
+            bases = [results.find(name, way, load=load) for name in (STAND_IN, FLOOR)]
             cpu = f"{ours.middle('cpu_percent'):.1f}" if way == DOWN else ""
             place = (way, load) if ours is some[0] else ("", "")
             counts = (str(len(ours.samples)), str(ours.lost))
@@ -123,8 +134,7 @@ def latency_table(results: Results, cells: Sequence[Cell]) -> Table:
                 *percentiles(ours, 50, 95, 99, 100),
                 *counts,
                 cpu,
-                compared(ours, base),
-                compared(ours, base, 99),
+                *(compared(ours, base, percent) for base in bases for percent in (50, 99)),
             )
     return grid
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import socket
+import subprocess
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from paho.mqtt.client import MQTTMessage
@@ -15,7 +17,7 @@ from paho.mqtt.client import MQTTMessage
 from pebble import contract
 from pebble.errors import PebbleError
 from pebble.extensions.lab.bench.clients import RobotSubscriber, StockClient, drive_of
-from pebble.extensions.lab.bench.results import STAND_IN
+from pebble.extensions.lab.bench.results import FLOOR, STAND_IN
 from pebble.extensions.lab.bench.usage import cpu_s
 from pebble.extensions.lab.rig.processes import python
 from pebble.extensions.lab.rig.robot import BASE, Robot, one_robot
@@ -143,7 +145,10 @@ class StandIn(Robot):
     def launch(self) -> None:
         rest = (*self.broker_ports[::-1], self.base, self.port, *(["--reports"] if self.reports else []))
         for part in ("bridge", "serial"):
-            self.start(f"the stand-in's {part}", python("pebble.extensions.lab.bench.stand_in", part, *rest))
+            self.start(f"the {self.name}'s {part}", [*self.command(), part, *map(str, rest)])
+
+    def command(self) -> list[str]:
+        return python("pebble.extensions.lab.bench.stand_in")
 
     def processes(self) -> dict[str, int]:
         """Return its two programs, by the names of the services that they stand for, and its broker."""
@@ -151,10 +156,27 @@ class StandIn(Robot):
         return {name: program.pid for name, program in zip((*SERVICES.values(), "mosquitto"), running, strict=False)}
 
 
+class CFloor(StandIn):
+    """The same two programs in C, which is the floor for robots of two programs and a broker."""
+
+    def command(self) -> list[str]:
+        return [str(compiled(self.folder / "floor"))]
+
+
+def compiled(program: Path) -> Path:
+    """Return the programs of floor.c, compiled. Raises PebbleError if gcc or libmosquitto is missing."""
+    source = Path(__file__).with_name("floor.c")
+    try:
+        subprocess.run(["gcc", "-O2", source, "-lmosquitto", "-o", program], check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        raise PebbleError(f"{FLOOR} is left out: it needs gcc and libmosquitto-dev") from None
+    return program
+
+
 @contextmanager
 def driven_robot(kind: str, *, reports: bool = True) -> Iterator[DrivenRobot]:
     """Launch a robot and connect its operator; with ``reports`` it forwards those of its MCU. Raises PebbleError."""
-    with one_robot(kind, StandIn if kind == STAND_IN else Robot, reports=reports) as robot:
+    with one_robot(kind, {STAND_IN: StandIn, FLOOR: CFloor}.get(kind, Robot), reports=reports) as robot:
         robot.launch()
         with closing(DrivenRobot(robot)) as driven:
             yield driven

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Final
 
 from rich.console import Console
@@ -24,7 +23,7 @@ from pebble.extensions.lab.bench.clients import RobotSubscriber, driving, ready_
 from pebble.extensions.lab.bench.results import Cell, Results, begin, grouped, round_cell
 from pebble.extensions.lab.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.extensions.lab.bench.show import RATIOS, Shown, compared, middle, plain_table
-from pebble.extensions.lab.bench.usage import cpu_s, pss_mb
+from pebble.extensions.lab.bench.usage import cpu_s, pss_mb, threads
 from pebble.extensions.lab.rig.robot import BASE, KINDS, Robot
 
 ALL: Final = "all"  # the processes of a robot together
@@ -94,8 +93,8 @@ def _phase(robot: Robot, phase: str, seconds: float) -> Iterator[Cell]:
     if robot.processes() != processes:
         raise PebbleError(f"{phase}: processes of the robot ended or started meanwhile\n{robot.log()}")
     memory = {name: pss_mb(pid) for name, pid in processes.items()}
-    threads = {name: len(list(Path(f"/proc/{pid}/task").iterdir())) for name, pid in processes.items()}
-    yield from cells_of(robot.kind, phase, {MEMORY: memory, CPU: cpu, THREADS: threads})
+    running = {name: threads(pid) for name, pid in processes.items()}
+    yield from cells_of(robot.kind, phase, {MEMORY: memory, CPU: cpu, THREADS: running})
 
 
 def cells_of(variant: str, phase: str, used: Mapping[str, Mapping[str, float]]) -> Iterator[Cell]:

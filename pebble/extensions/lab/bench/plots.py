@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pebble.extensions.lab.bench.results import STAND_IN, Cell, grouped, named, percentile
+from pebble.extensions.lab.bench.results import FLOOR, STAND_IN, Cell, grouped, named, percentile
 from pebble.extensions.lab.bench.show import Picture, digits
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ Style = dict[str, Any]  # keywords of a line
 _COLOURS: dict[str, str] = {
     "zenoh": "#0072B2", "zenoh-p2p": "#0072B2", "zenoh-shm": "#0072B2", "zenoh h264 opus": "#0072B2",
     "zenoh-hub": "#2AA198", "zenoh original": "#56B4E9", "mqtt": "#D55E00", "mqtt h264 opus": "#D55E00",
-    "mqtt-nodelay": "#E69F00", "mqtt original": "#E69F00", "mqtt5": "#A4133C", STAND_IN: "#8C510A",
+    "mqtt-nodelay": "#E69F00", "mqtt original": "#E69F00", "mqtt5": "#A4133C", STAND_IN: "#8C510A", FLOOR: "#000000",
     "gstreamer-shm": "#8A8A8A", "page": "#8A8A8A",
 }  # fmt: skip
 

@@ -47,8 +47,8 @@ class Section:
 
 SECTIONS: Final = (
     Section("control", "Service to service", 500, 40),
-    Section("bridge", "Operator to wheels, and back", 1700, 22),
-    Section("startup", "Start-up", 80, 18),
+    Section("bridge", "Operator to wheels, and back", 2200, 30),
+    Section("startup", "Start-up", 240, 60),
     Section("cost", "Memory and CPU", 180, 20),
     Section("frames", "Camera frames inside the robot", 200, 12),
     Section("scale", "Many boards", 150, 25),

@@ -25,6 +25,7 @@ from pebble.version import __version__
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+FLOOR: Final = "C floor"  # programs in C, see floor.c
 STAND_IN: Final = "stand-in"  # for the original: plain programs with stock paho, see stand_in.py
 _PACKAGES = ("eclipse-zenoh", "paho-mqtt", "numpy", "opencv-python-headless", "av", "msgspec")
 _DIGITS = 3  # decimal places of a sample

@@ -1,18 +1,21 @@
-"""Measures a robot's start-up, and how fast a late subscriber receives all retained messages.
+"""Measures a robot's start-up, its memory, and how fast a late subscriber receives all retained messages.
 
 Every launch is a fresh robot at a remote broker that runs already; an operator subscribes there, and sends drive
 commands at 20 Hz, before the launcher is started. ``first heartbeat``, ``all ready`` and ``first drive obeyed`` count
 from just before that, the last one until a line that moves the wheels has reached the MCU's pty. ``late …``: from the
-begin of a connection until the last retained topic has arrived.
+begin of a connection until the last retained topic has arrived. ``minimal``: a robot without motors, whose memory (PSS)
+and threads are measured, too; ``floor``: one process with the same connections (floor.py).
 """
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 from rich.console import Console
@@ -24,16 +27,40 @@ from pebble.extensions.lab.bench.clients import UP_S, RobotSubscriber, driving
 from pebble.extensions.lab.bench.results import Cell, Results, begin, round_cell
 from pebble.extensions.lab.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.extensions.lab.bench.show import RATIOS, Shown, compared, plain_table, spread
+from pebble.extensions.lab.bench.usage import pss_mb, threads
 from pebble.extensions.lab.rig.processes import HOST
-from pebble.extensions.lab.rig.robot import BASE, KINDS, Robot, one_robot
+from pebble.extensions.lab.rig.robot import BASE, KINDS, Config, Robot, one_robot
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message, MqttSettings, Transport, create
 
 STARTED: Final = ("first heartbeat", "all ready", "first drive obeyed")
 LATE: Final = ("late operator", "late service")
+MEMORY, THREADS = "PSS", "threads"
+_SETTLED_S = 0.5  # from the first heartbeat until memory is read
 _LATE_S = 10.0  # for one late subscriber
 _QUIET_S = 0.3  # without another retained message until all count as received
 _EVERYTHING = f"{BASE}/#"
+
+
+class Floor(Robot):
+    """One process in place of the launcher and its services."""
+
+    def launch(self) -> None:
+        program = [sys.executable, "-P", str(Path(__file__).with_name("floor.py"))]
+        place = self.folder / "floor.sock" if self.local_port is None else self.local_port
+        self.start(f"the {self.kind} floor", [*program, str(place), str(self.remote_port), self.base])
+
+    def processes(self) -> dict[str, int]:
+        return {program.name: program.pid for program in (self.launcher, self.local_broker) if program is not None}
+
+
+#: What is launched, of each kind: a robot, one without motors, and a floor.
+PARTS: Final[Mapping[str, tuple[type[Robot], Mapping[str, Config]]]] = {
+    "": (Robot, {}),
+    "minimal": (Robot, {"serial_mcu_bridge": {"enabled": False}}),
+    "floor": (Floor, {}),
+}
+VARIANTS: Final = [f"{kind} {part}".rstrip() for part in PARTS for kind in KINDS]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,12 +80,12 @@ def run(settings: Settings, console: Console) -> Shown:
     results = begin("startup", settings)
 
     def measure_round(number: int, progress: Progress) -> Iterator[Cell]:
-        for variant in in_turn(KINDS, number):
+        for variant in in_turn(VARIANTS, number):
             progress(variant)
             yield from launch(variant, settings.joins)
 
     measure_rounds(results, settings.rounds, measure_round, console)
-    return Shown(results, [table(results)])
+    return Shown(results, [table(results), floor_table(results)])
 
 
 def table(results: Results) -> Table:
@@ -72,20 +99,43 @@ def table(results: Results) -> Table:
     return grid
 
 
+def floor_table(results: Results) -> Table:
+    """Return the start and the memory of minimal robots, as multiples of the floor."""
+    heads = [f"{kind} {name}" for kind in KINDS for name in ("minimal", "floor", "ratio")]
+    grid = plain_table("Minimal robots, and one process", ["", "unit", *heads], left=2, caption=RATIOS)
+    for measure, unit in ((STARTED[0], "s"), (MEMORY, "MB"), (THREADS, "")):
+        row = list[str]()
+        for kind in KINDS:
+            ours, floor = (results.find(f"{kind} {name}", measure) for name in ("minimal", "floor"))
+            row += [spread(ours), spread(floor), compared(ours, floor)]
+        grid.add_row(measure, unit, *row)
+    return grid
+
+
 def launch(variant: str, joins: int) -> Iterator[Cell]:
     """Launch a fresh robot. Seconds count from just before the launcher is started. Raises PebbleError with its log."""
-    with one_robot(variant) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
+    kind, _, part = variant.partition(" ")
+    make, services = PARTS[part]
+    with (
+        one_robot(kind, make, services=services) as robot,
+        closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber,
+    ):
         subscriber.wait()
         with driving(robot.remote_port, BASE):
             began_ns = time.monotonic_ns()
             robot.launch()
             robot.expect(lambda: subscriber.first_heartbeat_ns is not None, "no heartbeat", UP_S)
             robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", UP_S)
-            robot.expect(lambda: bool(_obeyed(robot, began_ns)), "no drive command was obeyed", UP_S)
-        times = (subscriber.first_heartbeat_ns or 0, subscriber.ready_ns or 0, _obeyed(robot, began_ns)[0])
-        for name, at_ns in zip(STARTED, times, strict=True):
+            robot.expect(lambda: bool(part or _obeyed(robot, began_ns)), "no drive command was obeyed", UP_S)
+        times = (subscriber.first_heartbeat_ns or 0, subscriber.ready_ns or 0, *_obeyed(robot, began_ns)[:1])
+        for name, at_ns in zip(STARTED, times, strict=False):
             yield round_cell(variant, name, "s", [(at_ns - began_ns) / 1e9])
-        yield from _late(robot, joins)
+        time.sleep(_SETTLED_S)
+        pids = robot.processes().values()
+        yield round_cell(variant, MEMORY, "MB", [sum(map(pss_mb, pids))])
+        yield round_cell(variant, THREADS, "", [sum(map(threads, pids))])
+        if not part:
+            yield from _late(robot, joins)
 
 
 def _obeyed(robot: Robot, since_ns: int) -> list[int]:

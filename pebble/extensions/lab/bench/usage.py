@@ -30,6 +30,13 @@ def pss_mb(pid: int) -> float:
     return 0.0
 
 
+def threads(pid: int) -> int:
+    """Return the number of a process's threads; 0 if it has ended."""
+    with suppress(OSError):
+        return len(list(Path(f"/proc/{pid}/task").iterdir()))
+    return 0
+
+
 def wall_clock_ahead_ns() -> int:
     """Return how far the wall clock is ahead of CLOCK_MONOTONIC: its stamps minus this are stamps of that."""
     while True:
