@@ -30,7 +30,7 @@ AT = 1_795_341_630_000  # 22 November 2026, 10:00:30 UTC
 SIZES = {"desktop": (1440, 900), "tall": (1440, 1960), "phone": (390, 844), "landscape": (844, 390)}
 
 #: Both clocks of the page stand still; timers run.
-_FROZEN = f"""{{
+FROZEN = f"""{{
   const Then = Date;
   window.Date = class extends Then {{
     constructor(...parts) {{ parts.length ? super(...parts) : super({AT}); }}
@@ -46,7 +46,7 @@ UNANSWERED = """window.WebSocket = class extends EventTarget {
 };"""
 #: What is fetched without a server, too.
 _PARTS = "!document.querySelector('.loading') && Boolean(document.querySelector('.key-place'))"
-_HERE = """!document.querySelector('.loading') && document.fonts.status === 'loaded' &&
+_HERE = """!document.querySelector('.loading, .bench:not([data-rests])') && document.fonts.status === 'loaded' &&
   [...document.images].every((one) => one.complete || one.hidden) &&
   (!pebble.video.ref || Boolean(pebble.video.info))"""
 #: The first picture of a recording is drawn, and its timeline.
@@ -120,7 +120,7 @@ def taken(server: CannedServer, browser: Browser, look: Look) -> Pixels:
         "desktop" if width == SIZES["desktop"][0] else "phone",
         viewport={"width": width, "height": height},
         theme=look.theme,
-        script=_FROZEN + look.script,
+        script=FROZEN + look.script,
         **options,
     ) as opened:
         assert opened.until(look.here, 60), f"{state.path} is not shown"

@@ -29,7 +29,7 @@ def test_the_first_steps_are_ticked_and_can_be_hidden(show: Show) -> None:
 @pytest.mark.parametrize(
     ("state", "button", "words", "inside"),
     [
-        ("fleet", "fleet-more", ["Thumbnails", "Sort by"], "thumbnails"),
+        ("fleet", "fleet-more", ["Thumbnails"], "thumbnails"),
         ("fleet-stopped", "stopped", ["goob is stopped", "fred is stopped"], "reset"),
         ("free", "gear", ["Picture from"], "picture-from"),
     ],

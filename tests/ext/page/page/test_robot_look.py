@@ -11,7 +11,8 @@ from playwright.sync_api import Page
 
 from tests.ext.page.browser import Size, Tab
 from tests.ext.page.canned import CannedServer, Show
-from tests.ext.page.states import FRED, GOOB, LAMP, MAY_TAKE, STATES, at, changed, driver, estop, liveness
+from tests.ext.page.looks import AT, FROZEN
+from tests.ext.page.states import FRED, GOOB, GOOB_PATH, LAMP, MAY_TAKE, STATES, at, changed, driver, estop, liveness
 
 pytestmark = pytest.mark.page
 
@@ -100,6 +101,34 @@ def test_cards_stay_in_their_places(show: Show) -> None:
             assert opened.page.evaluate("window.shifted") <= 0.02
             assert opened.page.evaluate(COVERED) == []
             opened.page.reload()
+
+
+#: The lower ends of the columns, and how many cards there are besides the picture and Drive.
+ENDS = """() => {
+  const cards = [...document.querySelectorAll(".bench > *")].filter((one) => one.offsetHeight);
+  const usual = cards.filter(({ dataset }) => !dataset.span && dataset.at !== "side");
+  const ends = {};
+  for (const card of cards.filter(({ dataset }) => dataset.span !== "all")) {
+    const [, column, , span] = card.style.gridArea.split("/").map((part) => parseInt(part.replace("span", ""), 10));
+    for (let n = column; n < column + span; n++) ends[n] = Math.max(ends[n] ?? 0, card.getBoundingClientRect().bottom);
+  }
+  return [Object.values(ends).map(Math.round), usual.length];
+}"""
+#: Every state of the page of a robot that has a picture and is driven.
+BALANCED = [name for name, state in STATES.items() if state.path == GOOB_PATH]
+
+
+@pytest.mark.parametrize("name", BALANCED)
+def test_columns_end_within_200_px_where_there_are_cards_for_all(show: Show, name: str) -> None:
+    options = {"engineers": False, "reduced_motion": "reduce", "script": FROZEN}
+    state = replace(STATES[name], at=AT, still=True, repeated={})
+    with show(state, viewport={"width": 1440, "height": 900}, **options) as opened:
+        assert opened.until("Boolean(document.querySelector('.bench[data-rests]'))", 60)
+        for width, height in ((1440, 900), (1920, 1080)):
+            opened.page.set_viewport_size({"width": width, "height": height})
+            opened.page.wait_for_timeout(300)
+            ends, cards = opened.page.evaluate(ENDS)
+            assert max(ends) - min(ends) <= (200 if cards >= len(ends) else 400), ends
 
 
 def test_driving_of_a_board_that_says_nothing_is_allowed_and_withdrawn_on_its_page(

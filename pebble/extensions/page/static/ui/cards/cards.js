@@ -6,10 +6,10 @@ import { styled } from "../parts/hooks.js";
 /**
  * ``tab``: where it is on a phone. ``wants``: whether this component has it. ``part``: fetches what draws it; a
  * component with ``at`` and ``offers``. ``engineers``: below all others, and closed until it is opened. ``height``: px
- * that are kept free for it until it is here. ``sends``: it is for commands only, so screens that only watch are
+ * that are kept free for it until it is here. ``wide``: it may span several columns. ``sends``: it is for commands only, so screens that only watch are
  * without it.
  * @typedef {{id: string, title: string, icon: string, tab: string, wants: (offers: any) => boolean,
- *   part: (again: string) => Promise<any>, engineers?: boolean, height?: number, sends?: boolean}} CardKind
+ *   part: (again: string) => Promise<any>, engineers?: boolean, height?: number, wide?: boolean, sends?: boolean}} CardKind
  */
 
 /** Which keys drive. */
@@ -71,7 +71,8 @@ export const CARDS = [
     title: "Plots",
     icon: "plot",
     tab: "sensors",
-    height: 490,
+    height: 298,
+    wide: true,
     wants: () => true,
     part: styled(async (again) => (await import("./plots.js" + again)).Plots, "plots.css", "vendor/uPlot.css"),
   },

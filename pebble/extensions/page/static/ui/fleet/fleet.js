@@ -22,7 +22,7 @@ import {
 import { Offers, Route, WATCHES } from "../parts/models.js";
 import { charge, hasFace, looksOf, nameIn } from "../parts/looks.js";
 import { plain, shortTime } from "../parts/more-words.js";
-import { Button, Charge, Check, Drawing, Drop, Icon, RouteLink, Select, StopButton, useItself } from "../parts/parts.js";
+import { Button, Charge, Check, Drawing, Drop, Icon, RouteLink, StopButton, useItself } from "../parts/parts.js";
 import { RecordingsLink } from "./recordings-link.js";
 import { battery, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf } from "../parts/words.js";
 
@@ -33,7 +33,6 @@ const MANY = 100; // beyond, cards have no pictures, and only those near the scr
 const NEEDS_MS = 10_000; // so long a card stays among those that need a look
 const LOW_PERCENT = 20;
 const isRobot = (ref) => typeOf(ref) === "robots";
-const SORTS = { name: "Name", type: "Type", battery: "Battery" };
 
 const kept = { filter: "" }; // while a robot is looked at
 
@@ -53,7 +52,7 @@ export function Fleet() {
     online.forEach((ref) => settings.forgotten.has(ref) && settings.forget(ref, false));
   }, [online.join()]);
   const matches = matcher(store, filter);
-  const shown = sorted(store, online.filter(matches), settings.sort);
+  const shown = sorted(store, online.filter(matches));
   const shownAway = away.filter(matches).sort();
   const total = online.length + away.length;
   const robots = [...online, ...away].filter(isRobot);
@@ -121,17 +120,10 @@ function isPresent(store, ref) {
   return view.value.online === true || (view.value.online === null && view.value.silent_s !== null);
 }
 
-function sorted(store, refs, by) {
-  const level = (ref) => {
-    const value = inner(store.get(ref, "charging-level")?.value);
-    return typeof value === "number" ? value : Infinity;
-  };
-  const robotsFirst = (ref) => `${isRobot(ref) ? 0 : 1} ${nameIn(store, ref).toLowerCase()}`;
-  const keys = { name: robotsFirst, type: (ref) => `${typeOf(ref)} ${nameIn(store, ref).toLowerCase()}`, battery: level };
-  const key = keys[by] ?? robotsFirst;
-  const keyed = refs.map((ref) => ({ ref, key: key(ref) }));
-  keyed.sort((a, b) => (a.key < b.key ? -1 : a.key > b.key ? 1 : a.ref < b.ref ? -1 : 1));
-  return keyed.map(({ ref }) => ref);
+/** Robots first, by name. */
+function sorted(store, refs) {
+  const keyed = refs.map((ref) => [`${isRobot(ref) ? 0 : 1} ${nameIn(store, ref).toLowerCase()} ${ref}`, ref]);
+  return keyed.sort(([a], [b]) => (a < b ? -1 : 1)).map(([, ref]) => ref);
 }
 
 /** Those which a person should look at: at once, and for a while after the reason is gone. @returns {Set<string>} */
@@ -167,13 +159,6 @@ function FleetTools({ filter, onFilter, many }) {
     <${RecordingsLink} />
     <${Drop} test="fleet-more" look="button" summary="More">
         <${Button} test="phone" icon="phone" onPress=${() => panels.show("phone")}>Open on a phone<//>
-        <${Select}
-          test="sort"
-          title="Sort by"
-          value=${settings.sort}
-          choices=${Object.entries(SORTS)}
-          onChoose=${(name) => settings.set("sort", name)}
-        />
         ${!WATCHES &&
         !many &&
         html`<${Check} test="thumbnails" checked=${settings.thumbnails} onChange=${(on) => settings.set("thumbnails", on)}>Thumbnails<//>`}

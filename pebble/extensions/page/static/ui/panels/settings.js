@@ -9,10 +9,6 @@ import { RecordingsLink } from "../fleet/recordings-link.js";
 
 const THEMES = { auto: "As the system", light: "Light", dark: "Dark" };
 const SIDES = { left: "On the left", right: "On the right" };
-const MORE = [
-  { name: "help", icon: "help", text: "Help" },
-  { name: "phone", icon: "phone", text: "Open on a phone" },
-];
 
 export function SettingsPanel({ onClose }) {
   const { settings, driver, panels } = usePage();
@@ -48,17 +44,8 @@ export function SettingsPanel({ onClose }) {
     </fieldset>
     <div class="panel-links">
       <div onClick=${onClose}><${RecordingsLink} at=${driver.ref} className="button wide" /></div>
-      ${MORE.map(
-        ({ name, icon, text }) => html`<${Button}
-          key=${name}
-          className="wide"
-          test=${`open-${name}`}
-          icon=${icon}
-          onPress=${() => panels.show(name)}
-        >
-          ${text}
-        <//>`,
-      )}
+      <${Button} className="wide" test="open-help" icon="help" onPress=${() => panels.show("help")}>Help<//>
+      <${Button} className="wide" test="open-phone" icon="phone" onPress=${() => panels.show("phone")}>Open on a phone<//>
     </div>
   <//>`;
 }

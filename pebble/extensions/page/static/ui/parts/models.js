@@ -134,7 +134,6 @@ export class Settings extends Model {
     this.theme = read("theme", "auto");
     this.thumbnails = read("thumbnails", true) === true;
     this.begun = list(read("begun", [])); // of what is shown to who is here for the first time
-    this.sort = read("sort", "name");
     this.name = read("name", "");
     this.side = read("side", "right"); // of the stick, on a phone
     this.hints = read("hints", true); // which keys drive
@@ -142,7 +141,7 @@ export class Settings extends Model {
     this.apply();
   }
 
-  /** @param {"theme" | "thumbnails" | "sort" | "name" | "side" | "hints"} name @param {any} value */
+  /** @param {"theme" | "thumbnails" | "name" | "side" | "hints"} name @param {any} value */
   set(name, value) {
     Object.assign(this, { [name]: value });
     write(name, value);

@@ -1,4 +1,4 @@
-// Balanced columns: once all cards are here, each goes to the shortest column; later only what is below it in that column moves.
+// Balanced columns: once all cards are here, they are placed so that all columns end alike; later only what is below a card moves.
 
 import * as more from "../../core/browser-more.js";
 import { useLayoutEffect, useRef } from "../parts/hooks.js";
@@ -7,7 +7,8 @@ const GAP = 20;
 const ROW = 4; // px of a row of the grid: cards end at multiples of it
 const SIDE = 340; // the last column, if there is one for driving
 const LEAST = 440; // of each other column
-const EQUAL = 24; // px by which a column has to be shorter to be chosen: tops rise along the list
+const EQUAL = 24; // px by which a top may lie above that of a card before it in the list
+const REST_MS = 1000; // so long cards may change columns after all of them are here
 
 /** @param {number} width px @param {boolean} hasSide @returns {number} */
 const columnsOf = (width, hasSide) => {
@@ -16,85 +17,115 @@ const columnsOf = (width, hasSide) => {
 };
 
 /**
- * Where each card is: its column, and its first row. ``homes`` are the columns that were chosen before.
- * @param {{id: string, rows: number, span?: "main" | "all", side?: boolean}[]} cards in their order
- * @param {number} count of columns @param {boolean} hasSide @param {Map<string, number>} homes @returns {Map<string, [number, number, number]>} top, column, span
+ * ``rows`` in a main column, ``sideRows`` in the last one; ``wide``: it may span several main ones.
+ * @typedef {{id: string, rows: number, sideRows: number, span?: string, side: boolean, wide: boolean}} Size
+ * @typedef {[number, number, number]} Place its first row, its column, and how many columns it spans
  */
-function placed(cards, count, hasSide, homes) {
-  const ends = Array(count).fill(0);
-  const places = new Map();
-  for (const { id, rows, span, side } of cards) {
-    const wide = span === "all" ? count : span === "main" ? Math.max(1, count - Number(hasSide)) : 1;
-    const at = span ? 0 : side ? count - 1 : (homes.get(id) ?? shortest(ends));
-    const top = Math.max(...ends.slice(at, at + wide));
-    homes.set(id, at);
-    places.set(id, [top, at, wide]);
-    ends.fill(top + rows, at, at + wide);
-  }
-  return places;
+
+const range = (numbers) => Math.max(...numbers) - Math.min(...numbers);
+
+/**
+ * The places by which all columns end most alike, and so do those above a card that spans several. Tops rise along the
+ * list: it is the order of reading. Nothing else counts: cards that are as high have the same places.
+ * @param {Size[]} cards in their order @param {number} count of columns @param {boolean} hasSide
+ * @param {Map<string, number[][]>} [homes] of cards that keep their columns @returns {Place[]}
+ */
+export function placed(cards, count, hasSide, homes = new Map()) {
+  const main = Math.max(1, count - Number(hasSide));
+  let best = { cost: Infinity, places: /** @type {Place[]} */ ([]) };
+  const go = (/** @type {number[]} */ ends, highest, cost, /** @type {Place[]} */ places) => {
+    const card = cards[places.length];
+    const total = cost + (card ? 0 : range(ends));
+    if (total >= best.cost) return;
+    if (!card) return void (best = { cost: total, places });
+    for (const [at, span] of homes.get(card.id) ?? choices(card, count, main)) {
+      const above = ends.slice(at, at + span);
+      const top = Math.max(...above);
+      const next = [...ends].fill(top + (at < main ? card.rows : card.sideRows), at, at + span);
+      const early = Math.max(0, highest - EQUAL / ROW - top);
+      go(next, Math.max(top, highest), cost + range(above) + 1000 * early, [...places, [top, at, span]]);
+    }
+  };
+  go(Array(count).fill(0), 0, 0, []);
+  return best.places;
 }
 
-function shortest(ends) {
-  let at = 0;
-  for (let column = 1; column < ends.length; column++) if (ends[column] + EQUAL / ROW < ends[at]) at = column;
-  return at;
+/** Columns and spans that a card may have. @param {Size} card @param {number} count @param {number} main */
+function choices(card, count, main) {
+  if (card.span) return [[0, card.span === "all" ? count : main]];
+  if (card.side) return [[count - 1, 1]];
+  const columns = Array.from({ length: count }, (_, at) => at);
+  return columns.flatMap((at) => columns.slice(0, card.wide ? Math.max(1, main - at) : 1).map((n) => [at, n + 1]));
 }
 
-/** Places the children of one grid. Their order in the document is that of keyboard and screen reader: it stays. */
+/**
+ * Places the children of one grid. Their order in the document is that of keyboard and screen reader: it stays. Columns
+ * are kept from a moment after all cards are here, or from the first touch: later only what is below a card moves.
+ */
 class Columns {
   /** @param {HTMLElement} grid */
   constructor(grid) {
     this.grid = grid;
     this.homes = new Map();
     this.count = 0;
-    this.settled = false; // every card is as high as it is
+    this.rests = false;
+    this.timer = 0;
     this.seen = new Set();
     this.observer = more.sizes(() => this.place());
-    this.follow(grid);
-  }
-
-  /** @param {Element} one */
-  follow(one) {
-    if (this.seen.has(one)) return;
-    this.seen.add(one);
-    this.observer.observe(one);
+    const touched = () => (this.rests = true);
+    for (const name of ["pointerdown", "keydown", "wheel"]) addEventListener(name, touched, { passive: true, once: true });
   }
 
   place() {
-    const { grid, homes } = this;
+    const { grid } = this;
     const cards = /** @type {HTMLElement[]} */ ([...grid.children]);
-    cards.forEach((card) => this.follow(card));
+    for (const one of [grid, ...cards]) if (!this.seen.has(one)) this.observer.observe(one);
+    this.seen = new Set([grid, ...cards]);
     const hasSide = cards.some((card) => card.dataset.at === "side" && card.offsetHeight > 0);
     const count = columnsOf(grid.clientWidth, hasSide);
-    if (count !== this.count || !this.settled) {
-      this.settled = !grid.querySelector(".loading");
-      homes.clear();
-      const side = hasSide && count > 1 ? ` ${SIDE}px` : "";
-      grid.style.gridTemplateColumns = `repeat(${side ? count - 1 : count}, minmax(0, 1fr))${side}`;
-      for (const card of cards) {
-        const { span, at } = card.dataset; // as wide as it will be, else its height would be another one
-        const wide = span === "all" ? count : Math.max(1, count - Number(hasSide));
-        card.style.gridArea = `auto / ${at === "side" ? count : 1} / auto / span ${span ? wide : 1}`;
-      }
-    }
+    if (count !== this.count || !this.rests) this.arrange(cards, count, hasSide);
     this.count = count;
-    const known = cards.map((card) => {
-      const { card: id = "", span, at } = card.dataset;
-      const rows = card.offsetHeight ? Math.ceil((card.offsetHeight + GAP) / ROW) : 0;
-      return { id, rows, span: /** @type {any} */ (span), side: at === "side", card };
+    const sizes = sizesOf(cards); // all was read before anything is written
+    placed(sizes, count, hasSide, this.homes).forEach(([top, at, span], n) => {
+      this.homes.set(sizes[n].id, [[at, span]]);
+      const area = `${top + 1} / ${at + 1} / span ${Math.max(1, sizes[n].rows)} / span ${span}`;
+      if (cards[n].style.gridArea !== area) cards[n].style.gridArea = area; // this runs with each message, too
     });
-    const places = placed(known, count, hasSide, homes); // all was read before anything is written
-    for (const { id, rows, card } of known) {
-      const [top, at, wide] = places.get(id) ?? [0, 0, 1];
-      const area = `${top + 1} / ${at + 1} / span ${Math.max(1, rows)} / span ${wide}`;
-      if (card.style.gridArea !== area) card.style.gridArea = area; // this runs with each message, too
-    }
+    if (!this.timer && !grid.querySelector(".loading")) this.timer = setTimeout(() => this.rest(), REST_MS);
+  }
+
+  /** Choose columns by how high each card is in a main column and in the last one. */
+  arrange(cards, count, hasSide) {
+    const main = Math.max(1, count - Number(hasSide));
+    this.grid.style.gridTemplateColumns = `repeat(${main}, minmax(0, 1fr))${count > main ? ` ${SIDE}px` : ""}`;
+    const [sizes, side] = [1, count].map((column) => {
+      for (const { style, dataset: { span, at } } of cards) {
+        style.gridArea = `auto / ${span ? 1 : at === "side" ? count : column} / auto / span ${span === "all" ? count : span ? main : 1}`;
+      }
+      return sizesOf(cards);
+    });
+    const places = placed(sizes.map((size, n) => ({ ...size, sideRows: side[n].rows })), count, hasSide);
+    this.homes = new Map(places.map(([, at, span], n) => [sizes[n].id, [[at, span]]]));
+  }
+
+  rest() {
+    if (!this.rests) this.place();
+    this.rests = true;
+    this.grid.dataset.rests = "";
   }
 
   close() {
+    clearTimeout(this.timer);
     this.observer.disconnect();
   }
 }
+
+/** @param {HTMLElement[]} cards @returns {Size[]} */
+const sizesOf = (cards) =>
+  cards.map(({ offsetHeight, dataset: { card: id = "", span, at, wide } }) => {
+    const rows = offsetHeight ? Math.ceil((offsetHeight + GAP) / ROW) : 0;
+    return { id, rows, sideRows: rows, span, side: at === "side", wide: wide !== undefined };
+  });
 
 /** @returns {{current: any}} for the ``ref`` of the grid */
 export function useColumns() {
