@@ -14,9 +14,9 @@ from pebble.extensions.scripts.script.program import run_for
 _HELP = """Measure a robot's wheels, or its camera; docs/ext/calibrate.md explains how.
 
 \b
-    pebble calibrate wheels goob.json                  a person measures with a tape
-    pebble calibrate wheels goob.json --truth tag      its camera does, by a tag on the wall
-    pebble calibrate camera goob.json --size 0.25      hold a tag into its picture
+    pebble calibrate wheels goob.json                  a person has a tape
+    pebble calibrate wheels goob.json --truth tag      its camera sees a tag
+    pebble calibrate camera goob.json --size 0.25      hold a tag before it
 """
 _Config = Annotated[
     Path, typer.Argument(help="The robot's config file, on the robot.", metavar="CONFIG", show_default=False)

@@ -25,7 +25,7 @@ _AHEAD_M = 0.2  # more than the tag's least distance, at the end of a straight
 
 
 class Wanted(Struct, frozen=True, kw_only=True):
-    """What is driven, and what it is compared with."""
+    """The runs that are wanted, and the truth that they are compared with."""
 
     truth: Literal["tape", "tag", "gyro"] = "tape"
     length_m: float = 1.5

@@ -5,22 +5,26 @@ from __future__ import annotations
 import json
 import math
 import random
+import re
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
+from pebble.config import parse
 from pebble.contract import DRIVE
 from pebble.contract.payloads import Drive
 from pebble.errors import PebbleError
 from pebble.extensions.calibrate.wheels import Wanted, check
 from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, Wheels
+from pebble.extensions.scripts.perception.odometry import Calibration
 from pebble.extensions.scripts.perception.tags import Place, Tag
 from tests.ext.calibrate.simulated import TAG, TRUE, Measured, measure
-from tests.support import cases, some
+from tests.support import ROOT, cases, some
 
 SHORT = {"length_m": 0.3, "straights": 4, "spins": 2}
 QUICK = Wanted(**SHORT)
@@ -206,3 +210,10 @@ def test_without_hall_sensors_the_key_is_named(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(PebbleError, match=r"no hall sensors: set .*publish_touch_sensors"):
         measure(tmp_path, wanted=QUICK)
     assert [path.name for path in tmp_path.iterdir()] == ["room.json"]
+
+
+def test_the_files_in_the_document(tmp_path: Path) -> None:
+    config, written = re.findall(r"```json\n(.*?)```", (ROOT / "docs/ext/calibrate.md").read_text(), re.DOTALL)
+    telemetry = parse(json.loads(config), folder=tmp_path, env={}).services.serial_mcu_bridge.telemetry
+    assert telemetry.publish_touch_sensors
+    assert msgspec.json.decode(written, type=Calibration).track_mm == 134.382
