@@ -67,6 +67,7 @@ OURS: Final[Mapping[str, tuple[str, ...]]] = {
     "pebble.services.serial_mcu_bridge.devices": (),
     "pebble.extensions.foxglove": (),
     "pebble.extensions.metrics": (),
+    "pebble.extensions.calibrate": (),
     "pebble.extensions.lab": (),
     "pebble.extensions.checks": (),
     "pebble.extensions.install": (),

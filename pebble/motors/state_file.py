@@ -16,6 +16,8 @@ from pebble.transports.own_file import OwnFile
 log = logging.getLogger(__name__)
 
 _LONGEST = 16_384  # bytes; more is no file of ours
+CONTAINER = "PEBBLE_CONTAINER"  # set in the environment of a container
+LOST = ("/", "/tmp", "/run", "/dev/shm")  # noqa: S108 - its layer and what is in memory end with the container
 _END_S = 1.0  # longest wait for a write that is under way when closing
 
 
@@ -50,9 +52,15 @@ class StateFile:
             return True
 
     def can_save(self) -> bool:
-        """True if the folder can be written, or created."""
+        """True if the folder can be written, or created, or should be: what ends with a container counts as failed."""
         existing = next(folder for folder in self.path.parents if os.access(folder, os.F_OK))
-        return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
+        return self.ends_with_container or (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK))
+
+    @property
+    def ends_with_container(self) -> bool:
+        """True if this is a container, and no volume holds the folder: a new container does not know the value."""
+        folders = self.path.resolve().parents
+        return CONTAINER in os.environ and str(next(folder for folder in folders if folder.is_mount())) in LOST
 
     def load(self) -> Any:
         """Return the value that was saved last; None without a file, Unreadable() if it is damaged."""
@@ -122,6 +130,8 @@ class StateFile:
             make_folder(self.path.parent)
             write(self.path, json.dumps(value).encode(), 0o600, PebbleError)
             self._own = OwnFile(self.path)
+            if self.ends_with_container:
+                raise PebbleError(f"NOT SAVED: no volume holds {self.path.parent}, so a stop ends with this container")
         except (PebbleError, OSError) as error:
             self._log.log("failed", logging.ERROR, "the state cannot be written: %s", error)
             return False

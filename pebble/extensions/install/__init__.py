@@ -13,6 +13,7 @@ EXTENSION = Extension(
             "pebble.extensions.install.commands.flash:flash", "install a robot's firmware on its board", "own", 50
         ),
     },
+    facts="pebble.extensions.install.container:facts",
     former={"backup": "setup --backup FILE"},
     page="docs/life-of-a-robot.md",
 )

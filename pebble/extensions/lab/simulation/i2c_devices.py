@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable
 from typing import Final
 
-from pebble.extensions.lab.simulation.motion import TRACK_MM, RobotMotion
+from pebble.extensions.lab.simulation.motion import RobotMotion
 
 _GYRO_CONFIG, _ACCEL_CONFIG, _ACCEL_XOUT_H, _PWR_MGMT_1, _WHO_AM_I = 0x1B, 0x1C, 0x3B, 0x6B, 0x75
 _SLEEP = 0x40
@@ -95,7 +95,7 @@ class Mpu6050:
             return 0.0, 0.0, 0.0
         now = self._now()
         speed = (self._motion.left_mm_s + self._motion.right_mm_s) / 2
-        turn_rad_s = (self._motion.right_mm_s - self._motion.left_mm_s) / TRACK_MM
+        turn_rad_s = (self._motion.right_mm_s - self._motion.left_mm_s) / self._motion.wheels.track_mm
         seconds = now - self._moved_at
         ahead = (speed - self._speed_mm_s) / seconds / _G_MM_S2 if seconds > 0.0 else 0.0
         self._moved_at, self._speed_mm_s = now, speed

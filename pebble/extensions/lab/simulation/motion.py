@@ -18,6 +18,15 @@ class Pose:
     heading_rad: float = 0.0  # −π..π, counter-clockwise positive
 
 
+@dataclass(frozen=True, slots=True)
+class Wheels:
+    """The wheels as they are, which may differ from those that a program believes in."""
+
+    left_diameter_mm: float = WHEEL_DIAMETER_MM
+    right_diameter_mm: float = WHEEL_DIAMETER_MM
+    track_mm: float = TRACK_MM
+
+
 class Ground(Protocol):
     """The ground below a robot."""
 
@@ -34,8 +43,8 @@ class RobotMotion:
     Where ``ground`` stops the robot, its wheels slip; without one nothing is in the way.
     """
 
-    def __init__(self, pose: Pose | None = None, ground: Ground | None = None) -> None:
-        self.pose, self.ground = pose or Pose(), ground
+    def __init__(self, pose: Pose | None = None, ground: Ground | None = None, wheels: Wheels | None = None) -> None:
+        self.pose, self.ground, self.wheels = pose or Pose(), ground, wheels or Wheels()
         self.left_mm_s = self.right_mm_s = 0.0
         self.left_mm = self.right_mm = 0.0  # distance of each wheel; reverse is negative
 
@@ -47,14 +56,15 @@ class RobotMotion:
 
     def advance(self, left: float, right: float, seconds: float) -> None:
         """Drive the motors at ``left`` and ``right`` (−1..1 of full speed) for ``seconds``."""
-        self.left_mm_s, left_mm = _follow(self.left_mm_s, left * FULL_SPEED_MM_S, seconds)
-        self.right_mm_s, right_mm = _follow(self.right_mm_s, right * FULL_SPEED_MM_S, seconds)
+        full = FULL_SPEED_MM_S / WHEEL_DIAMETER_MM  # for each millimetre of a wheel's diameter
+        self.left_mm_s, left_mm = _follow(self.left_mm_s, left * full * self.wheels.left_diameter_mm, seconds)
+        self.right_mm_s, right_mm = _follow(self.right_mm_s, right * full * self.wheels.right_diameter_mm, seconds)
         self._roll(left_mm, right_mm)
 
     def _roll(self, left_mm: float, right_mm: float) -> None:
         self.left_mm += left_mm
         self.right_mm += right_mm
-        turn, ahead = (right_mm - left_mm) / TRACK_MM, (left_mm + right_mm) / 2
+        turn, ahead = (right_mm - left_mm) / self.wheels.track_mm, (left_mm + right_mm) / 2
         middle = self.pose.heading_rad + turn / 2
         end = Pose(
             self.pose.x_mm + ahead * math.cos(middle),
@@ -84,8 +94,8 @@ _SAG_V = 0.075  # under full load
 
 def hall(motion: RobotMotion) -> tuple[float, float, float]:
     """Return the Hall sensors, 0..1 of the ADC's range: left wheel, right wheel, left wheel a quarter wave later."""
-    waves_per_mm = _MAGNETS / 2 / (math.pi * WHEEL_DIAMETER_MM)
-    left, right = (math.tau * waves_per_mm * way for way in (motion.left_mm, motion.right_mm))
+    left = _MAGNETS * motion.left_mm / motion.wheels.left_diameter_mm  # half the magnets are waves of a turn, in rad
+    right = _MAGNETS * motion.right_mm / motion.wheels.right_diameter_mm
     return _part(math.sin(left)), _part(math.sin(right)), _part(math.sin(left - math.pi / 2))
 
 

@@ -10,6 +10,7 @@ _GAP_MS = 100  # samples farther apart are not integrated over
 _LIMIT_DPS = 320.0  # the sensor's protocol ends at 327
 _BIAS_WEIGHT = 0.005  # of a sample at rest, at 100 Hz: 2 s
 _TEST_TURN_RAD = math.pi  # of the wheels, before the sensor is judged
+_NOISE_RAD = 0.01  # per sample of the wheels: less may be noise of their sensors, and judges nothing
 _LEAST_RATIO, _MOST_RATIO = 0.5, 2.0  # sensor to wheels; else it is mounted otherwise than flat, x ahead, z up
 
 
@@ -47,7 +48,9 @@ class GyroHeading:
         return turn
 
     def _compare(self, turn: float, wheels_rad: float) -> None:
-        self._agreed += math.copysign(1.0, wheels_rad) * turn if wheels_rad else 0.0
+        if abs(wheels_rad) < _NOISE_RAD:
+            return
+        self._agreed += math.copysign(1.0, wheels_rad) * turn
         self._compared += abs(wheels_rad)
         if self._compared < _TEST_TURN_RAD:
             return

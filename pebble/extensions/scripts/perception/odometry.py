@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
 
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 
 from pebble.contract.payloads import ImuFast, MotorPower, TouchValues
 from pebble.extensions.scripts.perception.gyro import GyroHeading
@@ -23,7 +24,24 @@ _HOLD_S = 0.35  # wheels coast so long
 _LEAST_POWER = 0.02
 
 
+CALIBRATION = "odometry.json"  # in the config's folder
+
 Pin = Literal["a0", "a1", "a2"]
+Length = Annotated[float, Meta(gt=0, le=5000)]
+
+
+class Calibration(Struct, frozen=True, kw_only=True):
+    """The wheels as `pebble calibrate wheels` has measured them; the content of ``odometry.json``."""
+
+    version: Literal[1] = 1
+    made: str  # date and time
+    counts: Literal["once"] = "once"  # a step is counted once; the original's tuning program counts it twice
+    left_step_mm: Length
+    right_step_mm: Length
+    track_mm: Length
+    truth: str
+    runs: int
+    residual_mm: float
 
 
 class OdometrySettings(Struct, frozen=True, kw_only=True):
@@ -48,6 +66,17 @@ class OdometrySettings(Struct, frozen=True, kw_only=True):
         """A step of the left and of the right wheel, one for each magnet."""
         step = math.pi * self.wheel_diameter_mm / self.magnets
         return self.left_mm_per_event or step, self.right_mm_per_event or step
+
+
+def calibrated(settings: OdometrySettings, calibration: Calibration) -> OdometrySettings:
+    """Return the settings with what was measured, where they are not set otherwise than by default."""
+    default = OdometrySettings()
+    if settings.step_mm == default.step_mm:
+        steps = {"left_mm_per_event": calibration.left_step_mm, "right_mm_per_event": calibration.right_step_mm}
+        settings = replace(settings, **steps)
+    if settings.track_width_mm == default.track_width_mm:
+        settings = replace(settings, track_width_mm=calibration.track_mm)
+    return settings
 
 
 class WheelPose(NamedTuple):

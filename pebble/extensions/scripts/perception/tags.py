@@ -19,6 +19,7 @@ class Place(NamedTuple):
 
     distance_m: float
     angle_rad: float
+    down_m: float = 0.0  # below the camera's axis
 
 
 class Tag(NamedTuple):
@@ -74,7 +75,7 @@ class TagGeometry:
         distance = math.sqrt(right * right + down * down + ahead * ahead)
         if not math.isfinite(distance) or ahead <= 0.0:
             return None
-        return Place(distance, math.atan2(right, ahead))
+        return Place(distance, math.atan2(right, ahead), down)
 
 
 class TagFinder:

@@ -65,6 +65,15 @@ def run(
         sys.exit(1)
 
 
+def run_for(config: Path, main: Callable[[Robot], None], *, name: str, drives: bool = True) -> None:
+    """Run ``main(robot)`` as a script, for a command of ``pebble`` whose process does nothing else.
+
+    Raises PebbleError if there is no such robot, and what ``main`` raises; Stopped if the script was ended.
+    """
+    set_up_logging("WARNING")
+    _Program(name, drives=drives).run(main, config, ())
+
+
 def _options_of(main: Callable[..., None]) -> type[msgspec.Struct] | None:
     """Return the type of main's second parameter. Raises TypeError for what cannot be called."""
     parameters = list(inspect.signature(main, eval_str=True).parameters.values())

@@ -89,6 +89,32 @@ def test_of_the_originals_tuning_only_the_width_of_the_track_counts(
     assert bool(remark) == bool(caplog.text)
 
 
+MEASURED = {"left_step_mm": 19.36, "right_step_mm": 18.97, "track_mm": 134.4}
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "wheels", "remark"),
+    [
+        ({}, {}, (19.36, 18.97, 134.4), ""),
+        ({}, {"use_tune_state": True}, (19.36, 18.97, 134.4), ""),
+        ({}, {"track_width_mm": 120.0}, (19.36, 18.97, 120.0), ""),
+        ({}, {"left_mm_per_event": 19.0, "right_mm_per_event": 18.0}, (19.0, 18.0, 134.4), ""),
+        ({"counts": "twice"}, {}, (0, 0, 130.5), "odometry.json: Invalid enum value 'twice'"),
+        ({"track_mm": -1}, {}, (0, 0, 130.5), "the geometry counts"),
+    ],
+)
+def test_the_calibration_of_its_folder_counts_unless_options_say_otherwise(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, change: Any, options: Any, wheels: Any, remark: str
+) -> None:
+    usual = {"version": 1, "made": "2026-11-29", "counts": "once", "truth": "tape", "runs": 8, "residual_mm": 1.2}
+    (tmp_path / "odometry.json").write_text(json.dumps({**usual, **MEASURED, **change}))
+    robot = SimpleNamespace(config=SimpleNamespace(folder=tmp_path), log=logging.getLogger("script"))
+    tuned = run_path(str(SCRIPTS / "wheel-odometry" / "run.py"))["tuned"](robot, OdometrySettings(**options))
+    assert (tuned.left_mm_per_event, tuned.right_mm_per_event, tuned.track_width_mm) == wheels
+    assert remark in caplog.text
+    assert bool(remark) == bool(caplog.text)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_each_has_a_sentence_and_main_settings(name: str) -> None:
     found = described(name)

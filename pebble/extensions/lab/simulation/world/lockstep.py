@@ -9,12 +9,12 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from pebble.extensions.lab.simulation.board import SimulatedMcu
-from pebble.extensions.lab.simulation.motion import Pose, RobotMotion
+from pebble.extensions.lab.simulation.motion import Pose
 from pebble.extensions.lab.simulation.world.pose_page import PERIOD_S
 from pebble.extensions.lab.simulation.world.poses import RobotPose, Sample, Track
 from pebble.extensions.lab.simulation.world.renderer import Renderer
 from pebble.extensions.lab.simulation.world.surfaces import Image
-from pebble.extensions.lab.simulation.world.walls import Floor, start_pose
+from pebble.extensions.lab.simulation.world.walls import Floor, motion_of
 from pebble.extensions.lab.simulation.world.world_file import LONGEST_EXPOSURE_MS, LONGEST_LATENCY_MS, World
 
 STEP_S: Final = 0.005  # one turn of the firmware's loop
@@ -87,7 +87,7 @@ class LockstepRobot:
 
     def __init__(self, world: World, name: str, floor: Floor, camera: CameraMode) -> None:
         self.name = name
-        self.motion = RobotMotion(start_pose(world, name), floor.mover(name))
+        self.motion = motion_of(world, name, floor)
         self.mcu = SimulatedMcu(world.robots[name].kind, 0.0, motion=self.motion)
         self.tracks: dict[str, Track] = {}
         self._world, self._camera = world, camera

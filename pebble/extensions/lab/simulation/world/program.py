@@ -20,7 +20,7 @@ from pebble.extensions.lab.simulation.motion import Pose, RobotMotion
 from pebble.extensions.lab.simulation.pty import PtyMcu
 from pebble.extensions.lab.simulation.world.pose_page import PERIOD_S, PosePage, page_path
 from pebble.extensions.lab.simulation.world.poses import RobotPose
-from pebble.extensions.lab.simulation.world.walls import Floor, start_pose
+from pebble.extensions.lab.simulation.world.walls import Floor, motion_of
 from pebble.extensions.lab.simulation.world.world_file import World, read_world
 from pebble.runtime.signals import EndSignal
 
@@ -60,7 +60,7 @@ def run(
         page = _page(path, world)
         stack.callback(page.close)
         floor = Floor(world)
-        motions = {name: RobotMotion(start_pose(world, name), floor.mover(name)) for name in world.robots}
+        motions = {name: motion_of(world, name, floor) for name in world.robots}
         mcus = {name: stack.enter_context(mcu) for name, mcu in _mcus(world, motions, folder, trace).items()}
         imus = {name: stack.enter_context(imu) for name, imu in _imus(world, motions, folder).items()}
         if not report:

@@ -9,13 +9,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from msgspec.structs import replace
+
 from pebble.config import parse
 from pebble.contract import DRIVE, Channel
-from pebble.contract.payloads import Drive
+from pebble.contract.payloads import Drive, EstopState
 from pebble.errors import PebbleError
 from pebble.extensions.lab.simulation.world.lockstep import STEP_S, LockstepRobot, LockstepWorld
 from pebble.extensions.lab.simulation.world.world_file import read_world
-from pebble.extensions.scripts.script import Robot, Stopped
+from pebble.extensions.scripts.script import EXIT_ENDED, Robot, Stopped
 from pebble.extensions.scripts.script.drive_sender import DriveSender
 from pebble.extensions.scripts.script.robot import check_publish
 from pebble.runtime.addresses import Addresses
@@ -73,6 +75,7 @@ class SimulatedRobot(Robot):
         self._handlers: list[tuple[Channel, Handler]] = []
         self._picture: tuple[Image, float] | None = None
         self._calls = 0  # since time has passed
+        self._latched = False
 
     # -- for tests
 
@@ -110,6 +113,14 @@ class SimulatedRobot(Robot):
         for wanted, handler in self._handlers:
             if wanted == channel:
                 handler(value)
+
+    def estop(self, by: str = "a person") -> None:
+        """Stop the robot as STOP does: its motor owner latches, which ends a script that drives."""
+        free = EstopState(latched=False, boot="0", count=0, recent=[], by="", why="", since=0)
+        for state in (free, replace(free, latched=True, count=1, by=by, since=1)):
+            self._sender.owners({"serial": state}, self.world.now())
+        self._latched = True
+        self._body.drive(0.0, 0.0)
 
     # -- for scripts
 
@@ -176,6 +187,9 @@ class SimulatedRobot(Robot):
             raise PebbleError("time stands still: wait with robot.sleep(), not with time.sleep()")
         if self.world.now() >= self._end_at:
             raise Stopped(0)
+        if why := self._sender.ended(self.world.now()):
+            self.log.warning("%s", why)
+            raise Stopped(EXIT_ENDED)
 
     def _pass_step(self) -> None:
         self._check()
@@ -188,6 +202,7 @@ class SimulatedRobot(Robot):
             self._body.drive(0.0, 0.0)
 
     def _drive(self, command: Drive) -> bool:
-        self._driven_at = self.world.now()
-        self._body.drive(command.x, command.z)
+        if not self._latched:
+            self._driven_at = self.world.now()
+            self._body.drive(command.x, command.z)
         return True

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 
-from pebble.extensions.lab.simulation.motion import Pose
+from pebble.extensions.lab.simulation.motion import Pose, RobotMotion, Wheels
 from pebble.extensions.lab.simulation.world.world_file import World
 
 _HALVINGS = 12  # of a move that is not free, to find the contact: of 8 mm, 2 µm are left
@@ -86,6 +86,13 @@ class Mover:
 def start_pose(world: World, name: str) -> Pose:
     place = world.robots[name]
     return Pose(place.x * 1000, place.y * 1000, math.remainder(math.radians(place.heading_deg), math.tau))
+
+
+def motion_of(world: World, name: str, floor: Floor) -> RobotMotion:
+    """Return the motion of a robot from where it starts, on its wheels."""
+    place = world.robots[name]
+    wheels = Wheels(place.left_wheel_mm, place.right_wheel_mm, place.track_mm)
+    return RobotMotion(start_pose(world, name), floor.mover(name), wheels)
 
 
 def _between(start: Pose, end: Pose, part: float) -> tuple[float, float]:

@@ -21,6 +21,7 @@ from pebble.config.reader import Reader
 from pebble.config.types import EMPTY, Section, doc
 from pebble.contract.identity import LEVEL, LEVEL_RULE
 from pebble.errors import ConfigError, DeviceError
+from pebble.extensions.lab.simulation.motion import TRACK_MM, WHEEL_DIAMETER_MM
 
 MOST_ROBOTS: Final = 32
 LONGEST_NAME: Final = 64  # bytes of a robot's name
@@ -31,6 +32,7 @@ _TAGS_OF: Final = {"APRILTAG_16h5": 30, "APRILTAG_25h9": 35, "APRILTAG_36h10": 2
 
 Metres = Annotated[float, Meta(ge=-100, le=100)]
 Length = Annotated[float, Meta(gt=0, le=10)]
+Millimetres = Annotated[float, Meta(ge=10, le=1000)]
 Degrees = Annotated[float, Meta(ge=-3600, le=3600)]
 TagId = Annotated[int, Meta(ge=0, le=2319)]
 Share = Annotated[float, Meta(ge=0, le=1)]
@@ -91,6 +93,9 @@ class Start(Section, frozen=True, kw_only=True):
     radius_m: Annotated[float, Meta(ge=0.02, le=2)] = 0.1
     tag: TagId | None = None
     imu: Annotated[bool, doc("With the second board of a Goob, its inertial sensor.")] = False
+    left_wheel_mm: Millimetres = WHEEL_DIAMETER_MM
+    right_wheel_mm: Millimetres = WHEEL_DIAMETER_MM
+    track_mm: Millimetres = TRACK_MM
 
 
 class Room(Section, frozen=True, kw_only=True):

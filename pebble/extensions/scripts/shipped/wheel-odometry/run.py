@@ -8,12 +8,19 @@ from collections.abc import Callable
 from typing import Any
 
 from msgspec import convert
+from msgspec.json import decode
 from msgspec.structs import replace
 
 from pebble import Robot, run
 from pebble.contract import IMU_FAST, MOTOR_POWER, TOUCH_SENSORS, WHEEL_ODOMETRY
 from pebble.contract.payloads import WheelOdometry
-from pebble.extensions.scripts.perception.odometry import Odometry, OdometrySettings
+from pebble.extensions.scripts.perception.odometry import (
+    CALIBRATION,
+    Calibration,
+    Odometry,
+    OdometrySettings,
+    calibrated,
+)
 from pebble.extensions.scripts.perception.rate import Rate
 from pebble.runtime.rate_limit import RateLimitedLog
 
@@ -66,7 +73,14 @@ def main(robot: Robot, options: OdometrySettings) -> None:
 
 
 def tuned(robot: Robot, options: OdometrySettings) -> OdometrySettings:
-    """Return the settings; with use_tune_state the track width of the original's tuning program wins."""
+    """Return the settings with the calibration of the config's folder, else, if wanted, the original's track width."""
+    try:
+        raw = (robot.config.folder / CALIBRATION).read_bytes()
+        return calibrated(options, decode(raw, type=Calibration))
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError) as error:
+        robot.log.warning("%s: %s; the geometry counts", CALIBRATION, error)
     width = tune_state(robot).get("track_width_mm") if options.use_tune_state else None
     return replace(options, track_width_mm=options.track_width_mm if width is None else width)
 

@@ -1,0 +1,157 @@
+"""The calibration of a camera by pictures of one tag, held in all parts of the picture, near and far."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pebble.errors import PebbleError
+from pebble.extensions.calibrate.wheels import Person
+from pebble.extensions.scripts.perception.camera_model import Floats
+from pebble.extensions.scripts.perception.tags import Tag, TagFinder, largest
+from pebble.runtime.whole_file import write
+
+LEAST_PICTURES = 15
+LEAST_SHARE = 0.01  # of the picture that the tag fills
+WORST_PX = 1.0
+_NEAR, _MIDDLE = 0.08, 0.03  # shares of the picture from which the tag is near, or in between
+_STILL_PX = 1.0  # a corner moves less from picture to picture: the tag rests
+_STILL_PICTURES = 3
+_ROWS = ("top", "middle", "bottom")
+_COLUMNS = ("left", "middle", "right")
+
+
+class View(NamedTuple):
+    """A place of the tag in the picture: one of 3 rows, 3 columns and 3 distances."""
+
+    row: int
+    column: int
+    distance: int
+
+    def __str__(self) -> str:
+        return f"{_ROWS[self.row]} {_COLUMNS[self.column]}, {('near', 'between', 'far')[self.distance]}"
+
+
+class Lens(NamedTuple):
+    """A calibrated camera, for pictures of ``size`` (width, height)."""
+
+    matrix: Floats
+    distortion: Floats
+    size: tuple[int, int]
+    error_px: float
+    pictures: int
+
+
+def view_of(tag: Tag, width: int, height: int) -> View | None:
+    """Return the place of a tag in a picture of this size; None: it is too small."""
+    share = tag.area / (width * height)
+    x, y = tag.corners.mean(axis=0)
+    distance = 0 if share >= _NEAR else 1 if share >= _MIDDLE else 2
+    return View(int(3 * y / height), int(3 * x / width), distance) if share >= LEAST_SHARE else None
+
+
+def collect(pictures: Iterable[Any], finder: TagFinder, tag_id: int, person: Person, *, still: bool) -> list[Floats]:
+    """Return the corners of the tag in 27 different places, or as many as there are pictures of.
+
+    ``still``: every picture counts; otherwise the tag has to rest, and it ends after 15 that are well spread.
+    """
+    taken: dict[View, Floats] = {}
+    resting = 0
+    before: Floats | None = None
+    for picture in pictures:
+        height, width = picture.shape[:2]
+        tag = largest(finder.find(picture), tag_id)
+        corners = None if tag is None else tag.corners
+        moved = None if corners is None or before is None else float(np.abs(corners - before).max())
+        resting = resting + 1 if moved is not None and moved < _STILL_PX else 0
+        before = corners
+        if tag is None or not (still or resting >= _STILL_PICTURES):
+            continue
+        view = view_of(tag, width, height)
+        if view is None or view in taken:
+            continue
+        taken[view] = tag.corners
+        person.tell(f"{len(taken)} of {LEAST_PICTURES}: {view}; {_next(taken)}")
+        if not still and len(taken) >= LEAST_PICTURES and not _missing(taken):
+            break
+    return list(taken.values())
+
+
+def solve(corners: list[Floats], size: tuple[int, int], size_m: float) -> Lens:
+    """Return the camera. Raises PebbleError for too few pictures, or an error of more than a pixel."""
+    import cv2
+
+    if len(corners) < LEAST_PICTURES:
+        raise PebbleError(f"{len(corners)} pictures of the tag in different places: {LEAST_PICTURES} are needed")
+    half = size_m / 2
+    square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]], np.float32)
+    points = [four.astype(np.float32).reshape(4, 1, 2) for four in corners]
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST  # four corners a picture do not show more
+    solved: Any = cv2.calibrateCamera([square] * len(points), points, size, None, None, flags=flags)
+    error, matrix, distortion = solved[:3]
+    if not error <= WORST_PX:
+        why = f"the pictures fit to {error:.2f} pixels only, more than {WORST_PX:g}"
+        raise PebbleError(f"{why}: hold the tag flat and still, and begin again")
+    return Lens(np.asarray(matrix, float), np.asarray(distortion, float).ravel(), size, float(error), len(corners))
+
+
+def save(path: Path, lens: Lens, tag_id: int, size_m: float, family: str) -> None:
+    """Write the calibration with the keys of the original's program. Raises PebbleError."""
+    import cv2
+
+    file = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    values: dict[str, Any] = {
+        "image_width": lens.size[0],
+        "image_height": lens.size[1],
+        "camera_matrix": lens.matrix,
+        "distortion_coefficients": lens.distortion.reshape(1, -1),
+        "reprojection_error": lens.error_px,
+        "marker_dictionary": family,
+        "marker_id": tag_id,
+        "marker_size": size_m,
+        "num_samples": lens.pictures,
+    }
+    for key, value in values.items():
+        file.write(key, value)
+    write(path, file.releaseAndGetString().encode(), 0o644, PebbleError)
+
+
+def read_folder(folder: Path) -> Iterator[Any]:
+    """Yield the pictures of a folder, by their names. Raises PebbleError for pictures of several sizes, or none."""
+    import cv2
+
+    shape: tuple[int, ...] | None = None
+    for path in sorted(folder.glob("*")):
+        picture = cv2.imread(str(path))
+        if picture is None:
+            continue
+        if shape not in (None, picture.shape):
+            raise PebbleError(
+                f"{path}: it is {picture.shape[1]} pixels wide and {picture.shape[0]} high, unlike the others"
+            )
+        shape = picture.shape
+        yield picture
+    if shape is None:
+        raise PebbleError(f"{folder}: there is no picture")
+
+
+def tape_line(lens: Lens, size_m: float) -> str:
+    """Return a sentence by which a tape shows whether the calibration is right."""
+    wide = lens.matrix[0, 0] * size_m
+    return f"check it: where the black square is {wide:.0f} pixels wide, a tape from the lens to it reads 1.00 m"
+
+
+def _missing(taken: Iterable[View]) -> list[str]:
+    """Return the rows, columns and distances that no picture has."""
+    rows, columns, distances = ({view[axis] for view in taken} for axis in range(3))
+    return [
+        *(_ROWS[row] for row in range(3) if row not in rows),
+        *(_COLUMNS[column] for column in range(3) if column not in columns),
+        *(("near", "between", "far")[distance] for distance in range(3) if distance not in distances),
+    ]
+
+
+def _next(taken: Iterable[View]) -> str:
+    missing = _missing(taken)
+    return f"still missing: {', '.join(missing)}" if missing else "another place, tilted"

@@ -1,0 +1,213 @@
+"""The legs of a calibration: the robot drives or spins so far, within limits of way and time, and its steps counted."""
+
+import math
+import queue
+import time
+from collections.abc import Callable
+from statistics import median
+from typing import Any, NamedTuple
+
+from pebble.contract import IMU_FAST, MOTOR_POWER, TOUCH_SENSORS
+from pebble.errors import PebbleError
+from pebble.extensions.scripts.perception.odometry import Odometry, OdometrySettings
+from pebble.extensions.scripts.perception.tags import Place, TagFinder, largest
+from pebble.extensions.scripts.script import Robot
+
+POWER = 0.5
+MOST = 1.2  # of the expected way and time of a leg
+NEAREST_M = 0.4  # to the tag
+_SLOW_POWER = 0.12  # while a spin looks for the tag
+_BEFORE_TAG = 0.87  # of a spin that ends at the tag; it sees the tag again after the rest of its last turn
+_AT_TAG_RAD = math.radians(15)  # a spin that ends there has the tag in sight, which is measured at rest
+_PERIOD_S = 0.05
+_REST_S = 0.7  # after a leg: wheels coast
+_SAMPLES_S = 3.0  # for the first sample
+_PICTURES = 20  # of the tag, of which the median counts
+_SIGHT_S = 0.5  # without the tag in any picture: it is lost
+_LOOK_S = 10.0  # for the next picture of it
+
+
+class Counts(NamedTuple):
+    """The steps of both wheels, reverse negative, and the turn by the inertial sensor; None: there is none."""
+
+    left: float
+    right: float
+    gyro_rad: float | None
+
+
+class Legs:
+    """The robot as its calibration drives it. ``expected``: its wheels, as they are believed to be.
+
+    ``mm_s`` is its speed at half power. Every leg raises PebbleError if it is not driven to its end, or Stopped.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        expected: OdometrySettings,
+        mm_s: float,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._robot, self._expected, self._mm_s, self._clock = robot, expected, mm_s, clock
+        self._finder: TagFinder | None = None
+        self._tag_id = 0
+        self._picture: Any = None
+        self._odometry = Odometry(expected, clock())
+        self._inputs: queue.SimpleQueue[tuple[Callable[..., None], Any, float]] = queue.SimpleQueue()
+        self._samples, self._seen_at = 0, clock()
+        self._turned = self._heading = 0.0
+        for channel, take in (
+            (MOTOR_POWER, self._odometry.power),
+            (TOUCH_SENSORS, self._touch),
+            (IMU_FAST, self._odometry.imu),
+        ):
+            robot.on(channel, lambda value, take=take, **_: self._inputs.put((take, value, clock())))
+
+    def watch(self, finder: TagFinder, tag_id: int) -> None:
+        """Keep this tag in sight in all straight legs, and end spins at it."""
+        self._finder, self._tag_id = finder, tag_id
+
+    def rest(self, seconds: float) -> None:
+        """Let the robot stand. Raises PebbleError if it has no hall sensors, or its wheels turn."""
+        self._wait(_SAMPLES_S, lambda: self._samples > 0)
+        if not self._samples:
+            key = "services.serial_mcu_bridge.telemetry.publish_touch_sensors"
+            raise PebbleError(f"no hall sensors: set {key} to true, and start the robot again")
+        before = self._counts()
+        self._wait(seconds)
+        after = self._counts()
+        if max(abs(after.left - before.left), abs(after.right - before.right)) > 1.0:
+            raise PebbleError("its wheels turn although it rests: end what drives it, and begin again")
+
+    def straight(self, name: str, mm: float) -> Counts:
+        """Drive ``mm`` by the counts; negative is back."""
+
+        def ends(counts: Counts) -> bool:
+            left, right = self._way_mm(counts)
+            _check_way(name, max(abs(left), abs(right)), abs(mm))
+            self._check_sight(name, forward=mm > 0)
+            return abs(left + right) / 2 >= abs(mm)
+
+        self._seen_at = self._clock()
+        return self._drive(name, (0.0, math.copysign(POWER, mm)), abs(mm) / self._mm_s, ends)
+
+    def spin(self, name: str, turns: int) -> Counts:
+        """Spin so many turns on the spot, by the counts, and on to the tag if there is one; negative is clockwise."""
+        mm = abs(turns) * math.pi * self._expected.track_width_mm
+        side = -math.copysign(1.0, turns)
+        fast_mm = mm if self._finder is None else mm * _BEFORE_TAG
+
+        def ends(counts: Counts) -> bool:
+            ways = [abs(way) for way in self._way_mm(counts)]
+            _check_way(name, max(ways), mm)
+            return sum(ways) / 2 >= fast_mm
+
+        start = self.look() if self._finder is not None else None
+        began = self._counts()
+        self._drive(name, (side * POWER, 0.0), mm / self._mm_s, ends)
+        if start is not None:
+            slow_s = mm / abs(turns) * POWER / _SLOW_POWER / self._mm_s
+            late = f"it does not see tag {self._tag_id} again"
+            self._drive(name, (side * _SLOW_POWER, 0.0), slow_s, lambda _: self._is_at(start), late)
+        return _difference(began, self._counts())
+
+    def look(self) -> Place:
+        """Return where the tag is, the median of 20 pictures. Raises PebbleError if it is not in sight."""
+        places: list[Place] = []
+        until = self._clock() + _LOOK_S
+        while len(places) < _PICTURES:
+            if self._clock() > until:
+                raise PebbleError(
+                    f"tag {self._tag_id} is not in sight: turn the robot to it, light it, and begin again"
+                )
+            if (place := self._sight()) is not None:
+                places.append(place)
+        return Place(*(median(values) for values in zip(*places, strict=True)))
+
+    def _drive(
+        self,
+        name: str,
+        command: tuple[float, float],
+        expected_s: float,
+        ends: Callable[[Counts], bool],
+        late: str = "is it slower than --speed says?",
+    ) -> Counts:
+        """Drive until ``ends`` of the counts since the start is true, and wait until the wheels stand.
+
+        ``late``: what is wrong if that takes too long.
+        """
+        robot, start = self._robot, self._counts()
+        until = self._clock() + MOST * expected_s + 0.5  # motors take a moment to their speed
+        try:
+            while not ends(_difference(start, self._counts())):
+                if self._clock() > until:
+                    raise PebbleError(f"{name}: it is not at its end after {MOST * expected_s:.1f} s: {late}")
+                if not robot.drive(*command):
+                    raise PebbleError(f"{name}: it is not obeyed: {robot.why_refused or 'there is no connection'}")
+                self._wait(_PERIOD_S)
+        finally:
+            robot.stop()
+        self._wait(_REST_S)
+        return _difference(start, self._counts())
+
+    def _check_sight(self, name: str, *, forward: bool) -> None:
+        """Raise PebbleError if the tag is too near, or was in no picture for half a second."""
+        if self._finder is None:
+            return
+        place, now = self._sight(), self._clock()
+        if place is not None:
+            self._seen_at = now
+            if forward and place.distance_m < NEAREST_M:
+                raise PebbleError(f"{name}: the tag is nearer than {NEAREST_M:g} m")
+        elif now - self._seen_at > _SIGHT_S:
+            raise PebbleError(f"{name}: it has lost tag {self._tag_id}")
+
+    def _is_at(self, start: Place) -> bool:
+        place = self._sight()
+        return place is not None and abs(place.angle_rad - start.angle_rad) < _AT_TAG_RAD
+
+    def _sight(self) -> Place | None:
+        """Return where the tag is in the next new picture, if there is one."""
+        assert self._finder is not None  # noqa: S101 - only a calibration with a tag looks
+        self._wait(0.01)
+        before, picture = self._picture, self._robot.picture(0.3)
+        self._picture = picture
+        if picture is None or picture is before:
+            return None
+        tag = largest(self._finder.find(picture), self._tag_id)
+        return None if tag is None else tag.place
+
+    def _way_mm(self, counts: Counts) -> tuple[float, float]:
+        left, right = self._expected.step_mm
+        return counts.left * left, counts.right * right
+
+    def _counts(self) -> Counts:
+        value, (left, right) = self._odometry.value(), self._expected.step_mm
+        gyro = self._turned if "heading_source" in value else None
+        return Counts(value["left_mm"] / left, value["right_mm"] / right, gyro)
+
+    def _wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+        """Take what arrives for so long."""
+        end = self._clock() + seconds
+        while self._clock() < end and not until():
+            self._robot.sleep(min(0.01, seconds))
+            while not self._inputs.empty():
+                take, value, at = self._inputs.get()
+                take(value, at)
+                heading = self._odometry.pose.heading_rad
+                self._turned += math.remainder(heading - self._heading, math.tau)
+                self._heading = heading
+
+    def _touch(self, touch: Any, now: float) -> None:
+        self._samples += 1
+        self._odometry.touch(touch.value, now)
+
+
+def _difference(start: Counts, end: Counts) -> Counts:
+    gyro = None if start.gyro_rad is None or end.gyro_rad is None else end.gyro_rad - start.gyro_rad
+    return Counts(end.left - start.left, end.right - start.right, gyro)
+
+
+def _check_way(name: str, way_mm: float, expected_mm: float) -> None:
+    if way_mm > MOST * expected_mm:
+        raise PebbleError(f"{name}: a wheel has turned {way_mm:.0f} of {expected_mm:.0f} mm: does the other one turn?")

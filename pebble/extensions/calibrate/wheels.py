@@ -1,0 +1,226 @@
+"""The calibration of the wheels: straights there and back, spins, and a file that wheel odometry uses."""
+
+import math
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from typing import Literal, NamedTuple, Protocol
+
+from msgspec import Struct, json
+
+from pebble.errors import PebbleError
+from pebble.extensions.calibrate.fit import LIMIT_SIGMA, NOISE, Fit, Run, fit
+from pebble.extensions.calibrate.legs import NEAREST_M, POWER, Counts, Legs
+from pebble.extensions.scripts.perception.camera_model import CameraModel
+from pebble.extensions.scripts.perception.odometry import CALIBRATION, Calibration, OdometrySettings
+from pebble.extensions.scripts.perception.tags import FAMILY, Place, TagFinder
+from pebble.extensions.scripts.script import Robot
+from pebble.runtime.whole_file import write
+
+LEAST_STRAIGHTS, LEAST_SPINS = 4, 2
+_REST_S = 5.0
+_REPEATS = 2  # of a run
+_ODD = 0.25  # of the counted way: a typed one that differs more is a slip of the keys
+_AHEAD_M = 0.2  # more than the tag's least distance, at the end of a straight
+
+
+class Wanted(Struct, frozen=True, kw_only=True):
+    """The runs that are wanted, and the truth that they are compared with."""
+
+    truth: Literal["tape", "tag", "gyro"] = "tape"
+    length_m: float = 1.5
+    straights: int = 6
+    spins: int = 2
+    turns: int = 3
+    speed_m_s: float = 0.19  # at half power; Goob's
+    tag: int = 13
+    tag_size_m: float = 0.25
+    family: str = FAMILY
+    expected: OdometrySettings = OdometrySettings()
+
+
+class Person(Protocol):
+    """The person at the terminal."""
+
+    def tell(self, line: str) -> None:
+        """Show a line."""
+
+    def ask(self, question: str) -> str:
+        """Return what the person types."""
+
+
+class _Movement(NamedTuple):
+    """The movement of a straight: along its arc, reverse negative, and counter-clockwise."""
+
+    mm: float
+    turn_rad: float
+
+
+def calibrate(robot: Robot, person: Person, wanted: Wanted, clock: Callable[[], float] = time.monotonic) -> Calibration:
+    """Drive all runs, fit the wheels, and write ``odometry.json`` beside the config. Raises PebbleError, Stopped."""
+    check(wanted)
+    path = robot.config.folder / CALIBRATION
+    write(path.with_suffix(".try"), b"", 0o644, PebbleError)  # now, not after all runs
+    path.with_suffix(".try").unlink()
+    session = _Session(robot, person, wanted, clock)
+    result = session.run()
+    calibration = Calibration(
+        made=datetime.now(UTC).isoformat(timespec="seconds"),
+        left_step_mm=round(result.left_step_mm, 4),
+        right_step_mm=round(result.right_step_mm, 4),
+        track_mm=round(result.track_mm, 3),
+        truth=wanted.truth,
+        runs=len(session.runs),
+        residual_mm=round(result.residual_mm, 2),
+    )
+    write(path, json.format(json.encode(calibration), indent=2) + b"\n", 0o644, PebbleError)
+    return calibration
+
+
+def check(wanted: Wanted) -> None:
+    """Raise PebbleError for too few runs, or an odd number of straights."""
+    if wanted.straights < LEAST_STRAIGHTS or wanted.spins < LEAST_SPINS:
+        least = f"{LEAST_STRAIGHTS} straights and {LEAST_SPINS} spins"
+        raise PebbleError(f"{least} are the least: with fewer the result is twice as wrong")
+    if wanted.straights % 2:
+        raise PebbleError(
+            f"{wanted.straights} straights do not end where they began: an even number goes there and back"
+        )
+
+
+class _Session:
+    """All runs of one calibration."""
+
+    def __init__(self, robot: Robot, person: Person, wanted: Wanted, clock: Callable[[], float]) -> None:
+        self._person, self._wanted = person, wanted
+        self._legs = Legs(robot, wanted.expected, wanted.speed_m_s * 1000, clock)
+        if wanted.truth == "tag":
+            camera = CameraModel.find([robot.config.folder])
+            self._legs.watch(TagFinder(wanted.tag_size_m, camera, wanted.family), wanted.tag)
+        kinds = [self._straight] * wanted.straights + [self._spin] * wanted.spins
+        self._drives = [(drive, 1 if number % 2 == 0 else -1) for number, drive in enumerate(kinds)]
+        self.runs: list[Run] = []
+
+    def run(self) -> Fit:
+        self._person.tell(f"It rests {_REST_S:g} s; then {self._plan()}. STOP, Space on the page or Ctrl-C end it.")
+        self._legs.rest(_REST_S)
+        for number in range(len(self._drives)):
+            self.runs.append(self._drive(number))
+        result, repeats = self._fit(), [0] * len(self.runs)
+        while (worst := result.worst) is not None:
+            name, off = self.runs[worst].name, f"{result.mm[worst]:.0f} mm off, {result.sigma[worst]:.1f} sigma"
+            if repeats[worst] == _REPEATS:
+                raise PebbleError(f"{name} stays {off}: does a wheel slip, or a magnet miss?")
+            repeats[worst] += 1
+            self._person.tell(f"{name} is {off}, more than {LIMIT_SIGMA:g}: it is repeated")
+            for number in (worst // 2 * 2, worst // 2 * 2 + 1) if self.runs[worst].mm is not None else (worst,):
+                self.runs[number] = self._drive(number)  # there and back: it ends where it began
+            result = self._fit()
+        for run, mm, sigma in zip(self.runs, result.mm, result.sigma, strict=True):
+            self._person.tell(f"  {run.name:<22} residual {mm:5.1f} mm, {sigma:.1f} sigma")
+        return result
+
+    def _plan(self) -> str:
+        wanted = self._wanted
+        straights = f"{wanted.straights} straights of {wanted.length_m:g} m, there and back"
+        return f"{straights}, at {POWER:.0%} power, and {wanted.spins} spins of {wanted.turns} turns"
+
+    def _fit(self) -> Fit:
+        expected = self._wanted.expected
+        return fit(self.runs, NOISE[self._wanted.truth], expected.step_mm, expected.track_width_mm)
+
+    def _drive(self, number: int) -> Run:
+        drive, sign = self._drives[number]
+        return drive(f"{number + 1} of {len(self._drives)}", sign)
+
+    # -- the two kinds
+
+    def _straight(self, number: str, sign: int) -> Run:
+        name = f"{number}, straight {'there' if sign > 0 else 'back'}"
+        wanted, mm = self._wanted, sign * self._wanted.length_m * 1000
+        if wanted.truth == "tag":
+            start = self._legs.look()
+            if sign > 0 and start.distance_m < (least := wanted.length_m + NEAREST_M + _AHEAD_M):
+                raise PebbleError(
+                    f"the tag is {start.distance_m:.2f} m away: {least:.2f} m are needed, or a shorter --length"
+                )
+            self._person.tell(f"{name} …")
+            counts = self._legs.straight(name, mm)
+            moved = between(start, self._legs.look())
+        else:
+            self._person.ask(f"{name}: put it on the line, looking along it, and mark its axle. Enter drives: ")
+            counts = self._legs.straight(name, mm)
+            moved = self._typed(sign, counts)
+        self._tell(name, counts, f"{moved.mm:.0f} mm, turned {math.degrees(moved.turn_rad):+.1f}°")
+        return Run(name, counts.left, counts.right, moved.turn_rad, moved.mm)
+
+    def _spin(self, number: str, sign: int) -> Run:
+        name = f"{number}, spin {'left' if sign > 0 else 'right'}"
+        wanted, turns = self._wanted, sign * self._wanted.turns
+        start = self._legs.look() if wanted.truth == "tag" else None
+        if wanted.truth == "tape":
+            self._person.ask(f"{name}: mark where it looks. Enter drives: ")
+        else:
+            self._person.tell(f"{name} …")
+        counts = self._legs.spin(name, turns)
+        if wanted.truth == "gyro":
+            turn_rad = self._gyro(counts)
+        elif start is not None:
+            turn_rad = turns * math.tau + self._legs.look().angle_rad - start.angle_rad
+        else:
+            past = self._numbers("degrees past its mark (short of it: minus)", 1, lambda numbers: abs(numbers[0]) < 180)
+            turn_rad = turns * math.tau + sign * math.radians(past[0])
+        self._tell(name, counts, f"turned {math.degrees(turn_rad):+.1f}°")
+        return Run(name, counts.left, counts.right, turn_rad)
+
+    def _typed(self, sign: int, counts: Counts) -> _Movement:
+        left, right = self._wanted.expected.step_mm
+        counted = abs(counts.left * left + counts.right * right) / 2
+        side = self._wanted.truth == "tape"
+        half = 0.0 if side else self._gyro(counts) / 2
+        what = "mm along the line" + (" and mm to the left of it (right: minus), such as 1497 -12" if side else "")
+        numbers = self._numbers(what, 1 + side, lambda numbers: abs(numbers[0] - counted) < _ODD * counted)
+        along = sign * numbers[0]
+        return arc(along, numbers[1] if side else along * math.tan(half))
+
+    def _numbers(self, what: str, count: int, plausible: Callable[[list[float]], bool]) -> list[float]:
+        """Ask until so many plausible numbers are typed."""
+        while True:
+            try:
+                numbers = [float(word) for word in self._person.ask(f"    {what}: ").split()]
+            except ValueError:
+                numbers = []
+            if len(numbers) == count and all(map(math.isfinite, numbers)) and plausible(numbers):
+                return numbers
+            self._person.tell(f"    type {count} number{'s' * (count > 1)} near what its wheels have counted")
+
+    def _gyro(self, counts: Counts) -> float:
+        if counts.gyro_rad is None:
+            raise PebbleError("no inertial sensor that agrees with the wheels: use --truth tape or tag")
+        return counts.gyro_rad
+
+    def _tell(self, name: str, counts: Counts, moved: str) -> None:
+        self._person.tell(f"{name}: {counts.left:+.1f} and {counts.right:+.1f} steps, {moved}")
+
+
+def arc(along_mm: float, left_mm: float) -> _Movement:
+    """Return the movement that ends there, seen from where it began; along a line it looked along, back negative."""
+    half = math.atan2(math.copysign(1.0, along_mm) * left_mm, abs(along_mm))
+    return _along(math.copysign(math.hypot(along_mm, left_mm), along_mm), half)
+
+
+def between(start: Place, end: Place) -> _Movement:
+    """Return the movement between two places of one tag, on an arc."""
+    (near, right), (far, far_right) = ((_floor(place) * 1000, place.angle_rad) for place in (end, start))
+    half = math.atan2(
+        near * math.sin(right) - far * math.sin(far_right), near * math.cos(right) + far * math.cos(far_right)
+    )
+    return _along(far * math.cos(far_right + half) - near * math.cos(right - half), half)
+
+
+def _floor(place: Place) -> float:
+    return math.sqrt(place.distance_m**2 - place.down_m**2)
+
+
+def _along(chord_mm: float, half_rad: float) -> _Movement:
+    return _Movement(chord_mm * (half_rad / math.sin(half_rad) if half_rad else 1.0), 2 * half_rad)
