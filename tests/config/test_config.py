@@ -35,6 +35,7 @@ ROOT = Path(__file__).resolve().parents[2]
 ORIGINAL = ROOT / "tests" / "data" / "original-shaped-config.json"
 OURS = ("goob", "fred", "minilamp", "benjr", "pitcam", "minimal")
 FOLDER = Path("/nowhere")
+UPLINK = {"kind": "zenoh", "connect": ["tls/base.example:7447"]}
 
 
 def at(path: str, value: Any) -> dict[str, Any]:
@@ -157,12 +158,6 @@ class TestOriginal:
             assert f" {key}," in gone
         assert gone.endswith("; `pebble check --keys` says what replaces each")
 
-    def test_few_of_them_are_reported_with_what_replaces_them(self) -> None:
-        config = read(at("services.mqtt_bridge.heartbeat", {"qos": 0, "retain": False}))
-        assert config.warnings == (
-            "services.mqtt_bridge.heartbeat.{qos, retain}: no longer used, the contract fixes QoS and retain flag",
-        )
-
     def test_hall_memory_is_offered_to_its_scripts(self) -> None:
         services = load(ORIGINAL, env={}).services
         assert services.av_daemon.sockets() == {
@@ -244,11 +239,6 @@ class TestOriginal:
         assert config.local_mqtt.tls.ca_cert == tmp_path / "ca.pem"
         assert config.section(AvDaemon).video.camera_controls == {"brightness": 3}
         assert config.warnings == ()
-
-    @pytest.mark.parametrize("place", ["charging", "services.mqtt_logger", "version", "services.web"])
-    def test_a_section_of_another_program_is_not_read(self, place: str) -> None:
-        (warning,) = read(at(place, {"port": 1})).warnings
-        assert warning == f"{place}: is not read: nothing that is installed has a section of this name"
 
     def test_without_a_remote_host_operators_connect_to_the_robots_own_broker(self) -> None:
         place = "services.mqtt_bridge.remote_mqtt.host"
@@ -351,13 +341,6 @@ class TestOverridePoints:
         except ConfigError:
             return
         assert check_topic(str(config.services.launcher.logs.topic)) == topic
-
-
-class TestInheritance:
-    def test_a_warning_about_a_shared_value_is_reported_where_it_stands(self) -> None:
-        serial: dict[str, Any] = {"safety": {"stop_on_shutdown": False}, "instances": {"a": {}}}
-        (warning,) = read(at("services.serial_mcu_bridge", serial)).warnings
-        assert warning.startswith("services.serial_mcu_bridge.safety.stop_on_shutdown: ")
 
 
 class TestSerialInstances:
@@ -510,10 +493,46 @@ class TestMistakes:
             (at("services.mqtt_bridge", {"link": {"profile": "auto"},
                                          "remote": {"kind": "zenoh", "connect": ["tcp/a:1"]}}),
              'services.mqtt_bridge.link.profile: cannot be "auto": only MQTT connections are measured'),
+            ({"robot": {"id": "a", "type": "servers"}}, 'robot.type: must not be "servers"'),
+            *(
+                (at("web_interface", keys), f"web_interface.{expected}")
+                for keys, expected in (
+                    ({"tls": {"certificate": "a"}}, "tls.key: is missing, it belongs to certificate"),
+                    ({"tls": {"key": "a"}}, "tls.certificate: is missing, it belongs to key"),
+                    ({"host": "http://x/"}, "host: must be a name or a whole address"),
+                    ({"names": ["fair.local", "a b"]}, "names[1]: must be a name or a whole address"),
+                    ({"server": "a/b"}, "server: must be a topic level"),
+                )
+            ),
         ],
     )  # fmt: skip
     def test_missing_and_contradicting_keys_are_named(self, raw: dict[str, Any], expected: str) -> None:
         assert only_problem(raw).startswith(expected)
+
+    @pytest.mark.parametrize(
+        ("place", "value", "warning"),
+        [
+            ("services.mqtt_bridge.heartbeat", {"qos": 0, "retain": False},
+             ".{qos, retain}: no longer used, the contract fixes QoS and retain flag"),
+            ("services.mqtt_bridge", {"remote": UPLINK, "remote_mqtt": {"host": "broker.example"}},
+             '.remote_mqtt: not used: remote.kind is "zenoh"'),
+            ("services.serial_mcu_bridge", {"safety": {"stop_on_shutdown": False}, "instances": {"a": {}}},
+             ".safety.stop_on_shutdown: "),
+            ("local_mqtt.password", "x", ": is not sent: there is no username"),
+            ("local_mqtt", {"tls": {"ca_cert": "ca.pem"}}, ".tls.enabled: is false: nothing is encrypted, ca_cert unu"),
+            *((place, {"port": 1}, ": is not read: nothing that is installed has a section of this name")
+              for place in ("charging", "services.mqtt_logger", "version", "services.web")),
+            ("web_interface", {"mqtt": {"port": 8883}}, ".mqtt: not used: it has no host"),
+            ("web_interface", {"mqtt_history": {"enabled": True}},
+             ".mqtt_history: no longer used, `services.recorder` records into"),
+            ("web_interface", {"robots": [{"id": "goob", "video": {"controls": True}}]},
+             ".robots[0].video: no longer used, robots say"),
+            ("web_interface", {"robots": [{"name": "Goob"}]}, ".robots[0]: has no id, so it is none"),
+        ],
+    )  # fmt: skip
+    def test_what_has_no_effect_is_one_warning(self, place: str, value: Any, warning: str) -> None:
+        (found,) = read(at(place, value)).warnings
+        assert found.startswith(f"{place}{warning}")
 
     def test_two_sockets_cannot_have_one_path(self, tmp_path: Path) -> None:
         same = {"socket_path": str(tmp_path / "a.sock")}
@@ -534,11 +553,6 @@ class TestMistakes:
         socket = {"socket_path": str(link / "a.sock")}
         (warning,) = read(at("services.av_daemon", {"enabled": True, "audio": socket})).warnings
         assert f"{link} is a link of user 65534" in warning
-
-    def test_a_remote_broker_beside_another_uplink_is_not_used(self) -> None:
-        remote = {"kind": "zenoh", "connect": ["tls/base.example:7447"]}
-        config = read(at("services.mqtt_bridge", {"remote": remote, "remote_mqtt": {"host": "broker.example"}}))
-        assert config.warnings == ('services.mqtt_bridge.remote_mqtt: not used: remote.kind is "zenoh"',)
 
     def test_a_zenoh_uplink_only_connects(self) -> None:
         found = problems(at("services.mqtt_bridge.remote", {"kind": "zenoh", "listen": ["tls/0.0.0.0:7447"]}))
@@ -680,10 +694,6 @@ class TestPasswords:
         assert self.SECRET not in found
         assert "4711" not in found
 
-    def test_a_password_without_a_name_is_not_sent(self) -> None:
-        (warning,) = read(at("local_mqtt.password", "x")).warnings
-        assert warning == "local_mqtt.password: is not sent: there is no username"
-
     def test_values_of_variables_and_words_of_commands_are_hidden_too(self) -> None:
         look = {"env": {"API_KEY": "k3y", "STREAM_PASS": "p4ss", "PLAIN": "pl41n"}}
         stream = {
@@ -731,32 +741,6 @@ class TestWebInterface:
             "web_interface.tls.key: there is no file /nowhere/server.key",
         ]
 
-    @pytest.mark.parametrize(
-        ("keys", "expected"),
-        [
-            ({"tls": {"certificate": "a"}}, "tls.key: is missing, it belongs to certificate"),
-            ({"tls": {"key": "a"}}, "tls.certificate: is missing, it belongs to key"),
-            ({"host": "http://x/"}, "host: must be a name or a whole address"),
-            ({"names": ["fair.local", "a b"]}, "names[1]: must be a name or a whole address"),
-            ({"server": "a/b"}, "server: must be a topic level"),
-        ],
-    )
-    def test_mistakes_name_the_key(self, keys: dict[str, Any], expected: str) -> None:
-        assert only_problem(at("web_interface", keys)).startswith(f"web_interface.{expected}")
-
-    @pytest.mark.parametrize(
-        ("keys", "expected"),
-        [
-            ({"mqtt": {"port": 8883}}, "mqtt: not used: it has no host"),
-            ({"mqtt_history": {"enabled": True}}, "mqtt_history: no longer used, `services.recorder` records into"),
-            ({"robots": [{"id": "goob", "video": {"controls": True}}]}, "robots[0].video: no longer used, robots say"),
-            ({"robots": [{"name": "Goob"}]}, "robots[0]: has no id, so it is none"),
-        ],
-    )
-    def test_keys_without_an_effect_are_reported(self, keys: dict[str, Any], expected: str) -> None:
-        (warning,) = read(at("web_interface", keys)).warnings
-        assert warning.startswith(f"web_interface.{expected}")
-
     def test_plain_http_beside_a_certificate_has_no_effect(self, tmp_path: Path) -> None:
         (tmp_path / "a").write_text("x")
         (tmp_path / "a").chmod(0o600)
@@ -764,11 +748,6 @@ class TestWebInterface:
             at("web_interface", {"plain_http": True, "tls": {"certificate": "a", "key": "a"}}), folder=tmp_path
         ).warnings
         assert warning.startswith("web_interface.plain_http: has no effect")
-
-    def test_no_robot_may_pass_for_a_server(self) -> None:
-        assert only_problem(at("robot", {"id": "goob", "type": "servers"})).startswith(
-            'robot.type: must not be "servers"'
-        )
 
 
 class TestTls:
@@ -788,10 +767,6 @@ class TestTls:
             f"transport.tls.client_key: there is no file {tmp_path / 'no.key'}",
             "transport.tls.client_cert: is missing, it belongs to client_key",
         ]
-
-    def test_certificates_of_a_link_that_is_not_encrypted_are_pointed_out(self) -> None:
-        (warning,) = read(at("local_mqtt.tls.ca_cert", "ca.pem")).warnings
-        assert warning == "local_mqtt.tls.enabled: is false: nothing is encrypted, ca_cert unused"
 
 
 class TestRunDirectory:
