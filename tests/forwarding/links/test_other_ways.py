@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,8 @@ from tests.forwarding.links.test_table import (
     STOP,
     TRUE,
     VIDEO_FLAG,
-    storm,
 )
-from tests.services.mqtt_bridge.bridge_rig import Quiet
+from tests.services.mqtt_bridge.bridge_rig import Client, Quiet
 from tests.support import AmqttBroker, cases, until
 
 LIGHTS, STATUS = "incoming/lights-solid", "outgoing/status"
@@ -56,6 +56,16 @@ def amqtt() -> Iterator[AmqttBroker]:
     broker = AmqttBroker()
     yield broker
     broker.stop()
+
+
+def storm(*voices: tuple[Client, str, list[bytes]], seconds: float, retain: bool = False) -> None:
+    """Every client publishes all of it, evenly spread and in turns."""
+    began = time.monotonic()
+    rounds = list(zip(*(payloads for _, _, payloads in voices), strict=True))
+    for number, payloads in enumerate(rounds, 1):
+        for (client, suffix, _), payload in zip(voices, payloads, strict=True):
+            client.publish(suffix, payload, retain=retain and "/flags/" in suffix)
+        time.sleep(max(0.0, began + number * seconds / len(rounds) - time.monotonic()))
 
 
 class TestWithoutBridgeMode:
