@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterator
 from itertools import pairwise
 from statistics import median
@@ -93,17 +92,3 @@ def test_the_remote_broker_goes_and_comes_back(local: Broker, remote: Broker, ea
         young = [at - one.captured_ms / 1000 for at, one in zip(ear.arrived, ear.received, strict=True)][-10:]
         assert median(young) < 0.5  # nothing from before
         assert robot.reported(last_error=None)
-
-
-def test_it_ends_on_sigterm_and_leaves_nothing(local: Broker, remote: Broker, ear: Ear) -> None:
-    with Program(NAME, "mqtt", local.port, remote.port) as robot, Mouth(robot.run_dir) as mouth:
-        ear.wait(5)
-        robot.process.send_signal(signal.SIGTERM)
-        assert robot.process.wait(5) == 0
-        assert until(lambda: mouth.writer.readers == 0)
-        robot.start()
-        ear.wait(5)
-        robot.process.kill()
-        robot.process.wait(5)
-        robot.start()
-        ear.wait(5)
