@@ -716,15 +716,13 @@ class TestPasswords:
 
 
 class TestWebInterface:
-    def test_it_is_for_this_machine_by_default(self) -> None:
+    @pytest.mark.parametrize("host", ["127.1.2.3", "::1", "localhost"])
+    def test_it_is_for_this_machine_by_default(self, host: str) -> None:
+        config = read(at("web_interface.host", host))
+        assert (config.section(WebInterface).local, config.warnings) == (True, ())
         web = read({"robot": {"id": "goob"}}).web_interface
         assert (web.host, web.port, web.local, web.mqtt.host) == ("127.0.0.1", 8080, True, "")
         assert (web.plain_http, web.plain_http_drive) == (False, False)
-
-    @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost"])
-    def test_addresses_of_this_machine(self, host: str) -> None:
-        config = read(at("web_interface.host", host))
-        assert (config.section(WebInterface).local, config.warnings) == (True, ())
 
     @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.7", "goob.local"])
     def test_addresses_that_other_machines_reach(self, host: str) -> None:
