@@ -20,7 +20,7 @@ from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Tr
 from pebble.transports.mqtt import refused_topics
 from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.connection import UNACKED_LIMIT, UNACKED_RESERVE
-from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, beside, free_port, some, until
+from tests.support import ROOT, Broker, RefusingBroker, beside, free_port, some, until
 from tests.tcp_proxy import BridgelessProxy, ForbiddingProxy, Hole, TcpProxy
 from tests.transports.received import Received
 
@@ -55,13 +55,6 @@ tls_broker = module_broker(
     *(f"cafile {CERTS}/ca.crt", f"certfile {CERTS}/server.crt", f"keyfile {CERTS}/server.key"),
     "require_certificate true",
 )
-
-
-@pytest.fixture(scope="module")
-def amqtt() -> Iterator[AmqttBroker]:
-    broker = AmqttBroker()
-    yield broker
-    broker.stop()
 
 
 class Clients:
@@ -150,18 +143,6 @@ def test_subscribe_returns_after_the_retained_messages_however_long_after_the_su
 def test_as_published_refuses_to_promise_an_echo(broker: Broker, clients: Clients, topic: str) -> None:
     with pytest.raises(TransportError, match="echo=False"):
         clients(broker.port, as_published=True).subscribe(topic, Received())
-
-
-def test_a_broker_without_bridge_mode_gets_a_plain_connection(
-    amqtt: AmqttBroker, clients: Clients, topic: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    bridge, received = clients(amqtt.port, "bridge", as_published=True), Received()
-    assert not bridge.as_published
-    assert not bridge.exact_echo
-    assert "no bridge mode" in caplog.text
-    bridge.subscribe(topic, received, echo=False)
-    clients(amqtt.port, "other").publish(topic, b"x", qos=DELIVERED)
-    assert received.until(b"x")
 
 
 def test_a_broker_that_hangs_up_on_bridge_mode_gets_a_plain_connection_until_it_is_another_one(
