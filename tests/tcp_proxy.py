@@ -46,11 +46,6 @@ class TcpProxy:
 
     judges_answers = False  # `passes` is asked for what the target sends, too
 
-    @property
-    def in_use(self) -> bool:
-        """Whether a connection has been made through it."""
-        return bool(self._pairs)
-
     def blackhole(self) -> None:
         self._passing.clear()
 

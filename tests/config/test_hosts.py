@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.config import Config, load, parse
+from pebble.config import Config, parse
 from pebble.config.hosts import HostError, broker_host, endpoint, name_of_page
 from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.fleet.certificates import init
@@ -111,17 +111,8 @@ def test_the_address_of_a_stream(url: str, public: str, warned: str) -> None:
     assert bool(warned) == bool(config.warnings)
 
 
-def test_a_config_of_the_original_loads_unchanged() -> None:
-    config = load(Path(__file__).parent.parent / "data" / "original-shaped-config.json", {})
-    assert config.services.mqtt_bridge.remote_mqtt.host
-
-
 def _parse(raw: object) -> Config:
     return parse(raw, folder=Path("/"), env={})
-
-
-def _remote(**keys: object) -> dict[str, object]:
-    return {"robot": {"id": "r"}, "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": keys}}}
 
 
 @pytest.mark.parametrize("hosts", [["a"], ["a", "b:1884"], ["mqtt://ann:s3cr3t@b"]])

@@ -26,10 +26,6 @@ LIGHTS, EVENT = "incoming/lights-solid", "outgoing/somebody/happened"
 STATUS, READING, ONLINE = "outgoing/status", "outgoing/programs/reading", "outgoing/online"
 FLAG, MIRROR_FLAG = "incoming/flags/mqtt-video", "incoming/flags/remote-mirror"
 REBOOT, GIT_PULL = "incoming/flags/reboot", "incoming/flags/git-pull"
-ONE_SHOTS = (
-    *(DRIVE, REBOOT, GIT_PULL, "incoming/flags/service-restart", RESET),
-    *("incoming/soundboard-command", "incoming/autonomy-command", "incoming/something-new"),
-)
 TRUE = b"true"
 NOTHING_LOCAL = b'{"topics": []}'  # of what an MCU has
 Make = Callable[..., World]
@@ -140,33 +136,6 @@ class TestFlags:
 
 
 class TestOneShots:
-    @pytest.mark.parametrize("when", ["before", "live"])
-    @pytest.mark.parametrize("retainer", [0, 1], ids=["local", "remote"])
-    def test_retained_ones_neither_cross_nor_run(self, world: World, ran: list[str], retainer: int, when: str) -> None:
-        """Nor those that ask to be retained, nor after a reconnect."""
-        client, other = sides(world)[retainer]
-        if when == "live":
-            do(world, "start")
-            world.local.publish(MIRROR_FLAG, TRUE, retain=True)
-            world.run()
-        for suffix in ONE_SHOTS:
-            client.publish(suffix, TRUE, retain=True)
-        if when == "before":
-            do(world, "start")
-        do(world, "cut mend")
-        assert not [message for message in other.seen if message.topic.removeprefix(f"{BASE}/") in ONE_SHOTS]
-        assert not ran
-
-    def test_local_commands_reach_the_remote_side_only_while_mirroring(self, bridge: World) -> None:
-        do(bridge, "start")
-        for mirror, payload in ((None, b"1"), (TRUE, b"2"), (b'{"enabled": false}', b"3"), (b'"true"', b"4")):
-            if mirror is not None:
-                bridge.local.publish(MIRROR_FLAG, mirror, retain=True)
-            bridge.local.publish(DRIVE, payload)
-            bridge.run()
-        assert bridge.remote.payloads(DRIVE) == [b"2"]
-        assert bridge.service.counters["refused"] == 1
-
     @pytest.mark.parametrize("side", [0, 1], ids=["local", "remote"])
     @pytest.mark.parametrize("true", [b"true", b'{"value": true}', b'{"enabled": true}'])
     def test_actions_run_once_from_either_side(self, bridge: World, ran: list[str], side: int, true: bytes) -> None:
@@ -459,24 +428,6 @@ class TestPrivate:
 
 
 class TestHeartbeat:
-    def test_at_once_then_at_its_interval_to_the_remote_side_only(self, bridge: World) -> None:
-        do(bridge, "start")
-        heartbeats = bridge.remote.on(ONLINE)
-        assert 13 <= len(heartbeats) <= 14
-        stamps = [json.loads(one.payload) for one in heartbeats]
-        assert all(set(stamp) == {"t"} and type(stamp["t"]) is int for stamp in stamps)
-        assert all(one.qos == 1 and one.retain_requested for one in heartbeats)
-        assert not bridge.local.on(ONLINE)
-
-    @pytest.mark.parametrize("end", ["politely", "in a crash"])
-    def test_the_will_is_published_at_its_end(self, bridge: World, end: str) -> None:
-        do(bridge, "start")
-        {"politely": bridge.stop, "in a crash": lambda: bridge.remote_hub.crash(bridge.uplink)}[end]()
-        bridge.run(0)
-        last = bridge.remote.on(ONLINE)[-1]
-        assert json.loads(last.payload)["online"] is False
-        assert last.retain_requested
-
     def test_it_can_be_off_and_then_belongs_to_others(self, bridge: World) -> None:
         bridge.start(heartbeat={"enabled": False})
         bridge.local.publish(ONLINE, b'{"t": 1}', retain=True)

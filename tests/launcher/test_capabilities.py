@@ -39,85 +39,55 @@ def at(tree: Any, path: str) -> Any:
     return tree
 
 
+#: Of a robot without services: by part, its topics, and what else is listed.
+PARTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "video": (
+        "topic:outgoing/front-camera command_topic:incoming/front-camera flag_topic:incoming/flags/mqtt-video"
+        " overlays_topic:outgoing/video-overlays",
+        {"width": 640, "height": 480, "fps": 15, "encoding": "json", "encodings": ["json", "pbvd", "h264"]},
+    ),
+    "audio": (
+        "topic:outgoing/audio uplink_topic:incoming/audio-stream command_topic:incoming/audio"
+        " flag_topic:incoming/flags/mqtt-audio",
+        {"rate": 16000, "channels": 1, "encoding": "pcm", "encodings": ["pcm", "opus"]},
+    ),
+    **{
+        part: (
+            f"command_topic:incoming/{part}-command files_topic:outgoing/{part}-files"
+            f" status_topic:outgoing/{part}-status",
+            {},
+        )
+        for part in ("soundboard", "autonomy")
+    },
+    "drive": ("topic:incoming/drive-values", {}),
+    "estop": ("topic:incoming/estop reset_topic:incoming/estop-reset", {"owners": [], "status_topics": []}),
+    "lights": (
+        "solid_topic:incoming/lights-solid flash_topic:incoming/lights-flash", {"solid": False, "flash": False}
+    ),
+    "telemetry": (
+        "touch_topic:outgoing/touch-sensors charging_topic:outgoing/charging-status"
+        " charging_level_topic:outgoing/charging-level wheel_odometry_topic:outgoing/wheel-odometry"
+        " imu_topic:outgoing/sensors/imu",
+        dict.fromkeys(("touch_sensors", "charging_status", "wheel_odometry", "imu"), False),
+    ),
+    "outlets": ("", {"outlets": []}),
+}  # fmt: skip
+
+
 def test_a_robot_without_services_still_lists_everything() -> None:
-    assert of() == {
-        "identity": {"system": "pebble", "type": "robots", "id": "rover"},
-        "transport": {"kind": "mqtt"},
-        "video": {
-            "available": False,
-            "controls": False,
-            "topic": f"{BASE}/outgoing/front-camera",
-            "command_topic": f"{BASE}/incoming/front-camera",
-            "flag_topic": f"{BASE}/incoming/flags/mqtt-video",
-            "overlays_topic": f"{BASE}/outgoing/video-overlays",
-            "width": 640,
-            "height": 480,
-            "fps": 15,
-            "encoding": "json",
-            "encodings": ["json", "pbvd", "h264"],
-        },
-        "audio": {
-            "available": False,
-            "controls": False,
-            "topic": f"{BASE}/outgoing/audio",
-            "uplink_topic": f"{BASE}/incoming/audio-stream",
-            "command_topic": f"{BASE}/incoming/audio",
-            "flag_topic": f"{BASE}/incoming/flags/mqtt-audio",
-            "rate": 16000,
-            "channels": 1,
-            "encoding": "pcm",
-            "encodings": ["pcm", "opus"],
-        },
-        "soundboard": {
-            "available": False,
-            "controls": False,
-            "command_topic": f"{BASE}/incoming/soundboard-command",
-            "files_topic": f"{BASE}/outgoing/soundboard-files",
-            "status_topic": f"{BASE}/outgoing/soundboard-status",
-        },
-        "autonomy": {
-            "available": False,
-            "controls": False,
-            "command_topic": f"{BASE}/incoming/autonomy-command",
-            "files_topic": f"{BASE}/outgoing/autonomy-files",
-            "status_topic": f"{BASE}/outgoing/autonomy-status",
-        },
-        "system": {
-            "reboot": {"available": True, "controls": False, "flag_topic": f"{BASE}/incoming/flags/reboot"},
-            "service_restart": {
-                "available": True,
-                "controls": False,
-                "flag_topic": f"{BASE}/incoming/flags/service-restart",
-            },
-            "git_pull": {"available": True, "controls": False, "flag_topic": f"{BASE}/incoming/flags/git-pull"},
-        },
-        "drive": {"available": False, "controls": False, "topic": f"{BASE}/incoming/drive-values"},
-        "estop": {
-            "available": False,
-            "topic": f"{BASE}/incoming/estop",
-            "reset_topic": f"{BASE}/incoming/estop-reset",
-            "owners": [],
-            "status_topics": [],
-        },
-        "lights": {
-            "solid": False,
-            "flash": False,
-            "solid_topic": f"{BASE}/incoming/lights-solid",
-            "flash_topic": f"{BASE}/incoming/lights-flash",
-        },
-        "telemetry": {
-            "touch_sensors": False,
-            "charging_status": False,
-            "touch_topic": f"{BASE}/outgoing/touch-sensors",
-            "charging_topic": f"{BASE}/outgoing/charging-status",
-            "charging_level_topic": f"{BASE}/outgoing/charging-level",
-            "wheel_odometry": False,
-            "wheel_odometry_topic": f"{BASE}/outgoing/wheel-odometry",
-            "imu": False,
-            "imu_topic": f"{BASE}/outgoing/sensors/imu",
-        },
-        "outlets": {"available": False, "controls": False, "outlets": []},
+    found, offered = of(), {"available": False, "controls": False}
+    flags = {name: f"{BASE}/incoming/flags/{name.replace('_', '-')}" for name in found["system"]}
+    assert found.pop("system") == {
+        name: {"available": True, "controls": False, "flag_topic": flags[name]}
+        for name in ("reboot", "service_restart", "git_pull")
     }
+    assert found.pop("identity") == {"system": "pebble", "type": "robots", "id": "rover"}
+    assert found.pop("transport") == {"kind": "mqtt"}
+    for part, (topics, more) in PARTS.items():
+        named = (topic.split(":") for topic in topics.split())
+        state = {} if part in ("lights", "telemetry") else {"available": False} if part == "estop" else offered
+        assert found.pop(part) == state | {name: f"{BASE}/{suffix}" for name, suffix in named} | more
+    assert found == {}
 
 
 LOOKS = {"name": "Goob", "description": "Rover", "colour": "blue", "picture": "goob", "battery_cells": 2}

@@ -1,14 +1,8 @@
-"""Repeats what the cores did in histories, call by call, in the real MicroPython.
-
-``python -m tests.motion.traces --histories 10000``
-"""
+"""Repeats what the cores did in histories, call by call, in the real MicroPython."""
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
-import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -126,18 +120,3 @@ def repeat(folder: Path, lines: Iterable[str]) -> list[str]:
     done = run(folder, SCRIPTS / "motion.py", heap=8 * 1024 * 1024, timeout_s=600.0)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout.splitlines()
-
-
-def main(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--histories", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=1)
-    options = parser.parse_args(arguments)
-    with tempfile.TemporaryDirectory() as folder:
-        printed = repeat(Path(folder), traces(options.seed, options.histories))
-    print(*printed, sep="\n")
-    return int(len(printed) != 1 or json.loads(printed[-1])[2] is not True)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

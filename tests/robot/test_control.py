@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import threading
 import time
 from collections.abc import Iterator
@@ -69,20 +68,3 @@ def test_a_flood_of_strangers_takes_nothing_from_who_has_control(rig: Rig) -> No
         assert state(rig)["id"] == OTTO["id"]
     finally:
         stranger.close()
-
-
-def test_a_client_that_knows_nothing_of_control_drives_while_nobody_has_it(rig: Rig) -> None:
-    """Each of its commands reaches the line, and its bytes are not changed."""
-    began = time.monotonic()
-    wanted = [round(0.1 + number / 1000, 3) for number in range(20)]
-    for z in wanted:
-        rig.operator.send(DRIVE, json.dumps({"x": 0, "z": z, "source": "web", "t": 1}).encode())
-        assert until(lambda z=z: lines(rig, z, began), 5), z
-    assert until(lambda: state(rig)["others"], 5)
-    key = held(rig, CONTROL, OTTO)
-    rig.operator.send(DRIVE, {"x": 0, "z": 0.6})
-    rig.operator.send(DRIVE, {"x": 0, "z": 0.5, "key": key})
-    assert until(lambda: lines(rig, 0.5), 5)
-    assert lines(rig, 0.6) == []
-    rig.operator.send(DRIVE, {"x": 0, "z": 0})
-    assert until(lambda: rig.mcu.drives()[-1][1] == (0.0, 0.0), 5)

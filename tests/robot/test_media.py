@@ -70,20 +70,6 @@ def want_video(rig: Rig, **more: Any) -> float:
     return began
 
 
-def test_nothing_runs_and_nothing_comes_until_flag_and_request_agree(rig: Rig) -> None:
-    began = time.monotonic()
-    rig.operator.send(ASK_VIDEO, True)
-    assert not until(lambda: rig.operator.on(CAMERA, began), 1.0)
-    assert not media_programs(rig)
-    rig.operator.send(VIDEO_FLAG, True, retain=True)
-    assert pictures_come(rig, began)
-    rig.operator.send(VIDEO_FLAG, False, retain=True)
-    assert until(lambda: not media_programs(rig), 10)
-    again = time.monotonic()
-    rig.operator.send(VIDEO_FLAG, {"enabled": True}, retain=True)
-    assert pictures_come(rig, again), "what was asked for before starts when the flag goes up"
-
-
 @pytest.mark.parametrize(
     ("rig", "encoding"),
     [
@@ -117,24 +103,6 @@ def test_sound_in_every_encoding(rig: Rig, encoding: str) -> None:
     received = [decoder.feed(one.payload) for one in rig.operator.on(AUDIO, began)]
     assert all(one is not None for one in received)
     assert {one.encoding for one in received[-5:] if one is not None} == {encoding}
-
-
-@pytest.mark.parametrize(
-    ("rig", "program"),
-    [
-        ("mqtt", "camera_publisher"),
-        ("zenoh", "av_daemon"),
-        further("mqtt", "av_daemon"),
-        further("zenoh", "camera_publisher"),
-    ],
-    indirect=["rig"],
-)
-def test_a_killed_media_process_is_back_while_it_is_wanted(rig: Rig, program: str) -> None:
-    began = want_video(rig)
-    assert pictures_come(rig, began)
-    killed = rig.kill(program)
-    assert until(lambda: program in rig.processes(), 10)
-    assert pictures_come(rig, killed + 1.0)
 
 
 @two_kinds

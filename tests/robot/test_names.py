@@ -67,20 +67,6 @@ def test_only_who_has_control_drives(rig: Named) -> None:
     assert capabilities.json["value"]["named"] is True
 
 
-def test_who_takes_control_over_drives_and_only_they_start_scripts(rig: Named) -> None:
-    start = {"action": "start", "file": "no-such-script"}
-    with rig.held("otto") as old, driving(_By(rig, "otto"), 0.5, key=old):
-        assert until(lambda: lines(rig, 0.5), 5)
-        rig.send("mia", "control/take", {"id": "bbbbbbbb", "for_ms": 10_000})  # a driver has no right to
-        with rig.held("boss", "control/take") as key:
-            taken = time.monotonic()
-            rig.judged("boss", key, 0.6)
-            assert not [at for at in lines(rig, 0.5) if at > taken + 0.5]
-            for name, error in (("otto", "boss has control"), ("boss", "Unknown autonomy file")):
-                found = lambda e=error: e in str(rig.operator.last("outgoing/autonomy-status").json["error"])  # type: ignore[union-attr]  # noqa: E731
-                assert rig.sends(name, "autonomy-command", start, found), error
-
-
 def test_everybody_stops_it_and_only_a_safety_officer_resets_it(rig: Named) -> None:
     with rig.held("otto") as key, driving(_By(rig, "otto"), 0.7, key=key):
         for suffix, by in (("incoming/by/vera/estop", "vera"), ("incoming/estop", "somebody?")):

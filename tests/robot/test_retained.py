@@ -42,13 +42,6 @@ def unstarted(request: pytest.FixtureRequest) -> Iterator[Rig]:
         yield rig
 
 
-@pytest.fixture(params=["mqtt", "mirror"])
-def two_brokers(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    mirror = request.param == "mirror"
-    with Rig("zenoh" if mirror else "mqtt", mirror=mirror, start=False) as rig:
-        yield rig
-
-
 def test_retained_commands_at_the_remote_broker(unstarted: Rig) -> None:
     """None runs at the start, none after an uplink outage, none crosses."""
     retain_messages(unstarted.remote.port, COMMANDS)
@@ -108,13 +101,3 @@ def _turns(rig: Rig, since: float) -> bool:
     rig.operator.send("incoming/drive-values", {"x": 0, "z": 0.5})
     time.sleep(0.05)
     return any(wheels != (0.0, 0.0) for _, wheels in rig.mcu.drives(since))
-
-
-def test_retained_commands_at_the_local_broker(two_brokers: Rig) -> None:
-    """They are neither executed nor forwarded to the remote side, not even with everything mirrored."""
-    assert two_brokers.local is not None
-    retain_messages(two_brokers.local.port, COMMANDS)
-    retain_messages(two_brokers.remote.port, {"incoming/flags/remote-mirror": True})
-    two_brokers.start()
-    assert_untouched(two_brokers)
-    assert not set(retained_messages(two_brokers.remote.port, BASE)) & set(COMMANDS)

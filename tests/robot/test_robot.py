@@ -65,29 +65,6 @@ def test_silence_stops_the_wheels(station: Station) -> None:
     assert 0.70 <= stopped - started <= 0.85
 
 
-def test_a_burst_of_commands_ends_with_the_last_one(station: Station) -> None:
-    stop_and_wait(station)
-    began = time.monotonic()
-    for step in range(1, 301):
-        station.operator.send(DRIVE, {"x": 0, "z": step / 1000})
-    assert until(lambda: station.rig.mcu.drives(began)[-1:] and station.rig.mcu.drives(began)[-1][1] == (0.3, 0.3), 3)
-    speeds = [wheels[0] for _, wheels in station.rig.mcu.drives(began)]
-    assert speeds == sorted(speeds)
-
-
-@pytest.mark.parametrize(
-    ("topic", "body", "line"),
-    [
-        ("incoming/lights-solid", {"b": 0.1, "g": 0.2, "r": 0.3}, "L 0.100 0.200 0.300"),
-        ("incoming/lights-flash", {"b": 0.4, "g": 0.5, "r": 0.6, "period": 1.2}, "F 0.400 0.500 0.600 1.200"),
-    ],
-)
-def test_lights(station: Station, topic: str, body: Any, line: str) -> None:
-    began = time.monotonic()
-    station.operator.send(topic, body)
-    assert until(lambda: any(entry.line == line for entry in station.rig.mcu.entries(began)), 3)
-
-
 def test_telemetry(station: Station) -> None:
     touch = station.operator.wait_for("outgoing/touch-sensors").json
     assert set(touch["value"]) == {"a0", "a1", "a2"}
@@ -118,13 +95,6 @@ def test_a_late_operator_finds_retained_state(station: Station) -> None:
         retained
     )
     assert not [topic for topic in retained if topic.startswith(("outgoing/touch", "outgoing/logs", "incoming/drive"))]
-
-
-def test_capabilities_name_the_transport_and_the_topics(station: Station) -> None:
-    capabilities = station.operator.wait_for("outgoing/capabilities").json
-    assert capabilities["schema"] == "pebble-capabilities/v1"
-    assert capabilities["value"]["transport"]["kind"] == ("zenoh" if station.rig.kind == "zenoh" else "mqtt")
-    assert capabilities["value"]["drive"]["topic"] == f"{BASE}/{DRIVE}"
 
 
 # -- the way to the remote broker

@@ -8,24 +8,19 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-import paho.mqtt.client as paho
 import pytest
-from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble.errors import TransportError
-from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, clock, create
+from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, create
 from pebble.transports.mqtt import refused_topics
 from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.connection import UNACKED_LIMIT, UNACKED_RESERVE
-from pebble.transports.mqtt.packets import MAX_PACKET
-from pebble.transports.topics import MAX_BYTES
-from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, beside, free_port, some, until
+from tests.support import ROOT, Broker, RefusingBroker, beside, free_port, some, until
 from tests.tcp_proxy import BridgelessProxy, ForbiddingProxy, Hole, TcpProxy
 from tests.transports.received import Received
 
@@ -60,13 +55,6 @@ tls_broker = module_broker(
     *(f"cafile {CERTS}/ca.crt", f"certfile {CERTS}/server.crt", f"keyfile {CERTS}/server.key"),
     "require_certificate true",
 )
-
-
-@pytest.fixture(scope="module")
-def amqtt() -> Iterator[AmqttBroker]:
-    broker = AmqttBroker()
-    yield broker
-    broker.stop()
 
 
 class Clients:
@@ -107,18 +95,6 @@ def proxy(broker: Broker) -> Iterator[TcpProxy]:
 @pytest.fixture
 def topic(request: pytest.FixtureRequest) -> str:
     return "mqtt/" + request.node.name.replace("[", "/").rstrip("]")
-
-
-@contextmanager
-def stock_client(broker: Broker, client_id: str = "operator") -> Iterator[paho.Client]:
-    """A client of paho's with an id of its own choice, connected."""
-    client = paho.Client(CallbackAPIVersion.VERSION2, client_id=client_id, reconnect_on_failure=False)
-    client.connect("127.0.0.1", broker.port)
-    client.loop_start()
-    assert until(client.is_connected)
-    yield client
-    client.disconnect()
-    client.loop_stop()
 
 
 both_protocols = pytest.mark.parametrize("protocol", ["3.1.1", "5"])
@@ -167,18 +143,6 @@ def test_subscribe_returns_after_the_retained_messages_however_long_after_the_su
 def test_as_published_refuses_to_promise_an_echo(broker: Broker, clients: Clients, topic: str) -> None:
     with pytest.raises(TransportError, match="echo=False"):
         clients(broker.port, as_published=True).subscribe(topic, Received())
-
-
-def test_a_broker_without_bridge_mode_gets_a_plain_connection(
-    amqtt: AmqttBroker, clients: Clients, topic: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    bridge, received = clients(amqtt.port, "bridge", as_published=True), Received()
-    assert not bridge.as_published
-    assert not bridge.exact_echo
-    assert "no bridge mode" in caplog.text
-    bridge.subscribe(topic, received, echo=False)
-    clients(amqtt.port, "other").publish(topic, b"x", qos=DELIVERED)
-    assert received.until(b"x")
 
 
 def test_a_broker_that_hangs_up_on_bridge_mode_gets_a_plain_connection_until_it_is_another_one(
@@ -248,36 +212,6 @@ def test_what_was_typed_into_a_silent_link_never_arrives(
     assert operator.counters["silences"] == 1
 
 
-def test_what_a_frozen_broker_found_when_it_woke_up_never_arrives(tmp_path: Path, clients: Clients, topic: str) -> None:
-    broker = Broker(tmp_path)
-    robot, received = clients(broker.port, "robot", silence_s=0.7, reconnect_max_s=0.1), Received()
-    robot.subscribe(topic, received)
-    with stock_client(broker) as operator:
-        broker.freeze()
-        for _ in range(4_000):  # 0.1 s of a broker's work
-            operator.publish(topic, b"typed while it slept")
-        assert until(lambda: robot.state is State.CONNECTING, 5)
-        broker.thaw()
-        assert reconnected(robot)
-        operator.publish(topic, b"after", qos=1).wait_for_publish(10)
-        assert received.until(b"after")
-    broker.stop()
-
-
-def test_what_came_while_the_machine_was_suspended_never_arrives(
-    broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The connection may have survived that. ``time.monotonic()`` does not count a suspend."""
-    robot, received, now = clients(broker.port), Received(), clock.since_boot
-    robot.subscribe(topic, received)
-    with stock_client(broker) as operator:
-        monkeypatch.setattr(clock, "since_boot", lambda: now() + 10)
-        operator.publish(topic, b"typed while it slept", qos=1).wait_for_publish(10)
-        assert reconnected(robot)
-        operator.publish(topic, b"after", qos=1).wait_for_publish(10)
-        assert received.until(b"after")
-
-
 def test_what_waited_at_the_broker_or_on_the_way_is_no_younger(
     broker: Broker, clients: Clients, proxy: TcpProxy, topic: str
 ) -> None:
@@ -301,68 +235,7 @@ def test_what_waited_at_the_broker_or_on_the_way_is_no_younger(
     assert robot.counters["connected"] == 1
 
 
-@any_protocol
-@pytest.mark.parametrize("qos", [QoS.LATEST, DELIVERED])
-def test_retained_messages_that_are_not_wanted_are_skipped(
-    broker: Broker, clients: Clients, topic: str, protocol: str, qos: QoS
-) -> None:
-    planter = clients(broker.port, "planter")
-    for number in range(300):  # more than mosquitto sends before it waits for an acknowledgement
-        assert planter.publish(f"{topic}/skipped/{number}", b"x", qos=qos, retain=True)
-    assert planter.publish(f"{topic}/wanted", b"x", qos=qos, retain=True)
-    robot, received, asked = clients(broker.port, "robot", protocol=protocol, opened=False), Received(), list[bytes]()
-
-    def skips(name: bytes) -> bool:
-        asked.append(name)
-        return b"/skipped/" in name
-
-    robot.policy.skips_retained = skips
-    robot.open(5)
-    robot.subscribe(f"{topic}/#", received)
-    assert until(lambda: received.payloads == [b"x"])
-    assert until(lambda: len(asked) == 301)
-    assert planter.publish(f"{topic}/skipped/live", b"live", qos=qos)
-    assert until(lambda: received.payloads == [b"x", b"live"])
-    mistaken = clients(broker.port, "mistaken", protocol=protocol)
-    mistaken.policy.skips_retained = lambda name: name[1000] == 0
-    mistaken.subscribe(f"{topic}/wanted", received)
-    assert until(lambda: received.payloads == [b"x", b"live", b"x"])
-
-
 # -- messages that are too large
-
-
-@any_protocol
-@pytest.mark.parametrize("qos", [QoS.LATEST, DELIVERED])
-def test_a_message_that_is_too_large_is_discarded_and_costs_no_connection(
-    broker: Broker, clients: Clients, topic: str, protocol: str, qos: QoS
-) -> None:
-    robot, received = clients(broker.port, "robot", protocol=protocol), Received()
-    robot.subscribe(topic, received)
-    longest = MAX_PACKET - 2 - len(topic) - 2 - 1  # on 5: no properties
-    with stock_client(broker) as stranger:
-        for size in (longest, 20 * MAX_PACKET, 10):
-            stranger.publish(topic, bytes(size), qos=qos).wait_for_publish(30)
-        assert until(lambda: received.payloads[-1:] == [bytes(10)], 30)
-    assert [len(payload) for payload in received.payloads[:-1]] == [longest]
-    assert (robot.counters["too_long"], robot.counters["connected"]) == (1, 1)
-
-
-@any_protocol
-def test_a_topic_that_no_transport_carries_is_discarded(
-    broker: Broker, clients: Clients, topic: str, protocol: str
-) -> None:
-    robot, received = clients(broker.port, "robot", protocol=protocol), Received()
-    longest = f"{topic}/".ljust(MAX_BYTES, "x")
-    with stock_client(broker) as stranger:
-        for turn, retain in ((1, True), (2, False)):
-            for one in (f"{longest}x", longest.ljust(65_535, "x"), longest):
-                stranger.publish(one, b"x", qos=1, retain=retain).wait_for_publish(30)
-            if retain:
-                robot.subscribe(f"{topic}/#", received)
-            assert until(lambda: (robot.counters["too_long"], len(received.messages)) == (2 * turn, turn))  # noqa: B023
-    assert {message.topic for message in received.messages} == {longest}
-    assert robot.counters["connected"] == 1
 
 
 @both_protocols
@@ -428,23 +301,6 @@ def test_a_topic_on_which_the_broker_hangs_up_costs_that_topic_until_it_is_allow
             assert until(lambda: len(received.payloads) > (0 if retain else 20), 20)
 
 
-@pytest.mark.parametrize("qos", [QoS.LATEST, DELIVERED])
-def test_a_retained_message_lost_in_a_hole_is_sent_again(
-    broker: Broker, clients: Clients, proxy: TcpProxy, topic: str, qos: QoS
-) -> None:
-    client, late, received = clients(proxy.port, "client", silence_s=0.7), clients(broker.port), Received()
-    client.publish(topic, b"old", qos=qos, retain=True)
-    client.publish(f"{topic}/gone", b"old", qos=qos, retain=True)
-    late.subscribe(f"{topic}/#", received)
-    assert received.until(b"old", b"old")
-    proxy.blackhole()
-    assert client.publish(topic, b"new", qos=qos, retain=True)
-    assert client.publish(f"{topic}/gone", b"", qos=qos, retain=True)
-    assert until(lambda: client.state is State.CONNECTING, 5)
-    proxy.resume()
-    assert received.until(b"old", b"old", b"new", b""), received.messages
-
-
 def test_close_does_not_wait_for_a_silent_broker(clients: Clients, proxy: TcpProxy) -> None:
     proxy.blackhole()
     others = set(threading.enumerate())
@@ -489,26 +345,6 @@ def test_two_clients_with_one_id_do_not_fight_at_full_speed(
 # -- full sockets
 
 
-def test_a_stream_into_a_full_socket_is_bounded_and_the_newest_wins(
-    broker: Broker, clients: Clients, proxy: TcpProxy, topic: str
-) -> None:
-    client = clients(proxy.port, "client", silence_s=60, keepalive_s=60)
-    receiver, received = clients(broker.port), Received()
-    receiver.subscribe(topic, received, limit=100_000)
-    proxy.blackhole()
-    filler = bytes(20_000)
-    for number in range(1000):  # 20 MB: more than the kernel and the link hold
-        began = time.monotonic()
-        assert client.publish(topic, b"%d " % number + filler)
-        assert time.monotonic() - began < 1.0
-    assert client.counters["dropped"] > 500
-    proxy.resume()
-    assert until(lambda: received.payloads and received.payloads[-1].startswith(b"999 "), 30)
-    numbers = [int(payload.split()[0]) for payload in received.payloads if payload]
-    assert numbers == sorted(numbers)
-    assert len(numbers) == 1000 - client.counters["dropped"]
-
-
 def test_unacknowledged_messages_are_bounded(tmp_path: Path, clients: Clients, topic: str) -> None:
     """And there is room left for stops."""
     broker, received = Broker(tmp_path, "max_queued_messages 0"), Received()  # for the receiver, which may be slow
@@ -529,22 +365,6 @@ def test_unacknowledged_messages_are_bounded(tmp_path: Path, clients: Clients, t
 
 
 # -- brokers that lack things
-
-
-def test_nothing_is_announced_again_to_a_broker_that_still_has_it(
-    broker: Broker, clients: Clients, proxy: TcpProxy, topic: str
-) -> None:
-    retainer, watcher, received, echo = clients(proxy.port, "retainer"), clients(broker.port), Received(), Received()
-    watcher.subscribe(f"{topic}/#", received)
-    for number in range(30):
-        retainer.publish(f"{topic}/{number}", b"%d" % number, qos=DELIVERED, retain=True)
-    assert until(lambda: len(received.messages) == 30)
-    retainer.subscribe(f"{topic}/echo", echo)  # its answer comes after all acknowledgements
-    proxy.drop()
-    assert reconnected(retainer)
-    retainer.publish(topic, b"last", qos=DELIVERED)
-    assert until(lambda: received.payloads[-1] == b"last")
-    assert len([message for message in received.messages if message.topic != topic]) == 30
 
 
 def test_an_older_value_at_a_broker_is_replaced_unless_others_may_have_chosen_it(

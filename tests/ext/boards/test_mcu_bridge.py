@@ -268,19 +268,6 @@ def test_a_silent_inertial_sensor_ends_the_process(memory_rig: SerialRig, monkey
     assert memory_rig.world.newest_raw("mcu/goob-imu-nano/describe") == []
 
 
-def test_an_absent_sensor_is_waited_for(memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(imu, "TIMEOUT_S", 0.5)
-    mcu = memory_rig.mcu(IMU)
-    running = memory_rig.bridge()
-    mcu.stream(100, motion())
-    assert memory_rig.got("sensors/imu-fast")
-    mcu.unplug()
-    time.sleep(1.0)
-    assert running.alive
-    mcu.plug()
-    memory_rig.described("goob-imu-nano")
-
-
 def test_a_refused_alias_is_logged_and_its_interface_still_works(
     memory_rig: SerialRig, caplog: pytest.LogCaptureFixture
 ) -> None:

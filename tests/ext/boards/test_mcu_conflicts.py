@@ -114,20 +114,3 @@ def test_a_manifest_cleared_by_another_is_published_again(rig: SerialRig) -> Non
     other.publish(f"{rig.base}/outgoing/mcu/lamp-1/describe", b"", qos=QoS.DELIVERED, retain=True)
     assert until(lambda: len(rig.world.payloads("mcu/lamp-1/describe")) >= 2)
     rig.listener("late").described("lamp-1")
-
-
-def test_a_line_that_renames_its_channels_leaves_them_to_the_other(memory_rig: SerialRig) -> None:
-    out = f"{memory_rig.base}/outgoing/sensors"
-    rear = {"high_rate": f"{out}/rear-fast", "low_rate": f"{out}/rear"}
-    one, two = memory_rig.mcu(imu("imu-1"), "one"), memory_rig.mcu(imu("imu-2"), "two")
-    memory_rig.bridge("one")
-    memory_rig.bridge("two", topics=rear)
-    one.stream(50, motion(1000))
-    two.stream(50, motion(2000))
-    assert memory_rig.got("sensors/imu-fast")
-    assert memory_rig.got("sensors/rear-fast")
-    time.sleep(0.5)
-    for metric, expected in (("sensors/imu-fast", 1.0), ("sensors/rear-fast", 2.0)):
-        assert {body["value"]["accel_mps2"]["x"] for body in memory_rig.world.payloads(metric)} == {expected}
-    interfaces = memory_rig.world.payloads("mcu/imu-2/describe")[-1]["interfaces"]
-    assert [interface["channel"] for interface in interfaces] == ["sensors/rear-fast", "sensors/rear"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,23 +13,12 @@ from pebble.forwarding.side import Gate
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.serial_mcu_bridge.devices.private_topics import LocalOnly
 from pebble.transports import Message, MqttSettings, create
-from tests.ext.boards import mcu_wire as wire
-from tests.ext.boards.mcu_wire import F, I, M
-from tests.kit.board import SerialRig, motion
+from tests.kit.board import SerialRig
 from tests.kit.robot import BASE, Listener, Running
 from tests.services.mqtt_bridge.bridge_rig import gate_of
-from tests.support import Broker, cases, until
+from tests.support import Broker, until
 
 OUT = f"{BASE}/outgoing"
-#: One interface of each kind, private and public, and an inertial sensor with channels outside the contract.
-SPY = M("spy-1", (
-    I(1, "fast", wire.OUT, wire.KIND_SAMPLE, (F("v", wire.U8),), "lab/fast", "", wire.LOCAL_ONLY),
-    I(2, "slow", wire.OUT, wire.KIND_STATE, (F("v", wire.U8),), "lab/slow", "", wire.RETAIN),
-    I(3, "secret", wire.OUT, wire.KIND_STATE, (F("v", wire.U8),), "lab/secret", "", wire.RETAIN | wire.LOCAL_ONLY),
-    I(4, "set", wire.IN, wire.KIND_COMMAND, (F("v", wire.U8),), "lab/set"),
-    I(5, "tune", wire.IN, wire.KIND_COMMAND, (F("v", wire.U8),), "lab/tune", "", wire.LOCAL_ONLY),
-    *wire.imu_interfaces(6, channels=("lab/imu-fast", "lab/imu")),
-))  # fmt: skip
 PRIVATE = ("mcu/spy-1/fast", "lab/fast", "mcu/spy-1/secret", "lab/secret", "mcu/spy-1/imu_fast", "lab/imu-fast")
 
 
@@ -205,31 +193,3 @@ def world(rig: SerialRig) -> Iterator[World]:
     world = World(rig)
     yield world
     world.close()
-
-
-def test_nothing_private_leaves_the_robot_in_any_start_order(rig: SerialRig, world: World) -> None:
-    world.start()  # the first time before the MCU is known
-    mcu = rig.mcu(SPY)
-    line = rig.bridge()
-    rig.described("spy-1")
-    mcu.stream(300, b"\1")
-    assert rig.got("lab/fast")
-    for round_ in range(cases(2, 4)):  # then while the MCU sends values
-        world.stop()
-        mcu.send(wire.frame(wire.STATE, bytes([round_]), 2), wire.frame(wire.STATE, bytes([round_]), 3))
-        mcu.send(wire.frame(wire.SAMPLE, motion(), 6), wire.frame(wire.STATE, b"\0" * 18, 7))
-        world.start()
-        assert until(lambda r=round_: {"v": r} in world.operator.values("lab/slow"), 5), "retained, and from before"
-        mcu.send(wire.frame(wire.STATE, bytes([round_ + 100]), 2), wire.frame(wire.SAMPLE, motion(), 6))
-        assert until(lambda r=round_: {"v": r + 100} in world.operator.values("lab/slow"), 5)
-    mcu.unplug()
-    assert world.operator.cleared("mcu/spy-1/describe")
-    mcu.plug()
-    world.operator.described("spy-1")
-    time.sleep(0.5)
-    line.stop()
-    assert world.operator.cleared("lab/slow")
-    received = {message.topic.removeprefix(f"{OUT}/") for message in world.operator.received}
-    assert {metric for metric in PRIVATE if rig.world.on(metric)} == set(PRIVATE), "they were published locally"
-    assert received & set(PRIVATE) == set()
-    assert {"mcu/spy-1/slow", "lab/slow", "mcu/spy-1/describe"} <= received

@@ -14,9 +14,7 @@ from pebble.config import parse
 from pebble.errors import PayloadError
 from pebble.services.serial_mcu_bridge.devices.described_bridge import DescribedBridge
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import (
-    Direction,
     Hello,
-    InterfaceKind,
     parse_describe,
     parse_hello,
 )
@@ -24,17 +22,6 @@ from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.boards.mcu_wire import IMU, STATION, F, I, M
 from tests.support import cases
-
-
-def test_the_inertial_sensor_describes_itself() -> None:
-    manifest = parse_describe(IMU.describe())
-    assert manifest.uid == "goob-imu-nano"
-    fast, slow = manifest.interfaces
-    assert (fast.id, fast.name, fast.direction, fast.kind) == (1, "imu_fast", Direction.OUT, InterfaceKind.SAMPLE)
-    assert (fast.local_only, fast.retain, fast.rate_hz) == (True, False, 100)
-    assert (fast.channel, fast.profile) == ("sensors/imu-fast", "imu.motion.v1")
-    assert [field.scale for field in fast.fields] == [0.001] * 3 + [0.01] * 6
-    assert (slow.local_only, slow.kind) == (False, InterfaceKind.STATE)
 
 
 def test_the_published_manifest_has_exactly_the_keys_of_the_wire() -> None:

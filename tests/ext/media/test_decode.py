@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import struct
 import zlib
 from collections.abc import Callable
@@ -18,8 +17,6 @@ from pebble.extensions.media.jpeg import decode_jpeg, jpeg_size
 from pebble.extensions.media.json_video import inflate
 from pebble.extensions.media.packets import Picture, PictureKind
 from pebble.extensions.media.video import make_encoder
-from tests.ext.recordings.demo_robots import FRED, MEDIA, recorded
-from tests.kit.scene import read_counter
 
 T0 = 1_710_969_600_000
 FORMS = ("json", "pbvd", "h264")
@@ -76,38 +73,6 @@ def test_anything_refused_breaks_the_chain(name: str, bad: bytes) -> None:
     assert decoder.problem
 
 
-@pytest.mark.parametrize("name", FORMS)
-@pytest.mark.parametrize("number", [0, 1])
-def test_cut_short_anywhere_it_is_not_shown(name: str, number: int) -> None:
-    packets = stream(name)
-    for length in range(len(packets[number])):
-        decoder = VideoDecoder()
-        assert frames(decoder, [*packets[:number], packets[number][:length]])[-1] is None
-        assert decoder.wants_keyframe
-
-
-def test_a_change_of_form_is_seen_at_once() -> None:
-    decoder = VideoDecoder()
-    for name in (*FORMS, *FORMS):
-        assert frames(decoder, stream(name, count=3)) == [0, 1, 2]
-        other = next(form for form in FORMS if form != name)
-        assert frames(decoder, [stream(other)[3]]) == [None]
-
-
-def test_a_recorded_camera_counts_its_pictures_in_every_form() -> None:
-    """The number that the simulated camera draws into its pictures grows by one with each, whatever the form."""
-    packets, decoder = recorded(MEDIA, f"{FRED}/outgoing/front-camera"), VideoDecoder()
-    shown = [decoder.feed(packet) for packet in packets]
-    seen = [one for one in shown if one is not None]
-    assert len(seen) == len(packets) > 80
-    forms = ["json", "pbvd", "pbvz", "h264"]
-    assert list(dict.fromkeys(one.encoding for one in seen)) == forms
-    for name in forms:
-        counts = [read_counter(one.picture) for one in seen if one.encoding == name]
-        assert None not in counts
-        assert all(0 < after - before <= 2 for before, after in itertools.pairwise(counts)), name
-
-
 def test_raw_jpeg_is_a_key_frame_without_number_and_time() -> None:
     jpeg = cv2.imencode(".jpg", picture(1))[1].tobytes()
     decoder = VideoDecoder()
@@ -137,13 +102,6 @@ def test_numbers_wrap_after_32_bits() -> None:
         Picture(PictureKind.DELTA_JPEG, 0, T0 + 5, flat).pack(),
     ]
     assert frames(decoder, packets) == [(1 << 32) - 1, 0]
-
-
-def test_a_difference_of_another_size() -> None:
-    small = cv2.imencode(".jpg", picture(0, 32, 24))[1].tobytes()
-    decoder = VideoDecoder()
-    assert frames(decoder, [stream("pbvd")[0], Picture(PictureKind.DELTA_JPEG, 1, T0, small).pack()]) == [0, None]
-    assert "size" in decoder.problem
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import pytest
 from pebble.extensions.media.jitter import Chunk, JitterBuffer, ahead
 from pebble.extensions.media.packets import Codec, Sound
 from pebble.extensions.media.pcm import to_bytes
-from pebble.extensions.media.sound import make_sound_encoder, sequence_numbers
+from pebble.extensions.media.sound import make_sound_encoder
 from pebble.extensions.media.speech import Speech
 from tests.ext.recordings.demo_robots import FRED, MEDIA, messages
 
@@ -85,19 +85,6 @@ def on_time(count: int, *, first: int = 0, **more: Any) -> list[tuple[float, byt
 
 
 # -- all is well
-
-
-def test_what_comes_evenly_is_played_evenly_and_whole() -> None:
-    played = play(JitterBuffer(concealment_ms=0), on_time(100))
-    assert played.real == list(range(100))
-    assert played.stutters == 0
-    assert played.chunks[0][0] == pytest.approx(0.06)
-
-
-def test_a_single_packet_is_played() -> None:
-    played = play(JitterBuffer(), on_time(1))
-    assert played.real == [0]
-    assert played.concealed_s == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -250,18 +237,6 @@ def test_a_change_of_format_keeps_its_place() -> None:
     played = play(JitterBuffer(), [*first, *second])
     assert played.real == list(range(40))
     assert [(chunk.rate, chunk.channels) for _, chunk in played.chunks[19:21]] == [(16000, 1), (48000, 2)]
-    assert played.stutters == 0
-
-
-def test_a_change_of_encoding_in_midstream() -> None:
-    numbers = sequence_numbers()
-    raw: list[bytes] = []
-    for name in ("pcm", "opus", "pcm"):
-        encoder = make_sound_encoder(name, rate=RATE, channels=1, numbers=numbers)
-        raw += encoder.encode(to_bytes(Speech(RATE).samples(len(raw) * CHUNK, 20 * CHUNK)), EPOCH_MS + 20 * len(raw))
-    buffer = JitterBuffer(concealment_ms=0)
-    played = play(buffer, [(0.02 * index, one) for index, one in enumerate(raw)])
-    assert len(played.chunks) == 60
     assert played.stutters == 0
 
 

@@ -41,22 +41,6 @@ def test_the_counter_survives_coarse_coding_and_shrinking(size: tuple[int, int],
     assert read_counter(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY)) == number
 
 
-def test_a_torn_counter_is_read_as_none() -> None:
-    """The upper half of one picture above the lower half of another, as a lost slice leaves them."""
-    scene, mixed, other = Scene(640, 480), *np.empty((2, 480, 640, 3), np.uint8)
-    for number in range(100, cases(160, 400)):
-        scene.render(number, mixed)
-        scene.render(1000 * number, other)
-        mixed[456:] = other[456:]
-        assert read_counter(mixed) is None
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 3), (480, 640, 3), (240, 320), (39, 640, 3), (480, 39, 3)])
-@pytest.mark.parametrize("value", [0, 128, 255])
-def test_other_pictures_have_no_counter(shape: tuple[int, ...], value: int) -> None:
-    assert read_counter(np.full(shape, value, np.uint8)) is None
-
-
 def test_the_tag_can_be_found() -> None:
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11))
     scene, out = Scene(640, 480), np.empty((480, 640, 3), np.uint8)

@@ -1,4 +1,4 @@
-"""A bridge or a mirror between real brokers and hubs, and connections to them that can fail."""
+"""A bridge or a mirror between real brokers and hubs."""
 
 from __future__ import annotations
 
@@ -27,10 +27,8 @@ _numbers = count(1)
 class MqttEnd:
     """A mosquitto, or another broker of a test's own, and a way to it for the service.
 
-    The service can lose an end, and that can lose what it retains, or get an older save back.
+    An end can lose what it retains, or get an older save back.
     """
-
-    survives = False
 
     def __init__(
         self, folder: Path, protocol: str = "3.1.1", *, keeps: bool = False, broker: Broker | AmqttBroker | None = None
@@ -42,12 +40,6 @@ class MqttEnd:
 
     def transport(self, name: str) -> Transport:
         return create("mqtt", name, MqttSettings(**{**self.section, "port": self.broker.port, "as_published": True}))
-
-    def leave(self) -> None:
-        self.link.cut()
-
-    def come_back(self) -> None:
-        self.link.mend()
 
     def stop(self) -> None:
         assert isinstance(self.broker, Broker)
@@ -70,26 +62,20 @@ class MqttEnd:
 
 
 class ZenohEnd:
-    """A hub; ``uplink``: which operators reach over the network.
-
-    One that ``survives`` is no way between programs: these and the service reach one another while it is away.
-    """
+    """A hub; ``uplink``: which operators reach over the network."""
 
     section: dict[str, Any]  # of a config
 
     def __init__(self, folder: Path, *, keeps: bool = False, uplink: bool = False) -> None:
-        self.survives = not uplink
         self._journal = folder / "journal" if keeps else None
         self._hub = HubProcess(folder / ("uplink" if uplink else "run"), self._journal)
         # a machine that stands still for the usual two seconds would make live messages late, and they would be dropped
         settings = replace(self._hub.settings, lease_ms=5000)
-        self._link: TcpProxy | None = None
         if uplink:
-            port = free_port()
-            self._link, endpoint = TcpProxy(port), f"tcp/127.0.0.1:{port}"
+            endpoint = f"tcp/127.0.0.1:{free_port()}"
             self._hub.settings = replace(settings, listen=(endpoint,))
             settings = ZenohSettings(run_dir=folder / "operators", connect=(endpoint,), client=True, lease_ms=5000)
-            self.section = {"kind": "zenoh", "connect": [f"tcp/127.0.0.1:{self._link.port}"]}
+            self.section = {"kind": "zenoh", "connect": [endpoint]}
         else:
             self.section = {"kind": "zenoh", "run_dir": str(settings.run_dir), "lease_ms": settings.lease_ms}
         self._settings = settings
@@ -97,12 +83,6 @@ class ZenohEnd:
 
     def transport(self, name: str) -> Transport:
         return create("zenoh", name, self._settings)
-
-    def leave(self) -> None:
-        self.stop() if self._link is None else self._link.cut()
-
-    def come_back(self) -> None:
-        self._hub.start() if self._link is None else self._link.mend()
 
     def stop(self) -> None:
         self._hub.kill()
@@ -118,8 +98,6 @@ class ZenohEnd:
         self._hub.start()
 
     def close(self) -> None:
-        if self._link is not None:
-            self._link.stop()
         if self._hub.running:
             self._hub.end()
 

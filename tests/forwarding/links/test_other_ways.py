@@ -5,29 +5,26 @@ from __future__ import annotations
 import logging
 import shutil
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pebble.forwarding import cycles
 from pebble.forwarding.routing import Drop
 from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Rig, ZenohEnd
 from tests.forwarding.links.test_table import (
     AUDIO_FLAG,
     DRIVE,
     FALSE,
-    MIRROR_FLAG,
     PRESS,
     STOP,
     TRUE,
     VIDEO_FLAG,
-    storm,
 )
 from tests.services.mqtt_bridge.bridge_rig import Client, Quiet
-from tests.support import AmqttBroker, Broker, cases, until
-from tests.tcp_proxy import TcpProxy
+from tests.support import AmqttBroker, cases, until
 
 LIGHTS, STATUS = "incoming/lights-solid", "outgoing/status"
 MOVE = b'{"z": 0.5}'
@@ -59,6 +56,16 @@ def amqtt() -> Iterator[AmqttBroker]:
     broker = AmqttBroker()
     yield broker
     broker.stop()
+
+
+def storm(*voices: tuple[Client, str, list[bytes]], seconds: float, retain: bool = False) -> None:
+    """Every client publishes all of it, evenly spread and in turns."""
+    began = time.monotonic()
+    rounds = list(zip(*(payloads for _, _, payloads in voices), strict=True))
+    for number, payloads in enumerate(rounds, 1):
+        for (client, suffix, _), payload in zip(voices, payloads, strict=True):
+            client.publish(suffix, payload, retain=retain and "/flags/" in suffix)
+        time.sleep(max(0.0, began + number * seconds / len(rounds) - time.monotonic()))
 
 
 class TestWithoutBridgeMode:
@@ -112,48 +119,3 @@ def test_mosquittos_own_clients_use_a_mirror(make: Make, tmp_path: Path) -> None
     assert earlier == f'1 {rig.base}/{STATUS} {{"kept": 1}}'
     subprocess.run([pub, *where, "-t", f"{rig.base}/{DRIVE}", "-m", '{"x": 0, "z": 1}', "-q", "1"], check=True)
     assert until(lambda: rig.local.payloads(DRIVE) == [b'{"x": 0, "z": 1}'])
-
-
-class TestCycles:
-    """What is forwarded comes back: by a mosquitto that forwards it too, or by a second robot of this id."""
-
-    @staticmethod
-    def moves(client: Client) -> int:
-        return client.payloads(DRIVE).count(MOVE)
-
-    @pytest.mark.parametrize(
-        ("direction", "carried", "mirroring"),
-        [("out", DRIVE, b"false"), ("in", "incoming/#", b"true"), ("both", "incoming/#", b"true")],
-    )
-    def test_a_drive_command_comes_to_rest_beside_a_connection_of_the_brokers(
-        self,
-        make: Make,
-        tmp_path: Path,
-        caplog: pytest.LogCaptureFixture,
-        monkeypatch: pytest.MonkeyPatch,
-        direction: str,
-        carried: str,
-        mirroring: bytes,
-    ) -> None:
-        remote = MqttEnd(tmp_path)
-        with TcpProxy(remote.broker.port) as other_way:
-            connection = (
-                *("connection other", f"address 127.0.0.1:{other_way.port}", "notifications false"),
-                f"topic pebble/robots/+/{carried} {direction} 1",
-            )
-            rig = make("bridge", MqttEnd(tmp_path, broker=Broker(tmp_path, *connection)), remote)
-            assert until(lambda: other_way.in_use)
-            rig.start()
-            rig.remote.publish(MIRROR_FLAG, mirroring, retain=True)
-            assert until(lambda: rig.local.on(MIRROR_FLAG))
-            for _ in range(10):
-                rig.remote.publish(DRIVE, MOVE)
-            assert until(lambda: errors(caplog))
-            Quiet(rig.local, rig.remote).wait(0.2)
-            assert len(errors(caplog)) == 1
-            monkeypatch.setattr(cycles, "UNANSWERED", 1)  # not before: an answer that is late would end it, too
-            other_way.cut()
-            assert until(lambda: not rig.service.status.circulating)
-            before = self.moves(rig.local)
-            rig.remote.publish(DRIVE, MOVE)
-            assert until(lambda: self.moves(rig.local) == before + 1)

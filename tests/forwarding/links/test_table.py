@@ -7,7 +7,6 @@ both sides: QoS, retained or not, direction, known topic or not.
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,11 +19,10 @@ from zlib import crc32
 import pytest
 
 from pebble.contract import Kind
-from pebble.forwarding.forwarder import barrier
 from pebble.forwarding.side import Gate
 from pebble.transports import Message, State
 from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Rig, Side, ZenohEnd
-from tests.services.mqtt_bridge.bridge_rig import Client, Quiet
+from tests.services.mqtt_bridge.bridge_rig import Quiet
 from tests.support import Broker, until
 from tests.tcp_proxy import TcpProxy
 
@@ -104,11 +102,6 @@ class Cell:
             self.kind in PASSES[service][self.side] and self.topic not in STAYS[service] and not (once and self.retain)
         )
 
-    @property
-    def survives(self) -> bool:
-        """Passes although the other side is away: the newest retained message of a topic, and events."""
-        return self.qos == 1 and self.topic != STOP and (self.retain or self.kind is Kind.EVENT)
-
     def payload(self, situation: str) -> bytes:
         """A stop has a name: the bridge gives one to others, and so changes their bytes."""
         text = f"{situation}: QoS {self.qos}, {'retained' if self.retain else 'live'}"
@@ -137,25 +130,6 @@ class TableRig(Rig):
         for cell in TABLE:
             self.clients[cell.side].publish(cell.topic, cell.payload(situation), qos=cell.qos, retain=cell.retain)
 
-    def publish_meanwhile(self, situation: str, away: Side) -> None:
-        """The same while a side is away; what the service receives of the other one it has dealt with afterwards."""
-        present = away.other
-        incoming_only = present is REMOTE and self.name == "bridge"
-        topics = [cell.topic for cell in TABLE if cell.side is present]
-        due = sum(topic.startswith("incoming/") or not incoming_only for topic in topics)
-        if subscribed := present in self.service.status.subscribed:
-            barrier(self.transport(present), f"{self.base}/incoming/barrier")  # the other end has handled it
-        before = self.outcomes(present)
-        self.publish_table(situation)
-        dealt_with = lambda: self.outcomes(present) >= before + due  # noqa: E731
-        assert not subscribed or until(dealt_with), self.service.forwarder.counters.snapshot()
-
-    def outcomes(self, side: Side) -> int:
-        """How many messages of a side were passed on or dropped; the transport may skip retained ones."""
-        found = self.service.forwarder.counters.snapshot().items()
-        passed = sum(number for what, number in found if what.startswith(f"{side.value}: "))
-        return passed + self.transport(side).counters["stale"]
-
     def arrived(self, situation: str) -> Arrived:
         """What came across, by topic."""
         came: Arrived = {}
@@ -164,14 +138,10 @@ class TableRig(Rig):
                 came.setdefault(message.topic.removeprefix(f"{self.base}/"), []).append(_shape(message))
         return came
 
-    def expected(self, situation: str, away: End | None = None) -> Arrived:
-        """The whole table, or what of it survives that ``away`` is away."""
+    def expected(self, situation: str) -> Arrived:
         due: Arrived = {}
         for cell in TABLE:
-            whole = away is None or away.survives
-            # of what the clients of the absent side publish, the service finds retained copies
-            lost = away is self.ends[cell.side] and not cell.retain
-            if cell.passes(self.name) and (whole or (cell.survives and not lost)):
+            if cell.passes(self.name):
                 due.setdefault(cell.topic, []).append(cell.arrives(situation))
         return due
 
@@ -188,18 +158,6 @@ class TableRig(Rig):
             newest = {cell.topic: cell.payload(situation) for cell in cells if cell.arrives(situation)[2]}
             found = partial(self.retained_of_others, side)
             assert until(lambda found=found, newest=newest: found() == newest, LATEST_S), found()  # type: ignore[misc]
-
-    def crosses_later(self, situation: str, away: Side) -> None:
-        """What survives an outage has arrived (events of its beginning perhaps twice), and nothing else."""
-        due = {topic: set(messages) for topic, messages in self.expected(situation, self.ends[away]).items()}
-
-        def came() -> dict[str, set[tuple[bytes, int, bool]]]:
-            return {topic: set(messages) for topic, messages in self.arrived(situation).items()}
-
-        until(lambda: came() == due, LATEST_S)
-        assert until(lambda: self.synchronized)
-        Quiet(*self.clients.values()).wait(0.1)
-        assert came() == due
 
     def retained_of_others(self, side: Side) -> dict[str, bytes]:
         """What a late subscriber finds on ``side`` of what the other side has published."""
@@ -252,11 +210,6 @@ def over(*names: Any) -> pytest.MarkDecorator:
 FIRST, SECOND, _, *FURTHER = LINKS
 MARKS = {name: [pytest.mark.thorough] for name in FURTHER}
 each_link = over(*(pytest.param(name, marks=MARKS.get(name, ())) for name in LINKS))
-AWAY = [
-    pytest.param(name, side, marks=MARKS.get(name, ()))
-    for name, side in product(LINKS, Side)
-    if (name, side) != ("bridge to zenoh", REMOTE)
-]
 
 
 @each_link
@@ -269,38 +222,6 @@ def test_both_sides_are_there(rig: TableRig) -> None:
     assert {topic: messages[-1:] for topic, messages in rig.arrived("before").items()} == {
         topic: messages for topic, messages in before.items() if messages
     }
-
-
-@pytest.mark.parametrize(("ends", "away"), AWAY, indirect=["ends"])
-def test_one_side_is_away(rig: TableRig, away: Side) -> None:
-    end = rig.ends[away]
-    end.leave()
-    rig.start(ready=False)
-    assert until(lambda: rig.transport(away.other).state is State.CONNECTED)
-    if end.survives:
-        assert until(lambda: away.other in rig.service.status.synchronized)
-    elif away is REMOTE:  # a bridge may subscribe to the remote side only once it has seen that there are two brokers
-        assert until(lambda: LOCAL in rig.service.status.subscribed)
-    rig.publish_meanwhile("at the start", away)
-    end.come_back()
-    rig.crosses_later("at the start", away)
-    rig.crosses_once("between")
-    end.leave()
-    assert until(lambda: rig.transport(away).state is State.CONNECTING)
-    rig.publish_meanwhile("outage", away)
-    end.come_back()
-    rig.crosses_later("outage", away)
-    rig.crosses_once("after")
-
-
-def storm(*voices: tuple[Client, str, list[bytes]], seconds: float, retain: bool = False) -> None:
-    """Every client publishes all of it, evenly spread and in turns."""
-    began = time.monotonic()
-    rounds = list(zip(*(payloads for _, _, payloads in voices), strict=True))
-    for number, payloads in enumerate(rounds, 1):
-        for (client, suffix, _), payload in zip(voices, payloads, strict=True):
-            client.publish(suffix, payload, retain=retain and "/flags/" in suffix)
-        time.sleep(max(0.0, began + number * seconds / len(rounds) - time.monotonic()))
 
 
 @contextmanager

@@ -402,7 +402,6 @@ _STOPPED = {
 }  # fmt: skip
 
 
-MIXES = 4
 STEPS = RandomSteps(
     *(_ALL, _HANDOVERS, _FLOODED, _STOPPED),
     length=36,

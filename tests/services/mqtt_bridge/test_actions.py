@@ -84,13 +84,6 @@ def test_runs_without_a_shell_in_its_folder_with_its_environment(tmp_path: Path)
     assert not (tmp_path / "oops").exists()
 
 
-def test_a_line_of_text_is_split_as_a_shell_would(tmp_path: Path) -> None:
-    section = {"git_pull_control": {"command": f'{sys.executable} -c \'open("made here", "w")\'', "cwd": str(tmp_path)}}
-    actions = system_actions(make_config(**section).services.mqtt_bridge, tmp_path, Clock())
-    assert actions[GIT_PULL].request()
-    assert until(lambda: (tmp_path / "made here").exists())
-
-
 def test_its_words_and_its_output_stay_in_a_file_on_the_robot(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
     code = "import sys; print('pulls from https://deploy:ghp_TOKEN@git.example'); sys.exit(3)"

@@ -1,24 +1,15 @@
-"""Over which time the bridge vouches: histories as rows, and a real broker that stalls."""
+"""Over which time the bridge vouches: histories as rows."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 
-from pebble.config import parse
-from pebble.runtime.connections import local_transport
-from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.mqtt_bridge.vouching import Vouching
-from pebble.transports import Answer, create
-from pebble.transports.settings import MqttSettings
-from tests.services.mqtt_bridge.bridge_rig import Client, Running
-from tests.support import Broker, until
+from pebble.transports import Answer
 
 START_S, PERIOD_S = 100.0, 0.5
-VOUCHED = "outgoing/control-vouched"
 
 #: Each half second: does it pass, what was lost, how old and how late the answer is (None: there is none); and from
 #: when to when it vouches then.
@@ -73,35 +64,3 @@ def test_of_a_transport_that_asks_nothing_a_connection_that_lasts_is_prompt() ->
     assert [(one.begin, one.end) for one in vouched] == [
         *((100_000, 100_000), (100_000, 100_000), (100_000, 101_000), (104_000, 104_000)),
     ]
-
-
-def test_a_broker_that_stalls_ends_what_the_bridge_vouches_for(tmp_path: Path) -> None:
-    local, remote = Broker(tmp_path), Broker(tmp_path)
-    places = {"host": "127.0.0.1", "port": local.port}, {"host": "127.0.0.1", "port": remote.port}
-    services = {
-        "serial_mcu_bridge": {"enabled": True, "serial": {"port": str(tmp_path / "tty")}},
-        "mqtt_bridge": {"enabled": True, "remote_mqtt": places[1] | {"silence_seconds": 5.0}},
-    }
-    raw = {"robot": {"id": "rover"}, "local_mqtt": places[0], "services": services}
-    config = parse(raw, folder=tmp_path, env={"XDG_STATE_HOME": str(tmp_path)})
-    client = Client(create("mqtt", "owner", MqttSettings(host="127.0.0.1", port=local.port)))
-    running = Running(MqttBridge(config, local_transport(config, "local-bridge", as_published=True)))
-
-    def newest() -> dict[str, int]:
-        vouched: dict[str, int] = msgspec.json.decode(([b'{"from": 0, "to": 0}', *client.payloads(VOUCHED)])[-1])
-        return vouched
-
-    try:
-        assert until(lambda: newest()["to"] - newest()["from"] > 1000, 30)
-        began = newest()["from"]
-        remote.freeze()
-        assert until(lambda: newest()["from"] == newest()["to"] > began, 30)
-        remote.thaw()
-        assert until(lambda: newest()["to"] - newest()["from"] > 500, 30)
-        assert newest()["from"] > began
-    finally:
-        remote.thaw()
-        running.stop()
-        client.transport.close()
-        remote.stop()
-        local.stop()

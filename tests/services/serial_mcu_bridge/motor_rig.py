@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -78,22 +75,6 @@ class Bench:
         """What the MCU has received."""
         return self.mcu.trace.lines()
 
-    @contextmanager
-    def occupied(self) -> Iterator[None]:
-        """Keeps the service's thread busy: what arrives meanwhile waits."""
-        begun, ends = threading.Event(), threading.Event()
-
-        def work() -> None:
-            begun.set()
-            ends.wait(5)
-
-        self.service.post(work)
-        assert begun.wait(5)
-        try:
-            yield
-        finally:
-            ends.set()
-
     def send(self, metric: str, body: Any) -> None:
         self.world.command(metric, body)
 
@@ -104,11 +85,6 @@ class Bench:
         """Drive straight, and wait until the MCU is told so."""
         self.drive(z, **more)
         return self.line(f"M {z:.3f} {z:.3f}")
-
-    def shines(self, **colours: float) -> bool:
-        """Switch the lights on, and wait until the MCU is told so: what was sent before has been handled."""
-        self.send("lights-solid", colours)
-        return self.line("L " + " ".join(f"{colours.get(one, 0):.3f}" for one in "bgr"))
 
     def payloads(self, metric: str) -> list[Any]:
         return self.world.payloads(metric)

@@ -12,7 +12,7 @@ from pebble.config import Security
 from pebble.contract import CONTROL_STATE, codec
 from pebble.contract.payloads import ControlRequest, ControlState
 from pebble.motors.control import Control
-from tests.services.serial_mcu_bridge.motor_rig import STOPPED, Bench
+from tests.services.serial_mcu_bridge.motor_rig import Bench
 from tests.support import until
 
 ANN, OTTO = {"id": "aaaaaaaa", "by": "ann", "device": "phone"}, {"id": "00000001", "by": "otto"}
@@ -65,17 +65,6 @@ def test_a_state_is_repeated() -> None:
     assert states == [control.state()] * 2
 
 
-#: Is there a bridge, until when does it vouch, when was something lost here; and when control ends without a message.
-ENDS: dict[str, tuple[bool, float | None, float | None, float]] = {
-    "no bridge": (False, None, None, 3.0),
-    "no bridge, and something was lost": (False, None, 2.0, 3.0),
-    "a bridge that says nothing": (True, None, None, 30.0),
-    "a bridge that vouches for all of it": (True, 3.0, None, 10.0),
-    "a bridge that vouches for too little": (True, 2.9, None, 30.0),
-    "something was lost": (True, 3.0, 2.0, 30.0),
-}
-
-
 # -- a service, an MCU and operators
 
 
@@ -91,31 +80,6 @@ def held(bench: Bench, by: str) -> str:
     assert until(lambda: bench.world.newest("control/serial").get("by") == by, 5), bench.payloads("control/serial")
     key: str = bench.world.newest("control/serial")["key"]
     return key
-
-
-def test_who_has_control_drives_and_keys_of_before_do_not(bench: Bench) -> None:
-    assert bench.moves(0.1)  # control is free
-    bench.send("control", ANN)
-    ann = held(bench, "ann")
-    assert bench.moves(0.2, key=ann)
-    bench.send("control", OTTO)
-    assert until(lambda: bench.world.newest("control/serial")["asks"] == "otto", 5)
-    assert bench.moves(0.3, key=ann)
-    halts = bench.lines.count(STOPPED)
-    bench.send("control/take", OTTO)
-    otto = held(bench, "otto")
-    assert until(lambda: bench.lines.count(STOPPED) > halts, 5)
-    bench.drive(0.4, key=ann)
-    assert bench.moves(0.5, key=otto)
-    bench.drive(0.6)  # without a key
-    assert until(lambda: bench.service.counters["stranger"] == 2, 5)
-    bench.drive(0.0)
-    assert until(lambda: bench.lines[-1] == STOPPED, 5)
-    bench.send("control", OTTO | {"want": "release"})
-    assert held(bench, "") == ""
-    assert not {"M 0.400 0.400", "M 0.600 0.600"} & set(bench.lines)
-    assert bench.moves(0.7)
-    assert until(lambda: bench.world.newest("control/serial")["others"], 5)
 
 
 @pytest.mark.parametrize(

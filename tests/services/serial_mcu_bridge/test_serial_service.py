@@ -119,17 +119,6 @@ def test_a_drive_command_without_an_axis_is_logged_once_for_each_sender(
     assert "'linear', 'source'" in lines[0]
 
 
-def test_a_command_is_valid_for_its_valid_ms(bench: Bench) -> None:
-    assert bench.moves(0.5, valid_ms=100)
-    moved = next(entry for entry in bench.mcu.trace.entries() if entry.line == "M 0.500 0.500")
-    assert until(lambda: bench.lines[-1] == STOPPED, 2)
-    assert 0.08 <= (bench.mcu.trace.entries()[-1].ns - moved.ns) / 1e9 <= 0.3
-    bench.drive(0.25, valid_ms=5000)  # never longer than the watchdog
-    bench.drive(0.375, valid_ms=50)  # a later command may end earlier
-    assert bench.line("M 0.375 0.375")
-    assert until(lambda: bench.lines[-1] == STOPPED, 2)
-
-
 def test_stops_are_subscribed_to_before_drive_commands() -> None:
     assert handled(MotorBridge)[:5] == [ESTOP, ESTOP_RESET, CONTROL, CONTROL_TAKE, DRIVE]
 

@@ -550,19 +550,6 @@ def test_a_second_hub_is_refused(robot: Robot) -> None:
     assert robot.client("client").state is State.CONNECTED
 
 
-def test_a_tool_waits_for_a_hub(robot: Robot) -> None:
-    robot.hub.kill()
-    received: list[Message] = []
-    tool = robot.client("tool", client=True, timeout=0.1)
-    tool.subscribe("a", received.append)
-    assert (tool.state, tool.publish("a", b"lost")) == (State.CONNECTING, False)
-    assert tool.publish("a", b"kept", retain=True)
-    robot.hub.start()
-    assert until(lambda: [(m.payload, m.retain) for m in received] == [(b"kept", True)])
-    assert tool.publish("a", b"live", qos=DELIVERED)
-    assert until(lambda: received[-1].payload == b"live")
-
-
 def test_nonsense_does_not_disturb_the_hub(robot: Robot) -> None:
     client = robot.client("client")
     session: zenoh.Session = client.session  # type: ignore[attr-defined]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterator
 from itertools import pairwise
 from statistics import median
@@ -69,18 +68,6 @@ def test_every_encoding_in_turn_carries_the_recorded_speech(local: Broker, remot
         assert until(lambda: (robot.newest.doing or "").startswith("pcm 16 kHz mono, "))
 
 
-def test_a_robot_with_zenoh_inside_and_another_rate(local: Broker, remote: Broker, ear: Ear) -> None:
-    options = {"encoding": "opus", "rate": 16000, "channels": 1, "bundle": 3}
-    with Program(NAME, "zenoh", local.port, remote.port, **options) as robot, Mouth(robot.run_dir, 48000, 2):
-        received = ear.wait(15)
-        assert {(one.encoding, one.rate, one.channels, len(one.samples)) for one in received} == {
-            ("opus", 16000, 1, 960)
-        }
-        assert robot.reported(encoding="opus", running=True, last_error=None)
-        robot.ask(encoding="pcm")
-        ear.wait_for("pcm")
-
-
 def test_the_microphone_comes_later_and_comes_back(local: Broker, remote: Broker, ear: Ear) -> None:
     with Program(NAME, "mqtt", local.port, remote.port) as robot:
         assert robot.reported(doing="waits for the microphone")
@@ -105,17 +92,3 @@ def test_the_remote_broker_goes_and_comes_back(local: Broker, remote: Broker, ea
         young = [at - one.captured_ms / 1000 for at, one in zip(ear.arrived, ear.received, strict=True)][-10:]
         assert median(young) < 0.5  # nothing from before
         assert robot.reported(last_error=None)
-
-
-def test_it_ends_on_sigterm_and_leaves_nothing(local: Broker, remote: Broker, ear: Ear) -> None:
-    with Program(NAME, "mqtt", local.port, remote.port) as robot, Mouth(robot.run_dir) as mouth:
-        ear.wait(5)
-        robot.process.send_signal(signal.SIGTERM)
-        assert robot.process.wait(5) == 0
-        assert until(lambda: mouth.writer.readers == 0)
-        robot.start()
-        ear.wait(5)
-        robot.process.kill()
-        robot.process.wait(5)
-        robot.start()
-        ear.wait(5)

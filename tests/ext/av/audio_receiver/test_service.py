@@ -26,7 +26,7 @@ from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.ext.av.audio_rig import RECORDER, Program
 from tests.ext.av.media_rig import BASE, client
 from tests.kit.robot import Running
-from tests.kit.sound import best_match, envelope
+from tests.kit.sound import best_match
 from tests.support import Broker, until
 
 
@@ -122,17 +122,6 @@ def test_received_speech_is_played(receive: Receive, operator: Operator, recorde
     assert best_match(recorder.samples()[:28000], np.pad(speech, (8000, 8000))) > 0.95
     assert robot.reported(encoding="pcm", last_error=None, doing="plays 16 kHz, 1 channel")
     assert until(lambda: (robot.newest.bitrate or 0) > 0)
-
-
-@pytest.mark.alone
-def test_opus_on_a_robot_with_zenoh_inside(receive: Receive, operator: Operator, recorder: Recorder) -> None:
-    robot = receive("zenoh", latency_ms=1000)  # the most there is: what a busy machine delivers later is not played
-    operator.speak("opus", 2, bundle=2)
-    speech = np.pad(Speech(16000).samples(0, 32000)[:, 0].astype(float), (8000, 8000))
-    assert until(lambda: len(recorder.samples()) >= 32000 * 0.95)
-    played, loud = recorder.samples()[:28000], envelope(speech, 16000)
-    assert max(best_match(envelope(played[shift:], 16000), loud) for shift in range(0, 320, 40)) > 0.9
-    assert robot.reported(encoding="opus", last_error=None)
 
 
 def test_a_change_of_format_begins_another_player(receive: Receive, operator: Operator, recorder: Recorder) -> None:

@@ -25,7 +25,6 @@ from tests.support import Broker, until
 
 SYNTHETIC = {"video": {"backend": "synthetic", "fps": 30}, "audio": {"source": "synthetic"}}
 DEAF = {"video": {"backend": "libcamera", "fps": 30}, "audio": {"enabled": False}}
-BLIND = {"video": {"enabled": False}, "audio": {"source": "synthetic"}}
 
 
 class Robot(ProgramRobot):
@@ -133,29 +132,12 @@ def test_numbers_alone_are_published_rarely_and_everything_else_soon(robot: Robo
     assert robot.reported("other", 3, reduced="size 1/2")
 
 
-def test_devices_rest_and_silent_programs_are_forgotten(robot: Robot) -> None:
-    assert robot.reported("camera", doing="rests: nobody reads")
-    with FrameReader(robot.run_dir, "camera") as reader:
-        assert reader.read(10) is not None
-        robot.report("camera_publisher", MediaReport(running=True))
-        assert until(lambda: robot.status["camera"]["running"] and "camera_publisher" in robot.status)
-        assert robot.status["microphone"]["running"] is False
-    assert until(lambda: list(robot.status) == ["camera", "microphone"], 15)
-    assert robot.reported("camera", 15, running=False)
-
-
 def test_it_ends_at_once_and_publishes_it(robot: Robot) -> None:
     with FrameReader(robot.run_dir, "camera") as reader:
         assert reader.read(10) is not None
         assert robot.reported("camera", running=True)
         assert robot.daemon.end(signal.SIGTERM) == 0
     assert until(lambda: robot.status["camera"] == {"running": False, "doing": "ended"})
-
-
-@pytest.mark.parametrize("robot", [BLIND], indirect=True)
-def test_what_is_switched_off_is_not_there(robot: Robot) -> None:
-    assert until(lambda: robot.status)
-    assert list(robot.status) == ["microphone"]
 
 
 @pytest.fixture

@@ -48,17 +48,6 @@ def test_every_form_in_turn_at_the_wanted_rate(local: Broker, remote: Broker, vi
         assert viewer.decoder.problem == ""
 
 
-def test_a_robot_with_zenoh_inside(local: Broker, remote: Broker, viewer: Viewer) -> None:
-    video = {"encoding": "pbvd", "publish_width": 240, "rotate_degrees": 90}
-    with Publisher("zenoh", local.port, remote.port, **video) as robot, Camera(robot.run_dir, 15) as camera:
-        viewer.wait_for("pbvd")
-        assert viewer.wait(20)[-1].shape == (320, 240, 3)
-        assert robot.reported(encoding="pbvd", running=True, last_error=None)
-        robot.ask(encoding="json")
-        viewer.wait_for("json")
-        assert camera.writer.readers == 1
-
-
 def test_nothing_is_encoded_while_the_remote_side_is_away(local: Broker, remote: Broker, viewer: Viewer) -> None:
     with Publisher("mqtt", local.port, remote.port) as robot, Camera(robot.run_dir, 15) as camera:
         viewer.wait(10)
