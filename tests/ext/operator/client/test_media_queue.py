@@ -9,7 +9,6 @@ import pytest
 from pebble.extensions.operator.client.media_request.offer import Medium, best
 from pebble.extensions.operator.client.media_request.queue import (
     MAX_FRAMES,
-    MAX_QUEUED_BYTES,
     NO_FRAME,
     THIN_ACK_S,
     Frame,
@@ -50,21 +49,6 @@ def offered(viewer: ViewerQueue, seq: int, at: float, encoding: str = "pbvd") ->
     return viewer.rescued
 
 
-def test_two_are_under_way_and_one_when_acknowledgements_are_late() -> None:
-    queue = ViewerQueue(ALL, 0.0)
-    for seq in range(4):
-        queue.offer(frame(seq, keyframe=seq == 0))
-    assert [queue.take(0.0), queue.take(0.0), queue.take(0.0)] == [frame(0, keyframe=True), frame(1), None]
-    queue.acknowledge(0, 0.2)
-    assert queue.window == 1
-    assert queue.take(0.2) is None
-    queue.acknowledge(1, 0.3)
-    assert queue.take(0.3) == frame(2)
-    assert queue.take(0.3) is None
-    queue.acknowledge(2, 0.35)
-    assert queue.window == 2
-
-
 @pytest.mark.parametrize(("size", "most"), [(100, 8), (500, 8), (1000, 4), (3000, 2)])
 def test_more_are_under_way_if_they_are_small(size: int, most: int) -> None:
     queue, taken = ViewerQueue(ALL, 0.0), 0
@@ -78,15 +62,6 @@ def test_more_are_under_way_if_they_are_small(size: int, most: int) -> None:
     assert queue.take(1.0) is None
 
 
-def test_bytes_are_bounded_as_well() -> None:
-    queue = ViewerQueue(ALL, 0.0)
-    queue.offer(frame(0, keyframe=True, size=MAX_QUEUED_BYTES))
-    queue.offer(frame(1, size=1))
-    assert queue.waiting
-    queue.offer(frame(2, keyframe=True, size=MAX_QUEUED_BYTES))
-    assert drained(queue) == [2]
-
-
 def test_a_key_frame_replaces_what_waits_for_a_slow_page_only() -> None:
     fast, slow = ViewerQueue(ALL, 0.0), ViewerQueue(ALL, 0.0)
     for queue, took in ((fast, 0.01), (slow, 0.5)):
@@ -97,20 +72,6 @@ def test_a_key_frame_replaces_what_waits_for_a_slow_page_only() -> None:
             queue.offer(one)
     assert drained(fast) == [1, 2, 3]
     assert drained(slow) == [3]
-
-
-def test_a_slow_page_gets_few_differences_and_the_next_key_frame_soon() -> None:
-    queue = ViewerQueue(ALL, 0.0)
-    queue.offer(frame(0, keyframe=True))
-    queue.take(0.0)
-    queue.acknowledge(0, 0.3)
-    for one in (frame(1), frame(2), frame(3), frame(4)):
-        queue.offer(one)
-    assert queue.waiting
-    assert not queue.overflowed
-    assert drained(queue, 0.3) == [1]
-    queue.offer(frame(5, keyframe=True))
-    assert drained(queue, 0.4) == [5]
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -175,13 +136,6 @@ def overflow(viewer: ViewerQueue, now: float) -> None:
     assert viewer.overflowed
 
 
-def test_a_sole_viewer_and_half_of_them_get_a_key_frame() -> None:
-    assert assess(viewers(1, waiting=1), "h264", 0.1, can_rescue=True)
-    assert assess(viewers(2, waiting=1), "h264", 0.1, can_rescue=True)
-    assert not assess(viewers(2), "h264", 0.1, can_rescue=True)
-    assert not assess([], "h264", 0.1, can_rescue=True)
-
-
 def test_a_slow_viewer_among_fast_ones_gets_the_rescue_stream() -> None:
     some = viewers(3, waiting=1)
     assert not assess(some, "h264", 0.1, can_rescue=True)
@@ -200,13 +154,6 @@ def test_a_new_viewer_among_others_gets_one_key_frame_and_then_the_rescue_stream
     assert new.rescued
     new.offer_direct(frame(9, keyframe=True, encoding="h264"), 3.5)
     assert not new.rescued
-
-
-def test_jpegs_have_key_frames_of_their_own() -> None:
-    some = [ViewerQueue(ALL, 0.0)]
-    assert not assess(some, "pbvd", 0.5, can_rescue=True)
-    assert assess(some, "pbvd", 1.5, can_rescue=True)
-    assert not some[0].rescued
 
 
 def test_what_cannot_be_decoded_is_rescued_until_it_can() -> None:
@@ -236,15 +183,6 @@ def test_over_a_thin_connection_small_pictures_come_from_the_rescue_stream(encod
     assert viewer.rescued
     assert offered(viewer, 2, now + 59, encoding)
     assert not offered(viewer, 3, now + 61, encoding)
-
-
-def test_small_pictures_that_are_late_as_well_do_not_put_off_the_return() -> None:
-    viewer = ViewerQueue(ALL, 0.0)
-    for seq in range(18):
-        show(viewer, seq, seq / 2, seq / 2 + 0.5)
-        assess([viewer], "pbvd", seq / 2 + 0.5, can_rescue=True)
-        assert viewer.rescued == (seq > 0)
-    assert not offered(viewer, 18, 61.0)
 
 
 # -- the encoding
