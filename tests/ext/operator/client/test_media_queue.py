@@ -49,6 +49,21 @@ def offered(viewer: ViewerQueue, seq: int, at: float, encoding: str = "pbvd") ->
     return viewer.rescued
 
 
+def test_two_are_under_way_and_one_when_acknowledgements_are_late() -> None:
+    queue = ViewerQueue(ALL, 0.0)
+    for seq in range(4):
+        queue.offer(frame(seq, keyframe=seq == 0))
+    assert [queue.take(0.0), queue.take(0.0), queue.take(0.0)] == [frame(0, keyframe=True), frame(1), None]
+    queue.acknowledge(0, 0.2)
+    assert queue.window == 1
+    assert queue.take(0.2) is None
+    queue.acknowledge(1, 0.3)
+    assert queue.take(0.3) == frame(2)
+    assert queue.take(0.3) is None
+    queue.acknowledge(2, 0.35)
+    assert queue.window == 2
+
+
 @pytest.mark.parametrize(("size", "most"), [(100, 8), (500, 8), (1000, 4), (3000, 2)])
 def test_more_are_under_way_if_they_are_small(size: int, most: int) -> None:
     queue, taken = ViewerQueue(ALL, 0.0), 0
@@ -136,6 +151,13 @@ def overflow(viewer: ViewerQueue, now: float) -> None:
     assert viewer.overflowed
 
 
+def test_a_sole_viewer_and_half_of_them_get_a_key_frame() -> None:
+    assert assess(viewers(1, waiting=1), "h264", 0.1, can_rescue=True)
+    assert assess(viewers(2, waiting=1), "h264", 0.1, can_rescue=True)
+    assert not assess(viewers(2), "h264", 0.1, can_rescue=True)
+    assert not assess([], "h264", 0.1, can_rescue=True)
+
+
 def test_a_slow_viewer_among_fast_ones_gets_the_rescue_stream() -> None:
     some = viewers(3, waiting=1)
     assert not assess(some, "h264", 0.1, can_rescue=True)
@@ -183,6 +205,15 @@ def test_over_a_thin_connection_small_pictures_come_from_the_rescue_stream(encod
     assert viewer.rescued
     assert offered(viewer, 2, now + 59, encoding)
     assert not offered(viewer, 3, now + 61, encoding)
+
+
+def test_small_pictures_that_are_late_as_well_do_not_put_off_the_return() -> None:
+    viewer = ViewerQueue(ALL, 0.0)
+    for seq in range(18):
+        show(viewer, seq, seq / 2, seq / 2 + 0.5)
+        assess([viewer], "pbvd", seq / 2 + 0.5, can_rescue=True)
+        assert viewer.rescued == (seq > 0)
+    assert not offered(viewer, 18, 61.0)
 
 
 # -- the encoding
