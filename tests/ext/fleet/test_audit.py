@@ -18,25 +18,6 @@ from pebble.extensions.fleet.row_writer import DIFFERENT, OF_STRANGERS
 from tests.support import until
 
 
-def test_entries_are_read_with_the_newest_last(tmp_path: Path) -> None:
-    log = Audit(tmp_path / "people.sqlite")
-    before = time.time()
-    for number in range(5):
-        log.write(f"drive {number}", ref="pebble/robots/goob", user="alice", device="phone", address="::1", detail="x")
-    assert until(lambda: len(log.read(10)) == 5)
-    assert [entry.what for entry in log.read(2)] == ["drive 3", "drive 4"]
-    entry = log.read(1)[0]
-    assert (entry.ref, entry.user, entry.device, entry.address, entry.detail) == (
-        "pebble/robots/goob",
-        "alice",
-        "phone",
-        "::1",
-        "x",
-    )
-    assert before <= entry.at <= time.time()
-    log.close()
-
-
 def test_writing_never_blocks_and_what_was_locked_out_is_written(tmp_path: Path) -> None:
     log = Audit(tmp_path / "people.sqlite")
     blocker = sqlite3.connect(tmp_path / "people.sqlite", isolation_level=None)

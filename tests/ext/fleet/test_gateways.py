@@ -17,8 +17,6 @@ import pytest
 
 from pebble.contract import CAPABILITIES, DRIVE, ESTOP, ONLINE
 from pebble.transports import Message, MqttSettings, QoS, ZenohSettings, create
-from tests.robot.operator import Driver, retained_messages
-from tests.robot.rig import BASE, Rig
 from tests.support import Broker, free_port, further, until
 from tests.transports.forked import Forked
 
@@ -156,24 +154,4 @@ def test_a_second_one_does_not_start_and_takes_over_where_it_is_tried_again(hall
     hall.start("gate-2")
     assert until(lambda: hall.driven(began), SECOND_S)
     assert hall.start("gate-1").wait(SECOND_S) == 1
-    assert hall.wrong() == 0
-
-
-@pytest.mark.thorough
-def test_a_whole_robot_is_driven_and_stopped_through_a_gateway_that_is_started_again(hall: Hall) -> None:
-    remote = {"kind": "zenoh", "connect": [f"tcp/127.0.0.1:{hall.hub_port}"]}
-    with Rig("zenoh", remote=hall.broker, mqtt_bridge={"remote": remote}) as rig:
-        assert {"outgoing/capabilities", "outgoing/status"} <= retained_messages(hall.broker.port, BASE).keys()
-        driver = Driver(rig.operator)
-        assert until(rig.mcu.turning, 10)
-        began = time.monotonic()
-        kill(hall)
-        assert until(lambda: not rig.mcu.turning(), 2), "nothing commands it"
-        start_again(hall)
-        assert until(lambda: rig.mcu.moving(began + 0.75), 10)
-        stopped = time.monotonic()
-        rig.operator.send("incoming/estop", {"stop": "s" * 16, "by": "ann"})
-        assert until(lambda: not rig.mcu.turning(), 1)
-        assert rig.operator.wait_for("outgoing/estop/serial", since=stopped).json["latched"]
-        driver.stop()
     assert hall.wrong() == 0

@@ -24,7 +24,7 @@ from pebble.extensions.fleet.roles import Account, rules
 from pebble.transports import Message, QoS, TlsSettings, Transport, ZenohSettings, create
 from pebble.transports.topics import matches
 from tests.robot.rig import STOP, Rig
-from tests.support import ROOT, Child, free_port, until
+from tests.support import Child, free_port, until
 from tests.transports.zenoh_net import HubProcess
 
 FRED, GOOB = "pebble/robots/fred", "pebble/robots/goob"
@@ -248,24 +248,3 @@ def test_who_may_not_moves_nothing(hall: Hall, stack: ExitStack) -> None:
     assert {message.topic for _, message in hall.incoming} == {DRIVE.topic(FRED)}
     seen = [one.topic for one in hall.fred.operator.seen if "/from/" in one.topic or "/to/" in one.topic]
     assert seen == []
-
-
-@pytest.mark.thorough
-@pytest.mark.alone
-def test_goob_follows_fred_while_their_brokers_are_down(hall: Hall, stack: ExitStack) -> None:
-    hall.rests()
-    odometry = ROOT / "pebble/extensions/scripts/shipped/wheel-odometry/run.py"
-    follow = ROOT / "examples" / "follow-a-robot" / "run.py"
-    for robot, script in ((hall.fred, odometry), (hall.goob, odometry), (hall.goob, follow)):
-        hall.start(robot, script, stack)
-    for robot in (hall.fred, hall.goob):
-        robot.remote.kill()
-        stack.callback(robot.remote.start)
-    began = time.monotonic()
-
-    def fred_drives_and_goob_follows() -> bool:
-        hall.local.publish(DRIVE.topic(FRED), codec.encode(DRIVE, Drive(z=0.4)), qos=QoS.DELIVERED)
-        return any(min(wheels) > 0 for _, wheels in hall.goob.mcu.motors(began))
-
-    assert until(fred_drives_and_goob_follows, 20), hall.goob.log.read_text()[-3000:]
-    assert until(lambda: not hall.goob.mcu.turning(), 20), "fred stands, and goob has caught up"

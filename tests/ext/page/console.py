@@ -9,10 +9,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-import msgspec
 from playwright.sync_api import Browser, Error, Locator
 
-from pebble.transports import Message, MqttSettings, QoS, create
+from pebble.transports import Message, MqttSettings, create
 from tests.ext.page.browser import Size, Tab, Theme, tab
 from tests.ext.page.stage import Stage
 
@@ -233,25 +232,13 @@ def used(opened: Console, *, complaints: bool = True) -> Iterator[Console]:
 
 
 class Wire:
-    """What passes the operators' broker, except sound and pictures."""
+    """What motor owners publish of stops at the operators' broker."""
 
     def __init__(self, stage: Stage) -> None:
         self._last: dict[str, Any] = {}
-        self.received: list[tuple[str, Any]] = []
         self._transport = create("mqtt", "wire", MqttSettings(host="127.0.0.1", port=stage.broker_port))
         self._transport.open()
-        for metric in ("estop/+", "media-status", "online"):
-            self._transport.subscribe(f"pebble/+/+/outgoing/{metric}", self._receive)
-        for metric in ("drive-values", "front-camera", "flags/+", "estop"):
-            self._transport.subscribe(f"pebble/+/+/incoming/{metric}", self._receive)
-
-    def last(self, topic: str) -> Any:
-        """The newest payload below ``pebble/robots``."""
-        return self._last.get(f"pebble/robots/{topic}")
-
-    def publish(self, topic: str, value: object, *, retain: bool = False) -> None:
-        payload = b"" if value is None else msgspec.json.encode(value)
-        self._transport.publish(f"pebble/robots/{topic}", payload, qos=QoS.DELIVERED, retain=retain)
+        self._transport.subscribe("pebble/+/+/outgoing/estop/+", self._receive)
 
     def latched(self, name: str) -> bool:
         """Whether all motor owners of a robot say that they are stopped."""
@@ -259,18 +246,11 @@ class Wire:
         states = [payload for topic, payload in list(self._last.items()) if topic.startswith(prefix)]
         return bool(states) and all(state["latched"] for state in states)
 
-    def camera(self, name: str) -> bool:
-        """Whether the robot's own program for pictures is running."""
-        report = (self.last(f"{name}/outgoing/media-status") or {}).get("value", {})
-        return any(one.get("running") for program, one in report.items() if "video" in program or "camera" in program)
-
     def close(self) -> None:
         self._transport.close()
 
     def _receive(self, message: Message) -> None:
-        payload = json.loads(message.payload) if message.payload else None
-        self._last[message.topic] = payload
-        self.received.append((message.topic, payload))
+        self._last[message.topic] = json.loads(message.payload)
 
 
 def _of_connection(complaint: str) -> bool:

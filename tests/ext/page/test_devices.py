@@ -12,7 +12,7 @@ from pebble.extensions.page.robots import MAX_ALIASES, Interest, Robots
 from pebble.transports import Message
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.page.served import Page, Served
-from tests.ext.page.states import described, outlet, sample
+from tests.ext.page.states import described, sample
 from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
 
@@ -50,13 +50,6 @@ def test_what_an_mcu_publishes_under_an_alias_arrives(page: Page, robot: Recordi
     assert page.value(BASE, "lights/other") is None
     robot.remove(DESCRIBE)
     robot.remove("lights/lamp")
-
-
-def test_what_is_removed_is_gone_on_the_page(page: Page, robot: RecordingRobot) -> None:
-    robot.publish("outlets/o1/status", outlet("o1"), retain=True)
-    assert until(lambda: page.value(BASE, "outlets/o1/status"))
-    robot.remove("outlets/o1/status")
-    assert until(lambda: page.state[BASE, "outlets/o1/status"] is None)
 
 
 # -- without a broker

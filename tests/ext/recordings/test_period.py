@@ -70,11 +70,6 @@ def test_fractions_are_exact():
     assert parse_period("10:00:00.123456", None, now=NOW)[0] == ns("2026-11-20T10:00Z") + 123_456_000
 
 
-def test_times_are_in_the_zone_of_now():
-    now = datetime(2026, 11, 20, 0, 30, tzinfo=BERLIN)
-    assert parse_period("10:00", "+1h", now=now) == (ns("2026-11-19T10:00+01:00"), ns("2026-11-19T11:00+01:00"))
-
-
 def test_a_day_is_23_hours_long_when_clocks_go_forward():
     now = datetime(2026, 11, 20, 12, 30, tzinfo=BERLIN)
     since, until = parse_period("2026-03-29", "2026-03-29", now=now)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import sys
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +18,7 @@ from pebble.extensions.install.setup.system import MOSQUITTO, ROBOT, System
 from pebble.extensions.operator.places import Places
 from tests.commands.command_line import Run
 from tests.ext.install.setup.rig import answers_in, machine_root
-from tests.support import ROOT, needs_root
+from tests.support import needs_root
 
 OWNERS = {ROBOT: (65534, 65534), MOSQUITTO: (1, 1)}
 _ACTS = (
@@ -34,19 +32,6 @@ _ACTS = (
     "os.rmdir",
     "os.symlink",
 )
-_CHANGES = (
-    "set_mode",
-    "chmod",
-    "chown",
-    "os.open",
-    "mkdir",
-    "rename",
-    "rmdir",
-    "rmtree",
-    "sqlite3.connect",
-    "symlink_to",
-)
-_CHANGES += ("hardlink_to", "touch", "unlink", "write_bytes", "write_text")
 _watched: list[str] = []  # folders
 _acts: set[str] = set()
 
@@ -114,30 +99,3 @@ def test_in_folders_of_others_root_is_their_owner(
         assert (people.parent / "tls/ca.key").stat().st_uid == OWNERS[ROBOT][0]
         assert Places(other).people.stat().st_uid == OWNERS[ROBOT][0]
         assert {path.lstat().st_uid for path in Places(other).broker_folder.iterdir()} == {OWNERS[MOSQUITTO][0]}
-
-
-#: Calls that change something by its path in what root runs, and where: inside of as_owner, or in root's own folders.
-CALLS = {
-    "applying": 1,
-    "authority": 1,
-    "backup": 2,
-    "certificates": 1,
-    "database": 4,
-    "folder": 1,
-    "lan": 1,
-    "new_file": 2,
-    "own_broker": 1,
-    "people": 1,
-    "robot_audit": 2,
-    "steps": 2,
-    "system": 5,
-}
-
-
-def test_changes_by_a_path_are_known() -> None:
-    folders = ("checks", "fleet", "install/setup", "install/update", "page/commands")
-    found = Counter[str]()
-    for file in (file for folder in folders for file in (ROOT / "pebble/extensions" / folder).rglob("*.py")):
-        calls = [node.func for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Call)]
-        found[file.stem] += sum(ast.unparse(call).endswith(_CHANGES) for call in calls)
-    assert {file: number for file, number in found.items() if number} == CALLS

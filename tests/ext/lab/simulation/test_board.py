@@ -5,9 +5,7 @@ from itertools import pairwise
 import pytest
 
 from pebble.extensions.lab.simulation.board import SimulatedMcu
-from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import END, Type, decode
-from pebble.services.serial_mcu_bridge.text.goob_base import Touch, parse
 
 
 def run(mcu: SimulatedMcu, start: float, seconds: float, command: bytes = b"") -> bytes:
@@ -26,28 +24,6 @@ def test_after_a_pause_there_is_one_report_and_not_all_that_were_missed() -> Non
     mcu.tick(0.0)
     assert mcu.tick(3.0).count(b"T a0=") == 1
     assert mcu.tick(3.001) == b""
-
-
-def test_driving_ahead_moves_both_wheels_and_the_magnets() -> None:
-    mcu = SimulatedMcu("goob", 0.0)
-    output = run(mcu, 0.0, 2.0, b"M 1 1\n")
-    state = mcu.state()
-    assert state.left_mm_s == state.right_mm_s == pytest.approx(FULL_SPEED_MM_S)
-    assert state.pose.x_mm == pytest.approx(FULL_SPEED_MM_S * (2.0 - 0.07), rel=0.02)
-    assert abs(state.pose.y_mm) < 1e-6
-    touches = [report for line in output.splitlines() for report in parse(line) if isinstance(report, Touch)]
-    for wave in zip(*((touch.a0, touch.a1, touch.a2) for touch in touches), strict=True):
-        assert max(wave) > 750
-        assert min(wave) < 270
-
-
-def test_each_change_of_the_motors_is_reported_with_its_time() -> None:
-    changes = []
-    mcu = SimulatedMcu("goob", 0.0, on_motors=lambda now, motors: changes.append((now, motors)))
-    mcu.receive(b"M 0.5 -0.25\n", 0.1)
-    mcu.receive(b"M 0.5 -0.25\n", 0.2)
-    mcu.tick(5.0)
-    assert changes == [(0.1, (0.5, -0.25)), (pytest.approx(1.2, abs=0.005), (0.0, 0.0))], "+ is ahead on both sides"
 
 
 def test_an_error_in_the_firmware_stops_the_motors_and_starts_it_anew(monkeypatch: pytest.MonkeyPatch) -> None:

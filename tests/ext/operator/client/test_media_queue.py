@@ -9,7 +9,6 @@ import pytest
 from pebble.extensions.operator.client.media_request.offer import Medium, best
 from pebble.extensions.operator.client.media_request.queue import (
     MAX_FRAMES,
-    MAX_QUEUED_BYTES,
     NO_FRAME,
     THIN_ACK_S,
     Frame,
@@ -78,15 +77,6 @@ def test_more_are_under_way_if_they_are_small(size: int, most: int) -> None:
     assert queue.take(1.0) is None
 
 
-def test_bytes_are_bounded_as_well() -> None:
-    queue = ViewerQueue(ALL, 0.0)
-    queue.offer(frame(0, keyframe=True, size=MAX_QUEUED_BYTES))
-    queue.offer(frame(1, size=1))
-    assert queue.waiting
-    queue.offer(frame(2, keyframe=True, size=MAX_QUEUED_BYTES))
-    assert drained(queue) == [2]
-
-
 def test_a_key_frame_replaces_what_waits_for_a_slow_page_only() -> None:
     fast, slow = ViewerQueue(ALL, 0.0), ViewerQueue(ALL, 0.0)
     for queue, took in ((fast, 0.01), (slow, 0.5)):
@@ -97,20 +87,6 @@ def test_a_key_frame_replaces_what_waits_for_a_slow_page_only() -> None:
             queue.offer(one)
     assert drained(fast) == [1, 2, 3]
     assert drained(slow) == [3]
-
-
-def test_a_slow_page_gets_few_differences_and_the_next_key_frame_soon() -> None:
-    queue = ViewerQueue(ALL, 0.0)
-    queue.offer(frame(0, keyframe=True))
-    queue.take(0.0)
-    queue.acknowledge(0, 0.3)
-    for one in (frame(1), frame(2), frame(3), frame(4)):
-        queue.offer(one)
-    assert queue.waiting
-    assert not queue.overflowed
-    assert drained(queue, 0.3) == [1]
-    queue.offer(frame(5, keyframe=True))
-    assert drained(queue, 0.4) == [5]
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -200,13 +176,6 @@ def test_a_new_viewer_among_others_gets_one_key_frame_and_then_the_rescue_stream
     assert new.rescued
     new.offer_direct(frame(9, keyframe=True, encoding="h264"), 3.5)
     assert not new.rescued
-
-
-def test_jpegs_have_key_frames_of_their_own() -> None:
-    some = [ViewerQueue(ALL, 0.0)]
-    assert not assess(some, "pbvd", 0.5, can_rescue=True)
-    assert assess(some, "pbvd", 1.5, can_rescue=True)
-    assert not some[0].rescued
 
 
 def test_what_cannot_be_decoded_is_rescued_until_it_can() -> None:

@@ -65,6 +65,29 @@ def test_what_is_asked_and_taken_back(
     assert one.end() == []
 
 
+LIFTED, PICTURE, OTHERS = (0.0, FLAG, b"true"), (0.1, CAMERA, b"a picture"), b'{"enabled": true}'
+#: What arrives, what is asked within three seconds, and how it is ended by who shares a stream with others.
+SHARED: dict[str, tuple[list[tuple[float, str, bytes]], Sent, Sent]] = {
+    "a stream of others": ([LIFTED, PICTURE, (1.5, CAMERA, b"")], [], []),
+    "one that they have ended": ([LIFTED, PICTURE, (1.5, REQUEST, b'{"enabled": false}')], [H264], [OFF]),
+    "one that they have left without a word": ([LIFTED, PICTURE], [ON], [OFF]),
+    "others who come later": ([(1.0, CAMERA, b""), (1.5, REQUEST, OTHERS), (2.0, CAMERA, b"")], [UP, H264], []),
+    "others who lower the flag": ([(1.0, REQUEST, OTHERS), (2.9, FLAG, b"false")], [UP, H264, ON], [OFF]),
+    "who only looks on": ([(1.0, REQUEST, b'{"enabled": true, "keyframe": true}')], [UP, H264, H264], [OFF, DOWN]),
+    "nonsense": ([(1.0, CAMERA, b""), (1.5, REQUEST, b"{"), (2.0, CAMERA, b"")], [UP, H264], [OFF, DOWN]),
+}
+
+
+@pytest.mark.parametrize(("arrives", "asked", "ended"), SHARED.values(), ids=SHARED)
+def test_a_stream_that_is_shared_keeps_its_encoding_and_is_left_to_others(
+    arrives: list[tuple[float, str, bytes]], asked: Sent, ended: Sent
+) -> None:
+    one = ViewerRequest(BASE, "video", {"video": VIDEO}, shares=True)
+    one.want("h264", 0.0)
+    assert sent_until(one, 3.0, arrives) == asked
+    assert sent(one.end()) == ended
+
+
 def test_it_is_repeated_while_nothing_comes_and_changed_at_once() -> None:
     one = request()
     one.want(None, 0.0)

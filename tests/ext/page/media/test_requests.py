@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -111,76 +110,21 @@ async def test_a_page_that_reloads_does_not_restart_the_request(kind: Kind, robo
     assert robot.encodings == [robot.best]
 
 
-async def test_a_stream_of_others_keeps_its_encoding_and_goes_on_afterwards(kind: Kind, robot: Any) -> None:
-    """As with a page of the original, which reads what the robot is configured to send."""
-    other = Operator(robot)
-    other.start()
-    async with serving(robot) as server:
-        page = await opened(server, kind, 4)
-        await until(lambda: server.view.encoding == robot.default)
-        page.leave()
-        await until(lambda: server.shows("rest"))
-        await _still_sends(robot)
-    assert (robot.encodings, robot.flags) == ([""], [True])
-
-
 async def test_others_who_come_later_have_their_encoding_and_keep_the_stream(kind: Kind, robot: Any) -> None:
-    other = Operator(robot)
+    """As a page of the original; test_viewer_request has what else others do."""
+    original = MemoryTransport("original", robot.hub).open()
     async with serving(robot) as server:
         first = await opened(server, kind, 4)
         await until(lambda: server.view.encoding == robot.best)
-        other.start()
+        original.publish(robot.request, b'{"enabled":true}', qos=QoS.DELIVERED)
         await until(lambda: server.view.encoding == robot.default)
         second = await opened(server, kind, 4)
         for page in (first, second):
             page.leave()
         await until(lambda: server.shows("rest"))
-        await _still_sends(robot)
-    assert (robot.encodings, set(robot.flags)) == ([robot.best, ""], {True})
-
-
-async def test_a_stream_that_others_have_ended_is_withdrawn(kind: Kind, robot: Any) -> None:
-    other = Operator(robot)
-    other.start()
-    async with serving(robot) as server:
-        page = await opened(server, kind, 4)
-        other.ask(enabled=False)
-        await until(lambda: robot.encodings[-1] == robot.best)
-        await until(lambda: server.view.encoding == robot.best)
-        page.leave()
-        await until(lambda: server.shows("rest"))
-    assert robot.encodings == ["", None, robot.best, None]
-
-
-async def test_who_only_looks_on_does_not_keep_a_stream(kind: Kind, robot: Any) -> None:
-    """Another server, which asks for a key frame: it would ask for the stream, were that to end."""
-    other = Operator(robot)
-    async with serving(robot) as server:
-        page = await opened(server, kind, 4)
-        other.ask(enabled=True, encoding=robot.best, keyframe=True)
-        await until(lambda: any(request.get("keyframe") for request in robot.requests))
-        page.leave()
-        await until(lambda: robot.encodings == [robot.best, None])
-
-
-async def _still_sends(robot: Any) -> None:
-    count = len(robot.sent)
-    await until(lambda: len(robot.sent) > count + 3)
-
-
-class Operator:
-    """A stand-in of the original's page: it asks for no encoding."""
-
-    def __init__(self, robot: MediaRobot) -> None:
-        self._robot, self._transport = robot, MemoryTransport("original", robot.hub).open()
-
-    def start(self) -> None:
-        self._transport.publish(self._robot.flag, b'{"value": true}', qos=QoS.DELIVERED, retain=True)
-        self.ask(enabled=True)
-
-    def ask(self, *, enabled: bool, **more: Any) -> None:
-        payload = json.dumps({"enabled": enabled, **more}).encode()
-        self._transport.publish(self._robot.request, payload, qos=QoS.DELIVERED)
+        count = len(robot.sent)
+        await until(lambda: len(robot.sent) > count + 3)
+    assert (robot.encodings, robot.flags) == ([robot.best, ""], [True])
 
 
 async def test_it_is_requested_again_while_nothing_comes(kind: Kind, robot: Any, server: Server) -> None:

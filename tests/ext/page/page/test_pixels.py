@@ -114,21 +114,6 @@ def stream(
     return made
 
 
-@pytest.mark.parametrize(
-    ("quality", "size"),
-    [
-        (60, (112, 80)),
-        *(pytest.param(quality, (112, 80), marks=pytest.mark.thorough) for quality in (10, 95)),
-        *(pytest.param(quality, (640, 480), marks=pytest.mark.thorough) for quality in (10, 60, 95)),
-    ],
-    ids=str,
-)
-@pytest.mark.parametrize("name", EXACT)
-def test_every_pixel_is_the_same(check: Any, name: str, quality: int, size: tuple[int, int]) -> None:
-    shown = check(stream(name, 12, size=size, quality=quality))
-    assert [one["frame"] for one in shown] == list(range(12))
-
-
 NO_PICTURES = (b"", b"\0", b"{", b"PBVD", b"\xff\xd8", b"PBVD\x01\x09" + bytes(40), b"[]", b"null", b" 1", b" null")
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import av
 import pytest
 
 from tests.ext.page.browser import Tab
@@ -143,6 +144,19 @@ def test_space_stops_robots_again_once_the_page_is_left(show: Show, server: Cann
         assert opened.until(f"pebble.driver.ref === '{ROBOT}' && pebble.replay === null")
         opened.page.keyboard.press("Space")
         assert opened.until(lambda: server.sent("stop") == [{"op": "stop", "ref": ROBOT}])
+
+
+def test_a_film_is_taken_home(replay: Tab) -> None:
+    for name in ("open-download", "mark-in"):
+        replay.test(name).click()
+    seek(replay, AT + 3000)
+    assert shown(replay, AT + 3000)
+    for name in ("mark-out", "download"):
+        replay.test(name).click()
+    with replay.page.expect_download() as saved:
+        replay.test("download-file").click(timeout=60_000)
+    with av.open(saved.value.path()) as film:
+        assert sum(1 for _ in film.decode(video=0)) > 10
 
 
 def test_seeks_leave_nothing_behind(show: Show, server: CannedServer) -> None:

@@ -1,7 +1,4 @@
-"""Every control of the fleet and of a robot's page, used in a browser; what it does is asserted at the robot.
-
-The robots are microcontrollers; those with pictures are in test_whole_robots.
-"""
+"""Every control of the fleet and of a robot's page, used in a browser; what it does is asserted at the robot."""
 
 from __future__ import annotations
 

@@ -14,7 +14,6 @@ import pytest
 
 from pebble.config import Config, parse
 from pebble.extensions.operator.client.forms import Setting, form
-from pebble.services.autonomy_manager import interpreter as interpreter_module
 from pebble.services.autonomy_manager.catalogue import MAX_SCRIPTS, Catalogue, files, roots
 from pebble.services.autonomy_manager.environment import environment
 from pebble.services.autonomy_manager.interpreter import interpreter, lacking
@@ -259,23 +258,6 @@ def test_what_a_script_lacks_is_found_without_running_it(tmp_path: Path, text: s
     write(tmp_path, "walk", "import nowhere", "helper.py")
     (tmp_path / "above").mkdir()
     assert lacking((sys.executable, str(entry)), entry.parent, {}) == lacks
-
-
-@pytest.mark.parametrize(
-    ("configured", "ours", "there", "python"),
-    [
-        ("/opt/python", True, "system", "/opt/python"),
-        (None, True, "system", sys.executable),
-        (None, False, "system", "system"),
-        (None, False, "other", sys.executable),
-    ],
-)
-def test_the_python_of_a_script(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, configured: str | None, ours: bool, there: str, python: str
-) -> None:
-    monkeypatch.setattr(interpreter_module, "SYSTEM", tmp_path / "system")
-    (tmp_path / there).touch()
-    assert interpreter(configured, ours=ours).removeprefix(f"{tmp_path}/") == python
 
 
 def test_python3_of_a_script_of_others_is_the_systems(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
