@@ -1,8 +1,17 @@
-"""Fingers on a phone's glass, as Chromium takes them."""
+"""Fingers on a phone's glass, as Chromium takes them, and what they must reach."""
 
 from __future__ import annotations
 
 from tests.ext.page.browser import Tab
+
+#: Where STOP lies, and what somebody may need at once but cannot press: something else lies over it.
+REACHED = """(() => {
+  const middle = (one, { x, y, width, height } = one.getBoundingClientRect()) => [x + width / 2, y + height / 2];
+  const top = (one) => document.elementFromPoint(...middle(one));
+  const urgent = [...document.querySelectorAll(".top .stop, .banner button, [data-test=take]")];
+  const covered = urgent.filter((one) => top(one) && !one.contains(top(one))).map((one) => one.innerText);
+  return [[...document.querySelectorAll(".top .stop")].map((one) => middle(one).map(Math.round)), covered];
+})()"""
 
 
 class Fingers:

@@ -25,7 +25,7 @@ from tests.support import Child, free_port, listening, until
 #: Keys that a character cannot name, as WebDriver has them (W3C WebDriver, 17.4.2).
 KEYS = {"Escape": "\ue00c", "Enter": "\ue007", "Control": "\ue009", "Meta": "\ue03d", "Space": " "}
 SIZE = (1280, 800)
-_WAIT_S = 20.0
+_WAIT_S = 60.0
 
 
 class Engine(ABC):
@@ -53,12 +53,12 @@ class Engine(ABC):
         """Wait until an expression is true; assert on the result."""
         return until(lambda: self.evaluate(f"Boolean({expression})"), timeout)
 
-    def press(self, chord: str) -> None:
-        """Press keys together, such as "Control+Enter"."""
+    def press(self, chord: str, times: int = 1) -> None:
+        """Press keys together, such as "Control+Enter", some times in quick succession."""
         codes = [KEYS.get(key, key) for key in chord.split("+")]
-        keys = [{"type": "keyDown", "value": code} for code in codes]
+        keys: list[dict[str, Any]] = [{"type": "keyDown", "value": code} for code in codes]
         keys += [{"type": "keyUp", "value": code} for code in reversed(codes)]
-        self.perform([{"type": "key", "id": "keys", "actions": keys}])
+        self.perform([{"type": "key", "id": "keys", "actions": [*keys, {"type": "pause", "duration": 100}] * times}])
 
     def hold(self, key: str, ms: int) -> None:
         """Hold a key for some milliseconds."""
@@ -127,7 +127,7 @@ class Firefox(Engine):
         number = next(self._numbers)
         self._connection.send(json.dumps({"id": number, "method": method, "params": parameters}))
         while True:
-            answer = json.loads(self._connection.recv(60))
+            answer = json.loads(self._connection.recv(120))
             if answer.get("id") == number:
                 assert answer["type"] == "success", f"{method}: {answer.get('message')}"
                 return answer["result"]
@@ -139,7 +139,7 @@ class WebKit(Engine):
     name = "WebKitGTK"
 
     def __init__(self, port: int, browser: str) -> None:
-        self._connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+        self._connection = http.client.HTTPConnection("127.0.0.1", port, timeout=120)
         options = {"binary": browser, "args": ["--automation"]}
         self._path = ""
         session = self._send("POST", "/session", capabilities={"alwaysMatch": {"webkitgtk:browserOptions": options}})
@@ -188,7 +188,7 @@ def firefox(folder: Path, preferences: Mapping[str, object]) -> Iterator[Firefox
         assert until(lambda: found() is not None, 60), output.read_text(errors="replace")
         match = found()
         assert match is not None
-        with connect(f"{match[1]}/session", max_size=None, open_timeout=30) as connection:
+        with connect(f"{match[1]}/session", max_size=None, open_timeout=30, ping_interval=None) as connection:
             yield Firefox(connection)
 
 

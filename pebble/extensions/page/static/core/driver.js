@@ -241,7 +241,7 @@ export class Driver {
 
   keyDown(event) {
     if (isMeta(event)) this.leave(); // macOS does not report which keys are released while it is held
-    if (event.code === "Escape" && !event.repeat) this.escapes.press();
+    if (event.code === "Escape" && !event.repeat) this.escapes.press(event.timeStamp);
     const stop = stopKeys(event);
     if (stop) {
       event.preventDefault();

@@ -15,8 +15,8 @@ export class Escapes {
     this.value = ""; // as it was when it was opened
   }
 
-  press() {
-    const now = performance.now();
+  /** ``now``: when the key went down, also if it is handled much later. */
+  press(now = performance.now()) {
     if (now - this.pressedAt < TWICE_MS) this.onTwice();
     this.pressedAt = now;
   }
