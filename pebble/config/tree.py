@@ -141,6 +141,7 @@ class Link(Section, frozen=True, kw_only=True):
         Literal["wide", "thin", "auto"], doc("`wide`: it carries everything; `thin`: little; `auto`: by measurement.")
     ] = "wide"
     kbit: Annotated[Annotated[float, Meta(gt=0)] | None, doc("What it carries, in kbit/s, if that is known.")] = None
+    groups: Annotated[bool, doc("Take several commands in one message.")] = False
 
     @property
     def slowest(self) -> LinkLevel:

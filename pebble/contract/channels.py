@@ -141,6 +141,7 @@ LIGHTS_SOLID = _c("lights-solid", Kind.COMMAND, p.LightsSolid, "A steady colour.
                   newest=True, waits_s=_PATIENT_S, override=_serial("lights_solid"))  # fmt: skip
 LIGHTS_FLASH = _c("lights-flash", Kind.COMMAND, p.LightsFlash, "A colour fading in and out.",
                   newest=True, waits_s=_PATIENT_S, override=_serial("lights_flash"))  # fmt: skip
+GROUP = _c("group", Kind.COMMAND, p.AnyObject, "Several commands by their metrics: all are carried out, or none.")
 
 # -- incoming: media, sounds, scripts
 VIDEO_CONTROL = _c("front-camera", Kind.COMMAND, p.MediaRequest, "Start or stop remote video.",

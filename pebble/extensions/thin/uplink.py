@@ -11,6 +11,7 @@ from pebble.contract import DRIVE, LINK, codec
 from pebble.contract.levels import LEVELS, Level
 from pebble.contract.payloads import SCRIPT, Drive, LinkState
 from pebble.errors import PayloadError
+from pebble.extensions.thin.group_gate import gate_of
 from pebble.extensions.thin.link import LateRun, LinkMeter, Room
 from pebble.extensions.thin.media_hold import MediaHold
 from pebble.extensions.thin.sieve import Rank, Sieve
@@ -72,6 +73,22 @@ class LinkReport:
         self._remote.publish(address.topic, codec.encode(LINK, state), qos=QoS(address.qos), retain=address.retain)
 
 
+def make_uplink(
+    config: Config,
+    addresses: Addresses,
+    remote: Transport,
+    forwarder: Forwarder,
+    notifier: Notifier,
+    clock: Callable[[], float],
+) -> Uplink:
+    """Return the uplink of a robot whose link may be thin, or which takes groups of commands."""
+    if config.services.mqtt_bridge.link.profile != "wide":
+        return ThinUplink(config, addresses, remote, forwarder, notifier, clock)
+    uplink = Uplink()
+    gate_of(config, addresses, forwarder, uplink.note_drive)
+    return uplink
+
+
 class ThinUplink(Uplink):
     """The link to the remote broker, where a config says that it may be thin."""
 
@@ -94,7 +111,9 @@ class ThinUplink(Uplink):
         self._meter, self._room = LinkMeter(section.link.profile, section.link.kbit), Room(section.link.kbit)
         self._report = LinkReport(self._meter, addresses[LINK], remote)
         self._guard = threading.Lock()  # of the room: messages take it on the thread that received them
-        self._sieve, self._sifter = Sieve(self._takes, forwarder.counters, clock), Sifter(forwarder)
+        gate = gate_of(config, addresses, forwarder, self.note_drive)
+        self._sieve = Sieve(self._takes, forwarder.counters, clock)
+        self._sifter = Sifter(forwarder, gate or forwarder)
         self._late, self._hold = LateRun(), MediaHold(config.on_demand_programs(), notifier.hold)
         forwarder.note_age = lambda late: self._late.note(late, clock())
         self._quiet_log = RateLimitedLog(log, period_s=60.0)

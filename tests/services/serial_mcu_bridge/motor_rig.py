@@ -39,6 +39,7 @@ class Bench:
         broker: Broker | None = None,
         instance: str = "",
         peer: str = "",
+        groups: bool = False,
         **section: Any,
     ) -> None:
         folder.mkdir(exist_ok=True)
@@ -54,6 +55,7 @@ class Bench:
         bridge = {
             "enabled": True,
             "remote_mqtt": {"host": "localhost", "port": 1},
+            "link": {"groups": groups},
         }  # beside one, silence alone ends no control
         services = {"serial_mcu_bridge": serial, "mqtt_bridge": bridge}
         raw = {"robot": {"id": ROBOT}, "transport": transport, "services": services}
