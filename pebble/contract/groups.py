@@ -7,7 +7,6 @@ checked, ``by`` is the sender, in the place of those in the members.
 """
 
 import math
-from collections.abc import Iterable
 from typing import Any
 
 import msgspec
@@ -30,11 +29,9 @@ from pebble.contract.names import BY
 from pebble.errors import PayloadError
 
 MOST_MEMBERS, MOST_BYTES = 8, 2048
-#: Channels whose commands may be members. Motor owners take the first three, and ignore their copies.
-MARKED = (DRIVE, LIGHTS_SOLID, LIGHTS_FLASH)
-MEMBERS = (*MARKED, SOUNDBOARD_COMMAND, OUTLET_COMMAND, MCU_COMMAND)
+MEMBERS = (DRIVE, LIGHTS_SOLID, LIGHTS_FLASH, SOUNDBOARD_COMMAND, OUTLET_COMMAND, MCU_COMMAND)
 _SHOWN = 40  # characters of a metric
-_MARK = "group"
+MARK = "group"  # of a copy: true
 
 
 class Member(Struct, frozen=True):
@@ -44,18 +41,6 @@ class Member(Struct, frozen=True):
     metric: str
     value: Any
     payload: bytes
-
-    @property
-    def ends(self) -> bool:
-        """True if it can only end something."""
-        return self.channel.ends(self.value)
-
-    @property
-    def copy(self) -> bytes:
-        """The payload for those who know no groups; marked, if the owner of motors takes it from the group."""
-        if self.channel not in MARKED:
-            return self.payload
-        return msgspec.json.encode(msgspec.json.decode(self.payload) | {_MARK: True})
 
 
 def decode(raw: bytes) -> tuple[Member, ...]:
@@ -72,30 +57,13 @@ def decode(raw: bytes) -> tuple[Member, ...]:
     return tuple(_member(metric, command, by) for metric, command in commands.items())
 
 
-def encode(members: Iterable[Member]) -> bytes:
-    """Return a group of members as all readers understand it."""
-    return msgspec.json.encode({member.metric: msgspec.Raw(member.payload) for member in members})
-
-
-def is_marked(raw: bytes) -> bool:
-    """True if a command is marked as a copy, which only the bridge may send."""
-    if _MARK.encode() not in raw and b"\\" not in raw:
-        return False
-    try:
-        command = codec.plain(DRIVE, raw)
-    except PayloadError:
-        return False
-    bodies = (command, command.get("value")) if isinstance(command, dict) else ()
-    return any(isinstance(body, dict) and body.get(_MARK) is True for body in bodies)
-
-
 def _member(metric: str, command: Any, by: Any) -> Member:
     channel = channel_of(f"{INCOMING}/{metric}")
     if channel not in MEMBERS:
         raise PayloadError(f"{GROUP.metric}: {metric[:_SHOWN]!a} may not be in a group")
     if not isinstance(command, dict) or isinstance(command.get("value"), dict):
         raise PayloadError(f"{GROUP.metric}: {metric}: a bare object is needed")
-    command.pop(_MARK, None)
+    command.pop(MARK, None)
     if by is not None:
         command[BY] = by
     try:

@@ -341,6 +341,16 @@ class LinkState(Payload, frozen=True, kw_only=True):
     t: int  # epoch milliseconds
 
 
+class Wire(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """The form of a robot's groups of streams; what takes them apart needs nothing else."""
+
+    v: Literal[1] = 1
+    group_hz: float
+    named: bool = False  # it takes commands only with an account's name in the topic
+    dict_id: Annotated[int, Meta(ge=1, le=31)] | UnsetType = UNSET  # the first byte of groups that need ``dict``
+    dict: str | UnsetType = UNSET  # the dictionary of their deflate
+
+
 class LogRecord(Payload, frozen=True, kw_only=True):
     """One log line (paper A.8.7); ``message`` at most 2048 characters by default."""
 

@@ -1,9 +1,10 @@
 """Passes groups of commands into a robot: checked member by member, then whole, then as copies of the members."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
+import msgspec
 from msgspec.structs import replace
 
 from pebble.config import Config
@@ -15,6 +16,7 @@ from pebble.contract import (
     LIGHTS_SOLID,
     OUTLET_COMMAND,
     SOUNDBOARD_COMMAND,
+    codec,
     groups,
 )
 from pebble.contract.capabilities import CapabilitiesValue
@@ -28,7 +30,33 @@ from pebble.runtime.addresses import Addresses
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports import Message
 
+#: Channels that motor owners take from the group; their copies are marked.
+MARKED = (DRIVE, LIGHTS_SOLID, LIGHTS_FLASH)
 _log = RateLimitedLog(logging.getLogger(__name__), period_s=60.0)
+
+
+def encoded(members: Iterable[groups.Member]) -> bytes:
+    """Return a group of members as all readers understand it."""
+    return msgspec.json.encode({member.metric: msgspec.Raw(member.payload) for member in members})
+
+
+def copy_of(member: groups.Member) -> bytes:
+    """Return the payload for who knows no groups; marked, if motor owners take it from the group."""
+    if member.channel not in MARKED:
+        return member.payload
+    return msgspec.json.encode(msgspec.json.decode(member.payload) | {groups.MARK: True})
+
+
+def is_marked(raw: bytes) -> bool:
+    """True if a command is marked as a copy, which only the bridge may send."""
+    if groups.MARK.encode() not in raw and b"\\" not in raw:
+        return False
+    try:
+        command = codec.plain(DRIVE, raw)
+    except PayloadError:
+        return False
+    bodies = (command, command.get("value")) if isinstance(command, dict) else ()
+    return any(isinstance(body, dict) and body.get(groups.MARK) is True for body in bodies)
 
 
 class _Part(NamedTuple):
@@ -59,7 +87,7 @@ class GroupGate:
         if source.side is Side.REMOTE:
             if subject.channel is GROUP:
                 return self._receive_group(source, subject, message, forward, account)
-            marked = subject.channel in groups.MARKED and groups.is_marked(message.payload)
+            marked = subject.channel in MARKED and is_marked(message.payload)
             if marked and not ends_something(subject, message):
                 return Drop.REFUSED
         return self.pass_on(source, subject, message, forward, account)
@@ -76,11 +104,11 @@ class GroupGate:
         outcome: Forward | Drop = next((part.way for part in parts if isinstance(part.way, Drop)), forward)
         if isinstance(outcome, Forward):
             parts = [part._replace(member=replace(part.member, payload=part.message.payload)) for part in parts]
-            whole = replace(message, payload=groups.encode(part.member for part in parts))
+            whole = replace(message, payload=encoded(part.member for part in parts))
             outcome = self._forwarder.deliver(source, subject, whole, forward)
-            copies = [(part, part.member.copy) for part in parts] if isinstance(outcome, Forward) else []
+            copies = [(part, copy_of(part.member)) for part in parts] if isinstance(outcome, Forward) else []
         else:
-            copies = [(part, part.message.payload) for part in parts if part.member.ends]
+            copies = [(part, part.message.payload) for part in parts if part.member.channel.ends(part.member.value)]
         for part, payload in copies:
             if isinstance(part.way, Forward):
                 self._forwarder.deliver(source, part.subject, replace(part.message, payload=payload), part.way)

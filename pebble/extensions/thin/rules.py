@@ -1,8 +1,8 @@
-"""What a config must not say of groups."""
+"""Rules between the keys of groups and those of links and serial lines."""
 
 from pebble.config.problems import Path
 from pebble.config.reader import Reader, Rule
-from pebble.config.tree import Root
+from pebble.config.tree import Link, Root
 
 _LINK: Path = ("services", "mqtt_bridge", "link")
 
@@ -17,4 +17,10 @@ def _check(reader: Reader, root: Root, _: Path) -> Root:
     return root
 
 
-RULES: tuple[Rule, ...] = ((Root, _check),)
+def _check_link(reader: Reader, link: Link, path: Path) -> Link:
+    if link.group_hz and link.profile == "wide":
+        reader.notes.problem((*path, "group_hz"), 'has no effect at profile "wide": write "thin" or "auto"')
+    return link
+
+
+RULES: tuple[Rule, ...] = ((Root, _check), (Link, _check_link))
