@@ -44,7 +44,6 @@ _SECTION_KEY = re.compile(r"(services\.)?[A-Za-z]\w*", re.ASCII)
 OURS: Final[Mapping[str, tuple[str, ...]]] = {
     "pebble.extensions.media": ("services.mqtt_bridge.media",),
     "pebble.extensions.paho": (),
-    "pebble.extensions.thin": (),
     "pebble.services.mqtt_bridge.requests": (),
     "pebble.extensions.operator": (),
     "pebble.extensions.scripts": (),
@@ -60,6 +59,7 @@ OURS: Final[Mapping[str, tuple[str, ...]]] = {
     "pebble.services.neighbours": ("services.neighbours",),
     "pebble.services.ros1_bridge": ("services.ros1_bridge",),
     "pebble.services.homeassistant": ("services.homeassistant",),
+    "pebble.extensions.thin": (),
     "pebble.extensions.fleet": (),
     "pebble.extensions.page": ("services.web_handler", "web_interface"),
     "pebble.services.serial_mcu_bridge.imu": (),

@@ -141,6 +141,10 @@ class Link(Section, frozen=True, kw_only=True):
         Literal["wide", "thin", "auto"], doc("`wide`: it carries everything; `thin`: little; `auto`: by measurement.")
     ] = "wide"
     kbit: Annotated[Annotated[float, Meta(gt=0)] | None, doc("What it carries, in kbit/s, if that is known.")] = None
+    groups: Annotated[bool, doc("Take several commands in one message.")] = False
+    group_hz: Annotated[
+        Annotated[float, Meta(ge=0, le=10)], doc("Send streams together, so often a second; 0: each by itself.")
+    ] = 0.0
 
     @property
     def slowest(self) -> LinkLevel:

@@ -161,6 +161,7 @@ class CapabilitiesValue(Payload, frozen=True, kw_only=True):
     lights: LightsOffer | UnsetType = UNSET
     telemetry: TelemetryOffer | UnsetType = UNSET
     outlets: OutletsOffer | UnsetType = UNSET
+    groups: list[str] | UnsetType = UNSET  # metrics of the commands that it takes in a group; clients group no others
     named: bool | UnsetType = UNSET  # it takes commands only with an account's name in the topic (docs/ext/fleet.md)
     announced: bool | UnsetType = UNSET  # set by readers that derive this from a heartbeat's `subscribes`; never sent
 

@@ -141,6 +141,8 @@ LIGHTS_SOLID = _c("lights-solid", Kind.COMMAND, p.LightsSolid, "A steady colour.
                   newest=True, waits_s=_PATIENT_S, override=_serial("lights_solid"))  # fmt: skip
 LIGHTS_FLASH = _c("lights-flash", Kind.COMMAND, p.LightsFlash, "A colour fading in and out.",
                   newest=True, waits_s=_PATIENT_S, override=_serial("lights_flash"))  # fmt: skip
+GROUP = _c("group", Kind.COMMAND, p.AnyObject, "Several commands by their metrics: all are carried out, or none.")
+EXPANDER = _c("expander", Kind.COMMAND, p.AnyObject, "Someone beside the broker takes groups of streams apart.")
 
 # -- incoming: media, sounds, scripts
 VIDEO_CONTROL = _c("front-camera", Kind.COMMAND, p.MediaRequest, "Start or stop remote video.",
@@ -186,6 +188,8 @@ CONTROL_TURN = _c("control-turn/{owner}", Kind.EVENT, p.ControlTurn,
 CONTROL_VOUCHED = _c("control-vouched", Kind.EVENT, p.ControlVouched,
                      "Over which time the bridge has passed on in time all that it was sent.",
                      rate_hz=2, remote=False)  # fmt: skip
+STREAMS = _c("group", Kind.STREAM, bytes, "The newest of several streams; deflated with a dictionary of `wire`.")
+WIRE = _c("wire", Kind.STATE, p.Wire, "How the streams in a group are written.")
 LINK = _c("link", Kind.STATE, p.LinkState, "What the link to the remote broker carries; only where it may be thin.")
 BRIDGE_PROBE = _c(
     "bridge-probe",

@@ -125,6 +125,7 @@ class LightsSolid(Payload, frozen=True, kw_only=True):
     b: float = 0.0
     g: float = 0.0
     r: float = 0.0
+    group: Any = UNSET  # true: a copy of what a group of commands contained
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -338,6 +339,16 @@ class LinkState(Payload, frozen=True, kw_only=True):
     rtt_ms: int  # the shortest round trip of the last minutes
     queue_ms: int  # by so much the newest one was longer: what waits on the way
     t: int  # epoch milliseconds
+
+
+class Wire(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """The form of a robot's groups of streams; what takes them apart needs nothing else."""
+
+    v: Literal[1] = 1
+    group_hz: float
+    named: bool = False  # it takes commands only with an account's name in the topic
+    dict_id: Annotated[int, Meta(ge=1, le=31)] | UnsetType = UNSET  # the first byte of groups that need ``dict``
+    dict: str | UnsetType = UNSET  # the dictionary of their deflate
 
 
 class LogRecord(Payload, frozen=True, kw_only=True):

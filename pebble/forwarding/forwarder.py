@@ -43,7 +43,7 @@ _BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCUL
 _WARNED = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN)
 
 
-Pass = Callable[[SideState, Subject, Message, Forward], Forward | Drop]
+Pass = Callable[[SideState, Subject, Message, Forward, str], Forward | Drop]
 
 
 class Routed(msgspec.Struct, frozen=True):
@@ -108,7 +108,7 @@ class Forwarder:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.counters, self._steps = Counters(), steps
-        self._subjects, self._rules, self._names, self._clock = subjects, rules, names, clock
+        self.subjects, self._rules, self._names, self._clock = subjects, rules, names, clock
         self._pass_stop = pass_stop
         self.sides = Sides(
             (side, SideState(side, transport, self.counters, clock, wins=side is winner))
@@ -176,7 +176,7 @@ class Forwarder:
 
     def skips_retained(self, side: Side, topic: bytes) -> bool:
         """True if no retained message of ``topic`` passes; counts and logs the message then. For TopicPolicy."""
-        kind = self._subjects.invented(topic)
+        kind = self.subjects.invented(topic)
         if self._names is not None and topic.endswith(_STOP) and self._is_stop(topic.decode(errors="replace")):
             return False  # it may be a live one
         if kind is None or (kind is Kind.FLAG and not self._admission.refuses_flag(topic)):
@@ -192,10 +192,10 @@ class Forwarder:
         if self._names is not None and side is Side.REMOTE:
             routed = self._receive_named(source, self._names, message)
         else:
-            subject = self._subjects[message.topic]
-            outcome = self._admit(source, subject, message, message.topic, True)
+            subject = self.subjects[message.topic]
+            outcome = self.admit(source, subject, message, message.topic, True)
             if subject is not None and isinstance(outcome, Forward):
-                outcome = self.pass_on(source, subject, message, outcome)
+                outcome = self.pass_on(source, subject, message, outcome, "")
             routed = Routed(subject, outcome)
         if isinstance(routed.outcome, Drop):
             self.counters.add(f"{side.value}: {routed.outcome.value}")
@@ -207,7 +207,7 @@ class Forwarder:
         """Pass a message whose sender is checked, on the topic without the name and with the sender in the payload."""
         sender = names[message.topic]
         subject, by = sender.subject, sender.account  # sign() adds the person for whom an account acts
-        outcome = self._admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
+        outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
         if subject is None:
             outcome = sender.foreign
         elif isinstance(outcome, Forward):
@@ -215,7 +215,7 @@ class Forwarder:
                 case Signed(signed, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:
                     outcome = self.retained.change(subject, signed)
                 case Signed(signed, by):
-                    outcome = self.pass_now(source, subject, signed, outcome, sender.account)
+                    outcome = self.pass_on(source, subject, signed, outcome, sender.account)
                 case Drop.UNNAMED if outcome.retain:  # it may be a retained message of the robot itself
                     outcome = self.retained.receive(source, subject, message, outcome, old=True)
                 case Drop() as drop:
@@ -224,7 +224,7 @@ class Forwarder:
             self._warn(outcome, message.topic[:_LOGGED])
         return Routed(subject, outcome, by)
 
-    def _admit(
+    def admit(
         self, source: SideState, subject: Subject | None, message: Message, topic: str, named: bool
     ) -> Forward | Drop:
         """Return how to forward ``message``, or why not: no subject, no route, or a reason of `_ADMISSION`. Hot.
@@ -299,16 +299,20 @@ class Forwarder:
 
         ``account`` is the account of the sender, where names are checked.
         """
+        passing = self.examine(source, subject, message, forward, account)
+        if isinstance(passing, Drop):
+            return passing
+        if forward.retain:
+            return self.retained.receive(source, subject, passing, forward)
+        return self.deliver(source, subject, passing, forward)
+
+    def examine(
+        self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str
+    ) -> Message | Drop:
+        """Return an admitted message as it may pass, or why it may not: it is too old, or a script's from outside."""
         if subject.kind.one_shot and self._is_late(subject, message, forward, account):
             return Drop.LATE
-        if forward.unsigned:
-            passing = self._without_script(source, message)
-            if passing is None:
-                return Drop.SIGNED
-            message = passing
-        if forward.retain:
-            return self.retained.receive(source, subject, message, forward)
-        return self._deliver(source, subject, message, forward)
+        return (self._without_script(source, message) or Drop.SIGNED) if forward.unsigned else message
 
     def _is_late(self, subject: Subject, message: Message, forward: Forward, account: str) -> bool:
         """True if a command or action has waited for too long, unless it only ends something."""
@@ -331,7 +335,7 @@ class Forwarder:
         self.counters.add(f"{source.side.value}: zeros of a script, passed as a person's")
         return Message(message.topic, passing, message.qos)
 
-    def _deliver(self, source: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
+    def deliver(self, source: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
         """Publish a message that is not retained; hold an event while the gate waits."""
         target = self.sides[source.side.other]
         is_event = subject.kind is Kind.EVENT and message.qos is QoS.DELIVERED
@@ -373,7 +377,7 @@ class Forwarder:
         return Drop.HELD
 
     def _is_stop(self, topic: str) -> bool:
-        subject = self._subjects[topic] if self._names is None else self._names[topic].subject
+        subject = self.subjects[topic] if self._names is None else self._names[topic].subject
         return subject is not None and subject.is_stop
 
     def _warn(self, drop: Drop, topic: str) -> None:

@@ -5,6 +5,7 @@ from itertools import chain
 
 from msgspec import Struct
 
+from pebble.contract.groups import Member
 from pebble.contract.payloads import (
     SCRIPT,
     ControlRequest,
@@ -26,10 +27,11 @@ _HOLDER = -2  # in place of the number of a run: the holder of control
 
 
 class ReceivedDrive(Struct, frozen=True):
-    """A drive command, and when it was received on the service's clock."""
+    """A drive command, when it was received on the service's clock, and what is carried out with it or not at all."""
 
     drive: Drive
     at: float
+    company: tuple[Member, ...] = ()
 
 
 class ReceivedReset(Struct, frozen=True):
@@ -127,7 +129,7 @@ class MotionInbox:
             with self._lock:
                 self._lost = True
 
-    def put_drive(self, drive: Drive, now: float) -> bool:
+    def put_drive(self, drive: Drive, now: float, company: tuple[Member, ...] = ()) -> bool:
         with self._lock:
             was_empty = self._empty
             sender = run_of(drive)
@@ -137,7 +139,7 @@ class MotionInbox:
             if len(self._drives) >= _SENDERS:
                 del self._drives[next(key for key in self._drives if key not in (PERSON, _HOLDER))]
                 self.dropped += 1
-            newest = ReceivedDrive(drive, now)
+            newest = ReceivedDrive(drive, now, company)
             self._drives[sender] = [newest] if waiting is None else _replaced(waiting, newest)
             return was_empty
 
@@ -178,4 +180,4 @@ def _replaced(waiting: list[ReceivedDrive], newest: ReceivedDrive) -> list[Recei
     if newest.drive.moves or not zeros:
         return [*zeros, newest]
     final = next((received for received in zeros if received.drive.valid_ms == 0), None)
-    return [newest if final is None else ReceivedDrive(final.drive, newest.at)]
+    return [newest if final is None else ReceivedDrive(final.drive, newest.at, newest.company)]

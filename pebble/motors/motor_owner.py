@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import partial
 from typing import Any, ClassVar
 
 from pebble import contract as c
+from pebble.contract import groups
 from pebble.contract.payloads import (
     ControlRequest,
     ControlState,
@@ -15,8 +17,9 @@ from pebble.contract.payloads import (
     EstopCommand,
     EstopReset,
     EstopState,
+    LightsSolid,
 )
-from pebble.errors import TransportError
+from pebble.errors import PayloadError, TransportError
 from pebble.motors.control import Control
 from pebble.motors.motion_inbox import MotionInbox, ReceivedDrive, ReceivedRequest
 from pebble.motors.motor_guard import MotorGuard
@@ -42,9 +45,11 @@ class MotorOwner(Service, ABC):
     """
 
     publishes: ClassVar[tuple[c.Channel, ...]] = (c.ESTOP_STATE, c.CONTROL_STATE, c.CONTROL_TURN)
+    company: ClassVar[tuple[c.Channel, ...]] = ()  # commands that move nothing, and that it takes in a group
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
+        self._takes_groups = self.config.services.mqtt_bridge.link.groups
         self.notifier = Notifier()
         self._control = Control(
             self.config.security,
@@ -98,6 +103,16 @@ class MotorOwner(Service, ABC):
     def halt(self) -> None:
         """Stop the motors now. This is called again and again while the motors stand still."""
 
+    def move_with(self, drive: Drive, valid_s: float, company: tuple[groups.Member, ...]) -> None:  # noqa: ARG002
+        """Carry out a drive command, a zero too, and members of its group of the channels in :attr:`company`, at once.
+
+        A subclass with such channels overrides it.
+        """
+        self.move(drive, valid_s)
+
+    def accompany(self, company: tuple[groups.Member, ...]) -> None:
+        """Carry out members of a group that has no drive command; on the service's thread."""
+
     def report(self, able: bool, why: str = "") -> None:
         """Tell the launcher whether the motors can be moved, and if not, why: ``driveable`` in the robot's status."""
         self.notifier.mcu("ready" if able else "absent", 0 if able else None, why)
@@ -134,6 +149,9 @@ class MotorOwner(Service, ABC):
         for owner in self._control.peers:
             topic = c.CONTROL_TURN.topic(self.config.base, owner=owner)
             self.transport.subscribe(topic, receive, qos=QoS(c.CONTROL_TURN.default_qos), direct=True)
+        if self._takes_groups:
+            receive = self.refusals.reader(c.GROUP, self._receive_group)
+            self.transport.subscribe(self.addresses[c.GROUP].topic, receive, qos=QoS.DELIVERED, direct=True)
 
     def _receive_turn(self, message: Message, turn: ControlTurn, names: dict[str, str]) -> None:
         if not message.retain:
@@ -141,7 +159,26 @@ class MotorOwner(Service, ABC):
 
     @on(c.DRIVE, direct=True)
     def receive_drive(self, drive: Drive, arrived: float) -> None:
-        self._judge_soon(self._waiting.put_drive(drive, arrived))
+        if not (drive.moves and self.is_copy(drive)):
+            self._judge_soon(self._waiting.put_drive(drive, arrived))
+
+    def is_copy(self, command: Drive | LightsSolid) -> bool:
+        """True if ``command`` is the copy of a member of a group, which counts here."""
+        return self._takes_groups and command.group is True
+
+    def _receive_group(self, message: Message, _value: Any, _names: dict[str, str]) -> None:
+        """Take the members of a group that are for this motor owner; others follow the copies."""
+        try:
+            members = groups.decode(message.payload)
+        except PayloadError as error:
+            self.refusals.malformed(c.GROUP, error)
+            return
+        drive = next((member.value for member in members if member.channel is c.DRIVE), None)
+        company = tuple(member for member in members if member.channel in self.company)
+        if drive is not None:
+            self._judge_soon(self._waiting.put_drive(drive, self.clock() - message.waited_s, company))
+        elif company:
+            self.post_message(c.GROUP, partial(self.accompany, company), newest_of=c.GROUP.metric)
 
     @on(c.CONTROL_VOUCHED, direct=True)
     def receive_vouched(self, vouched: ControlVouched, _arrived: float) -> None:
@@ -205,9 +242,14 @@ class MotorOwner(Service, ABC):
         valid_s -= now - received.at
         if valid_s <= 0:
             self._halt()
+            if received.company and not drive.moves:
+                self.move_with(drive, 0.0, received.company)
             return
         self._set_deadline(now + valid_s)  # first: it holds even if a subclass fails
-        self.move(drive, valid_s)
+        if received.company:
+            self.move_with(drive, valid_s, received.company)
+        else:
+            self.move(drive, valid_s)
 
     def _answer(self, received: ReceivedRequest) -> None:
         now = self.clock()

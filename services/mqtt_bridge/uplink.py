@@ -50,11 +50,12 @@ class Uplink:
 def uplink_of(
     config: Config, addresses: Addresses, remote: Transport, forwarder: Forwarder, clock: Callable[[], float]
 ) -> Uplink:
-    """Return the uplink of a robot. Raises ConfigError if the link may be thin and no extension provides that."""
-    if config.services.mqtt_bridge.link.profile == "wide":
+    """Return the uplink of a robot. Raises ConfigError if it is not plain and no extension provides that."""
+    link = config.services.mqtt_bridge.link
+    if link.profile == "wide" and not link.groups:
         return Uplink()
     for extension in config.installed:
         if extension.uplink:
             uplink: Uplink = part(extension.uplink)(config, addresses, remote, forwarder, Notifier(), clock)
             return uplink
-    raise ConfigError('services.mqtt_bridge.link.profile: is of the extension thin: pip install "pebble-robot[all]"')
+    raise ConfigError('services.mqtt_bridge.link: is of the extension thin: pip install "pebble-robot[all]"')

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from pebble.config.security import Strangers
-from pebble.contract import DRIVE, INCOMING, Channel, codec
+from pebble.contract import DRIVE, GROUP, INCOMING, Channel, codec, groups
 from pebble.contract.names import BY, NO_ACCOUNT, stop_topic, unchecked, without_name
 from pebble.contract.payloads import AutonomyCommand, Drive, EstopCommand, MediaRequest, SoundboardCommand
 from pebble.errors import PayloadError
@@ -78,6 +78,8 @@ class CheckedNames(Names):
         elif (message.retain or message.retain_requested) and form is not EstopCommand:
             return Drop.STALE
         fields, by = _object(payload), account
+        if channel is GROUP and not _is_group(payload):
+            return Drop.UNREADABLE
         if fields is None:
             if channel is not None and form not in _BARE:
                 return Drop.UNREADABLE
@@ -116,6 +118,14 @@ def _body(command: dict[str, Any]) -> dict[str, Any]:
 def _is_zero(channel: Channel, payload: bytes) -> bool:
     try:
         return channel.payload is Drive and not codec.decode(channel, payload).moves
+    except PayloadError:
+        return False
+
+
+def _is_group(payload: bytes) -> bool:
+    """True if the payload is a group, before a key that is there twice becomes one."""
+    try:
+        return bool(groups.decode(payload))
     except PayloadError:
         return False
 

@@ -26,6 +26,7 @@ WRITES: Mapping[Right, tuple[Channel | str, ...]] = {
     Right.STOP: (c.ESTOP,),
     Right.DRIVE: (
         c.DRIVE,
+        c.GROUP,  # all that may be in it is in this right
         c.CONTROL,
         c.LIGHTS_SOLID,
         c.LIGHTS_FLASH,

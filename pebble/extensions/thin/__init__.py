@@ -3,5 +3,10 @@
 from pebble.extension import Extension
 
 EXTENSION = Extension(
-    name="thin", needs=("media",), uplink="pebble.extensions.thin.uplink:ThinUplink", page="docs/thin-links.md"
+    name="thin",
+    needs=("media",),
+    rules="pebble.extensions.thin.rules:RULES",
+    uplink="pebble.extensions.thin.uplink:make_uplink",
+    offers="pebble.extensions.thin.group_gate:offers",
+    page="docs/thin-links.md",
 )

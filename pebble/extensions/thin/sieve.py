@@ -71,7 +71,7 @@ class Sieve:
 
     def keeps(self, subject: Subject, message: Message, forward: Forward) -> bool:
         """Keep ``message`` and return True, or return False if it is sent now. One without room may be dropped."""
-        rank, topic = _rank(subject, message), message.topic
+        rank, topic = rank_of(subject, message), message.topic
         if rank is None:
             return False
         waits = topic in self._waiting
@@ -142,7 +142,7 @@ def _size(message: Message) -> int:
     return len(message.topic) + len(message.payload)
 
 
-def _rank(subject: Subject, message: Message) -> Rank | None:
+def rank_of(subject: Subject, message: Message) -> Rank | None:
     """Return the rank of a message; None: it never waits."""
     if subject.kind is Kind.STREAM or (subject.kind is Kind.EVENT and message.qos is QoS.LATEST):
         return Rank.STREAM

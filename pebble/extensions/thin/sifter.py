@@ -3,7 +3,10 @@
 import threading
 from collections.abc import Iterable
 
-from pebble.extensions.thin.sieve import Rank, Sieve, Waiting
+from pebble.contract import EXPANDER
+from pebble.extensions.thin.group_gate import GroupGate
+from pebble.extensions.thin.sieve import Rank, Sieve, Waiting, rank_of
+from pebble.extensions.thin.stream_groups import StreamGroups
 from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.routing import Drop, Forward, Side
 from pebble.forwarding.side import Gate, SideState
@@ -14,16 +17,18 @@ from pebble.transports import Message
 class Sifter:
     """The sieve in a forwarder, for messages that leave the robot; thread-safe."""
 
-    def __init__(self, forwarder: Forwarder) -> None:
-        self._forwarder, self._sides = forwarder, forwarder.sides
+    def __init__(self, forwarder: Forwarder, way: Forwarder | GroupGate, groups: StreamGroups | None) -> None:
+        """Store the arguments; ``way``: what passes messages on, the forwarder itself or a gate before it."""
+        self._forwarder, self._way, self._sides = forwarder, way, forwarder.sides
         self._sieve: Sieve | None = None
+        self._groups = groups
         self._lock = threading.RLock()  # so that a message which has waited is not sent after a newer one
 
     def use(self, sieve: Sieve | None) -> None:
         """Pass messages through ``sieve``, whose owner calls :meth:`send_waiting`; None: pass them at once."""
         with self._lock:
             former, self._sieve = self._sieve, sieve
-            self._forwarder.pass_on = self._forwarder.pass_now if sieve is None else self._sift
+            self._way.pass_on = self._forwarder.pass_now if sieve is None else self._sift
             events = self._sides[Side.REMOTE].events
             events.has_room = None if sieve is None else sieve.takes_event
             if former is not None and sieve is None:
@@ -44,9 +49,17 @@ class Sifter:
             if isinstance(self._forwarder.pass_now(robot, entry.subject, entry.message, entry.forward), Forward):
                 robot.count_forwarded()
 
-    def _sift(self, source: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
+    def _sift(
+        self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str
+    ) -> Forward | Drop:
         if source.side is not Side.LOCAL or subject.prompt:
-            return self._forwarder.pass_now(source, subject, message, forward)
+            if self._groups is not None and subject.channel is EXPANDER:
+                self._groups.heard()
+                return Drop.STAYS
+            return self._forwarder.pass_now(source, subject, message, forward, account)
+        is_stream = rank_of(subject, message) is Rank.STREAM and not forward.retain
+        if self._groups is not None and is_stream and self._sides.gate is Gate.OPEN and self._groups.takes(message):
+            return Drop.NO_ROOM
         with self._lock:
             sieve = self._sieve
             if sieve is not None and self._sides.gate is Gate.OPEN and sieve.keeps(subject, message, forward):

@@ -7,14 +7,16 @@ from contextlib import suppress
 from math import inf
 
 from pebble.config import Config
-from pebble.contract import DRIVE, LINK, codec
+from pebble.contract import DRIVE, LINK, WIRE, Channel, codec
 from pebble.contract.levels import LEVELS, Level
 from pebble.contract.payloads import SCRIPT, Drive, LinkState
 from pebble.errors import PayloadError
+from pebble.extensions.thin.group_gate import gate_of
 from pebble.extensions.thin.link import LateRun, LinkMeter, Room
 from pebble.extensions.thin.media_hold import MediaHold
 from pebble.extensions.thin.sieve import Rank, Sieve
 from pebble.extensions.thin.sifter import Sifter
+from pebble.extensions.thin.stream_groups import StreamGroups
 from pebble.forwarding.forwarder import Forwarder
 from pebble.runtime.addresses import Address, Addresses
 from pebble.runtime.parent import Notifier
@@ -72,10 +74,26 @@ class LinkReport:
         self._remote.publish(address.topic, codec.encode(LINK, state), qos=QoS(address.qos), retain=address.retain)
 
 
+def make_uplink(
+    config: Config,
+    addresses: Addresses,
+    remote: Transport,
+    forwarder: Forwarder,
+    notifier: Notifier,
+    clock: Callable[[], float],
+) -> Uplink:
+    """Return the uplink of a robot whose link may be thin, or which takes groups of commands."""
+    if config.services.mqtt_bridge.link.profile != "wide":
+        return ThinUplink(config, addresses, remote, forwarder, notifier, clock)
+    uplink = Uplink()
+    gate_of(config, addresses, forwarder, uplink.note_drive)
+    return uplink
+
+
 class ThinUplink(Uplink):
     """The link to the remote broker, where a config says that it may be thin."""
 
-    channels = (LINK,)
+    channels: tuple[Channel, ...] = (LINK,)
 
     def __init__(
         self,
@@ -94,7 +112,16 @@ class ThinUplink(Uplink):
         self._meter, self._room = LinkMeter(section.link.profile, section.link.kbit), Room(section.link.kbit)
         self._report = LinkReport(self._meter, addresses[LINK], remote)
         self._guard = threading.Lock()  # of the room: messages take it on the thread that received them
-        self._sieve, self._sifter = Sieve(self._takes, forwarder.counters, clock), Sifter(forwarder)
+        gate = gate_of(config, addresses, forwarder, self.note_drive)
+        self._sieve = Sieve(self._takes, forwarder.counters, clock)
+        self._groups: StreamGroups | None = None
+        if section.link.group_hz:
+            self.channels = (LINK, WIRE)
+            named = config.security.named
+            self._groups = StreamGroups(
+                addresses, remote, section.link.group_hz, forwarder.counters, clock, named=named
+            )
+        self._sifter = Sifter(forwarder, gate or forwarder, self._groups)
         self._late, self._hold = LateRun(), MediaHold(config.on_demand_programs(), notifier.hold)
         forwarder.note_age = lambda late: self._late.note(late, clock())
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
@@ -137,6 +164,8 @@ class ThinUplink(Uplink):
             self._suit(now)
         self._drop_late()
         self._sifter.send_waiting()
+        if self._groups is not None:
+            self._groups.send(lambda size: self._takes(Rank.STREAM, size), crowded=self._meter.crowded)
         self._hold.send(now)
         self._report_shed()
         if self._report.is_due(now) and self._takes(Rank.STATE, _HEARTBEAT_BYTES):

@@ -20,8 +20,9 @@ class Outbox:
         self._stop, self._drive_timeout = stop, drive_timeout_s
         self.waiting: dict[str, _Waiting] = {}  # by kind
 
-    def drive(self, line: bytes, now: float, valid_s: float) -> None:
-        """Add a drive line that is valid for ``valid_s``, at most for the timeout."""
+    def drive(self, line: bytes, now: float, valid_s: float, replaces: str = "") -> None:
+        """Add a drive line that is valid for ``valid_s``, at most for the timeout; ``replaces``: another kind too."""
+        self.waiting.pop(replaces, None)
         self._place(_DRIVE, _Waiting(line, now + min(valid_s, self._drive_timeout)))
 
     def halt(self) -> None:

@@ -96,13 +96,14 @@ class SerialLine:
         """Start the thread that opens the device. Returns at once."""
         self._thread.start()
 
-    def drive(self, line: bytes, valid_s: float = float("inf")) -> bool:
+    def drive(self, line: bytes, valid_s: float = float("inf"), *, replaces: str = "") -> bool:
         """Send a drive line now, or once earlier bytes are sent unless a newer one replaces it. False: no device.
 
-        A drive line that could not be sent for ``valid_s``, or for ``drive_timeout_s``, becomes a stop.
+        A drive line that could not be sent for ``valid_s``, or for ``drive_timeout_s``, becomes a stop. Other lines
+        may follow in ``line``: they have the same fate; ``replaces`` is their kind.
         """
         outbox = self.output.outbox
-        return self._hand_over(lambda now: outbox.drive(line, now, valid_s), line if valid_s > 0 else b"")
+        return self._hand_over(lambda now: outbox.drive(line, now, valid_s, replaces), line if valid_s > 0 else b"")
 
     def halt(self) -> bool:
         """Send the stop in place of any waiting drive line. False: no device; opening it begins with the stop."""

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any, ClassVar, Protocol
 
 from pebble import contract as c
+from pebble.contract.groups import Member
 from pebble.contract.payloads import (
     ChargingLevel,
     ChargingStatus,
@@ -53,6 +54,7 @@ class MotorBridge(MotorOwner, SerialService):
         *MotorOwner.publishes,
         *(c.MOTOR_POWER, c.TOUCH_SENSORS, c.CHARGING_STATUS, c.CHARGING_LEVEL),
     )
+    company = (c.LIGHTS_SOLID, c.LIGHTS_FLASH)
     protocol: ClassVar[MotorProtocol] = goob_base
     stop_line = goob_base.STOP
 
@@ -86,8 +88,21 @@ class MotorBridge(MotorOwner, SerialService):
     def move(self, drive: Drive, valid_s: float) -> None:
         power = self.protocol.mix(drive.x, drive.z)
         self.line.drive(self.protocol.drive_line(*power), valid_s)
-        self.sensors.drive(self.clock() + valid_s if all(power) else 0.0)
-        self._show_power(*power)
+        self._note_power(*power, valid_s)
+
+    def move_with(self, drive: Drive, valid_s: float, company: tuple[Member, ...]) -> None:
+        power = self.protocol.mix(drive.x, drive.z)
+        line = self.protocol.drive_line(*power) if drive.moves else self.stop_line
+        valid_s = valid_s if drive.moves else float("inf")
+        self.line.drive(line + self._lights_line(company[0].value), valid_s, replaces=_LIGHTS)
+        self._note_power(*power, valid_s)
+
+    def accompany(self, company: tuple[Member, ...]) -> None:
+        self.line.send(_LIGHTS, self._lights_line(company[0].value))
+
+    def _note_power(self, left: float, right: float, valid_s: float) -> None:
+        self.sensors.drive(self.clock() + valid_s if left and right else 0.0)
+        self._show_power(left, right)
 
     def halt(self) -> None:
         self.line.halt()
@@ -105,11 +120,17 @@ class MotorBridge(MotorOwner, SerialService):
 
     @on(c.LIGHTS_SOLID)
     def lights_solid(self, colour: LightsSolid) -> None:
-        self.line.send(_LIGHTS, self.protocol.lights_line(colour.b, colour.g, colour.r))
+        if not self.is_copy(colour):
+            self.line.send(_LIGHTS, self._lights_line(colour))
 
     @on(c.LIGHTS_FLASH)
     def lights_flash(self, colour: LightsFlash) -> None:
-        self.line.send(_LIGHTS, self.protocol.flash_line(colour.b, colour.g, colour.r, colour.period))
+        self.lights_solid(colour)
+
+    def _lights_line(self, colour: LightsSolid) -> bytes:
+        if isinstance(colour, LightsFlash):
+            return self.protocol.flash_line(colour.b, colour.g, colour.r, colour.period)
+        return self.protocol.lights_line(colour.b, colour.g, colour.r)
 
     # -- reports
 

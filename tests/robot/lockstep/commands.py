@@ -28,6 +28,7 @@ class Commands:
     def __init__(self) -> None:
         self._numbers = count()
         self._commands: dict[tuple[int, int], Command] = {}
+        self.grouped: set[tuple[int, int]] = set()  # those that were sent with lights
 
     def add(self, command: Command) -> tuple[float, float]:
         """Return ``x`` and ``z`` of a new command."""

@@ -7,7 +7,18 @@ from typing import Any
 
 import msgspec
 
-from pebble.contract import CONTROL, CONTROL_STATE, CONTROL_TAKE, DRIVE, ESTOP, ESTOP_RESET, ESTOP_STATE, codec
+from pebble.contract import (
+    CONTROL,
+    CONTROL_STATE,
+    CONTROL_TAKE,
+    DRIVE,
+    ESTOP,
+    ESTOP_RESET,
+    ESTOP_STATE,
+    GROUP,
+    LIGHTS_SOLID,
+    codec,
+)
 from pebble.transports import Message, QoS
 from tests.robot.lockstep.commands import PERSON, Command, Commands
 from tests.robot.lockstep.network import Connection, Network
@@ -22,7 +33,8 @@ PERIOD_S = 0.1
 class Driver(Process):
     """A page of a person, or a program that knows nothing of control."""
 
-    def __init__(self, name: str, network: Network, commands: Commands) -> None:
+    def __init__(self, name: str, network: Network, commands: Commands, *, groups: bool = False) -> None:
+        """``groups``: most commands are sent in a group with lights, whose colours are the speeds of the wheels."""
         super().__init__(name, network.scheduler)
         self.alive = True
         self.id = (name.encode().hex() * 8)[:8]
@@ -31,7 +43,7 @@ class Driver(Process):
         self.old_stops: list[dict[str, str]] = []
         self._stop_numbers = count(int.from_bytes(name.encode()) << 16)
         self._stops: dict[str, Any] = {}
-        self._commands = commands
+        self._commands, self._groups = commands, count() if groups else None
         self._wants = self._gesture = 0
         self.let_go_at = self.took_at = -1e9
         self._connection = Connection(self, network).open(0.0)
@@ -75,7 +87,7 @@ class Driver(Process):
             fields.get("run", PERSON), sender, self.scheduler.now, fields.get("valid_ms", 5000) / 1000, may_move=True
         )
         x, z = self._commands.add(command)
-        self._publish(DRIVE.topic(BASE), {"x": x, "z": z} | ({"key": key} if key else {}) | fields)
+        self._publish_drive({"x": x, "z": z} | ({"key": key} if key else {}) | fields)
 
     def steer(self, seconds: float, key: str | None = None, **fields: Any) -> None:
         """Drive for so long."""
@@ -92,7 +104,16 @@ class Driver(Process):
         self.steer(seconds, self.old_keys[-1])
 
     def zero(self, *, final: bool = False) -> None:
-        self._publish(DRIVE.topic(BASE), {"x": 0, "z": 0} | ({"valid_ms": 0} if final else {}))
+        self._publish_drive({"x": 0, "z": 0} | ({"valid_ms": 0} if final else {}))
+
+    def _publish_drive(self, fields: dict[str, Any]) -> None:
+        if self._groups is None or next(self._groups) % 3 == 0:
+            self._publish(DRIVE.topic(BASE), fields)
+            return
+        x, z = fields["x"], fields["z"]
+        self._commands.grouped.add((round(1000 * (z + x)), round(1000 * (z - x))))
+        lights = {"b": 1, "g": z + x, "r": z - x}
+        self._publish(GROUP.topic(BASE), {DRIVE.metric: fields, LIGHTS_SOLID.metric: lights})
 
     def stop(self, *, named: bool = True) -> None:
         """Stop once, with a name of its own or without one."""

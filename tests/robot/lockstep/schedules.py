@@ -1,6 +1,6 @@
 """Random schedules of real services in virtual time: ``python -m tests.kit.schedules services``.
 
-Of one motor owner, persons and scripts; and of two owners, drivers, a bridge and stops.
+Of one motor owner, persons and scripts; and of two owners, drivers, a bridge and stops, also with groups of commands.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def _shared(kind: str) -> Iterator[tuple[str, Any]]:
     if kind == "scripts":
         yield kind, Folder()
     else:
-        with two_owners.configs() as configs:
+        with two_owners.configs(groups=kind == "groups") as configs:
             yield kind, configs
 
 
@@ -67,5 +67,5 @@ ENGINE = Engine(
     draw=lambda kind, seed, number: (_SCRIPTS if kind == "scripts" else two_owners.STEPS)(kind, seed, number),
     world=_shared,
     perform=_perform,
-    kinds=("scripts", "owners"),
+    kinds=("scripts", "owners", "groups"),
 )

@@ -36,6 +36,7 @@ class Bench:
         broker: Broker | None = None,
         instance: str = "",
         peer: str = "",
+        groups: bool = False,
         **section: Any,
     ) -> None:
         folder.mkdir(exist_ok=True)
@@ -51,6 +52,7 @@ class Bench:
         bridge = {
             "enabled": True,
             "remote_mqtt": {"host": "localhost", "port": 1},
+            "link": {"groups": groups},
         }  # beside one, silence alone ends no control
         services = {"serial_mcu_bridge": serial, "mqtt_bridge": bridge}
         raw = {"robot": {"id": ROBOT}, "transport": transport, "services": services}

@@ -1,0 +1,90 @@
+"""Several commands in one message on ``incoming/group``, by their metrics: all are carried out, or none. Pure.
+
+    {"drive-values": {"x": -0.3, "z": 0.7, "valid_ms": 400}, "lights-solid": {"r": 0.2, "g": 0.7, "b": 1}}
+
+Members are bare objects. Stops, resets, flags, control, scripts and media are never among them. Where names are
+checked, ``by`` is the sender, in the place of those in the members.
+"""
+
+import math
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from pebble.contract import (
+    DRIVE,
+    GROUP,
+    INCOMING,
+    LIGHTS_FLASH,
+    LIGHTS_SOLID,
+    MCU_COMMAND,
+    OUTLET_COMMAND,
+    SOUNDBOARD_COMMAND,
+    Channel,
+    channel_of,
+    codec,
+)
+from pebble.contract.names import BY
+from pebble.errors import PayloadError
+
+MOST_MEMBERS, MOST_BYTES = 8, 2048
+MEMBERS = (DRIVE, LIGHTS_SOLID, LIGHTS_FLASH, SOUNDBOARD_COMMAND, OUTLET_COMMAND, MCU_COMMAND)
+_SHOWN = 40  # characters of a metric
+MARK = "group"  # of a copy: true
+
+
+class Member(Struct, frozen=True):
+    """A command of a group: its channel, metric, decoded value and JSON."""
+
+    channel: Channel
+    metric: str
+    value: Any
+    payload: bytes
+
+
+def decode(raw: bytes) -> tuple[Member, ...]:
+    """Return the members of a group. Raises PayloadError if any of them may not be there, or cannot be read."""
+    if len(raw) > MOST_BYTES:
+        raise PayloadError(f"{GROUP.metric}: {len(raw)} bytes, more than {MOST_BYTES}")
+    codec.plain(GROUP, raw)  # within the limits of all commands
+    commands = _unique_keys(codec.trim(raw))
+    by = commands.pop(BY, None) if isinstance(commands, dict) else None
+    if not isinstance(commands, dict) or not 1 <= len(commands) <= MOST_MEMBERS:
+        raise PayloadError(f"{GROUP.metric}: an object of 1 to {MOST_MEMBERS} commands is needed")
+    if {LIGHTS_SOLID.metric, LIGHTS_FLASH.metric} <= commands.keys():
+        raise PayloadError(f"{GROUP.metric}: {LIGHTS_SOLID.metric} and {LIGHTS_FLASH.metric} exclude one another")
+    return tuple(_member(metric, command, by) for metric, command in commands.items())
+
+
+def _member(metric: str, command: Any, by: Any) -> Member:
+    channel = channel_of(f"{INCOMING}/{metric}")
+    if channel not in MEMBERS:
+        raise PayloadError(f"{GROUP.metric}: {metric[:_SHOWN]!a} may not be in a group")
+    if not isinstance(command, dict) or isinstance(command.get("value"), dict):
+        raise PayloadError(f"{GROUP.metric}: {metric}: a bare object is needed")
+    command.pop(MARK, None)
+    if by is not None:
+        command[BY] = by
+    try:
+        payload = msgspec.json.encode(command)
+    except OverflowError:
+        raise PayloadError(f"{GROUP.metric}: {metric}: a number is too large") from None
+    return Member(channel, metric, codec.decode(channel, payload), payload)
+
+
+def _unique_keys(text: bytes) -> Any:
+    """Return the JSON value in ``text``. Raises PayloadError if an object has a key twice, however it is written."""
+    import json  # the only reader that shows it, and only robots with groups pay for it
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(fields := dict(pairs)) < len(pairs):
+            raise PayloadError(f"{GROUP.metric}: a key is there twice")
+        return fields
+
+    def finite(number: str) -> float:
+        if not math.isfinite(value := float(number)):
+            raise PayloadError(f"{GROUP.metric}: {number[:_SHOWN]} is not a finite number")
+        return value
+
+    return json.loads(text, object_pairs_hook=unique, parse_float=finite)

@@ -1,0 +1,162 @@
+"""Passes groups of commands into a robot: checked member by member, then whole, then as copies of the members."""
+
+import logging
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import msgspec
+from msgspec.structs import replace
+
+from pebble.config import Config
+from pebble.contract import (
+    DRIVE,
+    GROUP,
+    INCOMING,
+    LIGHTS_FLASH,
+    LIGHTS_SOLID,
+    OUTLET_COMMAND,
+    SOUNDBOARD_COMMAND,
+    codec,
+    groups,
+)
+from pebble.contract.capabilities import CapabilitiesValue
+from pebble.errors import PayloadError
+from pebble.forwarding.command_ages import ends_something
+from pebble.forwarding.forwarder import Forwarder, Pass
+from pebble.forwarding.routing import Drop, Forward, Side
+from pebble.forwarding.side import SideState
+from pebble.forwarding.subjects import Subject
+from pebble.runtime.addresses import Addresses
+from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.transports import Message
+
+#: Channels that motor owners take from the group; their copies are marked.
+MARKED = (DRIVE, LIGHTS_SOLID, LIGHTS_FLASH)
+_log = RateLimitedLog(logging.getLogger(__name__), period_s=60.0)
+
+
+def encoded(members: Iterable[groups.Member]) -> bytes:
+    """Return a group of members as all readers understand it."""
+    return msgspec.json.encode({member.metric: msgspec.Raw(member.payload) for member in members})
+
+
+def copy_of(member: groups.Member) -> bytes:
+    """Return the payload for who knows no groups; marked, if motor owners take it from the group."""
+    if member.channel not in MARKED:
+        return member.payload
+    return msgspec.json.encode(msgspec.json.decode(member.payload) | {groups.MARK: True})
+
+
+def is_marked(raw: bytes) -> bool:
+    """True if a command is marked as a copy, which only the bridge may send."""
+    if groups.MARK.encode() not in raw and b"\\" not in raw:
+        return False
+    try:
+        command = codec.plain(DRIVE, raw)
+    except PayloadError:
+        return False
+    bodies = (command, command.get("value")) if isinstance(command, dict) else ()
+    return any(isinstance(body, dict) and body.get(groups.MARK) is True for body in bodies)
+
+
+class _Part(NamedTuple):
+    """A member as a message of its own, and how it passes; or why not."""
+
+    member: groups.Member
+    subject: Subject
+    message: Message
+    way: Forward | Drop
+
+
+class GroupGate:
+    """A gate before a forwarder, for messages from outside; others go on to :attr:`pass_on`.
+
+    A group passes if each member would: it is published whole, and then each member by itself. Motor owners obey the
+    whole and ignore the copies, which are marked. A group of which a member may not pass is dropped, but for members
+    that only end something. Marked copies from outside are refused: observers would see motion that is not there.
+    """
+
+    def __init__(self, forwarder: Forwarder, addresses: Addresses, note_drive: Callable[[bytes], None]) -> None:
+        self.pass_on: Pass = forwarder.pass_now
+        self._forwarder, self._addresses, self._note_drive = forwarder, addresses, note_drive
+        self._subjects = forwarder.subjects
+
+    def receive(
+        self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str
+    ) -> Forward | Drop:
+        if source.side is Side.REMOTE:
+            if subject.channel is GROUP:
+                return self._receive_group(source, subject, message, forward, account)
+            marked = subject.channel in MARKED and is_marked(message.payload)
+            if marked and not ends_something(subject, message):
+                return Drop.REFUSED
+        return self.pass_on(source, subject, message, forward, account)
+
+    def _receive_group(
+        self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str
+    ) -> Forward | Drop:
+        try:
+            members = groups.decode(message.payload)
+        except PayloadError as error:
+            _log.warning("group", "a group is not forwarded: %s", error)
+            return Drop.REFUSED
+        parts = [self._part(source, message, member, account) for member in members]
+        outcome: Forward | Drop = next((part.way for part in parts if isinstance(part.way, Drop)), forward)
+        if isinstance(outcome, Forward):
+            parts = [part._replace(member=replace(part.member, payload=part.message.payload)) for part in parts]
+            whole = replace(message, payload=encoded(part.member for part in parts))
+            outcome = self._forwarder.deliver(source, subject, whole, forward)
+            copies = [(part, copy_of(part.member)) for part in parts] if isinstance(outcome, Forward) else []
+        else:
+            copies = [(part, part.message.payload) for part in parts if part.member.channel.ends(part.member.value)]
+        for part, payload in copies:
+            if isinstance(part.way, Forward):
+                self._forwarder.deliver(source, part.subject, replace(part.message, payload=payload), part.way)
+            if part.member.channel is DRIVE:
+                self._note_drive(payload)
+        return outcome
+
+    def _part(self, source: SideState, message: Message, member: groups.Member, account: str) -> _Part:
+        channel = member.channel
+        topic = (
+            f"{self._addresses.base}/{INCOMING}/{member.metric}"
+            if channel.is_pattern
+            else self._addresses[channel].topic
+        )
+        subject = self._subjects[topic]
+        assert subject is not None  # noqa: S101 - its metric is that of a channel
+        message = replace(message, topic=topic, payload=member.payload)
+        way = self._forwarder.admit(source, subject, message, topic, True)
+        if isinstance(way, Forward):
+            passing = self._forwarder.examine(source, subject, message, way, account)
+            if isinstance(passing, Drop):
+                way = passing
+            else:
+                message = passing
+        return _Part(member, subject, message, way)
+
+
+def gate_of(
+    config: Config, addresses: Addresses, forwarder: Forwarder, note_drive: Callable[[bytes], None]
+) -> GroupGate | None:
+    """Return the gate of a robot that takes groups, in its place before the forwarder; None for others."""
+    if not config.services.mqtt_bridge.link.groups:
+        return None
+    gate = GroupGate(forwarder, addresses, note_drive)
+    forwarder.pass_on = gate.receive
+    return gate
+
+
+def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
+    """Return the capabilities with the metrics that this robot takes in a group."""
+    link = config.services.mqtt_bridge.link
+    if not link.groups:
+        return value
+    has = {
+        DRIVE: value.drive and value.drive.available,
+        LIGHTS_SOLID: value.lights and value.lights.solid,
+        LIGHTS_FLASH: value.lights and value.lights.flash,
+        SOUNDBOARD_COMMAND: value.soundboard and value.soundboard.available,
+        OUTLET_COMMAND: value.outlets and value.outlets.available,
+    }
+    return replace(value, groups=[channel.metric for channel, offered in has.items() if offered])

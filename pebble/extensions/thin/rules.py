@@ -1,0 +1,26 @@
+"""Rules between the keys of groups and those of links and serial lines."""
+
+from pebble.config.problems import Path
+from pebble.config.reader import Reader, Rule
+from pebble.config.tree import Link, Root
+
+_LINK: Path = ("services", "mqtt_bridge", "link")
+
+
+def _check(reader: Reader, root: Root, _: Path) -> Root:
+    """Note groups that would not say which wheels they move."""
+    serial = root.services.serial_mcu_bridge
+    topics = {line.topics.drive_values for line in (serial, *serial.instances.values())}
+    if root.services.mqtt_bridge.link.groups and len(topics) > 1:
+        text = "a group does not say which line it is for: give all the same topics.drive_values, or leave groups out"
+        reader.notes.problem((*_LINK, "groups"), text)
+    return root
+
+
+def _check_link(reader: Reader, link: Link, path: Path) -> Link:
+    if link.group_hz and link.profile == "wide":
+        reader.notes.problem((*path, "group_hz"), 'has no effect at profile "wide": write "thin" or "auto"')
+    return link
+
+
+RULES: tuple[Rule, ...] = ((Root, _check), (Link, _check_link))

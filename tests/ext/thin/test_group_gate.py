@@ -1,0 +1,158 @@
+"""Groups of commands at a bridge, in virtual time: all of a group passes, or nothing that moves."""
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import pytest
+
+from pebble.contract import groups
+from pebble.errors import ConfigError
+from pebble.forwarding.routing import Drop
+from tests.forwarding.virtual import World
+from tests.services.mqtt_bridge.bridge_rig import make_config
+
+GROUP, DRIVE, LIGHTS, SOUND = (
+    "incoming/group",
+    "incoming/drive-values",
+    "incoming/lights-solid",
+    "incoming/soundboard-command",
+)
+BOTH = b'{"drive-values": {"z": 0.5}, "lights-solid": {"r": 1}}'
+ZERO = b'{"drive-values": {"z": 0}, "lights-solid": {"r": 1}}'
+SIGNED = b'{"drive-values": {"z": 0.5, "source": "autonomy", "run": 3}, "lights-solid": {"r": 1}}'
+SIGNED_ZERO = b'{"drive-values": {"z": 0, "source": "autonomy", "run": 3}, "lights-solid": {"r": 1}}'
+QUIET = b'{"soundboard-command": {"action": "stop"}, "drive-values": {"z": 0.5}}'
+
+Start = Callable[..., World]
+
+
+@pytest.fixture
+def start(monkeypatch: pytest.MonkeyPatch) -> Start:
+    def started(profile: str = "wide", *, on: bool = True, **section: Any) -> World:
+        world = World("bridge", monkeypatch)
+        world.start(link={"profile": profile, "groups": on}, **section)
+        world.run()
+        world.local.seen.clear()
+        return world
+
+    return started
+
+
+def arrived(world: World) -> list[tuple[str, Any]]:
+    """What has come to the robot, without the bridge's own messages."""
+    below = f"{world.local.base}/incoming/"
+    return [
+        (message.topic.removeprefix(below), msgspec.json.decode(message.payload))
+        for message in world.local.seen
+        if message.topic.startswith(below)
+    ]
+
+
+COPIES = [("drive-values", {"z": 0.5, "group": True}), ("lights-solid", {"r": 1, "group": True})]
+
+
+@pytest.mark.parametrize("profile", ["wide", "thin"])
+def test_a_group_passes_whole_and_then_as_copies(start: Start, profile: str) -> None:
+    world = start(profile)
+    world.remote.publish(GROUP, BOTH)
+    world.run(0.1)
+    assert arrived(world) == [("group", {"drive-values": {"z": 0.5}, "lights-solid": {"r": 1}}), *COPIES]
+
+
+def test_without_the_key_a_group_is_a_command_like_any_unknown_one(start: Start) -> None:
+    world = start(on=False)
+    world.remote.publish(GROUP, BOTH)
+    world.run(0.1)
+    assert [(message.topic, message.payload) for message in world.local.seen] == [(f"{world.local.base}/{GROUP}", BOTH)]
+
+
+@pytest.mark.parametrize(
+    ("payload", "late_s", "passes"),
+    [
+        (b'{"drive-values": {"z": 0.5}, "estop": {}}', 0.0, []),
+        (b'{"drive-values": {"z": 0.1}, "\\u0064rive-values": {"z": 0.9}}', 0.0, []),
+        (BOTH, 0.6, []),
+        (ZERO, 0.6, ["group", "drive-values", "lights-solid"]),
+        (ZERO, 2.5, ["drive-values"]),
+        (QUIET, 0.6, ["soundboard-command"]),
+        (SIGNED, 0.0, []),
+    ],
+)
+def test_of_a_bad_or_late_group_passes_what_ends_something(
+    start: Start, payload: bytes, late_s: float, passes: list[str]
+) -> None:
+    world = start()
+    world.uplink.late_s = late_s
+    world.remote.publish(GROUP, payload)
+    world.run(0.1)
+    assert [metric for metric, _ in arrived(world)] == passes
+
+
+def test_a_scripts_zero_passes_as_a_persons(start: Start) -> None:
+    world = start()
+    world.remote.publish(GROUP, SIGNED_ZERO)
+    world.run(0.1)
+    assert all("run" not in payload for _, payload in arrived(world))
+    assert len(arrived(world)) == 3
+
+
+def test_a_retained_group_is_stale(start: Start) -> None:
+    world = start()
+    world.remote.publish(GROUP, BOTH, retain=True)
+    world.run(0.1)
+    assert arrived(world) == []
+    assert world.service.status.counts[f"remote: {Drop.STALE.value}"] == 1
+
+
+@pytest.mark.parametrize(
+    ("suffix", "payload", "passes"),
+    [
+        (DRIVE, b'{"z": 0.5, "group": true}', False),
+        (DRIVE, b'{"z": 0.5, "gr\\u006fup": true}', False),
+        (LIGHTS, b'{"r": 1, "group": true}', False),
+        (DRIVE, b'{"z": 0, "group": true}', True),
+        (DRIVE, b'{"z": 0.5}', True),
+        (SOUND, b'{"action": "stop", "group": true}', True),
+    ],
+)
+def test_marked_copies_from_outside_are_refused_but_no_zero(
+    start: Start, suffix: str, payload: bytes, passes: bool
+) -> None:
+    world = start()
+    world.remote.publish(suffix, payload)
+    world.run(0.1)
+    assert world.local.payloads(suffix) == ([payload] if passes else [])
+
+
+def test_members_go_to_renamed_topics(start: Start) -> None:
+    world = start(serial={"topics": {"drive_values": "pebble/robots/rover/incoming/wheels"}})
+    world.remote.publish(GROUP, BOTH)
+    world.run(0.1)
+    assert [metric for metric, _ in arrived(world)] == ["group", "wheels", "lights-solid"]
+
+
+def test_a_dated_group_tells_its_age(start: Start) -> None:
+    world = start("thin")
+    now = 1_000_000
+    dated = b'{"drive-values": {"z": 0.5, "key": "0badf00d", "t": %d}, "lights-solid": {"r": 1}}'
+    for sent_ms, passes in ((now, 3), (now - 2000, 0)):  # the second was sent two seconds before, and comes now
+        world.local.seen.clear()
+        world.remote.publish(GROUP, dated % sent_ms)
+        world.run(0.1)
+        assert len(arrived(world)) == passes
+
+
+def test_lines_whose_wheels_have_other_topics_exclude_groups() -> None:
+    lines = {"enabled": True, "serial": {"port": "/dev/a"}}
+    arm = {"serial": {"port": "/dev/b"}, "topics": {"drive_values": "pebble/robots/rover/incoming/arm"}}
+    with pytest.raises(ConfigError, match=r"link\.groups"):
+        make_config(serial={**lines, "instances": {"arm": arm}}, link={"groups": True})
+
+
+def test_what_may_be_in_a_group_is_a_table() -> None:
+    """A member that is added must also be one that a driver may send by itself: pebble/extensions/fleet/rights.py."""
+    assert {channel.metric for channel in groups.MEMBERS} == {
+        "drive-values", "lights-solid", "lights-flash", "soundboard-command", "outlets/{outlet}/power",
+        "mcu/{uid}/{name}",
+    }  # fmt: skip

@@ -1,0 +1,214 @@
+"""Streams in groups from a bridge to expanders beside the broker, in virtual time."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import pytest
+
+from pebble.errors import ConfigError, PayloadError
+from pebble.extensions.thin.expander import ANNOUNCE_S, Expander
+from pebble.extensions.thin.packed import MOST_BYTES, joined, packed, unpacked
+from tests.forwarding.virtual import Connection, World
+from tests.services.mqtt_bridge.bridge_rig import make_config
+
+TOUCH, IMU, ODOMETRY, WIRE, STREAMS = (
+    "outgoing/touch-sensors",
+    "outgoing/sensors/imu",
+    "outgoing/wheel-odometry",
+    "outgoing/wire",
+    "outgoing/group",
+)
+VALUE = b'{"value": {"a0": %d, "a1": 2, "a2": 3}}'
+Start = Callable[..., World]
+
+
+@pytest.fixture
+def start(monkeypatch: pytest.MonkeyPatch) -> Start:
+    def started(**link: Any) -> World:
+        world = World("bridge", monkeypatch)
+        world.start(link={"profile": "thin", "group_hz": 2, **link})
+        world.run()
+        world.remote.seen.clear()
+        return world
+
+    return started
+
+
+class Beside:
+    """An expander at the operators' broker."""
+
+    def __init__(self, world: World, id_: str = "5") -> None:
+        self.world = world
+        self.connection = Connection(f"expander-{id_}", world.remote_hub, world)
+        self.connection.open(10)
+        self.expander = Expander(self.connection, clock=lambda: world.now, id_=id_)
+        self.expander.start()
+        world.run(0.1)
+
+    def close(self) -> None:
+        self.connection.close()
+        self.world.connections.remove(self.connection)
+
+
+def run(world: World, seconds: float, *expanders: Beside, first: int = 0) -> int:
+    """Publish two streams twenty times a second; returns the number after the last one."""
+    for step in range(round(20 * seconds)):
+        if step % round(20 * ANNOUNCE_S) == 0:
+            for beside in expanders:
+                beside.expander.announce()
+        world.local.publish(TOUCH, VALUE % (first + step))
+        world.local.publish(ODOMETRY, VALUE % (first + step), qos=0)
+        world.run(0.05)
+    return first + round(20 * seconds)
+
+
+def counted(world: World, suffix: str) -> int:
+    return len(world.remote.payloads(suffix))
+
+
+def test_while_an_expander_is_there_streams_come_in_groups_and_plain_at_the_tools(start: Start) -> None:
+    world = start()
+    expander = Beside(world)
+    run(world, 2, expander)
+    world.remote.seen.clear()
+    run(world, 6, expander, first=100)
+    groups = world.remote.payloads(STREAMS)
+    assert 10 <= len(groups) <= 13
+    assert groups[-1][0] <= 31, "deflated, once the dictionary is known"
+    assert len(groups[-1]) < 40
+    plain = world.remote.payloads(TOUCH)
+    assert len(plain) == len(groups)
+    assert plain[-1] in {VALUE % number for number in range(200, 220)}, "the same bytes"
+    assert expander.expander.counts["refused groups"] == 0
+
+
+def test_without_an_expander_streams_are_plain_again_within_six_seconds(start: Start) -> None:
+    world = start()
+    expander = Beside(world)
+    run(world, 4, expander)
+    expander.close()
+    number = run(world, 6)
+    world.remote.seen.clear()
+    run(world, 4, first=number)
+    assert counted(world, STREAMS) == 0
+    assert 3 <= counted(world, TOUCH) <= 5
+
+
+def test_of_two_expanders_the_smaller_id_works_and_no_value_comes_twice(start: Start) -> None:
+    world = start()
+    second = Beside(world, "7")
+    number = run(world, 4, second)
+    first = Beside(world, "3")
+    number = run(world, 6, second, first, first=number)
+    works = second.expander.counts["groups"]
+    number = run(world, 4, second, first, first=number)
+    assert second.expander.counts["groups"] == works, "one is silent"
+    first.close()
+    number = run(world, 6, second, first=number)
+    world.remote.seen.clear()
+    run(world, 4, second, first=number)
+    assert counted(world, TOUCH) >= 3, "the other one has taken over"
+    assert second.expander.counts["groups"] > works
+    values = world.remote.payloads(TOUCH)
+    assert len(values) == len(set(values))
+
+
+def test_values_come_once_while_expanders_change(start: Start) -> None:
+    world = start()
+    second = Beside(world, "7")
+    number = run(world, 5, second)
+    first = Beside(world, "3")
+    run(world, 8, first, second, first=number)
+    values = world.remote.payloads(TOUCH)
+    assert len(values) == len(set(values))
+
+
+def test_heartbeats_states_and_stops_are_never_in_a_group(start: Start) -> None:
+    world = start()
+    expander = Beside(world)
+    run(world, 4, expander)
+    state = b'{"latched": true, "boot": "5f0c11aa", "count": 1, "recent": []}'
+    for suffix, payload in (("outgoing/estop/serial", state), ("outgoing/status", b"{}")):
+        world.local.publish(suffix, payload, retain=True)
+        world.run(0.05)
+        assert world.retained(suffix)[1] == payload
+    run(world, 3, expander)
+    assert counted(world, "outgoing/online") >= 2
+
+
+@pytest.mark.parametrize("payload", [b"\x00\x01picture", b"[1", b"1" * 3000])
+def test_what_is_no_json_or_large_is_sent_by_itself(start: Start, payload: bytes) -> None:
+    world = start()
+    expander = Beside(world)
+    run(world, 2, expander)
+    world.local.publish(IMU, payload)
+    world.run(0.2)
+    assert world.remote.payloads(IMU) == [payload]
+
+
+@pytest.mark.parametrize(
+    "metric", ["estop/serial", "online", "control/serial", "status", "group", "wire", "estop/x", "a/+", "front-camera"]
+)
+def test_an_expander_publishes_nothing_but_streams(start: Start, metric: str) -> None:
+    world = start()
+    expander = Beside(world)
+    run(world, 1, expander)
+    world.remote.seen.clear()
+    world.remote.publish(STREAMS, joined({metric: b'{"z": 1}'}), qos=0)
+    world.run(0.1)
+    assert b'{"z": 1}' not in world.remote.payloads(f"outgoing/{metric}")
+    assert expander.expander.counts["refused members"] == 1
+
+
+BOMB = packed(b'{"a": "' + b" " * 50_000_000 + b'"}', 3, b"{}")
+
+
+@pytest.mark.parametrize(
+    ("raw", "why"),
+    [
+        (BOMB, f"more than {MOST_BYTES} bytes"),
+        (packed(b'{"a": 1}', 3, b"{}")[:-2], "or not all of them"),
+        (packed(b'{"a": 1}', 4, b"{}"), "dictionary 4 is not known"),
+        (b"\x03" + bytes(range(200)), "not deflated"),
+        (b"", "not a JSON object"),
+        (b"[1]", "not a JSON object"),
+        (b'{"a": ', "not a JSON object"),
+    ],
+)
+def test_what_cannot_be_read_is_dropped(raw: bytes, why: str) -> None:
+    with pytest.raises(PayloadError, match=why):
+        unpacked(raw, {3: b"{}"})
+
+
+def test_what_is_packed_is_unpacked() -> None:
+    streams = {"touch-sensors": b'{"a": 1.50}', "sensors/imu": b"[1, 2]"}
+    text = joined(streams)
+    assert unpacked(packed(text, 5, b""), {}) == streams
+    assert unpacked(packed(text, 5, text), {5: text}) == streams
+    assert len(packed(text, 5, text)) < len(zlib.compress(text)) < len(text) + 12
+
+
+def test_without_the_key_nothing_is_said_of_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World("bridge", monkeypatch)
+    world.start(link={"profile": "thin"})
+    world.run()
+    Beside(world)
+    assert world.retained(WIRE) == (None, None)
+
+
+def test_the_wire_says_how_often_and_has_the_dictionary(start: Start) -> None:
+    world = start()
+    wire = msgspec.json.decode(world.retained(WIRE)[1] or b"")
+    assert wire == {"group_hz": 2.0}
+    run(world, 8, Beside(world))
+    wire = msgspec.json.decode(world.retained(WIRE)[1] or b"")
+    assert msgspec.json.decode(wire["dict"]).keys() == {"touch-sensors", "wheel-odometry"}
+
+
+def test_groups_at_a_wide_link_are_refused() -> None:
+    with pytest.raises(ConfigError, match="group_hz"):
+        make_config(link={"group_hz": 2})
