@@ -277,7 +277,10 @@ def _check_parts(extension: Extension, section: type) -> None:
 
 
 def lacking(raw: Any) -> Iterator[Missing]:
-    """Yield our extensions that are not installed although the config has a section of theirs that is not disabled."""
+    """Yield those of our extensions that the config uses and that are not installed.
+
+    The config uses an extension if it has a section of the extension that is not disabled.
+    """
     unknown = keys_of_missing(ours())
     for module, keys in OURS.items():
         for key in keys:
