@@ -45,7 +45,7 @@ class CaptureProgram:
         self._poll.register(self._err, select.POLLIN)
 
     def read(self, limit: int = _CHUNK) -> bytes:
-        """Return what it has written since, at least one byte. Raises DeviceError when it ends or hangs."""
+        """Return the program's new output, at least one byte. Raises DeviceError when the program ends or hangs."""
         deadline = time.monotonic() + self._silence_s
         while True:
             left = deadline - time.monotonic()

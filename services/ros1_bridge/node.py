@@ -121,7 +121,7 @@ class Node:
 
     @property
     def alive(self) -> bool:
-        """False: a thread has ended by a mistake."""
+        """True until a thread of the node has ended by a mistake."""
         return all(thread.is_alive() for thread in self._threads)
 
     def dropped(self) -> dict[str, int]:

@@ -40,7 +40,7 @@ class Playback:
         self._on_change = partial(on_change, self)
 
     def start(self) -> None:
-        """Start it on the service's thread: a player ends with the thread that has started it."""
+        """Start the playback on the service's thread: a player ends with the thread that has started it."""
         try:
             if self.clip.encoded:
                 self._start_decoded()
