@@ -54,7 +54,7 @@ def view_of(tag: Tag, width: int, height: int) -> View | None:
 def collect(pictures: Iterable[Any], finder: TagFinder, tag_id: int, person: Person, *, still: bool) -> list[Floats]:
     """Return the corners of the tag in 27 different places, or as many as there are pictures of.
 
-    ``still``: every picture counts; otherwise the tag has to rest, and it ends after 15 that are well spread.
+    ``still``: every picture counts; otherwise the tag has to rest, and 15 places that are well spread suffice.
     """
     taken: dict[View, Floats] = {}
     resting = 0

@@ -184,7 +184,7 @@ class _Session:
         return arc(along, numbers[1] if side else along * math.tan(half))
 
     def _numbers(self, what: str, count: int, plausible: Callable[[list[float]], bool]) -> list[float]:
-        """Ask until so many plausible numbers are typed."""
+        """Ask until ``count`` plausible numbers are typed; return them."""
         while True:
             try:
                 numbers = [float(word) for word in self._person.ask(f"    {what}: ").split()]

@@ -31,7 +31,7 @@ def sequence_numbers() -> Iterator[int]:
 
 
 class _Intake:
-    """Converts sound to the rate and channels on the wire and cuts it into equal frames."""
+    """The converter of sound to the rate and channels on the wire; it cuts the sound into equal frames."""
 
     def __init__(self, rate: int, channels: int, rate_out: int, channels_out: int) -> None:
         self.rate, self.channels = rate_out, channels_out
@@ -60,7 +60,7 @@ class _Intake:
 
 
 class SoundEncoder:
-    """Takes any amount of s16le and returns whole packets; the rest waits for more samples.
+    """An encoder that takes any amount of s16le and returns whole packets; the rest waits for more samples.
 
     ``bundle`` Opus packets are in one of ours; without ``codec`` it holds the samples as they are.
     """

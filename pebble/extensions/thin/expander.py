@@ -28,7 +28,7 @@ _BASE = re.compile(rf"((?:[^/]+/){{2}}[^/]+)/(?:{INCOMING}|{OUTGOING})/")
 
 
 class _Robot:
-    """What an expander knows of a robot with groups; times are those of its clock."""
+    """The facts that an expander knows of a robot with groups; times are those of its clock."""
 
     def __init__(self) -> None:
         self.named = False

@@ -61,7 +61,7 @@ class Visitors:
         return now - self._moved.get(robot.base, -math.inf) >= DRIVES_S
 
     def free(self, robot: RobotView, now: float) -> bool:
-        """True if it may be driven in the present step, in which no person has had it so far."""
+        """True if no person has had the robot in the present step; else note the robot as left alone."""
         taken = self.taken(robot, now)
         if self._driven.get(robot.base, (-math.inf, ""))[0] < self._step_began and not taken:
             return True

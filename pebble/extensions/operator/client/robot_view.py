@@ -289,7 +289,7 @@ class RobotView:
         return named_topic(self.base, self.capabilities, channel)
 
     def offers(self, section: str) -> bool:
-        """True if that section of its capabilities, for example ``video``, can be requested."""
+        """True if ``section`` of the robot's capabilities, for example ``video``, can be requested."""
         return section_of(self.capabilities, section).get("controls") is True
 
     def ready(self, now: float) -> bool:

@@ -47,7 +47,7 @@ class Neighbour:
 
     @property
     def online(self) -> bool:
-        """True if it was heard within the last second."""
+        """True if the neighbour was heard within the last second."""
         return self._state is not None
 
     def latest(self, channel: Channel, max_age: float = 1.0) -> Any:

@@ -91,7 +91,10 @@ class Seen(msgspec.Struct):
 
 
 class Report(msgspec.Struct, kw_only=True, omit_defaults=True):
-    """A line from the operator: what was requested is done, or why it is not; after a trial what was measured."""
+    """A line from the operator: the answer to a request; after a trial, the measurements.
+
+    ``problem``: why the request was not carried out; None if it was.
+    """
 
     problem: str | None = None
     commands: list[Command] = []

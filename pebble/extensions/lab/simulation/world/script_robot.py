@@ -80,7 +80,7 @@ class SimulatedRobot(Robot):
     # -- for tests
 
     def run(self, main: Callable[..., None], *options: Any, seconds: float) -> None:
-        """Run a script for so long, or until it returns. The wheels are stopped in the end."""
+        """Run a script for ``seconds``, or until it returns. The wheels are stopped in the end."""
         self._end_at = self.world.now() + seconds
         try:
             main(self, *options)
