@@ -38,7 +38,7 @@ Publish = Callable[[Channel, dict[str, Any]], object]
 
 
 class Telemetry:
-    """Reads topics of ROS and calls ``publish(channel, payload)`` on the node's thread of sockets.
+    """A reader of ROS topics that calls ``publish(channel, payload)`` on the node's thread of sockets.
 
     ``on_odometry()`` is called with each odometry, whether it is published or not.
     """
