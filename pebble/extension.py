@@ -292,7 +292,7 @@ def lacking(raw: Any) -> Iterator[Missing]:
 
 
 def keys_of_missing(installed: Iterable[Extension]) -> list[str]:
-    """Return the keys of a config that belong to extensions of ours which are not among ``installed``."""
+    """Return the keys of a config that belong to those of our extensions that are not among ``installed``."""
     known = {key for extension in installed for key in extension.sections}
     return [key for keys in OURS.values() for key in keys if key not in known]
 

@@ -204,7 +204,7 @@ class _Session:
 
 
 def arc(along_mm: float, left_mm: float) -> _Movement:
-    """Return the movement that ends there, seen from where it began; along a line it looked along, back negative."""
+    """Return the movement on an arc to a place, measured along and left of the first heading; back is negative."""
     half = math.atan2(math.copysign(1.0, along_mm) * left_mm, abs(along_mm))
     return _along(math.copysign(math.hypot(along_mm, left_mm), along_mm), half)
 

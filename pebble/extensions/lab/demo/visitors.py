@@ -19,7 +19,7 @@ class Visitors:
     """
 
     def __init__(self, name: str) -> None:
-        """``name``: that of the operator, whose own stops are none of a person."""
+        """Begin with no visitors. ``name``: that of the demo's operator, whose own stops do not count as a person's."""
         self.left_alone: set[str] = set()  # names of robots that were found to be taken
         self.own_ids: set[str] = set()  # under which the operator itself has control
         self._name = name

@@ -122,7 +122,7 @@ class ScriptedOperator:
         return self._stop is not None and self._stop.confirmed
 
     def reset(self) -> None:
-        """End its own emergency stop; that of a person is the person's to reset."""
+        """End the operator's own emergency stop; a stop of a person is left for a person to reset."""
         stop = self.robot.stopped_by
         if stop is None or stop.by == self._by:
             self._publish_all(Reset(self.robot.estop, self._by).messages())

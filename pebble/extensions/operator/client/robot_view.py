@@ -207,7 +207,7 @@ class RobotView:
 
     @property
     def is_assumed(self) -> bool:
-        """True if its capabilities are those that people assumed."""
+        """True if the robot's capabilities are those that people assumed."""
         return "assumed" in self.capabilities
 
     def assume(self, axes: Collection[str], name: str = "") -> bool:

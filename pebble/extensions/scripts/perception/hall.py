@@ -83,7 +83,7 @@ class PhaseTracker:
     """
 
     def __init__(self, *, falls: bool = False) -> None:
-        """``falls``: the first level is on the falling half of the wave, as seen by a wheel that turns forward."""
+        """Begin. ``falls``: the first level is on the falling half of the wave, seen by a wheel that turns forward."""
         self.phase: float | None = None  # None: no sample yet
         self.surprise = 0.0  # the sum of all differences from the expected phases
         self.rejected = 0  # samples that fit a turn against the expected one better

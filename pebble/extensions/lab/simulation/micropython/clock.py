@@ -13,7 +13,7 @@ class Clock(Protocol):
 
 
 class RealClock:
-    """``time.monotonic()``, with real sleeps."""
+    """The real time: ``time.monotonic()``, with real sleeps."""
 
     def now(self) -> float:
         return time.monotonic()

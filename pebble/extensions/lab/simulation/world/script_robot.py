@@ -57,7 +57,7 @@ class SimulatedRobot(Robot):
     """
 
     def __init__(self, file: Path | str, name: str = "goob") -> None:
-        """Raises ConfigError for a file that is wrong, PebbleError if the robot is not in it."""
+        """Read the world. Raises ConfigError for a file that is wrong, PebbleError if the robot is not in it."""
         model = read_world(Path(file))
         if name not in model.robots:
             raise PebbleError(f"{file}: there is no robot {name!r}, only {', '.join(model.robots) or 'an empty world'}")
@@ -101,7 +101,7 @@ class SimulatedRobot(Robot):
 
     @property
     def body(self) -> LockstepRobot:
-        """Its true pose, and its motor board."""
+        """The robot in the world: its true pose, and its motor board."""
         return self._body
 
     def receive(self, channel: Channel, value: Any) -> None:
