@@ -117,7 +117,7 @@ class Step:
 
     @property
     def cost(self) -> float:
-        """The share of the bytes per second. Fewer frames differ more from each other."""
+        """The step's share of the full bytes per second. Fewer frames differ more from each other."""
         return self.bytes * math.pow(self.rate, 0.9)
 
     def __str__(self) -> str:

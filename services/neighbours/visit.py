@@ -86,7 +86,7 @@ class Visit:
         return self._refused | ({name: NeighbourRefusal(run=run, why=why)} if why else {})
 
     def _starts(self, name: str, run: int, now: float) -> bool:
-        """Return True if this run drives from now on."""
+        """Begin the run if nothing prevents it; return True if it drives from now on."""
         why = self._begin(name, run) or (PERSON if now - self._person_at < HOLD_S else "")
         barred = newest(state.last_barred for state in self._states.values())
         number = None if why else self._number(barred, self._received)

@@ -81,7 +81,7 @@ class CmdVel:
 
     @property
     def bases(self) -> set[str]:
-        """The nodes that listen."""
+        """The names of the nodes that listen."""
         return self._out.names
 
     @property

@@ -34,7 +34,7 @@ class Subscriber:
         self._blocked_from: float | None = None
 
     def send(self, data: bytes) -> bool:
-        """Send a block at once, or drop it: False. Raises OSError once it is no use any more."""
+        """Send a block at once, or drop it and return False. Raises OSError if the connection is of no use any more."""
         now = time.monotonic()
         try:
             if self._rest:
@@ -76,7 +76,7 @@ class Publication:
             return sum([self._send(subscriber, data) for subscriber in list(self._subscribers)])
 
     def add(self, subscriber: Subscriber) -> bool:
-        """Add one that has been greeted, and send it the first message; False: there are too many."""
+        """Add a subscriber that has been greeted, and send it the first message; False if there are too many."""
         with self._lock:
             if len(self._subscribers) >= MOST_PEERS:
                 return False
@@ -89,7 +89,7 @@ class Publication:
         return True
 
     def remove(self, subscriber: Subscriber, why: str) -> None:
-        """Disconnect one."""
+        """Disconnect one subscriber."""
         with self._lock:
             self._remove(subscriber, why)
 

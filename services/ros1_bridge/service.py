@@ -75,7 +75,7 @@ class Ros1Reader(Service):
 
 
 class Ros1Bridge(Ros1Reader, MotorOwner):
-    """Drives the base too. The lock of its multiplexer follows the latch: zeros alone stop no Husky."""
+    """A service that drives the base, too. The lock of its multiplexer follows the latch: zeros alone stop no Husky."""
 
     name = "ros1_bridge"
     publishes = (*MotorOwner.publishes, *PUBLISHES)

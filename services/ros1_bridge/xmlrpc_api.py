@@ -43,7 +43,7 @@ def call(uri: str, method: str, *arguments: Any) -> Any:
 
 
 def lives(uri: str) -> bool:
-    """True if a node answers there."""
+    """True if a node answers at that address."""
     try:
         return call(uri, "getPid", "/pebble") is not None
     except RosError:

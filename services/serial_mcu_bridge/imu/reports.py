@@ -81,7 +81,7 @@ class ImuReports:
 
 
 class ImuWatchdog:
-    """Measures the time without a sample while a device is connected; when it expires, the process must end.
+    """A watchdog for the time without a sample while a device is connected; when it expires, the process must end.
 
     The clock is passed in.
     """

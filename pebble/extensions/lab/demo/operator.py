@@ -218,7 +218,7 @@ class Operator:
         return time.monotonic()
 
     def _hold(self, drive: Drive, seconds: float) -> float:
-        """Send a command again and again, as a held stick does; returns when it was last sent."""
+        """Send a command again and again, as a held stick does; return when it was last sent."""
         self._take_control()
         sent = time.monotonic()
         for _ in paced(seconds, wait=self._wait):
@@ -308,9 +308,9 @@ class Operator:
         self._complete(AFTER_RESET, _FORWARD, reset_at, released, time.monotonic())
 
     def _show_trails(self, robots: Sequence[RobotView]) -> None:
-        """Have each robot with the script for it publish where it is, if it runs no other.
+        """Have each robot that has the script for it publish its own position, unless it runs another script.
 
-        One that is stopped, or was driven a moment ago, refuses to start a script.
+        A robot that is stopped, or was driven a moment ago, refuses to start a script.
         """
         now = time.monotonic()
         for robot in [one for one in robots if one.base in self._drawing]:
@@ -352,7 +352,7 @@ class Operator:
             return status is not None and status.running and status.overridden is not True
 
         def distance_m() -> float:
-            """Return that from the tag; infinite if the robot does not see it."""
+            """Return the robot's distance from the tag; infinite if the robot does not see the tag."""
             return math.inf if not seen or seen[0].distance_m is None else seen[0].distance_m
 
         self.show(f"STARTS: {FOLLOW}, {robot.name} plays {CLIP} and drives to tag {TAG_ID} by itself")

@@ -57,7 +57,7 @@ class Visitors:
         return f"is driven by {who}" if now - at < DRIVES_S else ""
 
     def rests(self, robot: RobotView, now: float) -> bool:
-        """True if no person has moved it for a moment, also if one has the control."""
+        """True if no person has moved the robot for a moment, even if a person has control."""
         return now - self._moved.get(robot.base, -math.inf) >= DRIVES_S
 
     def free(self, robot: RobotView, now: float) -> bool:

@@ -121,7 +121,10 @@ class PhaseTracker:
         return self._move_to(self.phase, predicted + math.remainder(phase - predicted, math.tau), power)
 
     def _predict(self, power: float) -> float:
-        """Return the phase that this sample is expected to add."""
+        """Return the phase that this sample is expected to add: by the power, and by the measured speed if it agrees.
+
+        When the expected direction changes, the farthest phase in that direction is the present one.
+        """
         before = self._expected
         drive = (self._power + power) / 2  # a command comes between two samples
         self._expected, self._power = _CARRY * before + (1.0 - _CARRY) * self._per_power * drive, power
