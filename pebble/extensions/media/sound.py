@@ -112,10 +112,11 @@ def make_sound_encoder(
     sent_channels: int | None = None,
     numbers: Iterator[int] | None = None,
 ) -> SoundEncoder:
-    """Make an encoder of what has ``rate`` and ``channels``, to ``sent_…`` as far as the encoding has them.
+    """Make an encoder of sound with ``rate`` and ``channels``.
 
-    Opus packets last ``chunk_ms`` rounded up to 20, 40 or 60, and ``bundle`` of them (at most 3) share a PBAT packet.
-    Raises PebbleError for an unknown name and for one this installation cannot make.
+    It sends ``sent_rate`` and ``sent_channels``, as far as the encoding has them. Opus packets last ``chunk_ms``
+    rounded up to 20, 40 or 60, and ``bundle`` of them (at most 3) share a PBAT packet. Raises PebbleError for an
+    unknown name and for one this installation cannot make.
     """
     numbers = sequence_numbers() if numbers is None else numbers
     rate_out, channels_out = sent_rate or rate, sent_channels or channels

@@ -193,7 +193,7 @@ class Operator:
         self._robots = [robot for robot in robots if self._mine(robot)]
 
     def _complete(self, step: str, drive: Drive, began: float, released: float, ended: float) -> None:
-        """Note what was commanded of each robot that is still free."""
+        """Note the command of this step for each robot that is still free."""
         for robot in filter(self._mine, self._robots):
             self.completed.append(Driven(robot.name, step, wheels_of(drive), began, released, ended))
 

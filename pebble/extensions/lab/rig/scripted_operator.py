@@ -130,7 +130,7 @@ class ScriptedOperator:
     # -- what is due
 
     def tick(self) -> None:
-        """Send what is due of requests for control and of a stop; ``command`` calls it."""
+        """Send the requests for control and the messages of a stop that are due; ``command`` calls this."""
         now = time.monotonic()
         self._publish_all(self.control.tick(now))
         while not self._received.empty():

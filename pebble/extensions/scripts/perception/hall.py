@@ -113,7 +113,7 @@ class PhaseTracker:
         return self._move_to(self.phase, nearest, power)
 
     def update_pair(self, phase: float, power: float) -> float:
-        """Do what ``update`` does, from the phase itself, which is known but for whole waves."""
+        """Return the phase that was added, as ``update``, from the phase itself, which is known but for whole waves."""
         if self.phase is None:
             self.phase = self._farthest = phase
             return 0.0
@@ -178,7 +178,7 @@ class HallWheel:
 
     @property
     def unknown(self) -> int:
-        """Steps whose direction was unknown: they are in no distance."""
+        """The steps whose direction was unknown: they are in no distance."""
         return int(self._counts.unknown_rad / math.pi)
 
     @property

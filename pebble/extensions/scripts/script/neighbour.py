@@ -33,7 +33,7 @@ class Way(NamedTuple):
 
 
 class Neighbour:
-    """Robot ``name``; ``me`` is this one. :meth:`pebble.script.Robot.neighbour` makes it. Any thread may use it."""
+    """The robot ``name`` as ``me`` sees it; :meth:`pebble.script.Robot.neighbour` makes it. Any thread may use it."""
 
     def __init__(self, name: str, me: Identity, way: Way) -> None:
         self.name = name
@@ -85,7 +85,7 @@ class Neighbour:
         return self._send(command) and not refusal
 
     def stop(self) -> bool:
-        """Stop its wheels: the same as ``drive()``."""
+        """Stop the other robot's wheels: the same as ``drive()``."""
         return self.drive()
 
     @property
