@@ -45,7 +45,7 @@ API = {
 
 
 def main() -> int:
-    """Build the site; returns Sphinx' exit code."""
+    """Build the site; return Sphinx' exit code."""
     shutil.rmtree(SOURCE, ignore_errors=True)
     shutil.copytree(ROOT / "docs", SOURCE, ignore=shutil.ignore_patterns("README.md"))
     pages = {ROOT / "docs" / path.relative_to(SOURCE): path for path in SOURCE.rglob("*") if path.is_file()}

@@ -37,7 +37,7 @@ class Visit:
         self._refused: dict[str, NeighbourRefusal] = {}
 
     def command(self, name: str, drive: Drive, now: float) -> bool:
-        """Take a command of a robot that may drive this one. False: it has no effect."""
+        """Take a command of a robot that may drive this one; return False if it has no effect."""
         if not drive.signed or not isinstance(drive.run, int):
             return False  # no script's: it could neither be ended nor told from the next one
         if self._who != (name, drive.run) and not (drive.moves and self._starts(name, drive.run, now)):

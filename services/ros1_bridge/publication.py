@@ -70,7 +70,7 @@ class Publication:
             return {subscriber.name for subscriber in self._subscribers}
 
     def send(self, body: bytes) -> int:
-        """Send a message to all who can take it now; returns how many could."""
+        """Send a message to all who can take it now; return how many could."""
         data = block(body)
         with self._lock:
             return sum([self._send(subscriber, data) for subscriber in list(self._subscribers)])

@@ -13,7 +13,7 @@ LIMIT_SIGMA = 3.0  # a run with a larger residual is repeated
 
 
 class Run(NamedTuple):
-    """A run: the steps that both wheels were counted, reverse negative, and how the robot has really moved."""
+    """A run: the counted steps of both wheels, reverse negative, and how the robot has really moved."""
 
     name: str
     left: float

@@ -36,7 +36,7 @@ class Counts(NamedTuple):
 
 
 class Legs:
-    """The robot as its calibration drives it. ``expected``: its wheels, as they are believed to be.
+    """The robot as its calibration drives it. ``expected``: its wheels, as they are believed to be before it.
 
     ``mm_s`` is its speed at half power. Every leg raises PebbleError if it is not driven to its end, or Stopped.
     """

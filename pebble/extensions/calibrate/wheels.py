@@ -50,7 +50,7 @@ class Person(Protocol):
 
 
 class _Movement(NamedTuple):
-    """The movement of a straight: along its arc, reverse negative, and counter-clockwise."""
+    """The movement of a straight run: along its arc, reverse negative; the turn is counter-clockwise."""
 
     mm: float
     turn_rad: float

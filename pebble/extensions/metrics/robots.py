@@ -50,7 +50,7 @@ class Samples:
 
 
 class Robot:
-    """One robot: the view of an operator's program, and what that does not keep."""
+    """One robot: the view of an operator's program, and the figures that the view does not keep."""
 
     def __init__(self, base: str, now: float) -> None:
         self.view = RobotView(base)
@@ -149,7 +149,7 @@ class Robots:
 
 
 def _named(entries: dict[str, T]) -> dict[str, T]:
-    """Return the entries that have a name which may be a label."""
+    """Return the entries whose names may be labels."""
     return {name: entry for name, entry in list(entries.items())[:MOST_NAMES] if _valid_level(name)}
 
 

@@ -213,7 +213,7 @@ class LateRun:
         self._since = self._newest_at = 0.0
 
     def note(self, late: bool, now: float) -> None:
-        """Count a command that does not tell its age, or start again."""
+        """Count a ``late`` command that does not tell its age; one that is on time starts the count again."""
         if not late:
             self.count = 0
             return

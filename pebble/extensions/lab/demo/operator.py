@@ -114,7 +114,7 @@ class Operator:
         self._thread = threading.Thread()
 
     def connect(self) -> None:
-        """Connect and subscribe; returns at once."""
+        """Connect and subscribe; return at once."""
         self._transport.open(timeout=0.0)
         self._transport.subscribe(
             ALL_OUTGOING, lambda message: self.discovery.receive(message, time.monotonic(), time.time())
@@ -212,7 +212,7 @@ class Operator:
             self._wait(_POLL_S)
 
     def _drive(self, drive: Drive) -> float:
-        """Send one command to all robots that are free; returns when."""
+        """Send one command to all robots that are free; return when."""
         for driver in self._free_drivers():
             driver.command(drive)
         return time.monotonic()
