@@ -19,6 +19,7 @@ make long PART=fleet      brokers and hubs that are killed, hung and cut off und
 make long PART=brokers    install NATS, RabbitMQ and aedes where possible, test robots with them, judge them, seven minutes
 make long PART=gstreamer  install GStreamer and OpenCV, and have them read the original's local media, three minutes
 make long PART=ros1       install Debian's rosmaster, rospy and roscpp where possible, and test the bridge with them, four minutes
+make long PART=metrics    install Prometheus where possible, and have each alert fired by its cause, a minute
 make long PART=firmware   measure the firmware's use of each board's memory in the real MicroPython
 make long PART=life       install, update, damage and remove packages on machines with a real systemd; root, 15 minutes
 make long PART=lowest     core, films, Foxglove and the demo with the lowest versions that pyproject.toml admits, ten minutes
@@ -62,6 +63,10 @@ ros1)
         debian =topic-tools =python3-rosmaster =python3-rospy =python3-nav-msgs =python3-geometry-msgs =python3-std-msgs \
             =python3-diagnostic-msgs =python3-actionlib-msgs
     tests -ra tests/ext/ros1_bridge
+    ;;
+metrics)
+    debian promtool=prometheus
+    tests -ra tests/ext/metrics
     ;;
 firmware) tests --log-cli-level=INFO tests/firmware/test_heap.py ;;
 life)

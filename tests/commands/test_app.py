@@ -52,7 +52,7 @@ def test_all_commands_are_listed_on_one_screen(run: Run, arguments: tuple[str, .
     usage, *lines = run.out.splitlines()
     assert [line[9:20].rstrip() for line in lines] == [name for name, *below in NAMES if not below]
     assert [line.split()[0] for line in lines if line[0] != " "] == ["use", "own", "write", "share", "measure"]
-    assert len(lines) == 22, "and the usage and a prompt: 24 lines"
+    assert len(lines) <= 24, "a screen of 24 lines shows all but the usage"
     assert max(map(len, (usage, *lines))) <= 80
 
 

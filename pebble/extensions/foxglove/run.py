@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from pebble.errors import TransportError
 from pebble.extensions.foxglove.robots import Robots, filters
 from pebble.extensions.foxglove.server import Server
 from pebble.extensions.operator.client.broker import Broker
-from pebble.extensions.operator.signals import handled_by
+from pebble.extensions.operator.signals import ending_event
 from pebble.extensions.recordings.exports.foxglove_messages import Schemas
 from pebble.transports import MqttSettings
 
@@ -38,7 +38,7 @@ class Summary(NamedTuple):
 
 def run(settings: Settings, on_ready: Callable[[str], None]) -> Summary:
     """Serve until SIGINT, SIGTERM or SIGHUP; ``on_ready`` gets the address. Raises PebbleError."""
-    return asyncio.run(serve(settings, on_ready, _signalled()))
+    return asyncio.run(serve(settings, on_ready, ending_event()))
 
 
 async def serve(
@@ -76,17 +76,6 @@ async def _show(settings: Settings, broker: Broker, robots: Robots, on_ready: Ca
         await broker.subscribe(filter_, robots.receive)
     on_ready()
     await asyncio.Event().wait()
-
-
-@contextlib.contextmanager
-def _signalled() -> Iterator[asyncio.Event]:
-    """Yield an event that is set by signals.
-
-    Not every platform lets an event loop handle signals.
-    """
-    loop, event = asyncio.get_running_loop(), asyncio.Event()
-    with handled_by(lambda *_: loop.call_soon_threadsafe(event.set)):
-        yield event
 
 
 def _call(loop: asyncio.AbstractEventLoop, robots: Robots, topic: str, on: bool) -> None:

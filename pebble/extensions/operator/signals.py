@@ -1,5 +1,6 @@
 """The signals that end a command: handled in a ``with`` block, or raised as KeyboardInterrupt."""
 
+import asyncio
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -32,3 +33,11 @@ def interrupted_by_signals() -> Iterator[None]:
 
     with handled_by(interrupt):
         yield
+
+
+@contextmanager
+def ending_event() -> Iterator[asyncio.Event]:
+    """Give an event that these signals set. Not all platforms let a loop handle signals."""
+    loop, event = asyncio.get_running_loop(), asyncio.Event()
+    with handled_by(lambda *_: loop.call_soon_threadsafe(event.set)):
+        yield event
