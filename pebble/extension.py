@@ -59,6 +59,7 @@ OURS: Final[Mapping[str, tuple[str, ...]]] = {
     "pebble.services.recorder": ("services.recorder",),
     "pebble.services.neighbours": ("services.neighbours",),
     "pebble.services.ros1_bridge": ("services.ros1_bridge",),
+    "pebble.services.homeassistant": ("services.homeassistant",),
     "pebble.extensions.fleet": (),
     "pebble.extensions.page": ("services.web_handler", "web_interface"),
     "pebble.services.serial_mcu_bridge.imu": (),

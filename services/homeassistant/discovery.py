@@ -1,0 +1,114 @@
+"""The message by which Home Assistant makes a device of a robot, from the robot's capabilities. Pure.
+
+It never has what moves a robot or ends a stop: Home Assistant repeats nothing, so it is no dead man.
+"""
+
+import re
+from collections.abc import Collection, Iterator
+from typing import Any, Final
+from zlib import crc32
+
+import msgspec
+
+from pebble import contract as c
+from pebble.contract.names import with_name
+from pebble.extensions.operator.client.robot_topics import names, section_of, topic_of
+from pebble.version import __version__
+
+MAX_BYTES, MAX_COMPONENTS = 8000, 24  # of the message, and of what is in it; the last owners are left out
+ACCOUNT: Final = "homeassistant"  # of Home Assistant at a broker that vouches for names
+_STALE_S: Final = 600  # after it, volts are not shown
+_ONLINE: Final = "value_json.online is defined and not value_json.online"
+_STOP: Final = """{"stop": "{{ '%016x' | format((now().timestamp() * 1000000) | int) }}", "by": "homeassistant"}"""
+_COLOUR: Final = (
+    '{"r": {{ (red | default(255)) / 255 }}, "g": {{ (green | default(255)) / 255 }}, '
+    '"b": {{ (blue | default(255)) / 255 }}}'
+)
+_FLAG: Final = "{{ (value_json.value if value_json is mapping else value_json) | string | lower }}"
+_DARK: Final = '{"r": 0, "g": 0, "b": 0}'
+_BUTTONS: Final = {"restart": ("service_restart", c.SERVICE_RESTART), "reboot": ("reboot", c.REBOOT)}
+_UNITS: Final = {"v": ("voltage", "V"), "%": ("battery", "%")}
+
+Component = dict[str, Any]
+
+
+def object_id(base: str) -> str:
+    """Return the robot's name where only letters, digits and lines are allowed; no two robots have the same."""
+    plain = base.replace("/", "_")
+    allowed = re.sub(r"[^A-Za-z0-9_-]", "_", plain)
+    exact = allowed == plain and base.count("_") == 0
+    return f"pebble_{allowed}" if exact else f"pebble_{allowed}_{crc32(base.encode()):08x}"
+
+
+def discovery(base: str, capabilities: dict[str, Any], expose: Collection[str] = (), unit: str = "") -> bytes:
+    """Return the message. ``unit``: of the battery's level, ``v`` or ``%``; "": none is known."""
+    name, identity = object_id(base), section_of(capabilities, "identity")
+    online = c.ONLINE.topic(base)
+    there = {"avty_t": online, "avty_tpl": f"{{{{ 'offline' if {_ONLINE} else 'online' }}}}"}
+    components: dict[str, Component] = {}
+    # Without availability: an absent tracker would be unavailable, not away.
+    here = {"p": "device_tracker", "name": "Presence", "stat_t": online, "src_type": "router"}
+    components["presence"] = here | {"val_tpl": f"{{{{ 'not_home' if {_ONLINE} else 'home' }}}}"}
+    components |= {key: value | there for key, value in _components(base, capabilities, expose, unit)}
+    for key, component in components.items():
+        component["uniq_id"] = f"{name}_{key}"
+    message = {
+        "dev": {
+            "ids": [name],
+            "name": identity.get("name") or base.rpartition("/")[2],
+            "mf": "Pebble",
+            "mdl": identity.get("description") or base.split("/")[1],
+            "sw": __version__,
+        },
+        "o": {"name": "pebble", "sw": __version__},
+        "cmps": components,
+    }
+    while len(components) > MAX_COMPONENTS or len(msgspec.json.encode(message)) > MAX_BYTES:
+        components.popitem()
+    return msgspec.json.encode(message)
+
+
+def _components(
+    base: str, capabilities: dict[str, Any], expose: Collection[str], unit: str
+) -> Iterator[tuple[str, Component]]:
+    def topic(channel: c.Channel) -> str:
+        return topic_of(base, capabilities, channel)
+
+    def command(where: str) -> Component:
+        return {"cmd_t": with_name(where, ACCOUNT) if named else where, "qos": 1}
+
+    named = capabilities.get("named") is True
+    estop, video = section_of(capabilities, "estop"), section_of(capabilities, "video")
+    if estop.get("available") is True:  # it needs no name
+        yield "stop", {"p": "button", "name": "STOP", "cmd_t": c.ESTOP.topic(base), "cmd_tpl": _STOP, "qos": 1}
+    if unit in _UNITS:
+        kind, shown = _UNITS[unit]
+        level = {"p": "sensor", "name": "Battery", "dev_cla": kind, "unit_of_meas": shown, "exp_aft": _STALE_S}
+        yield "battery", level | {"stat_t": topic(c.CHARGING_LEVEL), "val_tpl": "{{ value_json.value }}"}
+    if section_of(capabilities, "telemetry").get("charging_status") is True:
+        yield "charging", _binary("Charging", "battery_charging", topic(c.CHARGING_STATUS), "value")
+    if video.get("encoding") == "jpeg":  # it shows no other
+        yield "camera", {"p": "camera", "name": "Camera", "t": topic(c.CAMERA)}
+    if video.get("controls") is True:
+        flag = {"p": "switch", "name": "Video", "stat_t": topic(c.MQTT_VIDEO), "val_tpl": _FLAG}
+        yield "video", flag | {"pl_on": "true", "pl_off": "false"} | command(topic(c.MQTT_VIDEO)) | {"ret": not named}
+    if section_of(capabilities, "lights").get("solid") is True:
+        unread = dict.fromkeys(("r_tpl", "g_tpl", "b_tpl"), "{{ 0 }}")  # without them it offers no colours
+        light = {"p": "light", "name": "Light", "schema": "template", "cmd_on_tpl": _COLOUR, "cmd_off_tpl": _DARK}
+        yield "light", light | unread | command(topic(c.LIGHTS_SOLID))
+    for key, (section, channel) in _BUTTONS.items():
+        offer = section_of(capabilities, f"system.{section}")
+        if key in expose and offer.get("controls") is True:
+            listed = offer.get("flag_topic")
+            where = str(listed) if names(base, listed, channel) else channel.topic(base)
+            button = {"p": "button", "name": key.capitalize(), "dev_cla": "restart", "pl_prs": "true"}
+            yield key, button | command(where)
+    owners = estop.get("owners")
+    for owner in owners if isinstance(owners, list) else ():
+        state = c.ESTOP_STATE.topic(base, owner=owner)
+        yield f"stopped_{owner}", _binary(f"Stopped {owner}", "problem", state, "latched")
+
+
+def _binary(name: str, kind: str, topic: str, field: str) -> Component:
+    state = f"{{{{ 'ON' if value_json.{field} else 'OFF' }}}}"
+    return {"p": "binary_sensor", "name": name, "dev_cla": kind, "stat_t": topic, "val_tpl": state}

@@ -1,0 +1,112 @@
+"""The service that tells Home Assistant of the robot, over a connection of its own."""
+
+from typing import Any
+
+import msgspec
+
+from pebble.contract import CAPABILITIES, CHARGING_LEVEL
+from pebble.contract.payloads import Capabilities, ChargingLevel
+from pebble.errors import PebbleError
+from pebble.runtime.connections import remote_transport
+from pebble.runtime.service import Service, every, on
+from pebble.runtime.whole_file import make_folder, write
+from pebble.services.homeassistant.config import HomeAssistant, saved
+from pebble.services.homeassistant.discovery import discovery, object_id
+from pebble.transports import Message, QoS, State, Transport
+
+APART_S = 5.0  # between two messages
+_TICK_S = 0.25
+
+
+class HomeAssistantService(Service):
+    """The publisher of the discovery message, and of the empty one that ends it. ``remote`` is for tests."""
+
+    name = "homeassistant"
+
+    def __init__(self, *arguments: Any, remote: Transport | None = None, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._section = self.config.section(HomeAssistant)
+        self._remote = remote or remote_transport(self.config, "homeassistant")
+        self._place = f"{self._section.prefix}/device/{object_id(self.config.base)}/config"
+        self._capabilities: dict[str, Any] = {}
+        self._unit = ""
+        self._wanted = self._sent = b""  # messages
+        self._due = False  # again, although it has not changed
+        self._sent_at = float("-inf")
+        self._file = saved(self.config)
+        self._retained = self._load()  # topics that the broker may retain
+        self._emptied: set[str] = set()  # on this connection, perhaps not confirmed
+
+    def start(self) -> None:
+        self._remote.on_state(lambda state: self.post(self._on_connection) if state is State.CONNECTED else None)
+        self._remote.open(timeout=0.0)
+        self.on_stop(self._remote.close)
+        if self._section.enabled:
+            self._remote.subscribe(f"{self._section.prefix}/status", self._on_status, echo=False, direct=True)
+
+    @on(CAPABILITIES)
+    def capabilities(self, capabilities: Capabilities) -> None:
+        self._capabilities = capabilities.value
+        self._update()
+
+    @on(CHARGING_LEVEL)
+    def level(self, level: ChargingLevel) -> None:
+        if level.unit != self._unit:
+            self._unit = str(level.unit)
+            self._update()
+
+    def _update(self) -> None:
+        if self._section.enabled and self._capabilities:
+            self._wanted = discovery(self.config.base, self._capabilities, self._section.expose, self._unit)
+
+    def _on_status(self, message: Message) -> None:
+        """Take what Home Assistant says of itself, on the transport's thread."""
+        if message.payload == b"online":
+            self.post(self._on_connection)
+
+    def _on_connection(self) -> None:
+        self._due = True
+        self._emptied.clear()
+
+    @every(_TICK_S)
+    def send(self) -> None:
+        """Send what is due: the message, or empty ones where an earlier config had it."""
+        if self._remote.state is not State.CONNECTED:
+            return
+        now = self.clock()
+        if self._wanted and (self._due or self._wanted != self._sent) and now - self._sent_at >= APART_S:
+            self._save({*self._retained, self._place})  # first: it has to be emptied even if this process dies now
+            if self._publish(self._place, self._wanted):
+                self._sent, self._sent_at, self._due = self._wanted, now, False
+        old = self._retained - ({self._place} if self._section.enabled else set())
+        if old and old <= self._emptied and not self._remote.outgoing.waiting:
+            self._save(self._retained - old)
+        for topic in old - self._emptied:
+            if self._publish(topic, b""):
+                self._emptied.add(topic)
+
+    def _publish(self, topic: str, payload: bytes) -> bool:
+        return self._remote.publish(topic, payload, qos=QoS.DELIVERED, retain=True)
+
+    def _load(self) -> set[str]:
+        try:
+            return set(msgspec.json.decode(self._file.read_bytes(), type=list[str]))
+        except FileNotFoundError:
+            return set()
+        except (OSError, msgspec.MsgspecError) as error:
+            self.log.warning("%s cannot be read: %s", self._file, error)
+            return {self._place}
+
+    def _save(self, topics: set[str]) -> None:
+        """Save the topics; none removes the file, and with it this process from the next start."""
+        if topics == self._retained:
+            return
+        try:
+            if topics:
+                make_folder(self._file.parent)
+                write(self._file, msgspec.json.encode(sorted(topics)), 0o600, PebbleError)
+            else:
+                self._file.unlink(missing_ok=True)
+        except (OSError, PebbleError) as error:
+            self.log.warning("%s: Home Assistant may keep the robot when it is disabled: %s", self._file, error)
+        self._retained = topics
