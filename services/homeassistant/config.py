@@ -25,8 +25,8 @@ def _check(reader: Reader, root: Root, _: Place) -> Root:
     section: HomeAssistant = root.services.homeassistant  # type: ignore[attr-defined]  # of this extension
     bridge = root.services.mqtt_bridge
     if section.enabled and not (bridge.enabled and bridge.remote is None):
-        why = "needs a remote broker by MQTT: enable services.mqtt_bridge with remote_mqtt, without remote"
-        reader.notes.problem((*_PLACE, "enabled"), why)
+        why = "is not used without a remote broker by MQTT: enable services.mqtt_bridge with remote_mqtt"
+        reader.notes.warning((*_PLACE, "enabled"), why)
     return root
 
 

@@ -9,7 +9,7 @@ from pebble.contract.payloads import Capabilities, ChargingLevel
 from pebble.errors import PebbleError
 from pebble.runtime.connections import remote_transport
 from pebble.runtime.service import Service, every, on
-from pebble.runtime.whole_file import make_folder, write
+from pebble.runtime.whole_file import write
 from pebble.services.homeassistant.config import HomeAssistant, saved
 from pebble.services.homeassistant.discovery import discovery, object_id
 from pebble.transports import Message, QoS, State, Transport
@@ -93,8 +93,7 @@ class HomeAssistantService(Service):
             return set(msgspec.json.decode(self._file.read_bytes(), type=list[str]))
         except FileNotFoundError:
             return set()
-        except (OSError, msgspec.MsgspecError) as error:
-            self.log.warning("%s cannot be read: %s", self._file, error)
+        except (OSError, msgspec.MsgspecError):  # it may be there
             return {self._place}
 
     def _save(self, topics: set[str]) -> None:
@@ -103,7 +102,6 @@ class HomeAssistantService(Service):
             return
         try:
             if topics:
-                make_folder(self._file.parent)
                 write(self._file, msgspec.json.encode(sorted(topics)), 0o600, PebbleError)
             else:
                 self._file.unlink(missing_ok=True)
