@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from pebble.contract import ONLINE
 from pebble.errors import PebbleError
 from pebble.extensions.metrics.robots import Robots, Samples
 from pebble.extensions.operator.client.broker import Broker
@@ -38,9 +37,9 @@ class Exporter:
             await self._broker.open()
             try:
                 for channel in (*FLEET, *SYNONYMS):
-                    deferred = channel is ONLINE or channel in SYNONYMS
-                    await self._broker.subscribe(channel.filter("+/+/+"), self._receive, deferred=deferred)
-                on_ready(f"http://{host}:{server.sockets[0].getsockname()[1]}/metrics")
+                    await self._broker.subscribe(channel.filter("+/+/+"), self._receive)
+                name = f"[{host}]" if ":" in host else host
+                on_ready(f"http://{name}:{server.sockets[0].getsockname()[1]}/metrics")
                 await ended.wait()
             finally:
                 server.close()
@@ -51,7 +50,6 @@ class Exporter:
 
     def scrape(self) -> str:
         """Return all metrics; without a broker nothing is known of robots."""
-        self._broker.deliver()
         now, samples = time.monotonic(), Samples()
         if self._broker.connected:
             self._robots.add_to(samples, now)
