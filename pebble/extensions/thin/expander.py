@@ -27,7 +27,7 @@ _BASE = re.compile(rf"((?:[^/]+/){{2}}[^/]+)/(?:{INCOMING}|{OUTGOING})/")
 
 
 class _Robot:
-    """What an expander knows of a robot with groups; times are those of its clock."""
+    """The state of a robot with groups, as an expander follows it; times are those of its clock."""
 
     def __init__(self) -> None:
         self.named = False
