@@ -1,4 +1,4 @@
-"""`pebble expand`, and the page's server with `web_interface.expand`, at a real broker."""
+"""`pebble topic expand`, and the page's server with `web_interface.expand`, at a real broker."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TEXT = joined(STREAMS)
 
 @contextmanager
 def command(broker: Broker) -> Iterator[None]:
-    words = [sys.executable, "-m", "pebble.cli", "expand", f"mqtt://127.0.0.1:{broker.port}"]
+    words = [sys.executable, "-m", "pebble.cli", "topic", "expand", f"mqtt://127.0.0.1:{broker.port}"]
     process = Child(words, env=os.environ | {"PYTHONPATH": str(ROOT)}, stderr=subprocess.DEVNULL)
     try:
         yield
