@@ -8,7 +8,7 @@ const ROW = 4; // px of a row of the grid: cards end at multiples of it
 const SIDE = 340; // the last column, if there is one for driving
 const LEAST = 440; // of each other column
 const EQUAL = 24; // px by which a top may lie above that of a card before it in the list
-const REST_MS = 1000; // so long cards may change columns after all of them are here
+const REST_MS = 1000; // so often it is seen whether all cards are here
 
 /** @param {number} width px @param {boolean} hasSide @returns {number} */
 const columnsOf = (width, hasSide) => {
@@ -69,7 +69,7 @@ class Columns {
     this.homes = new Map();
     this.count = 0;
     this.rests = false;
-    this.timer = 0;
+    this.timer = setTimeout(() => this.rest(), REST_MS);
     this.seen = new Set();
     this.observer = more.sizes(() => this.place());
     const touched = () => (this.rests = true);
@@ -90,7 +90,6 @@ class Columns {
       const area = `${top + 1} / ${at + 1} / span ${Math.max(1, sizes[n].rows)} / span ${span}`;
       if (cards[n].style.gridArea !== area) cards[n].style.gridArea = area; // this runs with each message, too
     });
-    if (!this.timer && !this.grid.querySelector(".loading")) this.timer = setTimeout(() => this.rest(), REST_MS);
   }
 
   /** Choose columns by how high each card is in a main column and in the last one. */
@@ -109,6 +108,7 @@ class Columns {
   }
 
   rest() {
+    if (this.grid.querySelector(".loading")) return void (this.timer = setTimeout(() => this.rest(), REST_MS));
     if (!this.rests) this.place();
     this.rests = true;
     this.grid.dataset.rests = "";
