@@ -28,7 +28,7 @@ from pebble.contract import (
 from pebble.contract.names import BY
 from pebble.errors import PayloadError
 
-MOST_MEMBERS, MOST_BYTES = 8, 2048
+MOST_MEMBERS, MOST_BYTES = 8, 2048  # of a group: one packet of a thin link, and one write at a board
 MEMBERS = (DRIVE, LIGHTS_SOLID, LIGHTS_FLASH, SOUNDBOARD_COMMAND, OUTLET_COMMAND, MCU_COMMAND)
 _SHOWN = 40  # characters of a metric
 MARK = "group"  # of a copy: true

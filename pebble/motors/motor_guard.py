@@ -170,9 +170,7 @@ class MotorGuard:
         if not self._can_save and self._file.can_save():
             self._can_save = True
             self._save()
-        elif self._file.busy or self._file.ends_with_container:
-            pass  # no further try would last longer
-        elif self.persisted is False or not self._file.in_place:
+        elif not self._file.lost and not self._file.busy and (self.persisted is False or not self._file.in_place):
             self._save()
         if self._barred and not self._barred_file.busy and not self._barred_file.in_place:
             self._barred_file.save(self._barred)

@@ -54,10 +54,10 @@ class StateFile:
     def can_save(self) -> bool:
         """True if the folder can be written or created, or ends with a container: a write there counts as failed."""
         existing = next(folder for folder in self.path.parents if os.access(folder, os.F_OK))
-        return self.ends_with_container or (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK))
+        return self.lost or (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK))
 
     @property
-    def ends_with_container(self) -> bool:
+    def lost(self) -> bool:
         """True if this is a container, and no volume holds the folder: a new container does not know the value."""
         folders = self.path.resolve().parents
         return CONTAINER in os.environ and str(next(folder for folder in folders if folder.is_mount())) in LOST
@@ -130,7 +130,7 @@ class StateFile:
             make_folder(self.path.parent)
             write(self.path, json.dumps(value).encode(), 0o600, PebbleError)
             self._own = OwnFile(self.path)
-            if self.ends_with_container:
+            if self.lost:
                 raise PebbleError(f"NOT SAVED: no volume holds {self.path.parent}, so a stop ends with this container")
         except (PebbleError, OSError) as error:
             self._log.log("failed", logging.ERROR, "the state cannot be written: %s", error)

@@ -18,7 +18,7 @@ from tests.commands.command_line import Run, config_file, program, running
 from tests.support import ROOT, free_port, some, until
 
 NAMES = [tuple(words.split()) for words in app.commands(["up"])]
-TOPIC = [("topic", name) for name in ("list", "echo", "pub", "hz", "contract")]
+TOPIC = [("topic", name) for name in ("list", "echo", "pub", "hz", "contract", "expand")]
 
 
 def test_a_command_leaves_logging_as_it_was(run: Run) -> None:

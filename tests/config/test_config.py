@@ -85,6 +85,8 @@ class TestMeaning:
         assert (config.local_mqtt.host, config.local_mqtt.port) == ("127.0.0.1", 1883)
         assert config.robot.platform == "linux"
         assert config.warnings == ()
+        with pytest.raises(AttributeError):
+            config.log_level = "DEBUG"  # type: ignore[misc]
 
     def test_services_run_only_when_asked_except_the_launcher(self) -> None:
         services = read({"robot": {"id": "goob"}}).services

@@ -15,6 +15,7 @@ from pebble.transports import Message, MqttSettings, QoS, clock
 from pebble.transports.counters import Counters
 from pebble.transports.hosts import addresses_of
 from pebble.transports.mqtt import packets
+from pebble.transports.mqtt.broker_limits import Limits
 from pebble.transports.mqtt.client import Opening
 from pebble.transports.mqtt.connection import Connection
 from pebble.transports.mqtt.ending import Lost, Silent
@@ -266,6 +267,22 @@ def test_a_discarded_connection_sends_nothing_more(link: Link) -> None:
     link.connection.discard()
     with pytest.raises(ConnectionResetError):
         list(iter(lambda: link.other.recv(1 << 20), b""))
+
+
+def test_a_broker_without_qos_1_is_sent_no_more_than_its_socket_takes_but_stops(link: Link) -> None:
+    link.connection.limits = Limits(qos=0)
+    link.owner.policy.is_stop = lambda topic: topic == "stop"
+    assert link.connection.publish(Message("full", bytes(20_000_000)))
+    found = {topic: link.connection.publish(Message(topic, b"", QoS.DELIVERED)) for topic in ("a", "stop")}
+    assert found == {"a": False, "stop": True}
+
+
+def test_a_packet_may_be_as_long_as_the_broker_has_said(link: Link) -> None:
+    link.connection.max_packet = 100
+    longest = next(size for size in range(100, 0, -1) if link.connection.takes(Message("a" * 20, bytes(size))))
+    for topic in ("a", "a" * 40):
+        sizes = [size for size in range(100) if link.connection.takes(Message(topic, bytes(size)))]
+        assert len(sizes) - 1 + len(topic) == longest + 20
 
 
 def test_a_packet_has_eight_filters_at_most_and_what_was_asked_is_named_when_the_connection_is_lost(link: Link) -> None:

@@ -1,6 +1,7 @@
 """The calibration of a camera by pictures of one tag, held in all parts of the picture, near and far."""
 
 from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,19 +19,9 @@ WORST_PX = 1.0
 _NEAR, _MIDDLE = 0.08, 0.03  # shares of the picture from which the tag is near, or in between
 _STILL_PX = 1.0  # a corner moves less from picture to picture: the tag rests
 _STILL_PICTURES = 3
-_ROWS = ("top", "middle", "bottom")
-_COLUMNS = ("left", "middle", "right")
+_ROWS, _COLUMNS, _DISTANCES = ("top", "middle", "bottom"), ("left", "centre", "right"), ("near", "between", "far")
 
-
-class View(NamedTuple):
-    """A place of the tag in the picture: one of 3 rows, 3 columns and 3 distances."""
-
-    row: int
-    column: int
-    distance: int
-
-    def __str__(self) -> str:
-        return f"{_ROWS[self.row]} {_COLUMNS[self.column]}, {('near', 'between', 'far')[self.distance]}"
+View = tuple[str, str, str]  # a row, a column and a distance, in which the tag is
 
 
 class Lens(NamedTuple):
@@ -43,39 +34,46 @@ class Lens(NamedTuple):
     pictures: int
 
 
-def view_of(tag: Tag, width: int, height: int) -> View | None:
+def view_of(tag: Tag, size: tuple[int, int]) -> View | None:
     """Return the place of a tag in a picture of this size; None: it is too small."""
+    width, height = size
     share = tag.area / (width * height)
+    if share < LEAST_SHARE:
+        return None
     x, y = tag.corners.mean(axis=0)
     distance = 0 if share >= _NEAR else 1 if share >= _MIDDLE else 2
-    return View(int(3 * y / height), int(3 * x / width), distance) if share >= LEAST_SHARE else None
+    return _ROWS[int(3 * y / height)], _COLUMNS[int(3 * x / width)], _DISTANCES[distance]
 
 
-def collect(pictures: Iterable[Any], finder: TagFinder, tag_id: int, person: Person, *, still: bool) -> list[Floats]:
-    """Return the corners of the tag in 27 different places, or as many as there are pictures of.
+def collect(
+    pictures: Iterable[Any], finder: TagFinder, tag_id: int, person: Person, *, still: bool
+) -> tuple[list[Floats], tuple[int, int]]:
+    """Return the corners of the tag in up to 27 different places, and the width and height of the pictures.
 
     ``still``: every picture counts; otherwise the tag has to rest, and 15 places that are well spread suffice.
     """
     taken: dict[View, Floats] = {}
-    resting = 0
+    size, resting = (0, 0), 0
     before: Floats | None = None
     for picture in pictures:
-        height, width = picture.shape[:2]
+        size = picture.shape[1], picture.shape[0]
         tag = largest(finder.find(picture), tag_id)
-        corners = None if tag is None else tag.corners
-        moved = None if corners is None or before is None else float(np.abs(corners - before).max())
-        resting = resting + 1 if moved is not None and moved < _STILL_PX else 0
-        before = corners
-        if tag is None or not (still or resting >= _STILL_PICTURES):
+        if tag is None:
+            before = None
             continue
-        view = view_of(tag, width, height)
+        rests = before is not None and float(np.abs(tag.corners - before).max()) < _STILL_PX
+        resting, before = resting + 1 if rests else 0, tag.corners
+        view = view_of(tag, size) if still or resting >= _STILL_PICTURES else None
         if view is None or view in taken:
             continue
         taken[view] = tag.corners
-        person.tell(f"{len(taken)} of {LEAST_PICTURES}: {view}; {_next(taken)}")
-        if not still and len(taken) >= LEAST_PICTURES and not _missing(taken):
+        missing = [name for names in (_ROWS, _COLUMNS, _DISTANCES) for name in names if name not in {*chain(*taken)}]
+        person.tell(
+            f"{len(taken)} of {LEAST_PICTURES}: {' '.join(view)}; next: {', '.join(missing) or 'another place'}"
+        )
+        if not still and len(taken) >= LEAST_PICTURES and not missing:
             break
-    return list(taken.values())
+    return list(taken.values()), size
 
 
 def solve(corners: list[Floats], size: tuple[int, int], size_m: float) -> Lens:
@@ -140,18 +138,3 @@ def tape_line(lens: Lens, size_m: float) -> str:
     """Return a sentence by which a tape shows whether the calibration is right."""
     wide = lens.matrix[0, 0] * size_m
     return f"check it: where the black square is {wide:.0f} pixels wide, a tape from the lens to it reads 1.00 m"
-
-
-def _missing(taken: Iterable[View]) -> list[str]:
-    """Return the rows, columns and distances that no picture has."""
-    rows, columns, distances = ({view[axis] for view in taken} for axis in range(3))
-    return [
-        *(_ROWS[row] for row in range(3) if row not in rows),
-        *(_COLUMNS[column] for column in range(3) if column not in columns),
-        *(("near", "between", "far")[distance] for distance in range(3) if distance not in distances),
-    ]
-
-
-def _next(taken: Iterable[View]) -> str:
-    missing = _missing(taken)
-    return f"still missing: {', '.join(missing)}" if missing else "another place, tilted"

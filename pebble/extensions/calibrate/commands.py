@@ -123,15 +123,8 @@ def _calibrate_camera(config: Path, pictures: Any, tag: int, size: float, *, sti
     from pebble.extensions.scripts.perception.camera_model import CALIBRATION
     from pebble.extensions.scripts.perception.tags import FAMILY, TagFinder
 
-    shapes: list[tuple[int, int]] = []
-
-    def measured() -> Any:
-        for picture in pictures:
-            shapes[:] = [(picture.shape[1], picture.shape[0])]
-            yield picture
-
-    corners = collect(measured(), TagFinder(size), tag, _Terminal(), still=still)
-    lens = solve(corners, shapes[0], size)
+    corners, shape = collect(pictures, TagFinder(size), tag, _Terminal(), still=still)
+    lens = solve(corners, shape, size)
     path = config.parent / CALIBRATION
     save(path, lens, tag, size, FAMILY)
     typer.echo(f"written: {path}: {lens.pictures} pictures, which fit to {lens.error_px:.2f} pixels")

@@ -20,10 +20,11 @@ _SLOW_POWER = 0.12  # while a spin looks for the tag
 _BEFORE_TAG = 0.87  # of a spin that ends at the tag; it sees the tag again after the rest of its last turn
 _AT_TAG_RAD = math.radians(15)  # a spin that ends there has the tag in sight, which is measured at rest
 _PERIOD_S = 0.05
-_REST_S = 0.7  # after a leg: wheels coast
+_REST_S = 1.0  # after a leg: wheels coast; a picture that is not older shows it at rest, or almost
 _SAMPLES_S = 3.0  # for the first sample
 _PICTURES = 20  # of the tag, of which the median counts
-_SIGHT_S = 0.5  # without the tag in any picture: it is lost
+_SIGHT_S = 0.75  # without the tag in any picture: it is lost
+_GLANCE_S = 2.0  # at rest: a camera has shown several new pictures
 _LOOK_S = 10.0  # for the next picture of it
 
 
@@ -108,7 +109,10 @@ class Legs:
         if start is not None:
             slow_s = mm / abs(turns) * POWER / _SLOW_POWER / self._mm_s
             late = f"it does not see tag {self._tag_id} again"
-            self._drive(name, (side * _SLOW_POWER, 0.0), slow_s, lambda _: self._is_at(start), late)
+            for way in (side, -side):  # back, if it has rolled past
+                self._drive(name, (way * _SLOW_POWER, 0.0), slow_s, lambda _: self._is_at(start), late)
+                if self._sees():
+                    break
         return _difference(began, self._counts())
 
     def look(self) -> Place:
@@ -120,7 +124,7 @@ class Legs:
                 raise PebbleError(
                     f"tag {self._tag_id} is not in sight: turn the robot to it, light it, and begin again"
                 )
-            if (place := self._sight()) is not None:
+            if (place := self._sight(_REST_S)) is not None:
                 places.append(place)
         return Place(*(median(values) for values in zip(*places, strict=True)))
 
@@ -162,15 +166,22 @@ class Legs:
         elif now - self._seen_at > _SIGHT_S:
             raise PebbleError(f"{name}: it has lost tag {self._tag_id}")
 
+    def _sees(self) -> bool:
+        until = self._clock() + _GLANCE_S
+        while self._clock() < until:
+            if self._sight(_REST_S) is not None:
+                return True
+        return False
+
     def _is_at(self, start: Place) -> bool:
         place = self._sight()
         return place is not None and abs(place.angle_rad - start.angle_rad) < _AT_TAG_RAD
 
-    def _sight(self) -> Place | None:
-        """Return where the tag is in a new picture; None if there is no new picture, or no tag in it."""
+    def _sight(self, max_age: float = 0.3) -> Place | None:
+        """Return where the tag is in a new picture of the last ``max_age`` seconds; None if it is in none."""
         assert self._finder is not None  # noqa: S101 - only a calibration with a tag looks
         self._wait(0.01)
-        before, picture = self._picture, self._robot.picture(0.3)
+        before, picture = self._picture, self._robot.picture(max_age)
         self._picture = picture
         if picture is None or picture is before:
             return None

@@ -14,7 +14,7 @@ def facts(config: Config) -> Facts:
 
 
 def _lines(config: Config) -> Iterator[str]:
-    if StateFile(config.state_file("estop")).ends_with_container:
+    if StateFile(config.state_file("estop")).lost:
         yield f"NOT SAVED: no volume holds {config.state_dir()}, so a stop ends with this container"
     yield "cannot work: reboot, restart and git pull by operators; pebble setup; releases in slots; systemd's watch"
     if config.serial_instances():

@@ -17,12 +17,6 @@ EXTENSION = Extension(
             "use",
             40,
         ),
-        "expand": Command(
-            "pebble.extensions.operator.commands.expand:expand",
-            "take groups of streams apart, beside a broker",
-            "share",
-            90,
-        ),
         "topic": Command(
             "pebble.extensions.operator.commands.topic", "list, print, publish and measure messages", "write", 20
         ),

@@ -1,13 +1,17 @@
 """The signals that end a command: handled in a ``with`` block, or raised as KeyboardInterrupt."""
 
-import asyncio
+from __future__ import annotations
+
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pebble.runtime.signals import ending_signals
+
+if TYPE_CHECKING:
+    import asyncio
 
 
 @contextmanager
@@ -37,7 +41,12 @@ def interrupted_by_signals() -> Iterator[None]:
 
 @contextmanager
 def ending_event() -> Iterator[asyncio.Event]:
-    """Give an event that these signals set. Not all platforms let a loop handle signals."""
+    """Yield an event that these signals set.
+
+    Not every platform lets an event loop handle signals.
+    """
+    import asyncio  # most commands have no loop
+
     loop, event = asyncio.get_running_loop(), asyncio.Event()
     with handled_by(lambda *_: loop.call_soon_threadsafe(event.set)):
         yield event

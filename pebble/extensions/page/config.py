@@ -93,6 +93,7 @@ class WebInterface(Section, frozen=True, kw_only=True):
     recordings: Annotated[
         File | None, doc("Folder of recordings to look at on the page; unset: that of services.recorder, if it runs.")
     ] = None
+    expand: Annotated[bool, doc("Take groups of streams apart, as `pebble topic expand` does.")] = False
 
     @property
     def local(self) -> bool:

@@ -35,7 +35,8 @@ from pebble.extensions.page.robots import Robots
 from pebble.extensions.page.setting import WebSettings
 from pebble.extensions.page.silent_boards import SilentBoards
 from pebble.extensions.page.stops import Stops
-from pebble.transports import Message, QoS, Subscription
+from pebble.extensions.thin.expander import ANNOUNCE_S, Expander
+from pebble.transports import Message, MqttSettings, QoS, Subscription
 from pebble.transports.clock import since_boot as clock
 
 log = logging.getLogger(__name__)
@@ -86,6 +87,8 @@ class Server:
             deferred = channel is ONLINE or channel in SYNONYMS
             self._of_all.append(await self.broker.subscribe(channel.filter("+/+/+"), self.receive, deferred=deferred))
         self.spawn(self._tick())
+        if self.settings.expand:
+            self.spawn(expand(self.settings.broker))
         if self.settings.login:
             self.spawn(self._watch_people())
         if self.settings.cameras_in_turn:
@@ -252,6 +255,21 @@ class Server:
                 view = self.stops.view(robot.estop)
                 by = person(view.by, login=self.settings.login)
                 self.robots.set_server_metric(ref, _ESTOP_METRIC, replace(view, by=by))
+
+
+async def expand(settings: MqttSettings) -> None:
+    """Take groups of streams apart, on a connection of their own, until this is cancelled."""
+    broker = Broker(settings, "pebble-web-expander")
+    expander = Expander(broker.transport)
+    broker.is_named = expander.is_named
+    await broker.open()
+    try:
+        await asyncio.to_thread(expander.start)
+        while True:
+            expander.announce()
+            await asyncio.sleep(ANNOUNCE_S)
+    finally:
+        await broker.close()
 
 
 def _is_base(ref: str) -> bool:

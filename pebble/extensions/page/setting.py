@@ -40,6 +40,7 @@ class WebSettings:
     recordings: Path | None = None  # the folder of a recorder, to look at; None: none
     authority: Path | None = None  # offered for download, so that phones can trust it
     cameras_in_turn: bool = False  # for a moment each, while a page shows the fleet: the demo's
+    expand: bool = False  # groups of streams
     plain_http_drive: bool = True  # False: over plain http from another machine nothing drives
 
     @property
@@ -75,6 +76,7 @@ def settings_of(config: Config) -> WebSettings:
         level=config.security.level,
         listed=_listed(config),
         plain_http_drive=web.plain_http_drive,
+        expand=web.expand,
         recordings=_recordings(config),
     )
 

@@ -16,8 +16,7 @@ from pebble.contract.channels import is_reserved
 from pebble.contract.names import BY
 from pebble.contract.payloads import Wire
 from pebble.errors import PayloadError, TransportError
-from pebble.extensions.thin.packed import unpacked
-from pebble.extensions.thin.stream_groups import HEARD_S
+from pebble.extensions.thin.packed import HEARD_S, unpacked
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports import Message, QoS, Transport
 
@@ -28,7 +27,7 @@ _BASE = re.compile(rf"((?:[^/]+/){{2}}[^/]+)/(?:{INCOMING}|{OUTGOING})/")
 
 
 class _Robot:
-    """The facts that an expander knows of a robot with groups; times are those of its clock."""
+    """The state of a robot with groups, as an expander follows it; times are those of its clock."""
 
     def __init__(self) -> None:
         self.named = False

@@ -57,11 +57,14 @@ class Sifter:
                 self._groups.heard()
                 return Drop.STAYS
             return self._forwarder.pass_now(source, subject, message, forward, account)
-        is_stream = rank_of(subject, message) is Rank.STREAM and not forward.retain
-        if self._groups is not None and is_stream and self._sides.gate is Gate.OPEN and self._groups.takes(message):
+        if self._groups is not None and self._joins(subject, message, forward) and self._groups.takes(message):
             return Drop.NO_ROOM
         with self._lock:
             sieve = self._sieve
             if sieve is not None and self._sides.gate is Gate.OPEN and sieve.keeps(subject, message, forward):
                 return Drop.NO_ROOM
             return self._forwarder.pass_now(source, subject, message, forward)
+
+    def _joins(self, subject: Subject, message: Message, forward: Forward) -> bool:
+        """True if a message may leave in a group of streams."""
+        return not forward.retain and self._sides.gate is Gate.OPEN and rank_of(subject, message) is Rank.STREAM

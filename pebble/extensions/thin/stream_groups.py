@@ -9,13 +9,12 @@ from msgspec.structs import replace
 
 from pebble.contract import OUTGOING, STREAMS, WIRE, codec
 from pebble.contract.payloads import Wire
-from pebble.extensions.thin.packed import LAST_DICT, joined, packed
+from pebble.extensions.thin.packed import HEARD_S, LAST_DICT, joined, packed
 from pebble.runtime.addresses import Addresses
 from pebble.services.mqtt_bridge.same_broker import now_ms
 from pebble.transports import Message, QoS, Transport
 from pebble.transports.counters import Counters
 
-HEARD_S = 5.0  # an expander says every 2 s that it is there
 _MOST_STREAMS, _MOST_BYTES = 64, 2048  # in a group, and of each of them; others are sent by themselves
 _LEARN_S, _LEARN_AGAIN_S = 3.0, 60.0  # until a group is the dictionary of later ones: by then it has all streams
 _CROWDED = 4  # so much longer between two groups, while a queue stands

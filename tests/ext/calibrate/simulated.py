@@ -59,7 +59,7 @@ class Measured(SimulatedRobot):
         for found in filter(None, map(_touch, (line.strip() for line in lines))):
             a0, a1, a2 = (int(value) + round(self._noise.gauss(0, 2)) for value in found.groups())
             self.receive(TOUCH_SENSORS, TouchSensors(value=TouchValues(a0=a0, a1=a1, a2=a2)))
-        if self._gyro:
+        if self._gyro and round(self.world.now() * 1000) % 10 == 0:
             self.receive(IMU_FAST, self._imu())
         self.at_step()
 

@@ -76,12 +76,12 @@ def test_of_a_camera_pictures_of_a_tag_at_rest_count_alone(pictures: Path) -> No
     shown = list(itertools.islice(read_folder(pictures), 4))
     moving = [picture for picture in shown for _ in range(2)]
     resting = [picture for picture in shown for _ in range(5)]
-    assert collect(moving, TagFinder(), 13, Quiet(), still=False) == []
-    assert len(collect(resting, TagFinder(), 13, Quiet(), still=False)) == 4
+    assert collect(moving, TagFinder(), 13, Quiet(), still=False)[0] == []
+    assert len(collect(resting, TagFinder(), 13, Quiet(), still=False)[0]) == 4
 
 
 def test_what_cannot_be_measured_is_refused(pictures: Path, tmp_path: Path) -> None:
-    corners = collect(read_folder(pictures), TagFinder(), 13, Quiet(), still=True)
+    corners, _ = collect(read_folder(pictures), TagFinder(), 13, Quiet(), still=True)
     with pytest.raises(PebbleError, match="14 pictures of the tag in different places: 15 are needed"):
         solve(corners[:14], SIZE, 0.25)
     shaken = [four + np.random.default_rng(1).normal(0, 8, (4, 2)) for four in corners]

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from pebble.contract import CHANNELS, CONTROL, DRIVE, ESTOP, INCOMING, Channel, codec
+from pebble.contract import CHANNELS, CONTROL, DRIVE, ESTOP, GROUP, INCOMING, Channel, codec, groups
 from pebble.extensions.fleet.names import CheckedNames
 from pebble.extensions.fleet.rights import WRITES, Right
 from pebble.forwarding.names import Signed
@@ -78,6 +78,15 @@ class TestSign:
         assert found is Drop.UNREADABLE or (isinstance(found, Signed) and found.message.payload == payload)
         assert (found is Drop.UNREADABLE) >= (channel in (DRIVE, CONTROL))
 
+    def test_a_group_has_one_sender_and_no_key_twice(self) -> None:
+        lights = b'"lights-solid": {}}'
+        found = sign("by/ann/group", b'{"drive-values": {"z": 1}, ' + lights)
+        assert isinstance(found, Signed)
+        assert {member.payload for member in groups.decode(found.message.payload)} == {
+            b'{"z":1,"by":"ann"}', b'{"by":"ann"}'
+        }  # fmt: skip
+        assert sign("by/ann/group", b'{"lights-solid": {"r": 1}, ' + lights) is Drop.UNREADABLE
+
     def test_what_is_nested_too_deep_takes_no_name(self) -> None:
         deep = b'{"a":' * 3000 + b"{}" + b"}" * 3000
         assert sign("by/ann/drive-values", deep.ljust(300)) is Drop.UNREADABLE
@@ -100,7 +109,8 @@ class TestWithoutName:
         may = {one for right in (Right.LOOK, Right.DRIVE) for one in WRITES[right]}
         incoming = [one for one in CHANNELS if one.direction == INCOMING and one is not ESTOP]
         plain = {one: one.metric.replace("{", "").replace("}", "") for one in incoming}
-        assert {one for one in incoming if passes(plain[one], b'{"z":1}', strangers)} == may
+        bodies = {GROUP: b'{"lights-solid": {}}'}  # what is no group has no name either
+        assert {one for one in incoming if passes(plain[one], bodies.get(one, b'{"z":1}'), strangers)} == may
         assert not [one for one in incoming if one is not DRIVE and passes(plain[one], b'{"z":1}')]
 
     @pytest.mark.parametrize(

@@ -11,9 +11,12 @@ import jsonschema
 import pytest
 
 from pebble.config import load, parse
+from pebble.contract import LIGHTS_SOLID, codec
 from pebble.contract.names import without_name
+from pebble.contract.payloads import LightsSolid
 from pebble.errors import ConfigError
 from pebble.launcher.capabilities import capabilities
+from pebble.motion.latch import stop_of
 from pebble.runtime.addresses import Addresses
 from pebble.services.homeassistant.config import HomeAssistant, facts
 from pebble.services.homeassistant.discovery import discovery, object_id
@@ -126,6 +129,15 @@ def test_what_a_robot_offers_is_there_and_only_what_is_exposed() -> None:
     assert {key for key, part in components.items() if part.get("ret")} == {"video"}
     assert "avty_t" not in components["presence"]
     assert [*json.loads(discovery(BASE, {}))["cmps"]] == ["presence"]
+
+
+def test_what_it_sends_is_understood() -> None:
+    components = json.loads(discovery(BASE, EVERYTHING))["cmps"]
+    stop = re.sub(r"{{ '%016x' .+? }}", "00066171a4181e4e", components["stop"]["cmd_tpl"])
+    assert stop_of(json.loads(stop)) == ("00066171a4181e4e", "homeassistant", "")
+    light = re.sub(r"{{.+?}}", "0.5", components["light"]["cmd_on_tpl"])
+    assert codec.decode(LIGHTS_SOLID, light.encode()) == LightsSolid(r=0.5, g=0.5, b=0.5)
+    assert codec.decode(LIGHTS_SOLID, components["light"]["cmd_off_tpl"].encode()) == LightsSolid()
 
 
 def test_with_names_all_commands_but_stop_have_one() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 import zlib
 from collections.abc import Callable
@@ -17,6 +18,8 @@ from pebble.extensions.media.jpeg import decode_jpeg, jpeg_size
 from pebble.extensions.media.json_video import inflate
 from pebble.extensions.media.packets import Picture, PictureKind
 from pebble.extensions.media.video import make_encoder
+from tests.ext.recordings.demo_robots import FRED, MEDIA, recorded
+from tests.kit.scene import read_counter
 
 T0 = 1_710_969_600_000
 FORMS = ("json", "pbvd", "h264")
@@ -71,6 +74,20 @@ def test_anything_refused_breaks_the_chain(name: str, bad: bytes) -> None:
     packets, decoder = stream(name), VideoDecoder()
     assert frames(decoder, [*packets[:2], bad, *packets[2:7]]) == [0, 1, None, None, None, None, None, 6]
     assert decoder.problem
+
+
+def test_a_recorded_camera_counts_its_pictures_in_every_form() -> None:
+    """The number that the simulated camera draws into its pictures grows by one with each, whatever the form."""
+    packets, decoder = recorded(MEDIA, f"{FRED}/outgoing/front-camera"), VideoDecoder()
+    shown = [decoder.feed(packet) for packet in packets]
+    seen = [one for one in shown if one is not None]
+    assert len(seen) == len(packets) > 80
+    forms = ["json", "pbvd", "pbvz", "h264"]
+    assert list(dict.fromkeys(one.encoding for one in seen)) == forms
+    for name in forms:
+        counts = [read_counter(one.picture) for one in seen if one.encoding == name]
+        assert None not in counts
+        assert all(0 < after - before <= 2 for before, after in itertools.pairwise(counts)), name
 
 
 def test_raw_jpeg_is_a_key_frame_without_number_and_time() -> None:

@@ -9,6 +9,8 @@ import pytest
 from pebble.contract import groups
 from pebble.errors import ConfigError
 from pebble.forwarding.routing import Drop
+from pebble.launcher.capabilities import capabilities
+from pebble.runtime.addresses import Addresses
 from tests.forwarding.virtual import World
 from tests.services.mqtt_bridge.bridge_rig import make_config
 
@@ -148,6 +150,19 @@ def test_lines_whose_wheels_have_other_topics_exclude_groups() -> None:
     arm = {"serial": {"port": "/dev/b"}, "topics": {"drive_values": "pebble/robots/rover/incoming/arm"}}
     with pytest.raises(ConfigError, match=r"link\.groups"):
         make_config(serial={**lines, "instances": {"arm": arm}}, link={"groups": True})
+
+
+@pytest.mark.parametrize(
+    ("serial", "on", "listed"),
+    [
+        ({"enabled": True, "serial": {"port": "/dev/a"}}, True, ["drive-values", "lights-solid", "lights-flash"]),
+        ({}, True, []),
+        ({"enabled": True, "serial": {"port": "/dev/a"}}, False, None),
+    ],
+)
+def test_capabilities_list_what_a_robot_takes_in_a_group(serial: dict[str, Any], on: bool, listed: Any) -> None:
+    config = make_config(serial=serial, link={"groups": on})
+    assert capabilities(config, Addresses(config)).get("groups") == listed
 
 
 def test_what_may_be_in_a_group_is_a_table() -> None:

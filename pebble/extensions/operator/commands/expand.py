@@ -1,4 +1,4 @@
-"""``pebble expand``: takes groups of streams apart beside a broker, for all robots there."""
+"""``pebble topic expand``: takes groups of streams apart beside a broker, for all robots there."""
 
 import time
 from typing import Annotated
@@ -8,7 +8,6 @@ import typer
 from pebble.extensions.operator.client.connection import Target, connected, put_names
 from pebble.extensions.operator.commands.options import CaCert, PasswordFile
 from pebble.extensions.operator.signals import interrupted_by_signals
-from pebble.extensions.thin.expander import ANNOUNCE_S, Expander
 
 
 def expand(
@@ -22,8 +21,10 @@ def expand(
     the broker sees the plain topics.
 
     \b
-        pebble expand mqtt://127.0.0.1
+        pebble topic expand mqtt://127.0.0.1
     """
+    from pebble.extensions.thin.expander import ANNOUNCE_S, Expander
+
     target = Target(url=url, password_file=password_file, ca_cert=ca_cert, program="expand")
     with interrupted_by_signals(), connected(target) as (transport, names):
         expander = Expander(transport)

@@ -21,6 +21,7 @@ from pebble.extensions.operator.client.estop_states import RobotEstop
 from pebble.extensions.operator.client.names import Names, id_of
 from pebble.extensions.operator.commands import show
 from pebble.extensions.operator.commands.draft import Draft, draft
+from pebble.extensions.operator.commands.expand import expand
 from pebble.extensions.operator.commands.target import with_target
 from pebble.extensions.operator.commands.topic_contract import contract
 from pebble.transports import QoS, Transport
@@ -53,7 +54,7 @@ _GROUP_HELP = """List, print, publish and measure messages, on either transport.
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(help=_GROUP_HELP, rich_markup_mode=None)
-    for command in (list_, echo, pub, hz, contract):
+    for command in (list_, echo, pub, hz, contract, expand):
         group.command(command.__name__.rstrip("_"))(command)
     app.add_typer(group, name="topic")
 

@@ -26,6 +26,15 @@ def test_after_a_pause_there_is_one_report_and_not_all_that_were_missed() -> Non
     assert mcu.tick(3.001) == b""
 
 
+def test_each_change_of_the_motors_is_reported_with_its_time() -> None:
+    changes = []
+    mcu = SimulatedMcu("goob", 0.0, on_motors=lambda now, motors: changes.append((now, motors)))
+    mcu.receive(b"M 0.5 -0.25\n", 0.1)
+    mcu.receive(b"M 0.5 -0.25\n", 0.2)
+    mcu.tick(5.0)
+    assert changes == [(0.1, (0.5, -0.25)), (pytest.approx(1.2, abs=0.005), (0.0, 0.0))], "+ is ahead on both sides"
+
+
 def test_an_error_in_the_firmware_stops_the_motors_and_starts_it_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     mcu = SimulatedMcu("goob", 0.0)
     mcu.receive(b"M 1 1\n", 0.0)

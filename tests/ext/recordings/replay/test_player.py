@@ -56,6 +56,12 @@ def test_speed_may_change_meanwhile(walk: Path) -> None:
     assert stage.sent[-1].at == pytest.approx(10.5 + 4.85, abs=0.01)
 
 
+def test_stamps_are_as_old_as_they_were(walk: Path) -> None:
+    stage = Stage(walk, Options(), speed=2.0).run()
+    for sent in stage.sent:
+        assert stamp_ns(sent.message.payload) == pytest.approx(NOW_NS + sent.at * 1e9, abs=2e6)
+
+
 @pytest.mark.parametrize(("paused", "number", "begins"), [(False, 11, 100.5), (True, 0, 100)])
 def test_a_pause_takes_no_time_of_the_recording(walk: Path, paused: bool, number: int, begins: float) -> None:
     stage = Stage(walk, ALL, paused=paused)
@@ -98,6 +104,15 @@ def test_a_loop_of_one_message_is_no_flood(tmp_path: Path) -> None:
     stage = Stage(write(tmp_path / "one.mcap", [Line(0, LOGS, b"{}")]), ALL, loop=True)
     stage.at(10, stage.player.stop).run()
     assert 10 < len(stage.sent) <= 210
+
+
+def test_several_files_are_one_recording(tmp_path: Path) -> None:
+    paths = [
+        write(tmp_path / f"{name}.mcap", [Line(n, f"{GOOB}/outgoing/{name}", b"{}") for n in range(begin, 30, 2)])
+        for begin, name in enumerate(("logs", "audio"))
+    ]
+    stage = Stage(paths, ALL).run()
+    assert [topic.rpartition("/")[2] for topic in stage.topics] == ["logs", "audio"] * 15
 
 
 def test_an_empty_recording_ends(tmp_path: Path) -> None:

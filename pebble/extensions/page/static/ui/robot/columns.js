@@ -8,7 +8,7 @@ const ROW = 4; // px of a row of the grid: cards end at multiples of it
 const SIDE = 340; // the last column, if there is one for driving
 const LEAST = 440; // of each other column
 const EQUAL = 24; // px by which a top may lie above that of a card before it in the list
-const REST_MS = 1000; // so long cards may change columns after all of them are here
+const REST_MS = 1000; // so often it is seen whether all cards are here
 
 /** @param {number} width px @param {boolean} hasSide @returns {number} */
 const columnsOf = (width, hasSide) => {
@@ -69,7 +69,7 @@ class Columns {
     this.homes = new Map();
     this.count = 0;
     this.rests = false;
-    this.timer = 0;
+    this.timer = setTimeout(() => this.rest(), REST_MS);
     this.seen = new Set();
     this.observer = more.sizes(() => this.place());
     const touched = () => (this.rests = true);
@@ -77,12 +77,11 @@ class Columns {
   }
 
   place() {
-    const { grid } = this;
-    const cards = /** @type {HTMLElement[]} */ ([...grid.children]);
-    for (const one of [grid, ...cards]) if (!this.seen.has(one)) this.observer.observe(one);
-    this.seen = new Set([grid, ...cards]);
+    const cards = /** @type {HTMLElement[]} */ ([...this.grid.children]);
+    for (const one of [this.grid, ...cards]) if (!this.seen.has(one)) this.observer.observe(one);
+    this.seen = new Set([this.grid, ...cards]);
     const hasSide = cards.some((card) => card.dataset.at === "side" && card.offsetHeight > 0);
-    const count = columnsOf(grid.clientWidth, hasSide);
+    const count = columnsOf(this.grid.clientWidth, hasSide);
     if (count !== this.count || !this.rests) this.arrange(cards, count, hasSide);
     this.count = count;
     const sizes = sizesOf(cards); // all was read before anything is written
@@ -91,24 +90,25 @@ class Columns {
       const area = `${top + 1} / ${at + 1} / span ${Math.max(1, sizes[n].rows)} / span ${span}`;
       if (cards[n].style.gridArea !== area) cards[n].style.gridArea = area; // this runs with each message, too
     });
-    if (!this.timer && !grid.querySelector(".loading")) this.timer = setTimeout(() => this.rest(), REST_MS);
   }
 
   /** Choose columns by how high each card is in a main column and in the last one. */
   arrange(cards, count, hasSide) {
     const main = Math.max(1, count - Number(hasSide));
     this.grid.style.gridTemplateColumns = `repeat(${main}, minmax(0, 1fr))${count > main ? ` ${SIDE}px` : ""}`;
-    const [sizes, side] = [1, count].map((column) => {
-      for (const { style, dataset: { span, at } } of cards) {
-        style.gridArea = `auto / ${span ? 1 : at === "side" ? count : column} / auto / span ${span === "all" ? count : span ? main : 1}`;
-      }
+    const options = sizesOf(cards).map((size) => choices(size, count, main));
+    const lay = (homes) => {
+      cards.forEach(({ style }, n) => (style.gridArea = `auto / ${homes[n][0] + 1} / auto / span ${homes[n][1]}`));
       return sizesOf(cards);
-    });
-    const places = placed(sizes.map((size, n) => ({ ...size, sideRows: side[n].rows })), count, hasSide);
-    this.homes = new Map(places.map(([, at, span], n) => [sizes[n].id, [[at, span]]]));
+    };
+    const sizes = lay(options.map((all) => all[0]));
+    const side = lay(options.map((all) => all[all.length - 1]));
+    const homes = placed(sizes.map((size, n) => ({ ...size, sideRows: side[n].rows })), count, hasSide).map((place) => place.slice(1));
+    this.homes = new Map(lay(homes).map(({ id }, n) => [id, [homes[n]]]));
   }
 
   rest() {
+    if (this.grid.querySelector(".loading")) return void (this.timer = setTimeout(() => this.rest(), REST_MS));
     if (!this.rests) this.place();
     this.rests = true;
     this.grid.dataset.rests = "";
