@@ -170,7 +170,7 @@ class MotorGuard:
         if not self._can_save and self._file.can_save():
             self._can_save = True
             self._save()
-        elif not self._file.lost and not self._file.busy and (self.persisted is False or not self._file.in_place):
+        elif not self._file.busy and (self.persisted is False or not self._file.in_place) and not self._file.lost:
             self._save()
         if self._barred and not self._barred_file.busy and not self._barred_file.in_place:
             self._barred_file.save(self._barred)

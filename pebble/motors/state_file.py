@@ -59,8 +59,9 @@ class StateFile:
     @property
     def lost(self) -> bool:
         """True if this is a container, and no volume holds the folder: a new container does not know the value."""
-        folders = self.path.resolve().parents
-        return CONTAINER in os.environ and str(next(folder for folder in folders if folder.is_mount())) in LOST
+        if CONTAINER not in os.environ:
+            return False
+        return str(next(folder for folder in self.path.resolve().parents if folder.is_mount())) in LOST
 
     def load(self) -> Any:
         """Return the value that was saved last; None without a file, Unreadable() if it is damaged."""

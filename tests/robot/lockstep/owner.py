@@ -116,7 +116,7 @@ class MemoryFile:
         on_saved: Callable[[int, bool], None] = lambda _n, _ok: None,
     ) -> None:
         self.path = path
-        self.busy, self.in_place = False, True
+        self.busy, self.in_place, self.lost = False, True, False
         self._disk, self._process, self._writes_s, self._on_saved = disk, process, writes_s, on_saved
         self._number = 0
 

@@ -88,6 +88,11 @@ class Bench:
         self.drive(z, **more)
         return self.line(f"M {z:.3f} {z:.3f}")
 
+    def shines(self, **colours: float) -> bool:
+        """Switch the lights on, and wait until the MCU is told so: what was sent before has been handled."""
+        self.send("lights-solid", colours)
+        return self.line("L " + " ".join(f"{colours.get(name, 0):.3f}" for name in "bgr"))
+
     def payloads(self, metric: str) -> list[Any]:
         return self.world.payloads(metric)
 
