@@ -277,7 +277,10 @@ def _check_parts(extension: Extension, section: type) -> None:
 
 
 def lacking(raw: Any) -> Iterator[Missing]:
-    """Yield our extensions that are not installed although the config has a section of theirs that is not disabled."""
+    """Yield those of our extensions that the config uses and that are not installed.
+
+    The config uses an extension if it has a section of the extension that is not disabled.
+    """
     unknown = keys_of_missing(ours())
     for module, keys in OURS.items():
         for key in keys:
@@ -289,7 +292,7 @@ def lacking(raw: Any) -> Iterator[Missing]:
 
 
 def keys_of_missing(installed: Iterable[Extension]) -> list[str]:
-    """Return the keys of a config that belong to extensions of ours which are not among ``installed``."""
+    """Return the keys of a config that belong to those of our extensions that are not among ``installed``."""
     known = {key for extension in installed for key in extension.sections}
     return [key for keys in OURS.values() for key in keys if key not in known]
 

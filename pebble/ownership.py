@@ -64,7 +64,7 @@ def others_in(folder: Path) -> str:
 
 
 def _has_name(uid: int) -> bool:
-    """True for a user with an entry, and for those whom such a user may be in a container."""
+    """True if the user has an entry, or is one whom such a user may be in a container."""
     import pwd  # which Windows lacks
 
     with suppress(KeyError):
@@ -76,13 +76,13 @@ def _has_name(uid: int) -> bool:
 
 
 def _is_shared(found: os.stat_result) -> bool:
-    """True if others than the owner can replace what is in a folder; where it is sticky they cannot."""
+    """True if others than the owner can replace what is in a folder; in a sticky folder they cannot."""
     writers = stat.S_IWOTH | (stat.S_IWGRP if found.st_gid else 0)
     return bool(found.st_mode & writers) and stat.S_ISDIR(found.st_mode) and not found.st_mode & stat.S_ISVTX
 
 
 def is_open(folder: Path) -> bool:
-    """True for a folder where every user may make files, as in /tmp, though not remove those of others."""
+    """True if every user may make files in the folder, as in /tmp, though not remove those of others."""
     try:
         found = folder.stat()
     except OSError:
@@ -100,7 +100,7 @@ def open_plain(file: Path) -> BinaryIO:
 
 
 def read_plain(file: Path, most: int = 1 << 28) -> bytes:
-    """Return what is in such a file. Raises OSError, also for one with more than ``most`` bytes: holes cost nothing."""
+    """Return the content of a plain file. Raises OSError, also for more than ``most`` bytes: holes cost nothing."""
     with open_plain(file) as opened:
         if os.fstat(opened.fileno()).st_size > most:
             raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(file))
@@ -108,7 +108,7 @@ def read_plain(file: Path, most: int = 1 << 28) -> bytes:
 
 
 def read_for(place: Path, file: Path) -> bytes:
-    """Return what is in such a file that ``place`` names; to root, what the owner of that may read.
+    """Return the content of a plain file that ``place`` names; as root, only what the owner of ``place`` may read.
 
     Raises OSError, and PebbleError as :func:`owner_of`.
     """

@@ -244,7 +244,7 @@ class Trial:
         return True
 
     def read_rows(self) -> None:
-        """Order the rows that pass without a mutant, modules with the fastest first, and name those that do not."""
+        """Order the rows that pass without a mutant, modules with the fastest first; name the rows that do not pass."""
         rows = sorted(json.loads(self.passed.read_text()).items(), key=lambda row: row[1][0])
         self.slowest = {self.items[name].path: seconds for name, (seconds, _) in rows}
         rows.sort(key=lambda row: self.slowest[self.items[row[0]].path])  # those of a module share what they set up

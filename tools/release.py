@@ -117,7 +117,7 @@ def package(source: Path, version: str, release: list[Path], into: Path) -> Path
 
 
 def build(source: Path, into: Path, sbom: Path | None = None) -> str:
-    """Build the release of a folder that :func:`copied` wrote; returns its version. Reads ``SOURCE_DATE_EPOCH``."""
+    """Build the release of a folder that :func:`copied` wrote; return its version. Reads ``SOURCE_DATE_EPOCH``."""
     shutil.rmtree(into, ignore_errors=True)
     into.mkdir(parents=True)
     (version,) = re.findall(r'^__version__ = "(.+)"$', (source / "pebble/version.py").read_text(), re.MULTILINE)

@@ -45,7 +45,7 @@ API = {
 
 
 def main() -> int:
-    """Build the site; returns Sphinx' exit code."""
+    """Build the site; return Sphinx' exit code."""
     shutil.rmtree(SOURCE, ignore_errors=True)
     shutil.copytree(ROOT / "docs", SOURCE, ignore=shutil.ignore_patterns("README.md"))
     pages = {ROOT / "docs" / path.relative_to(SOURCE): path for path in SOURCE.rglob("*") if path.is_file()}
@@ -78,7 +78,7 @@ def main() -> int:
 
 
 def _link(origin: Path, page: Path, pages: dict[Path, Path], link: re.Match[str]) -> str:
-    """Return a link between pages as the site has it, of one to another file the text, and one to nothing as it is."""
+    """Return a link to a page as the site has it; to another file, only its text; to nothing, the link unchanged."""
     folder = origin if origin.is_dir() else origin.parent
     file = (folder / link[3]).resolve()
     if file not in pages:

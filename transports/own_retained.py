@@ -21,9 +21,10 @@ class OwnRetained(BoundedTable[Message]):
         self._counters = counters
 
     def remember(self, message: Message, *, sent: bool, shared: bool | None = None) -> bool:
-        """Store a message, to send it again. False if there is no room; an older message is not sent again then either.
+        """Store a message, to send it again.
 
-        ``shared`` None: as for the older message of the topic.
+        False if there is no room; an older message of the topic is not sent again then either. ``shared`` None: as for
+        the older message of the topic.
         """
         shared = message.topic in self.shared if shared is None else shared
         self.pending.pop(message.topic, None)

@@ -18,7 +18,7 @@ Watcher = Callable[[State], None]
 
 
 class StateChanges:
-    """Notifies watchers of each change of one transport's state, in order; any thread may use it."""
+    """A notifier of watchers about each change of one transport's state, in order; any thread may use it."""
 
     def __init__(self, client_id: str) -> None:
         self.lock = threading.RLock()  # held while the state changes and its watchers are called

@@ -27,12 +27,12 @@ class Wakeup:
             return
 
     def wait(self, end: float | None) -> bool:
-        """Wait until it is set or ``end`` (monotonic seconds) is reached; reset it and return whether it was set."""
+        """Wait until the event is set, or until ``end`` (monotonic seconds); reset it; return whether it was set."""
         return self._lock.acquire(timeout=-1 if end is None else max(0.0, end - time.monotonic()))
 
 
 class WakeupPipe:
-    """A descriptor that one thread polls beside its devices. Any other or a signal sets it; a set before counts."""
+    """A descriptor that one thread polls beside its devices. Any other or a signal sets it, also before the poll."""
 
     def __init__(self) -> None:
         self._reader, self._writer = socket.socketpair()
@@ -44,7 +44,7 @@ class WakeupPipe:
 
     @property
     def set_fileno(self) -> int:
-        """The descriptor that sets it when a byte is written there: for ``signal.set_wakeup_fd``."""
+        """The descriptor that sets the pipe when a byte is written there: for ``signal.set_wakeup_fd``."""
         return self._writer.fileno()
 
     def set(self) -> None:

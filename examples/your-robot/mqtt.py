@@ -82,7 +82,7 @@ class Mqtt:
         self.send(PUBLISH | qos << 1 | 1, text(topic) + number + json.dumps(value).encode())
 
     def exchange(self, wait_ms):
-        """Send what is to be sent, and wait so long for what arrives."""
+        """Send the bytes that wait, and read what arrives within ``wait_ms``."""
         if not self.socket:
             raise OSError("there is no connection")
         if self.unsent:
@@ -100,7 +100,7 @@ class Mqtt:
             self.send(PINGREQ, b"")
 
     def messages(self, wait_ms):
-        """Wait so long; yield topic, payload and the retain flag of each message that has arrived."""
+        """Wait up to ``wait_ms``; yield topic, payload and the retain flag of each message that has arrived."""
         self.exchange(wait_ms)
         for first, content in self.reader.packets():
             if first & 0xF0 == PUBLISH:

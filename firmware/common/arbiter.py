@@ -44,7 +44,7 @@ class Arbiter:
         self._script_ms = 0
 
     def judge(self, moves: bool, run: int, valid_ms: float, now: int, key: str = "", by: str | None = "") -> int:
-        """Return for how many milliseconds it moves, 0: it stops the motors, REFUSED: it has no effect.
+        """Return for how many milliseconds the command moves the motors; 0: it stops them, REFUSED: it has no effect.
 
         ``moves``: any axis is not 0. ``run`` may be PERSON, or UNKNOWN_RUN of a zero. ``valid_ms`` < 0: not given.
         ``key`` and ``by`` are those of the lease; ``by`` None: a program of the robot, which needs no key, as no script

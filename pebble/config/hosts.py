@@ -43,7 +43,7 @@ def host(text: str) -> str:
 
 
 def broker_host(text: str) -> str:
-    """Return the host of a broker. Raises HostError."""
+    """Return the host of a broker from ``text``. Raises HostError."""
     name = host(text)
     if ":" in name and IPv6Address(name).is_link_local and "%" not in name:
         raise HostError(f'names no network card: write "{name}%eth0" with the name of yours')

@@ -17,7 +17,7 @@ class Reading(NamedTuple):
 
 
 def switch(raw: Any) -> bool | None:
-    """Return the state that a number or a word such as "on" means; None: it is no word for a switch."""
+    """Return the state that a number or a word such as "on" means; None if it is no word for a switch."""
     return _SWITCHES.get(str(raw).lower()) if isinstance(raw, str | int) else None
 
 

@@ -33,10 +33,10 @@ def _known(kind: type[Section]) -> dict[str, FieldInfo]:
 
 
 class Reader:
-    """Reads one file. Relative paths start at ``folder``; ``env`` is the environment for secrets.
+    """A reader of one file. Relative paths start at ``folder``; ``env`` is the environment for secrets.
 
-    ``file``: what it reads; of files that this names, root reads only what its owner may.
-    With ``other_forms`` it reads what the original accepts as well; where that changes a value, it is a warning.
+    ``file``: the file that is read; of files that it names, root reads only what its owner may. With ``other_forms`` it
+    reads what the original accepts as well; where that changes a value, it is a warning.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Reader:
         return section
 
     def _key(self, kind: type[Section], known: Mapping[str, Any], key: str, path: problems.Path) -> str:
-        """Return the key under its own name, where it was written under another. Note an unknown one."""
+        """Return the key under its own name, if it was written under another. Note an unknown key."""
         name = kind.other_names.get(key, key)
         for retired, replacement in kind.all_retired().items():
             if key == retired or (retired.endswith("*") and key.startswith(retired[:-1])):

@@ -83,6 +83,7 @@ def decode(channel: Channel, raw: bytes, remark: Remark | None = None) -> Any:
         return msgspec.convert(decoded, channel.payload)
     except (msgspec.ValidationError, ValueError, OverflowError) as error:
         if issubclass(channel.payload, LightsSolid):
+            decoded = {key: value for key, value in decoded.items() if key != "group" or isinstance(value, bool)}
             return msgspec.convert(decoded | _numbers(channel, decoded, remark or _ignore), channel.payload)
         raise PayloadError(f"{channel.metric}: {error}") from None
 

@@ -3,7 +3,7 @@
     {"drive-values": {"x": -0.3, "z": 0.7, "valid_ms": 400}, "lights-solid": {"r": 0.2, "g": 0.7, "b": 1}}
 
 Members are bare objects. Stops, resets, flags, control, scripts and media are never among them. Where names are
-checked, ``by`` is the sender, in the place of those in the members.
+checked, ``by`` is the sender of the group, and counts instead of any ``by`` in the members.
 """
 
 import math
@@ -44,7 +44,7 @@ class Member(Struct, frozen=True):
 
 
 def decode(raw: bytes) -> tuple[Member, ...]:
-    """Return the members of a group. Raises PayloadError if any of them may not be there, or cannot be read."""
+    """Return the members of a group. Raises PayloadError if a member is not allowed, or cannot be read."""
     if len(raw) > MOST_BYTES:
         raise PayloadError(f"{GROUP.metric}: {len(raw)} bytes, more than {MOST_BYTES}")
     codec.plain(GROUP, raw)  # within the limits of all commands

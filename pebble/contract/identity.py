@@ -26,7 +26,7 @@ _valid_level = re.compile(LEVEL).search
 
 
 class Direction(StrEnum):
-    """Seen from the component: topics it subscribes to, and topics it publishes."""
+    """The direction of a topic as seen from the component, which subscribes to one kind and publishes the other."""
 
     INCOMING = "incoming"
     OUTGOING = "outgoing"
@@ -36,7 +36,7 @@ _DIRECTIONS = {str(direction): direction for direction in Direction}
 
 
 class Identity(Struct, frozen=True):
-    """``{system}/{type}/{id}`` of one component. Raises ConfigError for levels that no topic can hold.
+    """The identity ``{system}/{type}/{id}`` of a component. Raises ConfigError for levels that no topic can hold.
 
     Example: ``Identity("pebble", "robots", "goob").outgoing("online")`` is ``pebble/robots/goob/outgoing/online``.
     """
@@ -101,7 +101,7 @@ def untypeable(name: str) -> str:
 
 
 def meant(names: Iterable[str], typed: str) -> str:
-    """Return the name that was typed, or a name that looks the same; ``typed`` itself if there is none."""
+    """Return ``typed`` if it is one of ``names``, else a name that looks the same, else ``typed`` all the same."""
     if typed.isascii():
         return typed
     alike = [name for name in names if composed(name) == composed(typed)]

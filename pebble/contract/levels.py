@@ -17,7 +17,10 @@ INTERVAL_S: Final = 1.0  # assumed between heartbeats: most robots send four a s
 
 
 class Level(Struct, frozen=True, kw_only=True):
-    """The traffic on a link. QoS None: the channel's own. At each level an end of something is QoS 1, and at once."""
+    """The traffic on a link of one level. A QoS of None is the channel's own.
+
+    At every level, a message that ends something is sent at once, with QoS 1.
+    """
 
     drive_hz: float  # commands of one operator, a second
     drive_qos: int | None = None
@@ -50,8 +53,8 @@ LEVELS: Mapping[LinkLevel, Level] = {
 def silent_after(interval_s: float = INTERVAL_S, link: LinkLevel = "wide", late_s: float = 0.0) -> float:
     """Return the seconds without a heartbeat after which a robot counts as silent.
 
-    ``interval_s``: between its heartbeats, which come ``late_s`` late. ``link``: the level that it has published, if
-    known.
+    A heartbeat is sent every ``interval_s``, and arrives ``late_s`` late. ``link``: the level that the robot has
+    published, if known.
     """
     return max(2 * interval_s, 4 * late_s, LEVELS[link].silent_s)
 

@@ -125,7 +125,7 @@ class LightsSolid(Payload, frozen=True, kw_only=True):
     b: float = 0.0
     g: float = 0.0
     r: float = 0.0
-    group: Any = UNSET  # true: a copy of what a group of commands contained
+    group: bool | UnsetType = UNSET  # true: a copy of what a group of commands contained
 
     def __post_init__(self) -> None:
         super().__post_init__()

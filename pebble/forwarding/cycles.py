@@ -143,6 +143,10 @@ class Cycles:
     # -- with the lock held
 
     def _receive_probe(self, side: Side, topic: str, number: bytes) -> Finding:
+        """Return what to do with a probe from ``side``: relay another bridge's once; one of ours ends here.
+
+        One of ours that was sent to the other side has come back by another way: its topic circulates.
+        """
         sent_to = self._ours.get(number)
         if sent_to is side.other:
             self._close(side, topic)

@@ -309,7 +309,7 @@ class Forwarder:
     def examine(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str
     ) -> Message | Drop:
-        """Return an admitted message as it may pass, or why it may not: it is too old, or a script's from outside."""
+        """Return an admitted message as it may pass, or why not: it is too late, or is a script's from outside."""
         if subject.kind.one_shot and self._is_late(subject, message, forward, account):
             return Drop.LATE
         return (self._without_script(source, message) or Drop.SIGNED) if forward.unsigned else message

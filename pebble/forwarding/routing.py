@@ -120,14 +120,14 @@ def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *
 
 
 def _qos(subject: Subject, message: Message) -> QoS:
-    """Return the QoS as received; *to* a robot at least that of the channel: one QoS per topic keeps the order."""
+    """Return the QoS as received, but *to* a robot at least the channel's: one QoS per topic keeps the order."""
     if subject.kind.direction == INCOMING:
         return message.qos if message.qos >= subject.qos else QoS(subject.qos)
     return message.qos
 
 
 def _retain(subject: Subject, message: Message) -> bool:
-    """Return True if it is to be retained: as published, if that is known; flags always are, on both sides."""
+    """Return True if the message is to be retained: as published, if that is known; flags always are, on both sides."""
     if subject.kind.one_shot:
         return False
     if subject.kind is Kind.FLAG and subject.retain:

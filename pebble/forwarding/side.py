@@ -66,7 +66,10 @@ class SideState:
 
     @property
     def has_gone_back(self) -> bool:
-        """True if an earlier retained value here comes from a restored save, not from a program that chose it again."""
+        """True if older retained values of this side come from a restored save.
+
+        Otherwise a program has chosen the older value again.
+        """
         if self._wins or not self._went_back:
             return self._went_back
         return self._was_brief or self.transport.was_ended
@@ -74,7 +77,7 @@ class SideState:
     def arrived(self) -> None:
         """Note that the retained messages of this side have arrived.
 
-        An earlier value that comes from now on was chosen again.
+        An older value that comes from now on was chosen again by a program.
         """
         self._went_back = False
 

@@ -15,10 +15,10 @@ _SCRIPT, _BACKSLASH = SCRIPT.encode(), 0x5C
 
 
 def unsigned(payload: bytes) -> bytes | None:
-    """Return the drive command ``payload`` as it may pass; None if it may not. Hot: a person's is hardly looked at.
+    """Return a drive command without a script's signature; None if it may not pass. Hot: a person's is rarely decoded.
 
-    JSON writes the letters as they are or with backslashes. A payload with either of them that cannot be read does not
-    pass: the parser of a board may be more lenient.
+    JSON may write the name of a signature's field plainly or with backslashes. A payload that contains either and
+    cannot be decoded does not pass: the parser of a board may be more lenient.
     """
     if _BACKSLASH not in payload and _SCRIPT not in payload:
         return payload

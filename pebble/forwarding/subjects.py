@@ -93,8 +93,8 @@ class Subject(Struct, frozen=True, eq=False, dict=True):
 class Subjects(dict[str, Subject | None]):
     """Subjects by effective topic, those of every serial instance included.
 
-    None: the topic is not this robot's, or not valid. A topic that was looked up before is found without a call of
-    Python's. ``config``: the robot's, or its base if it renames nothing.
+    The subject of a topic that is not this robot's, or not valid, is None. A topic that was looked up before is found
+    without calling a Python function. ``config``: the robot's, or its base if it renames nothing.
     """
 
     def __init__(self, config: Config | str) -> None:

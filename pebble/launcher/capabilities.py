@@ -122,7 +122,7 @@ def _estop(config: Config, owners: list[str]) -> offers.EstopOffer:
 
 
 def _imu(config: Config) -> tuple[bool, str]:
-    """Return if a serial line has an inertial sensor, and the topic of the sensor."""
+    """Return whether a serial line has an inertial sensor, and the topic of the sensor."""
     lines = [name for name, line in config.serial_instances().items() if SERIAL_PROTOCOLS[line.protocol].has_imu(name)]
     addresses = Addresses(view_of(config, lines[0]) if lines else config)
     return bool(lines), addresses[c.IMU].topic

@@ -147,7 +147,7 @@ class StatusPublisher:
 
 
 def _rests(supervisor: ProcessSupervisor) -> bool:
-    """True for an on-demand program that is not requested: systemd's summary leaves it out."""
+    """True if the program is on-demand and not requested: systemd's summary leaves it out."""
     return supervisor.program.on_demand and not supervisor.requested and not supervisor.running
 
 

@@ -82,7 +82,7 @@ class Control:
             self.lease.hold(client, int(request.for_ms), over, _ms(now))
 
     def vouch(self, vouched: ControlVouched, now: float) -> None:
-        """Note the time for which the bridge vouches."""
+        """Note the time for which the bridge vouches that it has passed on all messages."""
         self.lease.vouch(vouched.begin, vouched.end, _ms(now))
 
     def doubt(self, now: float) -> None:

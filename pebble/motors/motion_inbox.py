@@ -27,7 +27,10 @@ _HOLDER = -2  # in place of the number of a run: the holder of control
 
 
 class ReceivedDrive(Struct, frozen=True):
-    """A drive command, when it was received on the service's clock, and what is carried out with it or not at all."""
+    """A drive command, and when it was received on the service's clock.
+
+    ``company``: the members of its group that are carried out together with it, or not at all.
+    """
 
     drive: Drive
     at: float

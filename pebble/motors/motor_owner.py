@@ -104,9 +104,9 @@ class MotorOwner(Service, ABC):
         """Stop the motors now. This is called again and again while the motors stand still."""
 
     def move_with(self, drive: Drive, valid_s: float, company: tuple[groups.Member, ...]) -> None:  # noqa: ARG002
-        """Carry out a drive command, a zero too, and members of its group of the channels in :attr:`company`, at once.
+        """Carry out a drive command, a zero too, together with the members of its group on channels in :attr:`company`.
 
-        A subclass with such channels overrides it.
+        Both are to take effect at once. A subclass with such channels overrides this method.
         """
         self.move(drive, valid_s)
 
@@ -163,11 +163,11 @@ class MotorOwner(Service, ABC):
             self._judge_soon(self._waiting.put_drive(drive, arrived))
 
     def is_copy(self, command: Drive | LightsSolid) -> bool:
-        """True if ``command`` is the copy of a member of a group, which counts here."""
+        """True if ``command`` is the copy of a group's member, and this motor owner takes the group itself."""
         return self._takes_groups and command.group is True
 
     def _receive_group(self, message: Message, _value: Any, _names: dict[str, str]) -> None:
-        """Take the members of a group that are for this motor owner; others follow the copies."""
+        """Take the members of a group that are for this motor owner; other programs act on the members' copies."""
         try:
             members = groups.decode(message.payload)
         except PayloadError as error:

@@ -1,4 +1,4 @@
-"""Root in folders of other users: it becomes the owner, so that a link there leads to what the owner could reach."""
+"""Work of root in other users' folders: done as the owner, so a link there reaches only what the owner could."""
 
 from __future__ import annotations
 
@@ -46,10 +46,11 @@ def as_before() -> Iterator[None]:
 
 
 def require_own(folder: Path, does: str = "does not write there", *, there: bool = False) -> None:
-    """Raise PebbleError for root in a folder of another user, where a program runs for long, or with threads.
+    """Raise PebbleError if this process is root and the folder belongs to another user.
 
-    The same in a folder where every user may make files, such as /tmp. It may be a file as well, and may have to be
-    ``there``. ``does``: what root does not, then.
+    For programs that run in the folder for long, or with threads. A folder where every user may make files, such as
+    /tmp, is refused, too. ``folder`` may be a file; with ``there`` it has to exist. ``does``: what root does not do
+    then, for the error.
     """
     if not is_root():
         return

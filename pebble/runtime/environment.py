@@ -9,7 +9,7 @@ _LAUNCHERS = (ENCODING, LAUNCHER_PID, NOTIFY_FD, WANTED)  # between the launcher
 
 
 def withhold(passwords: Iterable[str]) -> None:
-    """Empty these variables of this process: programs that it starts do not receive the passwords.
+    """Empty the variables ``passwords`` of this process: programs that it starts do not receive them.
 
     The variables remain set, so that such a program can read a config that names them.
     """

@@ -14,10 +14,11 @@ def ending_signals() -> list[signal.Signals]:
 
 
 class EndSignal:
-    """An event that signals, or :meth:`set`, set for good. Make it on the main thread.
+    """An event that a signal, or :meth:`set`, sets for good. Make it on the main thread.
 
-    This is no threading.Event: a handler may have interrupted a wait for it, which holds its lock, and would wait for
-    ever. And a signal on a thread of a library interrupts no wait of this one: the pipe ends it.
+    It is no threading.Event: a signal handler may have interrupted a wait for that event, which holds the event's lock,
+    and would wait for ever. And a signal that arrives on a thread of a library does not interrupt a wait on the main
+    thread: the pipe ends it.
     """
 
     def __init__(self) -> None:
@@ -31,5 +32,5 @@ class EndSignal:
         self._wakeup.set()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """True if it is set within ``timeout`` seconds."""
+        """True if the event is set within ``timeout`` seconds."""
         return bool(select.select([self._wakeup], [], [], timeout)[0])

@@ -15,7 +15,7 @@ _IN_USE = (errno.EACCES, errno.EPERM, errno.EBUSY, errno.ETXTBSY)  # a mount poi
 
 
 def is_root() -> bool:
-    """True if this process may give files away; on Windows none does."""
+    """True if this process may give files to other users; on Windows no process may."""
     return hasattr(os, "geteuid") and os.geteuid() == 0
 
 

@@ -8,7 +8,7 @@ from types import TracebackType
 class WorkLock:
     """A lock for which only the service's own thread waits, by ``with``. Other threads try, and never wait.
 
-    The own thread waits for one other thread at most: meanwhile no further one gets the lock.
+    The service's thread waits for at most one other thread, because no third thread gets the lock meanwhile.
     """
 
     def __init__(self) -> None:
@@ -32,6 +32,6 @@ class WorkLock:
         self._lock.release()
 
     def shut(self) -> None:
-        """Take the lock for good, for the own thread."""
+        """Take the lock for good, for the service's own thread."""
         self.awaited = True
         self._lock.acquire()

@@ -53,9 +53,10 @@ def steps(bundle: int, bitrate: int) -> tuple[Step, ...]:
 
 
 class RateController:
-    """A controller of how Opus is encoded, ``step``, and which packets are sent. ``outgoing()``: the unacknowledged.
+    """A controller of how Opus is encoded, ``step``, and which packets are sent.
 
-    ``thin``: after one that was slow, none is sent for a while.
+    ``outgoing()`` returns the unacknowledged messages. ``thin``: after a packet that was slow, none is sent for a
+    while.
     """
 
     def __init__(

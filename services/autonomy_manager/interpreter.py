@@ -45,10 +45,11 @@ def interpreter(configured: str | None, *, ours: bool) -> str:
 
 
 def lacking(command: Sequence[str], folder: Path, variables: Mapping[str, str]) -> list[str]:
-    """Return the modules that a script imports at its beginning and its Python does not find. It is read, not run.
+    """Return the modules that a script imports at its beginning and its Python does not find.
 
-    So are the files beside it that it names. Of OpenCV and NumPy also the functions that it calls and newer releases
-    lack. Nothing is known of what is no Python file. One that changes ``sys.path`` may find more.
+    The script is read, not run, and so are the files beside it that it names. For OpenCV and NumPy, the functions that
+    it calls and newer releases lack are returned as well. Nothing is known of a script that is no Python file. A script
+    that changes ``sys.path`` may find more modules.
     """
     entry = next((folder / word for word in command[1:] if word.endswith(".py")), None)
     if entry is None:

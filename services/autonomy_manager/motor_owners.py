@@ -15,7 +15,7 @@ OVERRIDDEN = "stopped by an operator"
 
 
 class MotorOwners:
-    """The newest state of each motor owner; if ``names`` are known, of those only."""
+    """The newest state of each motor owner; if ``names`` are known, only of the owners with these names."""
 
     def __init__(self, names: Collection[str]) -> None:
         self.newest_run = 0  # of all that were received or used; an owner bars the run before it

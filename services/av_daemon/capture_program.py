@@ -45,7 +45,7 @@ class CaptureProgram:
         self._poll.register(self._err, select.POLLIN)
 
     def read(self, limit: int = _CHUNK) -> bytes:
-        """Return what it has written since, at least one byte. Raises DeviceError when it ends or hangs."""
+        """Return the program's new output, at least one byte. Raises DeviceError when the program ends or hangs."""
         deadline = time.monotonic() + self._silence_s
         while True:
             left = deadline - time.monotonic()
@@ -64,11 +64,11 @@ class CaptureProgram:
                 return chunk
 
     def interrupt(self) -> None:
-        """Kill it, from any thread, which makes a waiting ``read`` fail."""
+        """Kill the program, from any thread, which makes a waiting ``read`` fail."""
         self._child.signal(signal.SIGKILL)
 
     def close(self) -> None:
-        """Terminate it, and kill it if it does not end in time."""
+        """Terminate the program, and kill it if it does not end in time."""
         self._child.signal(signal.SIGTERM)
         for pipe in self._pipes:  # frees a program that is blocked in a write
             pipe.close()

@@ -142,7 +142,10 @@ def _as_it_is(info: FrameInfo, data: Bytes) -> FrameInfo:
 
 
 def _content(info: FrameInfo, data: Bytes) -> int | str:
-    """Return what differs for frames with other bytes; of a large one some are looked at: all of a camera's change."""
+    """Return a checksum that differs for frames with other bytes.
+
+    Only some bytes of a large frame are read, because all bytes of a camera's frame change.
+    """
     if info.rate and not data.any():
         return NOTHING
     return crc32(data[:: data.size // _LOOKED_AT + 1].tobytes())

@@ -8,7 +8,10 @@ _BARE = frozenset((0x01, *range(0xD0, 0xD8)))  # markers without a length: TEM a
 
 
 class JpegSplitter:
-    """A splitter of bytes as they are read. Pictures longer than ``limit`` bytes, and bytes of none, are skipped."""
+    """A splitter of a stream of bytes into JPEGs.
+
+    Pictures longer than ``limit`` bytes, and bytes that belong to no picture, are skipped.
+    """
 
     def __init__(self, limit: int = 16 << 20) -> None:
         self._limit = limit

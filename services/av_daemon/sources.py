@@ -25,7 +25,10 @@ _BROKEN_LIMIT = 30  # pictures one after the other that cannot be decoded; a few
 
 
 def camera(options: AvDaemon, start: float) -> Opener:
-    """Return what opens the camera, upright; ``start``: when a synthetic one begins to count, in monotonic time."""
+    """Return a function that opens the camera, upright.
+
+    ``start``: when a synthetic camera begins to count, in monotonic time.
+    """
 
     def open_() -> Source:
         degrees = options.video.rotate_degrees
@@ -42,7 +45,10 @@ def microphone(options: AvDaemon, start: float) -> Opener:
 
 
 def asked_of_camera(video: CameraCapture) -> Asked | None:
-    """Return what a camera is asked for; of a file or a network's stream nothing can be."""
+    """Return the rate and size that a camera is asked for; None for a synthetic camera.
+
+    A file, or a network's stream, cannot be asked for any.
+    """
     if video.backend == "synthetic":
         return None
     if video.backend == "v4l2" and not is_device(video.device):

@@ -36,7 +36,7 @@ class Pacer:
         self._interrupted = threading.Event()
 
     def next(self) -> int:
-        """Wait for the next turn; returns its number, counted from ``start``. Raises DeviceError if interrupted."""
+        """Wait for the next turn; return its number, counted from ``start``. Raises DeviceError if interrupted."""
         self._turn += 1
         late = self._now() - self._turn
         self.skipped = late if late > self._behind else 0
@@ -78,7 +78,7 @@ class ComputedCamera(ComputedDevice, ABC):
 
     @abstractmethod
     def look(self, turn: int) -> int:
-        """Choose the picture to draw; returns its moment in ns, 0: now."""
+        """Choose the picture to draw; return its moment in ns, 0: now."""
 
     @abstractmethod
     def draw(self, picture: Bytes) -> None:

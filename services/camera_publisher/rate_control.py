@@ -87,7 +87,7 @@ class RateController:
         self._window.sent(size, now)
 
     def poll(self, now: float) -> Step | None:
-        """Measure what was acknowledged; returns the step if it has changed since the last poll."""
+        """Measure what was acknowledged; return the step if it has changed since the last poll."""
         self._update(now)
         changed, self._changed = self._changed, False
         return self.step if changed else None
@@ -117,7 +117,7 @@ class Step:
 
     @property
     def cost(self) -> float:
-        """The share of the bytes per second. Fewer frames differ more from each other."""
+        """The step's share of the full bytes per second. Fewer frames differ more from each other."""
         return self.bytes * math.pow(self.rate, 0.9)
 
     def __str__(self) -> str:

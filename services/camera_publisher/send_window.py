@@ -94,5 +94,8 @@ class SendWindow:
 
 
 def _credible(took_s: float, slack_s: float) -> float:
-    """Return the part of it that is surely due to the connection: none below the slack, all from twice the slack on."""
+    """Return the part of ``took_s`` that is surely due to the connection.
+
+    That is none below ``slack_s``, and all from twice ``slack_s`` on.
+    """
     return took_s * min(1.0, max(0.0, took_s / slack_s - 1.0))

@@ -126,7 +126,7 @@ class CameraPublisher(Service):
         self._report()
 
     def _poll(self) -> None:
-        """Repeat this while a picture is in flight: only so it is known how long it took."""
+        """Measure the picture in flight, repeatedly: only so it is known how long it took."""
         step = self._rate.poll(self.clock())
         if step is not None:
             self.log.info("reduced because the connection is slow: %s", str(step) or "nothing any more")
@@ -238,5 +238,5 @@ class CameraPublisher(Service):
 
 
 def is_black(picture: Pixels) -> bool:
-    """True if nothing is seen in it, as with a lid on the lens."""
+    """True if nothing is seen in the picture, as with a lid on the lens."""
     return bool(picture[::_STEP, ::_STEP].max() <= _DARK)

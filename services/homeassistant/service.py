@@ -97,7 +97,10 @@ class HomeAssistantService(Service):
             return {self._place}
 
     def _save(self, topics: set[str]) -> None:
-        """Save the topics; none removes the file, and with it this process from the next start."""
+        """Save the topics.
+
+        Without topics the file is removed, so that this process is not started next time.
+        """
         if topics == self._retained:
             return
         try:

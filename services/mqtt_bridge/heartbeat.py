@@ -11,7 +11,7 @@ _REMEMBERED = 64  # own heartbeats that a broker may still send back
 
 
 class Heartbeat:
-    """Publishes ``{"t": ms}`` on the heartbeat's effective topic (paper A.8.5)."""
+    """The publisher of ``{"t": ms}`` on the heartbeat's effective topic (paper A.8.5)."""
 
     def __init__(self, address: Address) -> None:
         self.topic = address.topic

@@ -102,7 +102,7 @@ class MqttBridge(ForwardingService):
 
     @property
     def winner(self) -> Side:
-        """The side whose retained messages count. Where names are checked, the robot alone leaves flags remotely."""
+        """The side whose retained messages count. Where names are checked, flags at the broker are the robot's own."""
         return Side.LOCAL if self.config.security.named else Side.REMOTE
 
     @property

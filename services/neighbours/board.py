@@ -51,7 +51,7 @@ class BoardNeighbours(NeighboursService):
 def of_board(
     base: str, section: Neighbours, broker: Mqtt, run_dir: Path, env: Mapping[str, str] = os.environ
 ) -> BoardNeighbours:
-    """Make those of the robot ``base`` at ``broker``; they do not run yet."""
+    """Make the neighbours of the robot ``base`` at ``broker``; they do not run yet."""
     system, kind, name = base.split("/")
     folder = run_dir / f"{zlib.crc32(base.encode()):08x}"  # short, because of sockets in it
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)

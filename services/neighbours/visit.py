@@ -37,7 +37,7 @@ class Visit:
         self._refused: dict[str, NeighbourRefusal] = {}
 
     def command(self, name: str, drive: Drive, now: float) -> bool:
-        """Take a command of a robot that may drive this one. False: it has no effect."""
+        """Take a command of a robot that may drive this one; return False if it has no effect."""
         if not drive.signed or not isinstance(drive.run, int):
             return False  # no script's: it could neither be ended nor told from the next one
         if self._who != (name, drive.run) and not (drive.moves and self._starts(name, drive.run, now)):
@@ -86,7 +86,7 @@ class Visit:
         return self._refused | ({name: NeighbourRefusal(run=run, why=why)} if why else {})
 
     def _starts(self, name: str, run: int, now: float) -> bool:
-        """Return True if this run drives from now on."""
+        """Begin the run if nothing prevents it; return True if it drives from now on."""
         why = self._begin(name, run) or (PERSON if now - self._person_at < HOLD_S else "")
         barred = newest(state.last_barred for state in self._states.values())
         number = None if why else self._number(barred, self._received)

@@ -26,9 +26,10 @@ _END_S = 1.0  # longest wait for the thread at the end
 
 
 class CmdVel:
-    """Its methods may be called on any thread. ``save(owed)`` keeps whether the lock is still to be opened.
+    """The publisher of commands to the base, and of its lock. Its methods may be called on any thread.
 
-    ``owed``: as an earlier life of this process saved it. One that never set the lock never opens it.
+    ``save(owed)`` stores whether a lock that was set is still to be opened. ``owed``: the value that an earlier process
+    of this program stored. A process that has set no lock, and owes none, never opens it.
     """
 
     def __init__(
@@ -75,12 +76,12 @@ class CmdVel:
 
     @property
     def alive(self) -> bool:
-        """False: nothing is repeated any more."""
+        """True if commands are still repeated."""
         return self._thread.is_alive()
 
     @property
     def bases(self) -> set[str]:
-        """The nodes that listen."""
+        """The names of the nodes that listen."""
         return self._out.names
 
     @property

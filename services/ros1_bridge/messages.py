@@ -92,7 +92,7 @@ def boolean(value: bool) -> bytes:
 
 
 class _Reader:
-    """Reads fields one after the other. Raises struct.error where the message ends too early."""
+    """A reader of fields, one after the other. Raises struct.error where the message ends too early."""
 
     def __init__(self, body: bytes) -> None:
         self._body, self._at = body, 0

@@ -49,11 +49,11 @@ class Subscription:
 
 
 class Node:
-    """Call :meth:`advertise` and :meth:`subscribe`, then :meth:`start`.
+    """A node of ROS 1. Call :meth:`advertise` and :meth:`subscribe`, then :meth:`start`.
 
-    One thread has the sockets, one serves the API of the node, one calls the master and publishers, one lost
-    subscribers: none of them waits for another, and no message for a call. ``on_evicted(why)`` is called, on some
-    thread, when another node has the name: nothing may move from then on.
+    One thread has the sockets, one serves the API of the node, one calls the master and publishers, one calls
+    subscribers that were lost: none of them waits for another, and no message for a call. ``on_evicted(why)`` is
+    called, on some thread, when another node has the name: nothing may move from then on.
     """
 
     def __init__(self, name: str, master: str, host: str, on_evicted: Callable[[str], object]) -> None:
@@ -121,11 +121,11 @@ class Node:
 
     @property
     def alive(self) -> bool:
-        """False: a thread has ended by a mistake."""
+        """True until a thread of the node has ended by a mistake."""
         return all(thread.is_alive() for thread in self._threads)
 
     def dropped(self) -> dict[str, int]:
-        """Return what was dropped since the start because a bound was reached, by what it was."""
+        """Return the numbers of messages that bounds dropped since the start, by what they were."""
         messages = sum(publication.dropped for publication in self._publications.values())
         return {**self.counters.snapshot(), **({"ros_messages": messages} if messages else {})}
 
@@ -142,7 +142,7 @@ class Node:
         return self._address if topic in self._publications and not self._evicted else None
 
     def evict(self, why: str) -> None:
-        """Another node has this name now: move nothing, and wait until it has gone."""
+        """Note that another node has this name now: move nothing, and wait until it has gone."""
         self.problem = f"the ROS master has ended this node: {why}"
         log.error("%s", self.problem)
         self._rest()
@@ -175,7 +175,7 @@ class Node:
                 self._attempt_call(self._calls.get(timeout=max(0.0, due - time.monotonic())))
 
     def _check(self) -> None:
-        """Register, or again: a master that restarts has forgotten everything."""
+        """Register the node, also again: a master that restarts has forgotten everything."""
         try:
             self._look()
             self.registered = not self._evicted

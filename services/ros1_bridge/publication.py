@@ -34,7 +34,7 @@ class Subscriber:
         self._blocked_from: float | None = None
 
     def send(self, data: bytes) -> bool:
-        """Send a block at once, or drop it: False. Raises OSError once it is no use any more."""
+        """Send a block at once, or drop it and return False. Raises OSError if the connection is of no use any more."""
         now = time.monotonic()
         try:
             if self._rest:
@@ -70,13 +70,13 @@ class Publication:
             return {subscriber.name for subscriber in self._subscribers}
 
     def send(self, body: bytes) -> int:
-        """Send a message to all who can take it now; returns how many could."""
+        """Send a message to all who can take it now; return how many could."""
         data = block(body)
         with self._lock:
             return sum([self._send(subscriber, data) for subscriber in list(self._subscribers)])
 
     def add(self, subscriber: Subscriber) -> bool:
-        """Add one that has been greeted, and send it the first message; False: there are too many."""
+        """Add a subscriber that has been greeted, and send it the first message; False if there are too many."""
         with self._lock:
             if len(self._subscribers) >= MOST_PEERS:
                 return False
@@ -89,7 +89,7 @@ class Publication:
         return True
 
     def remove(self, subscriber: Subscriber, why: str) -> None:
-        """Disconnect one."""
+        """Disconnect one subscriber."""
         with self._lock:
             self._remove(subscriber, why)
 

@@ -21,12 +21,12 @@ _CHECK_S = 0.5
 
 
 def service_of(config: Config) -> type[Service]:
-    """Return the service: without driving it only reads."""
+    """Return the class of the service: if driving is not enabled, one that only reads."""
     return Ros1Bridge if config.section(Ros1).drive.enabled else Ros1Reader
 
 
 class Ros1Reader(Service):
-    """Publishes what a base says, and sends it nothing."""
+    """A service that publishes what a base says, and sends it nothing."""
 
     name = "ros1_reader"
     publishes: ClassVar[tuple[Channel, ...]] = PUBLISHES
@@ -75,7 +75,7 @@ class Ros1Reader(Service):
 
 
 class Ros1Bridge(Ros1Reader, MotorOwner):
-    """Drives the base too. The lock of its multiplexer follows the latch: zeros alone stop no Husky."""
+    """A service that drives the base, too. The lock of its multiplexer follows the latch: zeros alone stop no Husky."""
 
     name = "ros1_bridge"
     publishes = (*MotorOwner.publishes, *PUBLISHES)

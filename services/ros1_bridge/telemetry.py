@@ -38,7 +38,7 @@ Publish = Callable[[Channel, dict[str, Any]], object]
 
 
 class Telemetry:
-    """Reads topics of ROS and calls ``publish(channel, payload)`` on the node's thread of sockets.
+    """A reader of ROS topics that calls ``publish(channel, payload)`` on the node's thread of sockets.
 
     ``on_odometry()`` is called with each odometry, whether it is published or not.
     """
@@ -208,7 +208,7 @@ class Telemetry:
 
 
 def _stamp(header: Header) -> float:
-    """Return when it was measured, in seconds; by our clock where the sender does not say."""
+    """Return the time of the measurement, in seconds; by our clock where the sender does not say."""
     return header.stamp or time.time()
 
 
@@ -237,6 +237,6 @@ def _label(labels: tuple[str, ...], code: int) -> str:
 
 
 def _refuse_odd(*numbers: float) -> None:
-    """Raise ValueError for what JSON cannot carry."""
+    """Raise ValueError for a number that JSON cannot carry: NaN or an infinity."""
     if not all(map(math.isfinite, numbers)):
         raise ValueError("a number is not finite")

@@ -34,7 +34,7 @@ def parse_header(body: bytes) -> dict[str, str]:
 
 
 class Blocks:
-    """Cuts what arrives into blocks of at most ``most`` bytes."""
+    """A splitter of received bytes into blocks of at most ``most`` bytes."""
 
     def __init__(self, most: int) -> None:
         self.most, self._data = most, bytearray()

@@ -29,7 +29,7 @@ class _Timed(xmlrpc.client.Transport):
 
 
 def call(uri: str, method: str, *arguments: Any) -> Any:
-    """Call an API of ROS; returns the value of the answer. Raises RosError."""
+    """Call an API of ROS; return the value of the answer. Raises RosError."""
     try:
         with xmlrpc.client.ServerProxy(uri, transport=_Timed()) as proxy:
             answer = getattr(proxy, method)(*arguments)
@@ -43,7 +43,7 @@ def call(uri: str, method: str, *arguments: Any) -> Any:
 
 
 def lives(uri: str) -> bool:
-    """True if a node answers there."""
+    """True if a node answers at that address."""
     try:
         return call(uri, "getPid", "/pebble") is not None
     except RosError:

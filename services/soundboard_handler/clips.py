@@ -43,7 +43,7 @@ class Clips:
 
         All, or 256 KiB of them. ``find`` knows the others, too.
 
-        What lies outside is left out, as ``find`` does.
+        A file that a link leads to outside of the folder is left out, as by ``find``.
         """
         self.problem = ""
         root = self._folder.resolve()
@@ -87,7 +87,7 @@ class Clips:
         return os.path.isfile(path)  # noqa: PTH113
 
     def _can_be_named(self, name: str) -> bool:
-        """True if a command can name it: commands are UTF-8, and a backslash in them is a slash."""
+        """True if a command can name the clip: commands are UTF-8, and a backslash in them is a slash."""
         if "\\" not in name and is_text(name):
             return True
         self.problem = self.problem or f"{name!r} cannot be named in commands: rename it"

@@ -27,7 +27,7 @@ Post = Callable[[Callable[[], None]], None]
 class Playback:
     """A playback of ``clip``. All methods are for the service's thread; ``on_change`` is posted there by ``post``.
 
-    It is called when the player runs (``process`` is set), and when the playback has ended.
+    ``on_change`` is called when the player runs (``process`` is set), and when the playback has ended.
     """
 
     def __init__(self, clip: Clip, config: Config, post: Post, on_change: Callable[[Playback], None]) -> None:
@@ -40,7 +40,7 @@ class Playback:
         self._on_change = partial(on_change, self)
 
     def start(self) -> None:
-        """Start it on the service's thread: a player ends with the thread that has started it."""
+        """Start the playback on the service's thread: a player ends with the thread that has started it."""
         try:
             if self.clip.encoded:
                 self._start_decoded()
@@ -51,7 +51,7 @@ class Playback:
         self._post(self._on_change)
 
     def stop(self) -> None:
-        """End soon. How a stopped player exits is no error."""
+        """End the playback soon. How a stopped player exits is no error."""
         self.stopped = True
         if self.process is not None:
             self.process.signal(signal.SIGTERM)

@@ -24,7 +24,7 @@ _HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connec
 
 
 class Dialler:
-    """Remembers how the attempts at a broker have ended, and makes the next attempt."""
+    """The maker of connections: remembers how the attempts at a broker have ended, and makes the next attempt."""
 
     def __init__(
         self, client_id: str, settings: MqttSettings, will: Message | None, client_class: type[Client] = Client

@@ -90,7 +90,7 @@ class BrokerFilters:
 
 
 class OwnMessageFilter:
-    """Recognises own retained messages that come back, and retained messages that come twice.
+    """A filter that recognises own retained messages that come back, and retained messages that come twice.
 
     For as-published connections, where retained and live messages look alike (T7): check those with ``retain`` set.
     """

@@ -260,7 +260,7 @@ class InFlightTable:
         return min(self._round_trips, default=0.0)
 
     def newest_answer(self, now: float) -> tuple[int, float]:
-        """Return the number of answered pings, and the time of the newest answer, or of a longer unanswered ping."""
+        """Return the number of answered pings, and the seconds that the newest answer took, or a longer ping waits."""
         waits = now - self._pings[0][0] if self._pings else 0.0
         return self._pong_number, max(self._newest_s, waits)
 

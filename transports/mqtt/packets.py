@@ -189,7 +189,7 @@ class Quota(Protocol):
 
 
 class Reader:
-    """Makes packets out of bytes as they come; ``acks`` collects the answers that are to be written."""
+    """A parser that makes packets out of bytes as they come; ``acks`` collects the answers that are to be written."""
 
     def __init__(self, listener: Listener, quota: Quota, *, modern: bool) -> None:
         self.acks = bytearray()

@@ -8,10 +8,10 @@ from pebble.transports.counters import Counters
 
 
 class LoopbackQueue:
-    """Hands a transport's own messages to its own direct handlers, on a thread that starts with the first message.
+    """A queue that hands a transport's own messages to its own direct handlers, on a thread of its own.
 
-    Zenoh delivers to subscribers of the same session inside ``put()``. A direct handler called there would run under
-    the publisher's lock, and two that publish to each other would deadlock.
+    The thread starts with the first message. Zenoh delivers to subscribers of the same session inside ``put()``. A
+    direct handler called there would run under the publisher's lock, and two that publish to each other would deadlock.
     """
 
     def __init__(self, counters: Counters) -> None:

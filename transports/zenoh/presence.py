@@ -95,8 +95,8 @@ class Barrier:
     directions. So a sibling that has answered ``@sync/<name>`` will send us what we subscribed to, and receive what we
     publish. The answer carries ``retained_count()``. Siblings know this session by its token.
 
-    ``by_name``: each sibling is asked by its name, for clients of hubs elsewhere: else all others there would answer,
-    too (measured with 200 of them: 3.3 to 7.3 s until one had opened, asked by name 1.4 s).
+    With ``by_name`` each sibling is asked by its name, as clients of hubs elsewhere do: otherwise all other clients
+    there would answer, too (measured with 200 of them: one took 3.3 to 7.3 s to open; asking by name, 1.4 s).
     """
 
     def __init__(

@@ -337,7 +337,7 @@ class ZenohTransport(Transport):
         )
 
     def _is_late(self, sample: zenoh.Sample, stamp: wire.LiveStamp, now: float) -> bool:
-        """True if it waited in a socket while this process was stopped, longer than the lease of a connection (T19).
+        """True if ``sample`` waited in a socket while this process was stopped, longer than a connection's lease (T19).
 
         Retained messages are never late, because they are not sent again; nor are stops, which must always take effect.
         """

@@ -103,7 +103,7 @@ class Stamp(msgspec.Struct, frozen=True):
 
     @classmethod
     def unpack(cls, data: bytes) -> Stamp:
-        """Raises ValueError for anything that ``pack`` did not make."""
+        """Return the stamp in ``data``. Raises ValueError for anything that ``pack`` did not make."""
         try:
             qos, retained_count = _RETAINED.unpack_from(data)
         except struct.error as error:

@@ -50,7 +50,7 @@ def collect(
 ) -> tuple[list[Floats], tuple[int, int]]:
     """Return the corners of the tag in up to 27 different places, and the width and height of the pictures.
 
-    ``still``: every picture counts; otherwise the tag has to rest, and it ends after 15 that are well spread.
+    ``still``: every picture counts; otherwise the tag has to rest, and 15 places that are well spread suffice.
     """
     taken: dict[View, Floats] = {}
     size, resting = (0, 0), 0

@@ -132,7 +132,7 @@ def _calibrate_camera(config: Path, pictures: Any, tag: int, size: float, *, sti
 
 
 def _run(config: Path, main: Any, *, drives: bool = True) -> None:
-    """Run it as a script. Raises PebbleError that says that there is no file."""
+    """Run ``main`` as a script. Raises PebbleError, which also says that no file was written."""
 
     def ended(robot: Robot) -> None:
         try:

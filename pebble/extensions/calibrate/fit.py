@@ -13,7 +13,7 @@ LIMIT_SIGMA = 3.0  # a run with a larger residual is repeated
 
 
 class Run(NamedTuple):
-    """A run: the steps that both wheels were counted, reverse negative, and how the robot has really moved."""
+    """A run: the counted steps of both wheels, reverse negative, and how the robot has really moved."""
 
     name: str
     left: float
@@ -79,7 +79,7 @@ def fit(runs: Sequence[Run], noise: Noise, step_mm: tuple[float, float], track_m
 
 
 def _equations(runs: Sequence[Run], noise: Noise, wheels: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return what is left of each equation, in parts of its noise, and its slopes by the three lengths."""
+    """Return the residual of each equation, divided by its noise, and its derivatives by the three lengths."""
     left_mm, right_mm, track = wheels
     differences, slopes = [], []
     for run in runs:

@@ -37,7 +37,7 @@ class Counts(NamedTuple):
 
 
 class Legs:
-    """The robot as its calibration drives it. ``expected``: its wheels, as they are believed to be.
+    """The robot as its calibration drives it. ``expected``: its wheels, as they are believed to be before it.
 
     ``mm_s`` is its speed at half power. Every leg raises PebbleError if it is not driven to its end, or Stopped.
     """
@@ -93,7 +93,7 @@ class Legs:
         return self._drive(name, (0.0, math.copysign(POWER, mm)), abs(mm) / self._mm_s, ends)
 
     def spin(self, name: str, turns: int) -> Counts:
-        """Spin so many turns on the spot, by the counts, and on to the tag if there is one; negative is clockwise."""
+        """Spin ``turns`` on the spot, by the counts, and on to the tag if there is one; negative is clockwise."""
         mm = abs(turns) * math.pi * self._expected.track_width_mm
         side = -math.copysign(1.0, turns)
         fast_mm = mm if self._finder is None else mm * _BEFORE_TAG
@@ -178,7 +178,7 @@ class Legs:
         return place is not None and abs(place.angle_rad - start.angle_rad) < _AT_TAG_RAD
 
     def _sight(self, max_age: float = 0.3) -> Place | None:
-        """Return where the tag is in the next new picture, if there is one that is not older than ``max_age``."""
+        """Return where the tag is in a new picture of the last ``max_age`` seconds; None if it is in none."""
         assert self._finder is not None  # noqa: S101 - only a calibration with a tag looks
         self._wait(0.01)
         before, picture = self._picture, self._robot.picture(max_age)
@@ -198,7 +198,7 @@ class Legs:
         return Counts(value["left_mm"] / left, value["right_mm"] / right, gyro)
 
     def _wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
-        """Take what arrives for so long."""
+        """Handle what arrives for ``seconds``, or until ``until()`` is true."""
         end = self._clock() + seconds
         while self._clock() < end and not until():
             self._robot.sleep(min(0.01, seconds))

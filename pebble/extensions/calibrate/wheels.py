@@ -50,7 +50,7 @@ class Person(Protocol):
 
 
 class _Movement(NamedTuple):
-    """The movement of a straight: along its arc, reverse negative, and counter-clockwise."""
+    """The movement of a straight run: along its arc, reverse negative; the turn is counter-clockwise."""
 
     mm: float
     turn_rad: float
@@ -184,7 +184,7 @@ class _Session:
         return arc(along, numbers[1] if side else along * math.tan(half))
 
     def _numbers(self, what: str, count: int, plausible: Callable[[list[float]], bool]) -> list[float]:
-        """Ask until so many plausible numbers are typed."""
+        """Ask until ``count`` plausible numbers are typed; return them."""
         while True:
             try:
                 numbers = [float(word) for word in self._person.ask(f"    {what}: ").split()]
@@ -204,7 +204,7 @@ class _Session:
 
 
 def arc(along_mm: float, left_mm: float) -> _Movement:
-    """Return the movement that ends there, seen from where it began; along a line it looked along, back negative."""
+    """Return the movement on an arc to a place, measured along and left of the first heading; back is negative."""
     half = math.atan2(math.copysign(1.0, along_mm) * left_mm, abs(along_mm))
     return _along(math.copysign(math.hypot(along_mm, left_mm), along_mm), half)
 

@@ -101,7 +101,7 @@ class Observer:
         return wait_for(holds, seconds)
 
     def look(self, seconds: float) -> float:
-        """Read messages for so many seconds; return when that began."""
+        """Read messages for ``seconds``; return when that began."""
         began = time.monotonic()
         self.wait(lambda: False, seconds)
         return began
@@ -166,7 +166,7 @@ class Observer:
 
 @contextmanager
 def observed(target: Target, seconds: float) -> Iterator[Observer]:
-    """Connect, and look on for so long. Raises PebbleError."""
+    """Connect, and observe for ``seconds``. Raises PebbleError."""
     with connected(target) as (transport, names):
         observer = Observer(target, transport, names)
         observer.look(seconds)

@@ -100,9 +100,9 @@ class Audit:
 
 
 def _values(row: Row) -> tuple[float | str | int, ...]:
-    """Return a row as it is stored.
+    """Return the values of a row in the form that is stored.
 
-    Without its texts it stands for rows that differ too much to be counted together.
+    A row without its texts stands for rows that differ too much to be counted together.
     """
     texts = (row.get(field, OTHERS if field == "user" else "") for field in _FIELDS)
     return (row["t"], row["what"], *texts, row.get("count", 1))

@@ -48,7 +48,7 @@ def camera(
 
 
 class Camera:
-    """Iterate over it; close it, or use it in a ``with`` statement, when you are done."""
+    """The pictures of one camera. Iterate over it; close it, or use it in a ``with`` statement, when you are done."""
 
     def __init__(self, run_dir: Path, *, width: int | None, views: bool, timeout: float | None) -> None:
         self.frame: Frame | None = None  # of the last picture: its time, its writer, and whether it is still valid
@@ -95,7 +95,7 @@ class Camera:
         return picture
 
     def close(self) -> None:
-        """Ends the iteration, from any thread."""
+        """End the iteration, from any thread."""
         self._reader.close()
 
     def __enter__(self) -> Self:
@@ -125,7 +125,7 @@ def _run_dir(robot: str | Path, env: Mapping[str, str]) -> Path:
 
 
 def _usual_places(robot: str, env: Mapping[str, str]) -> list[Path]:
-    """Return where its run directory is if it was started in this environment or in one without a login's folder."""
+    """Return the run directories of a robot started in this environment, or in one without a login's folder."""
     levels = robot.split("/")
     if len(levels) not in (1, 3):
         raise ConfigError(f"camera: {robot} is neither a robot's id nor a base topic nor a config file")

@@ -48,14 +48,14 @@ class Child:
         return found
 
     def signal(self, number: int) -> None:
-        """Send a signal to its group, if it still runs."""
+        """Send a signal to the program's group, if the program still runs."""
         with self._lock:
             if self.code is None:
                 with suppress(ProcessLookupError):
                     os.killpg(self.pid, number)
 
     def wait(self, timeout_s: float = float("inf")) -> int | None:
-        """Wait for its end, at most so long; returns ``code``."""
+        """Wait for the program's end, at most ``timeout_s``; return ``code``, None if the program still runs."""
         deadline = time.monotonic() + timeout_s
         while self.code is None and not self._has_ended(wait=timeout_s == float("inf")):
             if time.monotonic() >= deadline:
@@ -69,18 +69,18 @@ class Child:
         return self.code
 
     def finish(self, timeout_s: float) -> int:
-        """Wait for its end, at most so long, then kill it; returns ``code``."""
+        """Wait for the program's end, at most ``timeout_s``, then kill it; return ``code``."""
         if self.wait(timeout_s) is None:
             self.signal(signal.SIGKILL)
         return self.wait() or 0
 
     def watch(self, ended: Callable[[int], None]) -> None:
-        """Call ``ended(code)`` on a thread of its own when it has ended."""
+        """Call ``ended(code)`` on a thread of its own when the program has ended."""
         name = f"pebble-child {self.pid}"
         threading.Thread(target=lambda: ended(self.wait() or 0), name=name, daemon=True).start()
 
     def _has_ended(self, *, wait: bool) -> bool:
-        """True if it is a zombie, or reaped by another thread."""
+        """True if the program is a zombie, or was reaped by another thread."""
         try:
             return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT | (0 if wait else os.WNOHANG)) is not None
         except ChildProcessError:

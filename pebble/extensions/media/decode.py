@@ -27,10 +27,10 @@ class Decoded:
 
 
 class VideoDecoder:
-    """Decodes the payloads of one topic: json, pbvd, pbvz, h264 and raw JPEG, in any order.
+    """A decoder of the payloads of one topic: json, pbvd, pbvz, h264 and raw JPEG, in any order.
 
-    After a lost frame, a restart of the sender or a refused payload it returns nothing until the next key frame.
-    Damage is found by the checksums of json, pbvz and h264; of pbvd and raw JPEG, which have none, by their structure.
+    After a lost frame, a restart of the sender or a refused payload it returns nothing until the next key frame. Damage
+    is found by the checksums of json, pbvz and h264; of pbvd and raw JPEG, which have none, by their structure.
     """
 
     def __init__(self) -> None:

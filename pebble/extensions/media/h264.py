@@ -85,7 +85,7 @@ class H264Encoder:
         return seal(b"".join(bytes(packet) for packet in packets))
 
     def _rests(self, picture: Pixels) -> bool:
-        """True if it shows what those of the last second showed."""
+        """True if the picture shows what those of the last second showed."""
         reduced = cv2.resize(picture, _GRID, interpolation=cv2.INTER_AREA)
         if self._reduced is None or cv2.absdiff(reduced, self._reduced).max() > _RESTS:
             self._reduced, self._resting = cast(Pixels, reduced), 0

@@ -86,7 +86,7 @@ class Depth:
 
 
 class JitterBuffer:
-    """:meth:`put` what arrives, :meth:`take` what is to be played and write it to the player at once.
+    """A buffer: :meth:`put` what arrives, :meth:`take` what is to be played and write it to the player at once.
 
     At most ``limit`` packets wait; the oldest is dropped for the newest. A gap is filled with at most
     ``concealment_ms`` of estimated sound, which fades; then the next received packet is played, or nothing if the

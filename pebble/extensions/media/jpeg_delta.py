@@ -20,14 +20,14 @@ def add(reference: Pixels, difference: Pixels, out: Pixels | None = None) -> Pix
 
 
 class JpegDelta:
-    """Encodes pictures one after the other.
+    """An encoder of pictures, one after the other.
 
     It decodes its own JPEGs, so a difference also corrects the errors of the one before. (Differences from the camera's
     previous picture, as the paper's first encoder made them, add the errors up until the next full picture.)
     """
 
     def __init__(self, interval: int) -> None:
-        """``interval``: pictures from one full picture to the next."""
+        """Store ``interval``, the number of pictures from one full picture to the next."""
         self.keyframe = False  # was the last one a full picture?
         self._interval = interval
         self._since_keyframe = 0

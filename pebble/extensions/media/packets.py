@@ -55,7 +55,7 @@ class Sound:
     flags: int = 0
 
     def pack(self) -> bytes:
-        """Raises PayloadError for numbers that the header cannot hold."""
+        """Return the packet as bytes. Raises PayloadError for numbers that the header cannot hold."""
         try:
             head = _SOUND.pack(
                 PBAT, VERSION, self.codec, self.channels, self.flags,
@@ -67,7 +67,7 @@ class Sound:
 
     @classmethod
     def unpack(cls, raw: bytes) -> Sound:
-        """Raises PayloadError for anything but a PBAT packet of version 1 with sound in it."""
+        """Return the packet in ``raw``. Raises PayloadError if it is no PBAT packet of version 1 with sound in it."""
         if len(raw) < _SOUND.size:
             raise PayloadError(f"PBAT: {len(raw)} bytes, less than its header")
         magic, version, codec, channels, flags, rate, samples, sequence, captured_ms = _SOUND.unpack_from(raw)
@@ -89,7 +89,7 @@ class Picture:
     flags: int = 0
 
     def pack(self) -> bytes:
-        """Raises PayloadError for numbers that the header cannot hold."""
+        """Return the packet as bytes. Raises PayloadError for numbers that the header cannot hold."""
         try:
             head = _PICTURE.pack(PBVD, VERSION, self.kind, self.flags, self.frame, self.captured_ms)
         except struct.error as error:
@@ -98,7 +98,7 @@ class Picture:
 
     @classmethod
     def unpack(cls, raw: bytes) -> Picture:
-        """Raises PayloadError for anything but a PBVD packet of version 1."""
+        """Return the packet in ``raw``. Raises PayloadError for anything but a PBVD packet of version 1."""
         if len(raw) < _PICTURE.size:
             raise PayloadError(f"PBVD: {len(raw)} bytes, less than its header")
         magic, version, kind, flags, frame, captured_ms = _PICTURE.unpack_from(raw)

@@ -45,13 +45,14 @@ class Resampler:
     """
 
     def __init__(self, rate: int, rate_out: int, channels: int) -> None:
+        """Compute the filter. ``_up`` output samples take as long as ``_down`` input samples."""
         common = gcd(rate, rate_out)
         self._up, self._down = rate_out // common, rate // common
         widened = max(1.0, self._down / self._up)
         self._taps = 2 * ceil(_CROSSINGS * widened)
         self._filter = _filter(min(self._up, _PHASES), self._taps, _PASS / widened)
         self._tail = np.zeros((self._taps - 1, channels), np.float32)
-        self._at = 0  # of the next output sample, from the tail's beginning, in input samples / _up
+        self._at = 0  # of the next output sample, from the beginning of the tail; unit: an input sample / _up
 
     def feed(self, samples: Samples) -> Samples:
         if self._up == self._down:

@@ -62,7 +62,7 @@ def follows(last: PictureHeader | None, header: PictureHeader) -> bool:
 
 
 class PictureSequence:
-    """Notices that a picture is missing: those after it are of no use until the next key frame."""
+    """A watch that notices missing pictures: those after a missing one are of no use until the next key frame."""
 
     def __init__(self) -> None:
         self.complete = False  # none is missing before the newest

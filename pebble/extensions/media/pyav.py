@@ -10,7 +10,7 @@ INSTALL: Final = "needs PyAV: pip install 'pebble-robot[media]'"
 
 
 def installed() -> bool:
-    """Is PyAV installed? Does not import it."""
+    """True if PyAV is installed. Does not import it."""
     try:
         return find_spec("av") is not None
     except ValueError:  # sys.modules["av"] is None, which forbids the import

@@ -8,9 +8,9 @@ _LONGEST_S: Final = 30.0  # the link may be a better one by then
 
 
 class Rests:
-    """After a slow picture or sound the next one waits: on a thin link commands share what the modem carries.
+    """The rests after slow pictures or sound, because on a thin link commands share what the modem carries.
 
-    ``on`` False: there are none.
+    The next picture or sound waits for the end of the rest. ``on`` False: there are none.
     """
 
     def __init__(self, on: bool) -> None:
@@ -18,7 +18,7 @@ class Rests:
         self._until = float("-inf")
 
     def note(self, took_s: float, now: float) -> None:
-        """Note for how long what was confirmed just now has kept the connection busy."""
+        """Note ``took_s``: for how long a message that was confirmed just now has kept the connection busy."""
         if self.on and took_s > SLOW_S:
             self._until = max(self._until, now + min(_TIMES * took_s, _LONGEST_S))
 

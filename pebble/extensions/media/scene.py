@@ -44,7 +44,7 @@ def noise(seed: int, count: int) -> NDArray[np.float32]:
 
 
 class Scene:
-    """Draws any frame of the scene into an array that the caller owns. The same number gives the same pixels."""
+    """A scene that draws any of its frames into an array of the caller. The same number gives the same pixels."""
 
     def __init__(self, width: int, height: int) -> None:
         self.width, self.height = width, height

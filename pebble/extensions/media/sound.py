@@ -31,7 +31,7 @@ def sequence_numbers() -> Iterator[int]:
 
 
 class _Intake:
-    """Converts sound to the rate and channels on the wire and cuts it into equal frames."""
+    """The converter of sound to the rate and channels on the wire; it cuts the sound into equal frames."""
 
     def __init__(self, rate: int, channels: int, rate_out: int, channels_out: int) -> None:
         self.rate, self.channels = rate_out, channels_out
@@ -60,7 +60,7 @@ class _Intake:
 
 
 class SoundEncoder:
-    """Takes any amount of s16le and returns whole packets; the rest waits for more samples.
+    """An encoder that takes any amount of s16le and returns whole packets; the rest waits for more samples.
 
     ``bundle`` Opus packets are in one of ours; without ``codec`` it holds the samples as they are.
     """
@@ -112,10 +112,11 @@ def make_sound_encoder(
     sent_channels: int | None = None,
     numbers: Iterator[int] | None = None,
 ) -> SoundEncoder:
-    """Make an encoder of what has ``rate`` and ``channels``, to ``sent_…`` as far as the encoding has them.
+    """Make an encoder of sound with ``rate`` and ``channels``.
 
-    Opus packets last ``chunk_ms`` rounded up to 20, 40 or 60, and ``bundle`` of them (at most 3) share a PBAT packet.
-    Raises PebbleError for an unknown name and for one this installation cannot make.
+    It sends ``sent_rate`` and ``sent_channels``, as far as the encoding has them. Opus packets last ``chunk_ms``
+    rounded up to 20, 40 or 60, and ``bundle`` of them (at most 3) share a PBAT packet. Raises PebbleError for an
+    unknown name and for one this installation cannot make.
     """
     numbers = sequence_numbers() if numbers is None else numbers
     rate_out, channels_out = sent_rate or rate, sent_channels or channels

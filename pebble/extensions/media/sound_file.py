@@ -21,7 +21,7 @@ class SoundFile:
     """An open file. ``rate`` is in Hz; ``channels`` is 1 or 2."""
 
     def __init__(self, path: Path) -> None:
-        """Raises PebbleError if there is no sound in it, and OSError if it cannot be read."""
+        """Open the file. Raises PebbleError if there is no sound in it, and OSError if it cannot be read."""
         self._name, self._av = path.name, pyav.load(path.suffix.removeprefix("."))
         try:
             self._container = self._av.open(str(path), format=_FORMATS[path.suffix.lower()])

@@ -21,13 +21,16 @@ class VideoEncoder:
     """One stream to one topic; frames are numbered from 0, by one."""
 
     def __init__(self, name: str, codec: H264Encoder | JpegDelta, quality: float) -> None:
-        """``quality``, 1..100 as of a JPEG, may change."""
+        """Store the arguments. ``quality``, 1..100 as of a JPEG, may change."""
         self.name, self.quality = name, quality
         self.last_was_keyframe = False
         self._codec, self._frame = codec, 0
 
     def encode(self, picture: Pixels, captured_ms: int, *, keyframe: bool = False) -> bytes:
-        """Return one MQTT payload. ``picture``: BGR, uint8, (height, width, 3), only read. ``keyframe``: a full one."""
+        """Return one MQTT payload; with ``keyframe`` a full picture.
+
+        ``picture``: BGR, uint8, (height, width, 3), only read.
+        """
         body = self._codec.encode(picture, self.quality, keyframe=keyframe)
         self.last_was_keyframe = full = self._codec.keyframe
         frame, self._frame = self._frame, (self._frame + 1) % SEQUENCE_LIMIT

@@ -42,7 +42,7 @@ class Samples:
             self._lines[metric].append(f"{metric}{{{named}}} {value:.12g}\n")
 
     def text(self) -> str:
-        """Return Prometheus' text format 0.0.4. What ends in ``_total`` is a counter, all else a gauge."""
+        """Return Prometheus' text format 0.0.4. A name that ends in ``_total`` is a counter, any other a gauge."""
         return "".join(
             f"# TYPE {metric} {'counter' if metric.endswith('_total') else 'gauge'}\n{''.join(lines)}"
             for metric, lines in self._lines.items()
@@ -50,7 +50,7 @@ class Samples:
 
 
 class Robot:
-    """One robot: the view of an operator's program, and what that does not keep."""
+    """One robot: the view of an operator's program, and the figures that the view does not keep."""
 
     def __init__(self, base: str, now: float) -> None:
         self.view = RobotView(base)
@@ -89,7 +89,7 @@ class Robot:
                 self._loss[name] = dropped / handled
 
     def add_to(self, samples: Samples, now: float) -> None:
-        """Add what is known of it; of one that is silent only that, and what holds it."""
+        """Add what is known of the robot; if it is silent, only that, and which of its owners are stopped."""
         robot, view = id_of(self.view.base), self.view
         online = view.online(now) is True
         samples.add("pebble_robot_online", online, robot=robot)
@@ -149,7 +149,7 @@ class Robots:
 
 
 def _named(entries: dict[str, T]) -> dict[str, T]:
-    """Return the entries that have a name which may be a label."""
+    """Return the entries whose names may be labels."""
     return {name: entry for name, entry in list(entries.items())[:MOST_NAMES] if _valid_level(name)}
 
 

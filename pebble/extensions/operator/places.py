@@ -40,12 +40,12 @@ class Places:
 
     @cached_property
     def slots(self) -> Path:
-        """``a`` and ``b``, each a virtual environment, and the link ``active``."""
+        """The folder of ``a`` and ``b``, each a virtual environment, and of the link ``active``."""
         return self.root / "opt/pebble"
 
     @cached_property
     def slot_state(self) -> Path:
-        """``trial``, ``refused`` and ``sequence``: of ``pebble-slot`` and of updates."""
+        """The folder of ``trial``, ``refused`` and ``sequence``: of ``pebble-slot`` and of updates."""
         return self.root / "var/lib/pebble-update"
 
     @cached_property
@@ -74,7 +74,7 @@ class Places:
         return self.state / "people.sqlite"
 
     def named(self, path: Path) -> str:
-        """Return the path as it is called on the machine of this root."""
+        """Return the path without this root: as programs on the machine name it."""
         return f"/{path.relative_to(self.root)}"
 
 

@@ -37,7 +37,7 @@ class PageClock:
     def shown_round_trip_s(self) -> float | None:
         """Return the second longest of the last four round trips, as one slow answer is no slow connection.
 
-        The last one if it is late.
+        If the last round trip is late, it is returned instead.
         """
         if self.round_trip_s is None or self.round_trip_s >= LATE_S:
             return self.round_trip_s

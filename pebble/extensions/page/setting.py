@@ -21,7 +21,10 @@ PEOPLE = "people.sqlite"  # in the state directory
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WebSettings:
-    """``certificate`` and ``key`` None: plain http. ``login`` False: everybody is admin; only on loopback."""
+    """The settings of an operator page. ``certificate`` and ``key`` None: plain http.
+
+    ``login`` False: everybody is admin; only on loopback.
+    """
 
     broker: MqttSettings
     host: str = "127.0.0.1"

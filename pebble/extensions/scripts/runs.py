@@ -58,7 +58,7 @@ class LocalScripts:
 
     @contextmanager
     def none_runs(self) -> Iterator[bool]:
-        """Give True if no script runs; none begins in the block then. False: one runs, or that is unknown."""
+        """Give True if no script runs; none begins in the block then. Give False if one runs, or that is unknown."""
         try:
             file = self._open()
         except OSError as error:

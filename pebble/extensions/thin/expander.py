@@ -39,9 +39,9 @@ class _Robot:
 class Expander:
     """An expander on a connection; its owner calls :meth:`announce` every ANNOUNCE_S.
 
-    Of several the one with the smallest id works. Each goes by the announcements as the broker passes them on, its own
-    too: these stand between the same groups for all, so no group is taken apart twice.
-    Members become nothing but streams: no state, stop or command is published for a robot.
+    If there are several, the one with the smallest id works. Each goes by the announcements as the broker passes them
+    on, its own included: all see them between the same groups, so no group is taken apart twice. Members become nothing
+    but streams: no state, stop or command is published for a robot.
     """
 
     def __init__(self, transport: Transport, clock: Callable[[], float] = time.monotonic, id_: str = "") -> None:

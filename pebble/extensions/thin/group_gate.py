@@ -41,7 +41,7 @@ def encoded(members: Iterable[groups.Member]) -> bytes:
 
 
 def copy_of(member: groups.Member) -> bytes:
-    """Return the payload for who knows no groups; marked, if motor owners take it from the group."""
+    """Return the payload for programs that know no groups; marked as a copy if motor owners take the group itself."""
     if member.channel not in MARKED:
         return member.payload
     return msgspec.json.encode(msgspec.json.decode(member.payload) | {groups.MARK: True})

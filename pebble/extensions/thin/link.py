@@ -120,7 +120,7 @@ class LinkMeter:
             self.answered(answer.seconds, now, answer.queue_s)
 
     def answered(self, seconds: float, now: float, tcp_queue_s: float | None = None) -> None:
-        """Note how long an answer took. ``tcp_queue_s``: by so much TCP's own round trips exceed the shortest one."""
+        """Note how long an answer took. ``tcp_queue_s``: the excess of TCP's own round trips over the shortest one."""
         self._shortest.note(seconds, now)
         queue_s = seconds - self._shortest.seconds
         self.queue_s = queue_s if tcp_queue_s is None else min(queue_s, tcp_queue_s)
@@ -213,7 +213,7 @@ class LateRun:
         self._since = self._newest_at = 0.0
 
     def note(self, late: bool, now: float) -> None:
-        """Count a command that does not tell its age, or start again."""
+        """Count a ``late`` command that does not tell its age; one that is on time starts the count again."""
         if not late:
             self.count = 0
             return

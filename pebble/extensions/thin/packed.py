@@ -23,7 +23,7 @@ def joined(streams: Mapping[str, bytes]) -> bytes:
 
 
 def packed(text: bytes, dict_id: int, dictionary: bytes) -> bytes:
-    """Return ``text`` as it is sent; without a dictionary as it is."""
+    """Return ``text`` as it is sent: deflated with a dictionary, or unchanged without one."""
     if not dictionary:
         return text
     deflater = zlib.compressobj(9, zlib.DEFLATED, -15, 9, zlib.Z_DEFAULT_STRATEGY, dictionary)

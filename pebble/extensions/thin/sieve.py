@@ -61,7 +61,7 @@ class Sieve:
         return len(self._waiting)
 
     def takes_event(self, message: Message) -> bool:
-        """Return True if an event is sent now; else note since when one waits. Events wait elsewhere, in order."""
+        """Return True if an event is sent now; else note since when one has waited. Events wait elsewhere, in order."""
         overdue = self._event_is_overdue
         if (overdue or Rank.STATE not in self._short) and self._takes(Rank.STATE, _size(message)):
             self._event_since = inf
@@ -70,7 +70,7 @@ class Sieve:
         return False
 
     def keeps(self, subject: Subject, message: Message, forward: Forward) -> bool:
-        """Keep ``message`` and return True, or return False if it is sent now. One without room may be dropped."""
+        """Keep ``message`` and return True; return False if it is sent now. If there is no room, it may be dropped."""
         rank, topic = rank_of(subject, message), message.topic
         if rank is None:
             return False

@@ -72,7 +72,7 @@ class StreamGroups:
         return True
 
     def send(self, takes_room: Callable[[int], bool], *, crowded: bool) -> None:
-        """Send what waits, if it is time and there is room; call this often."""
+        """Send the waiting streams, if it is time and there is room; call this often."""
         now = self._clock()
         if not self._is_announced:
             self._publish_wire()

@@ -48,11 +48,11 @@ class LinkReport:
 
     @property
     def is_outdated(self) -> bool:
-        """True if the others have to act otherwise."""
+        """True if the level of the link, or whether it is crowded, has changed: others have to act otherwise."""
         return (self._meter.level, self._meter.crowded) != (self._level, self._crowded)
 
     def is_due(self, now: float) -> bool:
-        """True if its figures have changed enough, or are old."""
+        """True if the figures of the link have changed enough since they were published, or are old."""
         change_s = abs(self._meter.queue_s - self._queue_s)
         state_s = _CROWDED_STATE_S if self._crowded else _STATE_S
         changed = now - self._at >= state_s and change_s >= max(_CHANGE_S, self._meter.round_trip_s / 2)

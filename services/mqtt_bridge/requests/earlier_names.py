@@ -88,7 +88,7 @@ class EarlierNames:
 
 
 class Renaming(Requests):
-    """Has earlier names looked for once the bridge forwards; nobody requests it."""
+    """The task that looks for earlier names once the bridge forwards; nobody requests it."""
 
     channels = ()
 
@@ -112,7 +112,10 @@ class Renaming(Requests):
 
 
 class _Removal:
-    """Watches for a robot of one name; if there is none, removes what brokers retain, and checks that it has gone."""
+    """The removal of one earlier name: watches for a robot of that name, and if there is none, cleans the brokers.
+
+    It removes the messages that brokers retain under the name, and checks that they have gone.
+    """
 
     def __init__(self, name: str, sides: list[Transport], call_in: CallIn, done: Callable[[], None]) -> None:
         self._name, self._sides, self._call_in, self._done = name, sides, call_in, done

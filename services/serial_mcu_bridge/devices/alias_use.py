@@ -30,7 +30,7 @@ class AliasUse:
         return alias.claim in self.used
 
     def announce(self, device: Device) -> None:
-        """Set a device whose manifest was just published; no alias is in use yet."""
+        """Store a device whose manifest was just published; no alias is in use yet."""
         self._device, self.permitted = device, False
 
     def permit(self, device: Device) -> None:

@@ -18,7 +18,7 @@ _WATCH_S = 0.5
 
 
 class ImuBridge(SerialService):
-    """The service of a sensor, which is sent nothing. Drive commands tell when it must not repeat itself."""
+    """The service of a sensor, which is sent nothing. Drive commands tell when its samples have to change."""
 
     publishes = (IMU_FAST, IMU)
     receive_only = True

@@ -57,7 +57,7 @@ class ImuReports:
         return ImuFast(t=t, seq=seq, mcu_ms=mcu_ms, value=self._newest)
 
     def summary(self, t: int, seq: int, mcu_ms: int, values: Values) -> Imu | None:
-        """Return None before the first sample."""
+        """Return the summary; None before the first sample."""
         newest = self._newest
         if newest is None:
             return None
@@ -81,7 +81,7 @@ class ImuReports:
 
 
 class ImuWatchdog:
-    """Measures the time without a sample while a device is connected; when it expires, the process must end.
+    """A watchdog for the time without a sample while a device is connected; when it expires, the process must end.
 
     The clock is passed in.
     """

@@ -97,10 +97,11 @@ class SerialLine:
         self._thread.start()
 
     def drive(self, line: bytes, valid_s: float = float("inf"), *, replaces: str = "") -> bool:
-        """Send a drive line now, or once earlier bytes are sent unless a newer one replaces it. False: no device.
+        """Send a drive line now, or once earlier bytes are sent unless a newer one replaces it.
 
-        A drive line that could not be sent for ``valid_s``, or for ``drive_timeout_s``, becomes a stop. Other lines
-        may follow in ``line``: they have the same fate; ``replaces`` is their kind.
+        Return False if there is no device. A drive line that could not be sent for ``valid_s``, or for
+        ``drive_timeout_s``, becomes a stop. Other lines may follow in ``line``: they have the same fate; ``replaces``
+        is their kind.
         """
         outbox = self.output.outbox
         return self._hand_over(lambda now: outbox.drive(line, now, valid_s, replaces), line if valid_s > 0 else b"")
@@ -110,7 +111,7 @@ class SerialLine:
         return self._hand_over(lambda _now: self.output.outbox.halt(), self.output.stop)
 
     def send(self, kind: str, line: bytes) -> bool:
-        """Send a line that drives nothing; a waiting line of the same ``kind`` is replaced. False: no device."""
+        """Send a line that drives nothing, in place of a waiting one of the same ``kind``; False without a device."""
         return self._hand_over(lambda _now: self.output.outbox.put(kind, line), line)
 
     def close(self, timeout: float = 0.8) -> None:

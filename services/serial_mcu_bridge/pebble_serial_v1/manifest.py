@@ -28,7 +28,7 @@ _level = re.compile(LEVEL).search
 
 
 class Direction(IntEnum):
-    """Seen from the robot, as in its topics."""
+    """The direction of an interface as seen from the robot, as in its topics."""
 
     IN = 1
     OUT = 2
@@ -79,7 +79,7 @@ class Manifest:
         return self.hello.device_uid
 
     def payload(self) -> McuManifest:
-        """Return it as it is published on ``outgoing/mcu/{uid}/describe``, with the original's keys."""
+        """Return the manifest as it is published on ``outgoing/mcu/{uid}/describe``, with the original's keys."""
         hello = self.hello
         return McuManifest(
             protocol=PROTOCOL,

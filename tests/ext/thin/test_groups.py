@@ -21,6 +21,10 @@ def test_members_have_their_values() -> None:
     assert [metric for metric, member in members.items() if member.channel.ends(member.value)] == ["soundboard-command"]
 
 
+def test_a_mark_that_is_none_is_as_good_as_absent() -> None:
+    assert codec.decode(LIGHTS_SOLID, b'{"r": 1, "group": 5}') == codec.decode(LIGHTS_SOLID, b'{"r": 1}')
+
+
 def test_what_is_encoded_is_the_same_group() -> None:
     members = groups.decode(GROUP)
     assert groups.decode(encoded(members)) == members

@@ -89,7 +89,7 @@ class Intake:
             self._changed.notify()
 
     def take(self, timeout: float | None) -> Task | None:
-        """Return the next task, one that does nothing after ``timeout`` seconds, or None at the end."""
+        """Return the next task; after ``timeout`` seconds, one that does nothing; None at the end."""
         with self._lock:
             if not (self._tasks or self._queries or self._ended) and not self._changed.wait(timeout):
                 return _nothing

@@ -83,7 +83,7 @@ def _why_unread(trial: BrokerTrial, reader: Peer) -> str:
 
 
 def _kept(trial: BrokerTrial) -> Received | None:
-    """Return what a later subscriber gets of a message that was published as retained."""
+    """Return the message that a later subscriber gets if it was published as retained; None if there is none."""
     writer, late = trial.peer(), trial.peer()
     writer.publish("retained", qos=trial.qos, retain=True)
     writer.ping()

@@ -53,7 +53,7 @@ class Driver:
         return self._robot.send(c.DRIVE, msgspec.json.encode({"value": command} if wrapped else command))
 
     def drive(self, seconds: float = DRIVES_S, *, z: object = SPEED, **fields: Any) -> tuple[float, float]:
-        """Send commands for so many seconds, at the link's pace; return when the first and the last were sent."""
+        """Send commands for ``seconds``, at the link's pace; return when the first and the last were sent."""
         began = last = time.monotonic()
         pace = self._robot.view.pace
         while time.monotonic() < began + seconds:

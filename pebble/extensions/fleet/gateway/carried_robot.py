@@ -195,7 +195,7 @@ class CarriedRobot:
     # -- media
 
     def _is_wanted(self, channel: Channel | None) -> bool:
-        """True unless it is a medium that is not allowed, or that the operator at the broker has ended."""
+        """True if the channel may pass: a medium must be allowed, and not ended by the operator at the broker."""
         if channel not in self._requested:
             return True
         return self._allowed.get(channel, False) and self._requested[channel] is not False

@@ -63,7 +63,7 @@ def show_steps(options: FlashOptions, tools: Tools, report: Report) -> None:
 
 
 class Steps:
-    """Makes the steps for these options; compiled code and files to copy are in the folder ``work``."""
+    """The steps for these options; compiled code and files to copy are in the folder ``work``."""
 
     def __init__(self, options: FlashOptions, tools: Tools, work: Path, report: Report) -> None:
         self._options, self._tools, self._work, self._report = options, tools, work, report

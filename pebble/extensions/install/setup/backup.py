@@ -73,7 +73,7 @@ class Saved:
 
 @dataclass(slots=True)
 class Backup:
-    """``files`` by their paths below the root; ``left_out``: why a file that belongs to the robot is not in it."""
+    """A backup: ``files`` by their paths below the root; ``left_out``: why a file of the robot's is not in it."""
 
     about: About
     files: dict[str, Saved] = field(default_factory=dict)

@@ -57,7 +57,10 @@ def boards(folder: Path, bauds: Sequence[int] = BAUDS, seconds: float = LISTEN_S
 
 
 def listen(port: str, bauds: Sequence[int] = BAUDS, seconds: float = LISTEN_S) -> Board:
-    """Return what a port sends by itself. Nothing is written to it, and its reset lines are not changed."""
+    """Return the board at a port, by what the port sends by itself.
+
+    Nothing is written to it, and its reset lines are not changed.
+    """
     try:
         for baud in bauds:
             received = _received(port, baud, seconds)

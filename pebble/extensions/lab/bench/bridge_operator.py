@@ -151,7 +151,7 @@ class StandIn(Robot):
         return python("pebble.extensions.lab.bench.stand_in")
 
     def processes(self) -> dict[str, int]:
-        """Return its two programs, by the names of the services that they stand for, and its broker."""
+        """Return the two programs, by the names of the services that they stand for, and the robot's broker."""
         running = [*self._started, *([self.local_broker] if self.local_broker else [])]
         return {name: program.pid for name, program in zip((*SERVICES.values(), "mosquitto"), running, strict=False)}
 

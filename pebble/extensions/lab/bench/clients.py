@@ -59,7 +59,7 @@ class StockClient:
             self.paho.on_socket_open = _send_at_once
 
     def open(self, port: int) -> Self:
-        """Connects and starts the network thread; returns before anything was subscribed."""
+        """Connect and start the network thread; return before anything was subscribed."""
         self.paho.connect("127.0.0.1", port)
         self.paho.loop_start()
         return self
@@ -80,7 +80,7 @@ class StockClient:
         self.paho.loop_stop()
 
     def send(self, channel: contract.Channel, base: str, body: Any) -> MQTTMessageInfo:
-        """Publishes ``body`` as JSON, with the QoS and the retain flag of the channel."""
+        """Publish ``body`` as JSON, with the QoS and the retain flag of the channel."""
         return self.paho.publish(channel.topic(base), json.dumps(body), channel.default_qos, channel.default_retain)
 
     def publish(self, message: Message) -> None:
@@ -126,7 +126,7 @@ def driving(port: int, *bases: str) -> Iterator[None]:
 
 
 class RobotSubscriber(StockClient):
-    """Records when and how much one robot publishes: CLOCK_MONOTONIC, in ns; None: not yet."""
+    """A record of when and how much one robot publishes: CLOCK_MONOTONIC, in ns; None: not yet."""
 
     def __init__(self, port: int, base: str) -> None:
         self._base = base

@@ -161,7 +161,7 @@ class Participants(Processes):
             worker.answer(_READY_S)
 
     def run(self, variant: str, case: Case, seconds: float) -> tuple[Slice, float]:
-        """Run one slice; returns its results, and the pictures per second meanwhile.
+        """Run one slice; return its results, and the pictures per second meanwhile.
 
         Raises PebbleError if a process ended, or no pictures flow.
         """

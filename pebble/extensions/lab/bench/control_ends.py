@@ -118,7 +118,7 @@ def echo(connection: Connection) -> None:
 
 
 class Sender:
-    """Sends slices and collects the replies; the transport's thread fills entries that the slice has made."""
+    """A sender of slices that collects the replies; the transport's thread fills entries that the slice has made."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection

@@ -37,7 +37,7 @@ def curves(name: str, caption: str, cells: Sequence[Cell]) -> list[Picture]:
 
 
 def _curves(cells: Sequence[Cell], title: str) -> Figure:
-    """Return the curves end below 100 % by the lost share; the slowest few are cut off."""
+    """Return the figure. A curve ends below 100 % by the share of lost messages; the slowest few are cut off."""
     by_place, style_of = grouped(cells, Cell.conditions), styles([cell.variant for cell in cells])
     figure, every = panels(len(by_place), 3, (3.9, 2.7), title)
     ends = around([percentile(cell.samples, percent) for cell in cells for percent in (0.1, 99.8)])

@@ -91,7 +91,7 @@ HEADLINES: Final = (
 
 
 def run(names: Sequence[str], folder: Path, *, quick: bool, console: Console) -> int:
-    """Measure and write; returns 0 if every comparison succeeded. A failed one does not stop the others.
+    """Measure and write; return 0 if every comparison succeeded. A failed one does not stop the others.
 
     Without names all that this user may run. Raises PebbleError if the folder cannot be written.
     """
@@ -132,7 +132,7 @@ def _chosen(names: Sequence[str]) -> list[Section]:
 
 
 def run_one(section: Section, folder: Path, quick: bool) -> str:
-    """Run a comparison's command line; returns why it failed. The process ends with this one."""
+    """Run a comparison's command line; return why it failed. The process ends with this one."""
     results, output = (folder / f"{section.name}.{ending}" for ending in ("json", "txt"))
     for path in (results, output, *folder.glob(f"{section.name}*.png")):  # of an earlier run: they would hide a failure
         path.unlink(missing_ok=True)

@@ -152,7 +152,7 @@ class Viewer:
         return len(self._online)
 
     def wait_until(self, condition: Callable[[], bool], what: str) -> None:
-        """Wait until the page shows it. Raises PebbleError if it never does."""
+        """Wait until the page meets ``condition``. Raises PebbleError, which names ``what``, if it never does."""
         end = time.monotonic() + _UP_S
         while not condition():
             if time.monotonic() > end:
@@ -200,7 +200,7 @@ def _voltage(value: float) -> bytes:
 
 
 def capabilities(identity: Identity) -> bytes:
-    """Return those of a board that drives, as its payload."""
+    """Return the payload of the capabilities of a board that drives."""
     drive = {"available": True, "controls": True, "axes": ["x", "z", "y"], "topic": DRIVE.topic(identity.base)}
     value = {"identity": msgspec.to_builtins(identity), "transport": {"kind": "mqtt"}, "drive": drive}
     return json.dumps({"schema": "pebble-capabilities/v1", "t": _epoch_ms(), "value": value}).encode()

@@ -47,7 +47,7 @@ class Shown:
 
 
 def finish(shown: Shown, folder: Path, console: Console) -> int:
-    """Print and write everything; returns 0 if all was measured. Raises PebbleError if a file cannot be written."""
+    """Print and write everything; return 0 if all was measured. Raises PebbleError if a file cannot be written."""
     results = shown.results
     results.save(file := folder / f"{results.bench}.json")  # before anything that may fail
     for table in shown.tables:

@@ -139,7 +139,7 @@ def demo(
 
 
 def _check_options(context: typer.Context, kind: str) -> None:
-    """Raise BadParameter for an option of another kind."""
+    """Raise BadParameter for a given option that this ``kind`` of simulation does not take."""
     for parameter in context.command.params:
         source = context.get_parameter_source(str(parameter.name))
         if source is not None and source.name == "COMMANDLINE" and kind not in _OF.get(str(parameter.name), (kind,)):

@@ -21,7 +21,7 @@ class BrokerKind(StrEnum):
 
     @property
     def program(self) -> str | None:
-        """The module that is one; None: it is mosquitto."""
+        """The module that runs as the broker; None: the broker is mosquitto."""
         return "pebble.extensions.lab.demo.brokers" if self is BrokerKind.EMBEDDED else None
 
 

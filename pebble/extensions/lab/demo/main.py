@@ -101,7 +101,7 @@ class Demo:
         self._media = MediaViewer(testbed.broker_port)
 
     def play(self) -> list[str]:
-        """Drive until the end; returns a line for each robot and each process that failed."""
+        """Drive until the end; return a line for each robot and each process that failed."""
         robots = list(self._testbed.robots.values())
         view = View(self._console, self._operator, robots, self._ending)
         try:

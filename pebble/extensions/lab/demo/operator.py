@@ -114,7 +114,7 @@ class Operator:
         self._thread = threading.Thread()
 
     def connect(self) -> None:
-        """Connect and subscribe; returns at once."""
+        """Connect and subscribe; return at once."""
         self._transport.open(timeout=0.0)
         self._transport.subscribe(
             ALL_OUTGOING, lambda message: self.discovery.receive(message, time.monotonic(), time.time())
@@ -193,7 +193,7 @@ class Operator:
         self._robots = [robot for robot in robots if self._mine(robot)]
 
     def _complete(self, step: str, drive: Drive, began: float, released: float, ended: float) -> None:
-        """Note what was commanded of each robot that is still free."""
+        """Note the command of this step for each robot that is still free."""
         for robot in filter(self._mine, self._robots):
             self.completed.append(Driven(robot.name, step, wheels_of(drive), began, released, ended))
 
@@ -212,13 +212,13 @@ class Operator:
             self._wait(_POLL_S)
 
     def _drive(self, drive: Drive) -> float:
-        """Send one command to all robots that are free; returns when."""
+        """Send one command to all robots that are free; return when."""
         for driver in self._free_drivers():
             driver.command(drive)
         return time.monotonic()
 
     def _hold(self, drive: Drive, seconds: float) -> float:
-        """Send a command again and again, as a held stick does; returns when it was last sent."""
+        """Send a command again and again, as a held stick does; return when it was last sent."""
         self._take_control()
         sent = time.monotonic()
         for _ in paced(seconds, wait=self._wait):
@@ -308,9 +308,9 @@ class Operator:
         self._complete(AFTER_RESET, _FORWARD, reset_at, released, time.monotonic())
 
     def _show_trails(self, robots: Sequence[RobotView]) -> None:
-        """Have each robot with the script for it publish where it is, if it runs no other.
+        """Have each robot that has the script for it publish its own position, unless it runs another script.
 
-        One that is stopped, or was driven a moment ago, refuses to start a script.
+        A robot that is stopped, or was driven a moment ago, refuses to start a script.
         """
         now = time.monotonic()
         for robot in [one for one in robots if one.base in self._drawing]:
@@ -352,7 +352,7 @@ class Operator:
             return status is not None and status.running and status.overridden is not True
 
         def distance_m() -> float:
-            """Return that from the tag; infinite if the robot does not see it."""
+            """Return the robot's distance from the tag; infinite if the robot does not see the tag."""
             return math.inf if not seen or seen[0].distance_m is None else seen[0].distance_m
 
         self.show(f"STARTS: {FOLLOW}, {robot.name} plays {CLIP} and drives to tag {TAG_ID} by itself")

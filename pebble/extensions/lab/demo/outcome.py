@@ -54,7 +54,7 @@ def _same_way(wheels: Wheels, commanded: Wheels) -> bool:
 
 
 def _off_at(motors: Sequence[tuple[float, Wheels]]) -> float:
-    """Return when they were switched off for the last time; infinite if they run at the end."""
+    """Return when the motors were switched off for the last time; infinite if they run at the end."""
     running = [index for index, (_, wheels) in enumerate(motors) if any(wheels)]
     if not running:
         return -math.inf

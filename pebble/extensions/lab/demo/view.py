@@ -70,7 +70,7 @@ class View:
 
 
 def show_outcomes(console: Console, robots: Sequence[str], outcomes: Outcomes) -> None:
-    """Print a table with a row for each step and a column for each robot, of several rounds the worst."""
+    """Print a table with a row for each step and a column for each robot; if there were several rounds, the worst."""
     table = Table("step", *robots, title="Measured by the MCUs: time until the motors were off", title_justify="left")
     for step in outcomes.steps():
         table.add_row(step, *(_cell(outcomes.of(name, step)) for name in robots))

@@ -19,7 +19,7 @@ class Visitors:
     """
 
     def __init__(self, name: str) -> None:
-        """``name``: that of the operator, whose own stops are none of a person."""
+        """Begin with no visitors. ``name``: that of the demo's operator, whose own stops do not count as a person's."""
         self.left_alone: set[str] = set()  # names of robots that were found to be taken
         self.own_ids: set[str] = set()  # under which the operator itself has control
         self._name = name
@@ -57,11 +57,11 @@ class Visitors:
         return f"is driven by {who}" if now - at < DRIVES_S else ""
 
     def rests(self, robot: RobotView, now: float) -> bool:
-        """True if no person has moved it for a moment, also if one has the control."""
+        """True if no person has moved the robot for a moment, even if a person has control."""
         return now - self._moved.get(robot.base, -math.inf) >= DRIVES_S
 
     def free(self, robot: RobotView, now: float) -> bool:
-        """True if it may be driven in the present step, in which no person has had it so far."""
+        """True if no person has had the robot in the present step; else note the robot as left alone."""
         taken = self.taken(robot, now)
         if self._driven.get(robot.base, (-math.inf, ""))[0] < self._step_began and not taken:
             return True

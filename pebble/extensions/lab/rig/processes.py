@@ -49,7 +49,10 @@ class Program:
     has_input: ClassVar = False  # it ends with its standard input, not with the thread that starts it
 
     def __init__(self, name: str, command: Sequence[str], log: Path, each: Each | None = None) -> None:
-        """``each`` runs on a thread of its own; without it standard output is in the log, as errors are."""
+        """Start the program. ``each`` gets its lines on a thread of its own.
+
+        Without ``each`` standard output is in the log, as errors are.
+        """
         self.name, self.log = name, log
         with log.open("ab") as errors:
             self._process = subprocess.Popen(
@@ -65,7 +68,7 @@ class Program:
 
     @property
     def code(self) -> int | None:
-        """Its exit code, once it has ended."""
+        """The exit code of the program, once it has ended."""
         return self._process.poll()
 
     @property
@@ -192,14 +195,17 @@ class Broker(Program):
         program: str | None = None,
         port: int | None = None,
     ) -> None:
-        """``extra``: more lines of mosquitto's configuration. ``program``: a module to run at the port in its place."""
+        """Start the broker. ``extra``: more lines of mosquitto's configuration.
+
+        ``program``: a module to run at the port in mosquitto's place.
+        """
         self.port = port or free_port()
         stem = folder / name
         command = python(program, self.port) if program else mosquitto_command(self.port, stem, extra, host)
         super().__init__(name, wrap(command), folder / f"{name}.log")
 
     def wait(self, ending: threading.Event | None = None) -> None:
-        """Wait until it answers, or ``ending``. Raises PebbleError on timeout, or if the broker has ended."""
+        """Wait until the broker answers, or ``ending``. Raises PebbleError on timeout, or if the broker has ended."""
         self.wait_until(lambda: self._answers() and not self.ended, _BROKER_START_S, ending)
 
     def _answers(self) -> bool:
@@ -211,7 +217,10 @@ P = TypeVar("P", bound=Program)
 
 
 class Processes:
-    """Ends all of them with its ``with`` block, those of a kind at the same time; then deletes the folder."""
+    """The processes of a run, and their folder.
+
+    The ``with`` block ends all of them, those of a kind at the same time; then it deletes the folder.
+    """
 
     ends_s: ClassVar[tuple[float, ...]] = (_END_S, 6.0, 2.0, 2.0)  # what is left of each kind after that is killed
     keep = False  # the folder

@@ -62,7 +62,7 @@ class ScriptedOperator:
     # -- driving
 
     def drive(self, x: float = 0.0, z: float = 0.0, seconds: float = math.inf) -> None:
-        """Drive for so long, then let go, also if it is interrupted."""
+        """Drive for ``seconds``, then let go, also if the wait is interrupted."""
         try:
             for _ in paced(seconds, wait=self._wait):
                 self.command(Drive(x=x, z=z))
@@ -93,7 +93,7 @@ class ScriptedOperator:
 
     @property
     def has_control(self) -> bool:
-        """True if it has what it asked for; also if it did not ask."""
+        """True if the operator has the control that it asked for, or did not ask for any."""
         return self.control.held or not self.control.wanted
 
     def release(self) -> None:
@@ -118,11 +118,11 @@ class ScriptedOperator:
 
     @property
     def stopped(self) -> bool:
-        """True if its newest stop is confirmed."""
+        """True if the operator's newest stop is confirmed."""
         return self._stop is not None and self._stop.confirmed
 
     def reset(self) -> None:
-        """End its own emergency stop; that of a person is the person's to reset."""
+        """End the operator's own emergency stop; a stop of a person is left for a person to reset."""
         stop = self.robot.stopped_by
         if stop is None or stop.by == self._by:
             self._publish_all(Reset(self.robot.estop, self._by).messages())
@@ -130,7 +130,7 @@ class ScriptedOperator:
     # -- what is due
 
     def tick(self) -> None:
-        """Send what is due of requests for control and of a stop; ``command`` calls it."""
+        """Send the requests for control and the messages of a stop that are due; ``command`` calls this."""
         now = time.monotonic()
         self._publish_all(self.control.tick(now))
         while not self._received.empty():

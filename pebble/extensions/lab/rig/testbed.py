@@ -130,7 +130,7 @@ class PageServer(Program):
     """A server of the operator page for one broker; ``settings`` are further fields of WebSettings."""
 
     def __init__(self, folder: Path, broker_port: int, **settings: Any) -> None:
-        """Raises PebbleError without the packages that it needs."""
+        """Start the server. Raises PebbleError without the packages that it needs."""
         require_packages()
         self.url = ""  # with a slash at the end; empty until it can be opened
         fields = {"broker": {"host": HOST, "port": broker_port}, "host": HOST, "server": "demo", **settings}
@@ -194,7 +194,7 @@ class Testbed(Processes):
         return self.add(Program("pebble record", command, self.folder / "record.log"), OPERATORS)
 
     def start_robots(self) -> None:
-        """Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""
+        """Start the robots. Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""
         for robot in self.robots.values():
             robot.bring_up(self._ending)
 

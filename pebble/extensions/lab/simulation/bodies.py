@@ -138,7 +138,7 @@ class Body:
         return DARK
 
     def half_bridge(self, pins: tuple[PinName, PinName]) -> float:
-        """Speed of a motor on half a DRV8833: the first pin high turns it forward."""
+        """Return the speed of a motor on half a DRV8833: the first pin high turns it forward."""
         forward, back = pins
         level = self.board.duty
         return round(level(forward) - level(back), 4) + 0.0  # 16-bit duties; + 0.0: no −0.0

@@ -28,7 +28,7 @@ _LONGEST_S = 0.05
 
 
 class Fleet:
-    """``add`` robots, then ``run`` them; leaving the context stops all motors and closes all connections."""
+    """A fleet: ``add`` robots, then ``run`` them; leaving the context stops all motors and closes all connections."""
 
     def __init__(self, broker: MqttSettings) -> None:
         self.broker = broker
@@ -95,7 +95,7 @@ class Fleet:
 
 
 class ConnectionReporter:
-    """Reports in one line when robots cannot connect, and again when that changes. Call ``poll`` often."""
+    """A reporter, in one line, of robots that cannot connect, and again when that changes. Call ``poll`` often."""
 
     def __init__(self, robots: Sequence[WirelessRobot], report: Callable[[str], None]) -> None:
         self._robots, self._report = robots, report

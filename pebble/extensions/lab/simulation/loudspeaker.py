@@ -78,7 +78,7 @@ class _Sound(msgspec.Struct):
 
 
 class _Recorder:
-    """Writes events and samples into a folder; without one nothing."""
+    """A recorder of events and samples in a folder; without a folder it records nothing."""
 
     def __init__(self, sound: _Sound, folder: Path | None, resources: ExitStack) -> None:
         self._sound, self._folder, self._resources = sound, folder, resources

@@ -26,7 +26,7 @@ _TRACED_LINE = 4096  # bytes; far longer than any line that the MCU accepts
 
 
 class _Recorder:
-    """Adds to a trace what passes the port, in lines."""
+    """A recorder that adds to a trace what passes the port, in lines."""
 
     def __init__(self, trace: Trace, *, is_text: bool, output: bool) -> None:
         self._trace = trace

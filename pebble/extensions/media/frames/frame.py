@@ -70,7 +70,7 @@ class Frame:
         return picture(self.data, self.info, width)
 
     def valid(self) -> bool:
-        """True if the memory still holds this frame. False: what was read may be wrong and must be discarded."""
+        """True if the memory still holds this frame; else what was read may be wrong and must be discarded."""
         if self._data is None:
             return False
         return self._buffer is None or bool(self._buffer.is_valid())

@@ -204,7 +204,7 @@ class FrameWriter:
         return self._put(slot.take(), info, shared=True)
 
     def slot(self, size: int) -> Slot | None:
-        """Return shared memory to build a frame in, without a copy. None: use `write`.
+        """Return shared memory to build a frame in, without a copy; None if `write` is to be used.
 
         It contains data of earlier frames: fill it completely.
         """

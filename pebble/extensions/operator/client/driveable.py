@@ -17,7 +17,7 @@ class Driveable(NamedTuple):
 
     @property
     def doubt(self) -> str:
-        """Return why it cannot be driven, in words; empty if it can."""
+        """Return why the robot cannot be driven, in words; empty if it can."""
         if self.state == "yes":
             return ""
         what = "CANNOT BE DRIVEN OR STOPPED" if self.state == "no" else "not known whether its motors obey"
@@ -27,7 +27,7 @@ class Driveable(NamedTuple):
 def driveable_of(status: bytes) -> Driveable | None:
     """Return the answer in the value of an ``outgoing/status``.
 
-    None: it has none, as that of an older robot or of one without motors.
+    None if the status has no answer, as that of an older robot or of one without motors.
     """
     section = _value(status).get("driveable")
     if not isinstance(section, dict) or section.get("state") not in ("yes", "no", "unknown"):
@@ -37,7 +37,7 @@ def driveable_of(status: bytes) -> Driveable | None:
 
 
 def is_held(status: bytes, program: str) -> bool:
-    """True if that program is requested and waits while a person drives over a thin link."""
+    """True if ``program`` is requested, and waits while a person drives over a thin link."""
     section: Any = _value(status)
     for level in ("services", program, "state"):
         section = section.get(level) if isinstance(section, dict) else None

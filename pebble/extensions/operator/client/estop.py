@@ -79,7 +79,7 @@ class RobotStop:
 
     @property
     def progress(self) -> Progress:
-        """Return how far its stop has got."""
+        """Return how far the robot's stop has got."""
         if self.confirmed_s is not None:
             return Progress.CONFIRMED
         if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._order.named):
@@ -90,7 +90,7 @@ class RobotStop:
 
     @property
     def is_gone(self) -> bool:
-        """True if only its broker's retained messages are left, which say that it is offline."""
+        """True if only messages that its broker retains are left of the robot, which say that it is offline."""
         return self._is_offline and not self.live
 
     @property
@@ -108,7 +108,7 @@ class RobotStop:
 
     @property
     def why(self) -> str:
-        """Return why it is not confirmed, in words; empty if it is. The owners' names in it come from the robot."""
+        """Return why the stop is not confirmed, in words; empty if it is. The owners' names come from the robot."""
         if self.progress in (Progress.CONFIRMED, Progress.SPARED):
             return ""
         if self.estop.old:
@@ -128,7 +128,7 @@ class RobotStop:
 
     @property
     def sending(self) -> bool:
-        """True if the stop is repeated."""
+        """True if the stop is still being repeated."""
         unsettled = self.progress is Progress.CONFIRMED and not self._settled
         unsent = self._names_due or self._sent_at == float("-inf")
         is_due = unsent or unsettled or self.progress in (Progress.WAITING, Progress.OLD)

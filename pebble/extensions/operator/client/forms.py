@@ -48,7 +48,7 @@ class Setting(Struct, frozen=True, kw_only=True):
 
     @property
     def names_file(self) -> bool:
-        """True if its value is a path, which a command must not choose on the robot."""
+        """True if the setting's value is a path, which a command must not choose on the robot."""
         words = re.split(r"[^a-z]+", f"{self.key} {self.arg or ''}".lower())
         free_text = self.type == "string" or (self.type == "enum" and not self.options)
         return free_text and not _FILE_WORDS.isdisjoint(words)

@@ -17,7 +17,7 @@ _WAITING = 10_000  # heartbeats, of which the oldest goes: it comes again
 class Heartbeats:
     """A connection subscribed to heartbeats only: with MQTT 5 to live ones, else also to retained ones.
 
-    It is made on a thread for which nothing waits.
+    The connection is made on a thread of its own, for which nothing waits.
     """
 
     def __init__(self, settings: MqttSettings) -> None:

@@ -33,7 +33,7 @@ class Names:
         return [self._place(synonym, name) for synonym in _with_synonyms(channel)]
 
     def topic(self, name: str) -> str:
-        """Return the topic to publish to for ``name``. Raises PebbleError unless it is exactly one."""
+        """Return the topic to publish to for ``name``. Raises PebbleError unless ``name`` means exactly one topic."""
         channel = self._find(name, (INCOMING, OUTGOING))
         topic = name if channel is None else self._place(channel, name)
         if is_pattern(topic):

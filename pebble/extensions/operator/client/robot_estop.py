@@ -66,7 +66,7 @@ class RobotEstop:
 
     @property
     def lacks(self) -> bool:
-        """True if its capabilities, or a state of an owner that they list, are missing."""
+        """True if the robot's capabilities, or a state of an owner that they list, are missing."""
         return not self.has_capabilities or bool(self.missing)
 
     @property

@@ -64,7 +64,7 @@ class Liveness:
 
     @property
     def whole_seconds(self) -> bool:
-        """True if its clock counts whole seconds, so that latency cannot be measured."""
+        """True if the component's clock counts whole seconds, so that latency cannot be measured."""
         return len(self._stamps) == _STAMPS and all(stamp % 1000 == 0 for stamp in self._stamps)
 
     def age_s(self, now: float) -> float | None:
@@ -84,9 +84,9 @@ class Liveness:
         return age <= silent_after(interval, self.link, self.average_latency_s or 0.0) or age < at_least_s
 
     def online_to_people(self, now: float) -> bool | None:
-        """True if people are shown it as online.
+        """True if people are shown the component as online.
 
-        A silence counts after 1.5 s, or later if its heartbeats are irregular.
+        A silence counts after 1.5 s, or later if heartbeats are irregular.
         """
         returns = sum(now - at < _COMES_AND_GOES_S for at in self._returns)
         return self.online(now, SILENT_S * (1 + returns))
@@ -117,7 +117,7 @@ class RobotView:
 
     @property
     def name(self) -> str:
-        """Return the last level of its base topic."""
+        """Return the last level of the robot's base topic."""
         return self.base.rpartition("/")[2]
 
     # -- what arrives
@@ -207,7 +207,7 @@ class RobotView:
 
     @property
     def is_assumed(self) -> bool:
-        """True if its capabilities are those that people assumed."""
+        """True if the robot's capabilities are those that people assumed."""
         return "assumed" in self.capabilities
 
     def assume(self, axes: Collection[str], name: str = "") -> bool:
@@ -226,7 +226,7 @@ class RobotView:
 
     @property
     def live(self) -> bool:
-        """True if anything but retained messages has arrived from it."""
+        """True if anything but retained messages has arrived from the robot."""
         return self.liveness.received_at is not None
 
     @property
@@ -235,7 +235,7 @@ class RobotView:
 
     @property
     def latched(self) -> bool:
-        """True if any of its motor owners is stopped by an emergency stop: it must not be driven."""
+        """True if any of the robot's motor owners is stopped by an emergency stop: it must not be driven."""
         return bool(self.estop.latched)
 
     @property
@@ -289,7 +289,7 @@ class RobotView:
         return named_topic(self.base, self.capabilities, channel)
 
     def offers(self, section: str) -> bool:
-        """True if that section of its capabilities, for example ``video``, can be requested."""
+        """True if ``section`` of the robot's capabilities, for example ``video``, can be requested."""
         return section_of(self.capabilities, section).get("controls") is True
 
     def ready(self, now: float) -> bool:

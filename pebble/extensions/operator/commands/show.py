@@ -239,7 +239,7 @@ def _cells(record: TopicRecord, now: float, wall: float) -> tuple[str, str, str,
 
 
 def _age(record: TopicRecord, last: Message, now: float, wall: float) -> str:
-    """Return the age of a live message since its arrival, of a retained one by the payload's stamp."""
+    """Return the age of a message: if live, since its arrival; if retained, since the stamp in its payload."""
     if not last.retain:
         return duration(now - record.arrived)
     stamp = stamp_of(parsed(last.payload))

@@ -89,7 +89,7 @@ def named(session: Session, name: str) -> Session:
 
 
 def printable(text: str) -> str:
-    """Return what a page says about itself, made fit to be shown to others."""
+    """Return a text that a client sent as others may see it: 32 characters at most, "?" for all but printable ASCII."""
     return "".join(char if " " <= char <= "~" else "?" for char in text[:32])
 
 

@@ -124,7 +124,7 @@ def role_(name: _Name, role: _RoleArgument, config: _ConfigOption = None, people
 
 
 def register_people(group: typer.Typer) -> None:
-    """Add both to the commands of ``pebble web``."""
+    """Add ``user`` and ``audit`` to the commands of ``pebble web``."""
     users = typer.Typer(help=_USER_HELP, rich_markup_mode=None)
     for name, command in (("add", add), ("list", list_), ("remove", remove), ("password", password), ("role", role_)):
         users.command(name)(command)

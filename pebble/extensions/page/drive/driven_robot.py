@@ -176,7 +176,7 @@ class DrivenRobot:
         return self.state is State.FREE and not self._wishes and not self._repeats and now > self._awaited[1]
 
     def shown(self, tab: Tab, now: float) -> DriverView:
-        """Return what this page is shown about the driver."""
+        """Return the view of the driver for this page."""
         wish, state = self._wishes.get(tab), self.published
         view = DriverView(keeps=self.keeps, asking=wish is not None and wish.client.wanted and not wish.client.held)
         if state is not None:

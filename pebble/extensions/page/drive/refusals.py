@@ -36,7 +36,7 @@ class Refusals:
         return why or (PARKED if robot.parked else "")
 
     def nameless(self, robot: RobotView) -> str:
-        """Return why it takes no commands of this server, which has no account."""
+        """Return why the component takes no commands of this server, which has no account."""
         return why_not(robot.name, self._broker.names.account) if robot.named else ""
 
     def of_op(self, op: m.RobotOp) -> str:

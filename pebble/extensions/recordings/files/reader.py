@@ -173,7 +173,7 @@ class RecordingFile:
         return self._unpacked(chunk, chooses)[0]
 
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Return the file's metadata by name; of two with one name the last."""
+        """Return the file's metadata by name; if two have one name, the last."""
         from mcap.records import Metadata
 
         return {record.name: record.metadata for record in self.beside() if isinstance(record, Metadata)}

@@ -66,7 +66,7 @@ class RecordingWriter:
         return number
 
     def channel(self, topic: str, encoding: str, metadata: Mapping[str, str], schema: int = 0) -> int:
-        """Declare a channel, one of MOST_CHANNELS; returns its number for :meth:`add`."""
+        """Declare a channel, one of MOST_CHANNELS; return its number for :meth:`add`."""
         from mcap.records import Channel
 
         number = self._writer.register_channel(topic, encoding, schema, dict(metadata))

@@ -93,6 +93,10 @@ class Writing:
             self._quiet_log.exception("message", "a message of %s cannot be recorded", item.topic[:100])
 
     def _add(self, item: Item) -> None:
+        """Write a message, an event of the recorder (EVENTS), or forget a connection's retained values (FORGET).
+
+        While nothing can be written, an event goes back into the queue, and a message is counted as dropped.
+        """
         if item.topic == FORGET:
             self._files.retained.forget(item.source)
             return

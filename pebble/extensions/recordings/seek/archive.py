@@ -51,7 +51,7 @@ class Archive:
             self._open.popitem()[1].close()
 
     def messages(self, robot: str, since_ns: int, until_ns: int) -> list[Recorded]:
-        """Return what a robot published and was sent, from ``since_ns`` to before ``until_ns``."""
+        """Return the messages that a robot published and was sent, from ``since_ns`` to before ``until_ns``."""
         found: list[Recorded] = []
         for file in self.files(robot, since_ns, until_ns):
             for chunk in _within(file, file.channels_of(robot), since_ns, until_ns):

@@ -83,7 +83,7 @@ class PhaseTracker:
     """
 
     def __init__(self, *, falls: bool = False) -> None:
-        """``falls``: the first level is on the falling half of the wave, as seen by a wheel that turns forward."""
+        """Begin. ``falls``: the first level is on the falling half of the wave, seen by a wheel that turns forward."""
         self.phase: float | None = None  # None: no sample yet
         self.surprise = 0.0  # the sum of all differences from the expected phases
         self.rejected = 0  # samples that fit a turn against the expected one better
@@ -113,7 +113,7 @@ class PhaseTracker:
         return self._move_to(self.phase, nearest, power)
 
     def update_pair(self, phase: float, power: float) -> float:
-        """Do what ``update`` does, from the phase itself, which is known but for whole waves."""
+        """Return the phase that was added, as ``update``, from the phase itself, which is known but for whole waves."""
         if self.phase is None:
             self.phase = self._farthest = phase
             return 0.0
@@ -121,7 +121,10 @@ class PhaseTracker:
         return self._move_to(self.phase, predicted + math.remainder(phase - predicted, math.tau), power)
 
     def _predict(self, power: float) -> float:
-        """Return the phase that this sample is expected to add."""
+        """Return the phase that this sample is expected to add: by the power, and by the measured speed if it agrees.
+
+        When the expected direction changes, the farthest phase in that direction is the present one.
+        """
         before = self._expected
         drive = (self._power + power) / 2  # a command comes between two samples
         self._expected, self._power = _CARRY * before + (1.0 - _CARRY) * self._per_power * drive, power
@@ -175,7 +178,7 @@ class HallWheel:
 
     @property
     def unknown(self) -> int:
-        """Steps whose direction was unknown: they are in no distance."""
+        """The steps whose direction was unknown: they are in no distance."""
         return int(self._counts.unknown_rad / math.pi)
 
     @property

@@ -39,9 +39,9 @@ def overlays(source: str, tags: Sequence[Tag], size: Size, timestamp: float) -> 
 
 
 def tag_data(marker_id: int, tag: Tag | None, size: Size, timestamp: float, of: int = 1) -> TagData:
-    """Return the followed tag, of so many with its id.
+    """Return the followed tag; ``of``: the number of tags with its id in the picture.
 
-    Without one, ``corners_norm`` is an empty list, as consumers expect.
+    Without a tag, ``corners_norm`` is an empty list, as consumers expect.
     """
     if tag is None:
         return TagData(detected=False, marker_id=marker_id, corners_norm=[], timestamp=timestamp)

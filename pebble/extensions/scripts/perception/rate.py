@@ -9,7 +9,7 @@ class Rate:
         self._due = float("-inf")
 
     def due(self, now: float) -> bool:
-        """True if it is time. Comparing with the time since the last one would lose a part of each period."""
+        """True if the next turn is due. Comparing with the time since the last one would lose a part of each period."""
         self._due = min(self._due, now + 1.0 / self.hz)  # the rate was raised
         if now < self._due:
             return False

@@ -79,10 +79,10 @@ class TagGeometry:
 
 
 class TagFinder:
-    """Finds tags of one family and size. ``family`` is spelled as the original does, such as ``APRILTAG_25H9``."""
+    """A finder of tags of one family and size. ``family`` is spelled as in the original, such as ``APRILTAG_25H9``."""
 
     def __init__(self, size_m: float = 0.25, camera: CameraModel | None = None, family: str = FAMILY) -> None:
-        """Raises PebbleError for an unknown family."""
+        """Make a finder. Raises PebbleError for an unknown family."""
         import cv2  # late: it takes 15 MB and 0.2 s
 
         cv2.setNumThreads(1)  # more are slower at this size, and take processors from other programs

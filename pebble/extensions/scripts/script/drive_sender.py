@@ -51,7 +51,7 @@ class DriveSender:
     # -- what the script wants
 
     def drive(self, wanted: Drive, now: float) -> bool:
-        """Publish a command now or at its turn. False: it has no effect, as far as is known."""
+        """Publish a command now or at its turn; return False if it has no effect, as far as is known."""
         self._tried = True
         if self._end:
             return False

@@ -33,7 +33,7 @@ class Way(NamedTuple):
 
 
 class Neighbour:
-    """Robot ``name``; ``me`` is this one. :meth:`pebble.script.Robot.neighbour` makes it. Any thread may use it."""
+    """The robot ``name`` as ``me`` sees it; :meth:`pebble.script.Robot.neighbour` makes it. Any thread may use it."""
 
     def __init__(self, name: str, me: Identity, way: Way) -> None:
         self.name = name
@@ -47,7 +47,7 @@ class Neighbour:
 
     @property
     def online(self) -> bool:
-        """True if it was heard within the last second."""
+        """True if the neighbour was heard within the last second."""
         return self._state is not None
 
     def latest(self, channel: Channel, max_age: float = 1.0) -> Any:
@@ -85,7 +85,7 @@ class Neighbour:
         return self._send(command) and not refusal
 
     def stop(self) -> bool:
-        """Stop its wheels: the same as ``drive()``."""
+        """Stop the other robot's wheels: the same as ``drive()``."""
         return self.drive()
 
     @property

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Pictures:
-    """The robot's camera, opened when it is first used, as are its imports. One thread reads; any may close."""
+    """The robot's camera; it is opened, and its modules are imported, at first use. One thread reads; any may close."""
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir

@@ -198,7 +198,10 @@ def _connected(config: Config, path: Path) -> Transport:
 
 
 def _numbered(config: Config) -> Callable[[int], int]:
-    """Return what gives the run's number: the manager's, else a new one above the given. Raises ConfigError."""
+    """Return a function that gives the run's number: the manager's, else a new one above its argument.
+
+    Raises ConfigError.
+    """
     text = os.environ.get(RUN)
     if text is None:
         return lambda above: next_run(config, above)

@@ -97,7 +97,10 @@ class Robot:
         clock: Callable[[], float] = time.monotonic,
         drives: bool = True,
     ) -> None:
-        """``transport`` is open. ``number`` gives the run's number, above the given one. ``drives``: it may."""
+        """Store the arguments. ``transport`` is open already.
+
+        ``number`` returns the run's number, above the one that it is given. ``drives``: the script may drive.
+        """
         self.config = config
         self.log = logging.getLogger(f"pebble.script.{name}")
         self._refusals = Refusals(RateLimitedLog(self.log), Counters())
@@ -156,9 +159,10 @@ class Robot:
     def drive(self, x: float = 0.0, z: float = 0.0, y: float = 0.0) -> bool:
         """Steer by ``x`` (-1..1, positive: right), throttle ``z`` (positive: forward), and ``y``, as the robot has it.
 
-        It moves the robot for 0.75 s at most: repeat it, 5 to 50 times a second. False: it has no effect, because a
-        person drives, the robot is stopped, or there is no connection. At most 50 commands a second are published: of
-        more, the newest; a stop never waits. Numbers of NumPy will do. Raises ValueError or TypeError for no number.
+        A command moves the robot for 0.75 s at most: repeat it, 5 to 50 times a second. Return False if the command has
+        no effect, because a person drives, the robot is stopped, or there is no connection. At most 50 commands a
+        second are published: if there are more, only the newest is, but a stop never waits. Numbers of NumPy will do.
+        Raises ValueError or TypeError for a value that is no number.
         """
         self._check_drives()
         return self._wheels.drive(Drive(x=_axis("x", x), z=_axis("z", z), y=_axis("y", y)))
@@ -185,7 +189,7 @@ class Robot:
             return self._publish(channel, value, topic)
 
     def publish_at_end(self, channel: Channel, value: Callable[[], Any]) -> None:
-        """Publish what ``value()`` returns then, once the script ends, however it does; not if it is killed."""
+        """Call ``value()`` and publish its result when the script ends, however it ends; not if it is killed."""
         self._check_publish(channel, self._addresses[channel].topic)
         self._last_values[channel] = value
 

@@ -53,7 +53,7 @@ class Wheels:
         return self._sender.run
 
     def drive(self, wanted: Drive) -> bool:
-        """Publish a drive command. False: it has no effect, as far as is known."""
+        """Publish a drive command; return False if it has no effect, as far as is known."""
         with self._lock:
             now = self._clock()
             self._sender.owners(self.estop.states, now)

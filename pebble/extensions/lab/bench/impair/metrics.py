@@ -46,7 +46,7 @@ class Arrival(NamedTuple):
 
     @property
     def ms(self) -> float:
-        """Its latency."""
+        """The latency of the message, in ms."""
         return (self.arrived_ns - self.sent_ns) / 1e6
 
 
@@ -91,7 +91,10 @@ class Seen(msgspec.Struct):
 
 
 class Report(msgspec.Struct, kw_only=True, omit_defaults=True):
-    """A line from the operator: what was requested is done, or why it is not; after a trial what was measured."""
+    """A line from the operator: the answer to a request; after a trial, the measurements.
+
+    ``problem``: why the request was not carried out; None if it was.
+    """
 
     problem: str | None = None
     commands: list[Command] = []
@@ -100,7 +103,7 @@ class Report(msgspec.Struct, kw_only=True, omit_defaults=True):
 
 
 def heard(sounds: Iterable[Arrival], window: Window) -> Heard:
-    """Return what counts of a window's sound; a packet that came twice counts once."""
+    """Return the figures of a window's sound; a packet that came twice counts once."""
     packets = [packet for packet in {sound.number: sound for sound in sounds}.values() if window.overlap_s(packet) > 0]
 
     def percent(within_ms: float) -> float:
@@ -111,7 +114,7 @@ def heard(sounds: Iterable[Arrival], window: Window) -> Heard:
 
 
 def seen(pictures: Iterable[Arrival], window: Window) -> Seen:
-    """Return what counts of a window's pictures; those that arrived outside of it do not."""
+    """Return the figures of a window's pictures; those that arrived outside of the window do not count."""
     inside = [picture for picture in pictures if window.began_ns <= picture.arrived_ns < window.ended_ns]
     moments = [window.began_ns, *sorted(picture.arrived_ns for picture in inside), window.ended_ns]
     gaps_s = [(after - before) / 1e9 for before, after in pairwise(moments)]

@@ -159,7 +159,7 @@ class TrialOperator:
 
 
 def _wait(condition: Callable[[], bool], seconds: float, meanwhile: Callable[[], None] = lambda: None) -> bool:
-    """Wait for ``condition``, at most so long; return whether it was met. Calls ``meanwhile`` now and then."""
+    """Wait for ``condition``, at most ``seconds``; return whether it was met. Calls ``meanwhile`` now and then."""
     end = time.monotonic() + seconds
     while not (met := condition()) and (left := end - time.monotonic()) > 0:
         time.sleep(min(left, _POLL_S))
@@ -168,7 +168,7 @@ def _wait(condition: Callable[[], bool], seconds: float, meanwhile: Callable[[],
 
 
 def _pause(seconds: float, meanwhile: Callable[[], None] = lambda: None) -> Window:
-    """Wait for so long; returns when."""
+    """Wait for ``seconds``; return the window from the beginning to the end."""
     began_ns = time.monotonic_ns()
     _wait(lambda: False, seconds, meanwhile)
     return Window(began_ns, time.monotonic_ns())

@@ -91,7 +91,7 @@ def _draw_trials(cells: Sequence[Cell], title: str, shown_panels: Sequence[Panel
 def _lines(
     axes: Axes, cells: Sequence[Cell], names: Sequence[str], style_of: Mapping[str, Style], panel: Panel
 ) -> list[float]:
-    """Draw one line per subject, and the references; returns all values."""
+    """Draw one line per subject, and the references; return all values."""
     value_of = {
         (cell.variant, str(cell.params["trial"])): value
         for cell in cells

@@ -13,7 +13,7 @@ class Clock(Protocol):
 
 
 class RealClock:
-    """``time.monotonic()``, with real sleeps."""
+    """The real time: ``time.monotonic()``, with real sleeps."""
 
     def now(self) -> float:
         return time.monotonic()
@@ -23,7 +23,10 @@ class RealClock:
 
 
 class VirtualClock:
-    """Moves only when advanced. Calls that block the firmware advance it, so that blocking shows in its deadlines."""
+    """A clock that moves only when advanced.
+
+    Calls that block the firmware advance it, so that blocking shows in its deadlines.
+    """
 
     def __init__(self, now: float = 0.0) -> None:
         self._now = now

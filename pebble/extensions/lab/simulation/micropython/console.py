@@ -122,7 +122,7 @@ class Output:
         return mask & POLLOUT if console.reading or console.writable() else 0
 
     def write(self, data: Any, start: int = 0, length: int | None = None) -> int:
-        """Write as ``write(data)`` or ``write(data, offset, length)``; returns the size written."""
+        """Write as ``write(data)`` or ``write(data, offset, length)``; return the size written."""
         data = data if length is None else data[start : start + length]
         if not self._text:
             return self._console.write(data)

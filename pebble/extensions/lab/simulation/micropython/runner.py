@@ -10,7 +10,10 @@ log = logging.getLogger(__name__)
 
 
 class Runner:
-    """``step`` is one turn of the loop. A reset or an error in the firmware reboots the board, and is counted."""
+    """A board that runs its firmware; ``step`` is one turn of the loop.
+
+    A reset or an error in the firmware reboots the board, and is counted.
+    """
 
     def __init__(self, board: Board, robot: str, settings: dict[str, Any] | None = None) -> None:
         self.board, self.name, self.settings = board, robot, settings or {}

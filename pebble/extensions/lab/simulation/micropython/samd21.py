@@ -48,7 +48,7 @@ def pin(name: str) -> str:
 
 
 class PwmTimers:
-    """Assigns PWM channels of the timers to pins."""
+    """The assignment of the timers' PWM channels to pins."""
 
     def __init__(self) -> None:
         self._started: set[int] = set()  # a timer stays started when its last signal ends

@@ -8,11 +8,11 @@ from pebble.extensions.lab.simulation.micropython.clock import Clock
 
 
 class BoardReset(BaseException):
-    """The board resets. A BaseException, so that no firmware catches it; the runner reboots the board."""
+    """A reset of the board. A BaseException, so that no firmware catches it; the runner reboots the board."""
 
 
 class Watchdog:
-    """Resets the board unless it is fed in time, once armed."""
+    """A watchdog that resets the board unless it is fed in time, once armed."""
 
     def __init__(self, clock: Clock) -> None:
         self.feeds = 0
@@ -39,7 +39,7 @@ class Watchdog:
         return max(0.0, self._fed_at + self.timeout_ms / 1000 - self._clock.now())
 
     def starved(self, now: float) -> bool:
-        """True if it would have reset the board by ``now``."""
+        """True if the watchdog would have reset the board by ``now``."""
         return self.timeout_ms is not None and now >= self._fed_at + self.timeout_ms / 1000
 
     def check(self) -> None:

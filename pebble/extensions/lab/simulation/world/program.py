@@ -154,7 +154,7 @@ def _run_commands(mcus: Mcus, end: EndSignal) -> None:
 
 
 def _command(mcus: Mcus, words: list[str]) -> str:
-    """Execute one line of standard input; returns what is wrong with it."""
+    """Execute one line of standard input; return what is wrong with it."""
     if len(words) < 2 or words[0] not in mcus:
         return f"begin with a robot ({', '.join(mcus)}) and a command"
     mcu, command, arguments = mcus[words[0]], words[1], words[2:]

@@ -37,7 +37,7 @@ class RobotView:
         self.look()
 
     def look(self) -> int:
-        """Choose the moment of the next picture; returns it, monotonic ns. Raises NotRunningError."""
+        """Choose the moment of the next picture; return it, monotonic ns. Raises NotRunningError."""
         self._tracks = self._page.tracks()
         track = self._tracks.get(self._robot)
         if track is None or self._clock_ns() - track.newest.ns > STALE_S * 1e9:

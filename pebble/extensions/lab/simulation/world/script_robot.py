@@ -57,7 +57,7 @@ class SimulatedRobot(Robot):
     """
 
     def __init__(self, file: Path | str, name: str = "goob") -> None:
-        """Raises ConfigError for a file that is wrong, PebbleError if the robot is not in it."""
+        """Read the world. Raises ConfigError for a file that is wrong, PebbleError if the robot is not in it."""
         model = read_world(Path(file))
         if name not in model.robots:
             raise PebbleError(f"{file}: there is no robot {name!r}, only {', '.join(model.robots) or 'an empty world'}")
@@ -80,7 +80,7 @@ class SimulatedRobot(Robot):
     # -- for tests
 
     def run(self, main: Callable[..., None], *options: Any, seconds: float) -> None:
-        """Run a script for so long, or until it returns. The wheels are stopped in the end."""
+        """Run a script for ``seconds``, or until it returns. The wheels are stopped in the end."""
         self._end_at = self.world.now() + seconds
         try:
             main(self, *options)
@@ -101,7 +101,7 @@ class SimulatedRobot(Robot):
 
     @property
     def body(self) -> LockstepRobot:
-        """Its true pose, and its motor board."""
+        """The robot in the world: its true pose, and its motor board."""
         return self._body
 
     def receive(self, channel: Channel, value: Any) -> None:

@@ -106,7 +106,7 @@ def _bgr(colour: str) -> Colour:
 
 
 def _drawn(drawing: Drawing) -> Surface:
-    """Return its surface, beside whose shapes the colour of the first one is drawn, and masked."""
+    """Return the surface of a drawing; between its shapes it has the first shape's colour, and is masked."""
     import cv2
 
     picture = np.full((_DRAWING_PX, _DRAWING_PX, 3), _bgr(drawing.shapes[0].colour), np.uint8)

@@ -30,7 +30,7 @@ class Floor:
         return Mover(self, name)
 
     def move(self, name: str, start: Pose, end: Pose) -> Pose:
-        """Move a robot as far as it is free; returns where it is then, with the heading of ``end``."""
+        """Move a robot as far as it is free; return where it is then, with the heading of ``end``."""
         with self._lock:
             before = self._clearance_mm(name, start.x_mm, start.y_mm)
             part = 1.0 if self._free(name, start, end, 1.0, before) else self._contact(name, start, end, before)

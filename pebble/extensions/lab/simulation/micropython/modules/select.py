@@ -28,7 +28,7 @@ class Poll:
         self._watched[id(thing)] = thing, mask
 
     def poll(self, timeout: int = -1) -> Sequence[tuple[Pollable, int]]:
-        """Return what is ready."""
+        """Return the objects that are ready, with their events."""
         return list(self.ipoll(timeout))
 
     def ipoll(self, timeout: int = -1) -> Iterable[tuple[Pollable, int]]:
