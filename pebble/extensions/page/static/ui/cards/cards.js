@@ -6,10 +6,12 @@ import { styled } from "../parts/hooks.js";
 /**
  * ``tab``: where it is on a phone. ``wants``: whether this component has it. ``part``: fetches what draws it; a
  * component with ``at`` and ``offers``. ``engineers``: below all others, and closed until it is opened. ``height``: px
- * that are kept free for it until it is here. ``wide``: it may span several columns. ``sends``: it is for commands only, so screens that only watch are
- * without it.
+ * that it usually has, by which its column is chosen, and that are kept free for it until it is here; ``sideHeight``:
+ * if it is another one in the narrow column. ``wide``: it may span several columns. ``sends``: it is for commands only,
+ * so screens that only watch are without it.
  * @typedef {{id: string, title: string, icon: string, tab: string, wants: (offers: any) => boolean,
- *   part: (again: string) => Promise<any>, engineers?: boolean, height?: number, wide?: boolean, sends?: boolean}} CardKind
+ *   part: (again: string) => Promise<any>, engineers?: boolean, height?: number, sideHeight?: number, wide?: boolean,
+ *   sends?: boolean}} CardKind
  */
 
 /** Which keys drive. */
@@ -72,6 +74,7 @@ export const CARDS = [
     icon: "plot",
     tab: "sensors",
     height: 347,
+    sideHeight: 566,
     wide: true,
     wants: () => true,
     part: styled(async (again) => (await import("./plots.js" + again)).Plots, "plots.css", "vendor/uPlot.css"),
@@ -102,6 +105,7 @@ export const CARDS = [
     icon: "light",
     tab: "more",
     height: 202,
+    sideHeight: 304,
     wants: (offers) => ["solid", "flash", "available"].some((kind) => offers.section("lights")[kind] === true),
     part: styled(async (again) => (await import("./lights.js" + again)).Lights, "commands.css"),
   },
@@ -111,7 +115,7 @@ export const CARDS = [
     title: "Outlets",
     icon: "plug",
     tab: "more",
-    height: 280,
+    height: 372,
     wants: (offers) => offers.section("outlets").available === true || offers.received("outlets/"),
     part: styled(async (again) => (await import("./outlets.js" + again)).Outlets, "devices.css"),
   },

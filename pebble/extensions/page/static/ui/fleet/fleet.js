@@ -342,7 +342,7 @@ function DriverFact({ at, offers, online, estop, pictured }) {
   if (!offers.drives) return null;
   if (!online) return html`<${Fact} icon="wheel">who drives is not known<//>`;
   if (estop?.latched) return pictured && html`<${Fact} icon="stop">reset it to drive<//>`;
-  if (itself) return html`<${Fact} icon="script" className=""><b title=${itself}>${itself}</b><//>`;
+  if (itself) return html`<${Fact} icon="script" className="told"><b>${itself}</b><//>`;
   if (!view?.by) return null;
   return html`<${Fact} icon="wheel" className="">${view.you ? html`<b>driven by you</b>` : `driven by ${driverName(view)}`}<//>`;
 }

@@ -175,7 +175,7 @@ export function Live({ entry, online = true, ended = false, usual = 0, children 
   useLater(online && !late ? lateAt - age + 1 : Infinity);
   if (!entry) return html`<span class="dim">–</span>`;
   if (isGone({ age, period }, online) || (late && ended)) return html`<${Gone} age=${age}>${children}<//>`;
-  return html`<span class=${late ? "late" : ""}>${children}${late && html` <small>${roughly(age)} old</small>`}</span>`;
+  return html`<span class=${late ? "late" : ""}>${children}${late && age >= 1000 && html` <small>${roughly(age)} old</small>`}</span>`;
 }
 
 /**

@@ -1,4 +1,4 @@
-// Balanced columns: once all cards are here, they are placed so that all columns end alike; later only what is below a card moves.
+// Balanced columns: cards are placed so that all columns end alike; later only what is below a card moves.
 
 import * as more from "../../core/browser-more.js";
 import { useLayoutEffect, useRef } from "../parts/hooks.js";
@@ -60,7 +60,7 @@ function choices(card, count, main) {
 
 /**
  * Places the children of one grid. Their order in the document is that of keyboard and screen reader: it stays. Columns
- * are kept from a moment after all cards are here, or from the first touch: later only what is below a card moves.
+ * are chosen by the heights that cards usually have, so they are the same before and after their parts are here.
  */
 class Columns {
   /** @param {HTMLElement} grid */
@@ -84,27 +84,26 @@ class Columns {
     const count = columnsOf(this.grid.clientWidth, hasSide);
     if (count !== this.count || !this.rests) this.arrange(cards, count, hasSide);
     this.count = count;
-    const sizes = sizesOf(cards); // all was read before anything is written
+    const sizes = cards.map((card) => sizeOf(card, !this.rests && card.querySelector(".loading") !== null));
     placed(sizes, count, hasSide, this.homes).forEach(([top, at, span], n) => {
-      this.homes.set(sizes[n].id, [[at, span]]);
-      const area = `${top + 1} / ${at + 1} / span ${Math.max(1, sizes[n].rows)} / span ${span}`;
+      const { id, rows, sideRows } = sizes[n]; // all was read before anything is written
+      this.homes.set(id, [[at, span]]);
+      const high = hasSide && at === count - 1 ? sideRows : rows;
+      const area = `${top + 1} / ${at + 1} / span ${Math.max(1, high)} / span ${span}`;
       if (cards[n].style.gridArea !== area) cards[n].style.gridArea = area; // this runs with each message, too
     });
   }
 
-  /** Choose columns by how high each card is in a main column and in the last one. */
   arrange(cards, count, hasSide) {
     const main = Math.max(1, count - Number(hasSide));
     this.grid.style.gridTemplateColumns = `repeat(${main}, minmax(0, 1fr))${count > main ? ` ${SIDE}px` : ""}`;
-    const options = sizesOf(cards).map((size) => choices(size, count, main));
-    const lay = (homes) => {
+    const lay = (homes) =>
       cards.forEach(({ style }, n) => (style.gridArea = `auto / ${homes[n][0] + 1} / auto / span ${homes[n][1]}`));
-      return sizesOf(cards);
-    };
-    const sizes = lay(options.map((all) => all[0]));
-    const side = lay(options.map((all) => all[all.length - 1]));
-    const homes = placed(sizes.map((size, n) => ({ ...size, sideRows: side[n].rows })), count, hasSide).map((place) => place.slice(1));
-    this.homes = new Map(lay(homes).map(({ id }, n) => [id, [homes[n]]]));
+    lay(cards.map((card) => choices(sizeOf(card), count, main)[0])); // as wide as they will be
+    const sizes = cards.map((card) => sizeOf(card, true));
+    const homes = placed(sizes, count, hasSide).map((place) => place.slice(1));
+    lay(homes);
+    this.homes = new Map(sizes.map(({ id }, n) => [id, [homes[n]]]));
   }
 
   rest() {
@@ -120,12 +119,14 @@ class Columns {
   }
 }
 
-/** @param {HTMLElement[]} cards @returns {Size[]} */
-const sizesOf = (cards) =>
-  cards.map(({ offsetHeight, dataset: { card: id = "", span, at, wide } }) => {
-    const rows = offsetHeight ? Math.ceil((offsetHeight + GAP) / ROW) : 0;
-    return { id, rows, sideRows: rows, span, side: at === "side", wide: wide !== undefined };
-  });
+const rowsOf = (px) => (px ? Math.ceil((px + GAP) / ROW) : 0);
+
+/** How high it is, or ``usually``. @param {HTMLElement} card @returns {Size} */
+function sizeOf({ offsetHeight, className, dataset: { card: id = "", span, at, wide, height, sideHeight } }, usually = false) {
+  const usual = usually && height && !className.includes("closed");
+  const [rows, sideRows] = (usual ? [+height, +(sideHeight ?? height)] : [offsetHeight, offsetHeight]).map(rowsOf);
+  return { id, rows, sideRows, span, side: at === "side", wide: wide !== undefined };
+}
 
 /** @returns {{current: any}} for the ``ref`` of the grid */
 export function useColumns() {

@@ -246,7 +246,9 @@ function CardOf({ card, at, offers, view, side = false }) {
     view=${view}
     isFirst=${isEngineers(card)}
     className=${isEngineers(card) ? "of-engineers" : ""}
-    place=${side ? { "data-at": "side" } : card.wide && { "data-wide": "" }}
+    place=${side
+      ? { "data-at": "side" }
+      : { "data-height": card.height, "data-side-height": card.sideHeight, "data-wide": card.wide ? "" : undefined }}
     style=${body || failed || !card.height ? undefined : { minHeight: `${card.height}px` }}
   >
     <${Boundary} what=${card.title}><${Part} part=${card.part} lines=${5} at=${at} offers=${offers} view=${view} /><//>
