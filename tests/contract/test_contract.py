@@ -195,8 +195,14 @@ def services() -> list[type[Service]]:
 
 
 #: A manager of scripts stops the wheels as the scripts do, and reads whether a motor owner is stopped. Scripts of other
-#: robots drive through a program of this one.
-AGAINST_THE_DIRECTION = {("autonomy_manager", DRIVE), ("autonomy_manager", ESTOP_STATE), ("neighbours", DRIVE)}
+#: robots drive through a program of this one. Home Assistant is told what the robot offers.
+AGAINST_THE_DIRECTION = {
+    ("autonomy_manager", DRIVE),
+    ("autonomy_manager", ESTOP_STATE),
+    ("neighbours", DRIVE),
+    ("homeassistant", c.CAPABILITIES),
+    ("homeassistant", c.CHARGING_LEVEL),
+}
 
 
 def test_services_publish_what_goes_out_and_handle_what_comes_in() -> None:

@@ -1,7 +1,7 @@
 """The floor of a robot's start and memory: one process with a local transport and an MQTT connection to operators.
 
-It runs as a plain file, and imports nothing of Pebble: ``floor.py LOCAL REMOTE_PORT BASE``. LOCAL is the port of a
-local broker, or the path of a Unix socket on which Zenoh listens.
+It runs as a plain file, and imports nothing of Pebble: ``floor.py LOCAL REMOTE_PORT ONLINE STATUS``. LOCAL is the port
+of a local broker, or the path of a Unix socket on which Zenoh listens; ONLINE and STATUS are topics.
 """
 
 import json
@@ -35,13 +35,13 @@ def open_zenoh(socket: str) -> Any:
     return zenoh.open(zenoh.Config.from_json5(json.dumps({"listen": listen, "scouting": _SCOUTING})))
 
 
-def main(place: str, remote_port: str, base: str) -> None:
+def main(place: str, remote_port: str, online: str, status: str) -> None:
     local = connected(int(place)) if place.isdigit() else open_zenoh(place)  # kept open
     remote = connected(int(remote_port))
     while local is not None:
-        remote.publish(f"{base}/outgoing/online", json.dumps({"t": round(1000 * time.time())}), 1, retain=True)
+        remote.publish(online, json.dumps({"t": round(1000 * time.time())}), 1, retain=True)
         services = {"floor": {"state": "ready"}}
-        remote.publish(f"{base}/outgoing/status", json.dumps({"value": {"services": services}}), 1, retain=True)
+        remote.publish(status, json.dumps({"value": {"services": services}}), 1, retain=True)
         time.sleep(_HEARTBEAT_S)
 
 

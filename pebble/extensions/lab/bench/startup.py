@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pebble.config import load
+from pebble.contract import ONLINE, STATUS
 from pebble.errors import PebbleError
 from pebble.extensions.lab.bench.clients import UP_S, RobotSubscriber, driving
 from pebble.extensions.lab.bench.results import Cell, Results, begin, round_cell
@@ -48,7 +49,8 @@ class Floor(Robot):
     def launch(self) -> None:
         program = [sys.executable, "-P", str(Path(__file__).with_name("floor.py"))]
         place = self.folder / "floor.sock" if self.local_port is None else self.local_port
-        self.start(f"the {self.kind} floor", [*program, str(place), str(self.remote_port), self.base])
+        topics = (ONLINE.topic(self.base), STATUS.topic(self.base))
+        self.start(f"the {self.kind} floor", [*program, str(place), str(self.remote_port), *topics])
 
     def processes(self) -> dict[str, int]:
         return {program.name: program.pid for program in (self.launcher, self.local_broker) if program is not None}
