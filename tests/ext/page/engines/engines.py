@@ -70,11 +70,13 @@ class Engine(ABC):
     def click(self, selector: str, hold_ms: int = 0, pointer: str = "mouse") -> None:
         """Press the middle of an element with the mouse or by "touch", once it is shown and rests."""
         found = f"[...document.querySelectorAll({json.dumps(selector)})].find((one) => one.getClientRects().length)"
-        assert self.until(found), f"{self.name} shows no {selector}"
-        middle = f"(({{ x, y, width, height }}) => [x + width / 2, y + height / 2])({found}.getBoundingClientRect())"
-        self.evaluate(f"void {found}.scrollIntoView({{ block: 'nearest' }})")
-        places = [self.evaluate(middle)]
-        while len(places) < 2 or places[-1] != places[-2]:
+        scrolled = f"({found}?.scrollIntoView({{ block: 'nearest' }}), {found})"
+        assert self.until(scrolled), f"{self.name} shows no {selector}"
+        box = f"{found}?.getBoundingClientRect()"
+        middle = f"((box) => box && [box.x + box.width / 2, box.y + box.height / 2])({box}) ?? null"
+        places: list[Any] = [None]
+        while places[-1] is None or places[-1] != places[-2]:
+            assert len(places) < 400, f"{self.name}: {selector} does not rest"
             time.sleep(0.15)
             places.append(self.evaluate(middle))
         x, y = places[-1]
