@@ -131,5 +131,5 @@ def test_a_visitor_sees_drives_stops_and_starts_a_script(
             visitor.insists("[data-test=settings]", _SHOWN.format('[href*="/replay/"]'))
         visitor.insists("[href*='/replay/']", "pebble.replay")
         visitor.arrives()
-        visitor.sees("pebble.replay.video.info")
+        visitor.insists("[data-test=play]", "pebble.replay.video.info")
         visitor.did("its recording is open")
