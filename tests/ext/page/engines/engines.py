@@ -1,4 +1,4 @@
-"""Browsers beside Chromium: Debian's Firefox by WebDriver BiDi, and WebKitGTK by its WebDriver."""
+"""Browsers behind the same interface: Firefox by WebDriver BiDi, WebKitGTK by its WebDriver, Chromium by Playwright."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from typing import Any
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
+from tests.ext.page.browser import Tab, chromium, tab
+from tests.ext.page.fingers import Fingers
 from tests.support import Child, free_port, listening, until
 
 #: Keys that a character cannot name, as WebDriver has them (W3C WebDriver, 17.4.2).
@@ -68,11 +70,13 @@ class Engine(ABC):
     def click(self, selector: str, hold_ms: int = 0, pointer: str = "mouse") -> None:
         """Press the middle of an element with the mouse or by "touch", once it is shown and rests."""
         found = f"[...document.querySelectorAll({json.dumps(selector)})].find((one) => one.getClientRects().length)"
-        assert self.until(found), f"{self.name} shows no {selector}"
-        middle = f"(({{ x, y, width, height }}) => [x + width / 2, y + height / 2])({found}.getBoundingClientRect())"
-        self.evaluate(f"void {found}.scrollIntoView({{ block: 'nearest' }})")
-        places = [self.evaluate(middle)]
-        while len(places) < 2 or places[-1] != places[-2]:
+        scrolled = f"({found}?.scrollIntoView({{ block: 'nearest' }}), {found})"
+        assert self.until(scrolled), f"{self.name} shows no {selector}"
+        box = f"{found}?.getBoundingClientRect()"
+        middle = f"((box) => box && [box.x + box.width / 2, box.y + box.height / 2])({box}) ?? null"
+        places: list[Any] = [None]
+        while places[-1] is None or places[-1] != places[-2]:
+            assert len(places) < 400, f"{self.name}: {selector} does not rest"
             time.sleep(0.15)
             places.append(self.evaluate(middle))
         x, y = places[-1]
@@ -174,6 +178,53 @@ class WebKit(Engine):
         value = json.loads(self._connection.getresponse().read())["value"]
         assert not (isinstance(value, dict) and "error" in value), value
         return value
+
+
+class Chromium(Engine):
+    """Debian's Chromium, with a finger as its only pointer."""
+
+    name = "Chromium"
+
+    def __init__(self, opened: Tab) -> None:
+        self.tab, self._page, self._finger = opened, opened.page, Fingers(opened)
+
+    def open(self, url: str) -> None:
+        self._page.goto(url)
+
+    def evaluate(self, expression: str) -> Any:
+        return self._page.evaluate(f"async () => ({expression})")
+
+    def perform(self, actions: list[dict[str, Any]]) -> None:
+        place = (0, 0)
+        for step in itertools.chain.from_iterable(source["actions"] for source in actions):
+            match step["type"]:
+                case "pause":
+                    self._page.wait_for_timeout(step["duration"])
+                case "keyDown":
+                    self._page.keyboard.down(step["value"])
+                case "keyUp":
+                    self._page.keyboard.up(step["value"])
+                case "pointerMove":
+                    place = step["x"], step["y"]
+                case "pointerDown":
+                    self._finger.down(0, *place)
+                case "pointerUp":
+                    self._finger.lift()
+
+    def picture(self) -> bytes:
+        return self._page.screenshot()
+
+
+@contextmanager
+def chromium_with_finger(width: int, height: int) -> Iterator[Chromium]:
+    """A Chromium whose page has this many CSS pixels; a narrow one is a phone's."""
+    size = {"width": width, "height": height}
+    phone = width < 600
+    with (
+        chromium() as browser,
+        tab(browser, "about:blank", engineers=False, viewport=size, has_touch=True, is_mobile=phone) as opened,
+    ):
+        yield Chromium(opened)
 
 
 @contextmanager

@@ -83,6 +83,8 @@ def test_letters_of_26_pixels_cut_no_state(served: Served, robot: RecordingRobot
 
 
 def _full_screen(engine: Engine) -> None:
+    if engine.evaluate("Boolean(document.fullscreenElement)"):
+        return
     full = "document.documentElement.requestFullscreen()"
     engine.evaluate(f"void addEventListener('click', () => {full}, {{ once: true }})")
     engine.click("h2")

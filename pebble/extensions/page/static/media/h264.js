@@ -4,6 +4,7 @@ import * as browser from "../core/browser.js";
 import { checkUnit } from "./access-unit.js";
 
 const HELD_MS = 150; // some decoders give a picture out only when the next one comes
+const UNABLE = "This browser cannot play H.264 video: open the page in another browser";
 const FAILURES = 2; // key frames in a row that are whole and fail: this browser cannot decode them
 
 /** This browser lacks what it takes to decode; a key frame does not help. */
@@ -74,10 +75,10 @@ export class H264Decoder {
   /** @param {string} codec */
   async open(codec) {
     this.close();
-    if (!browser.find("VideoDecoder")) throw new UnsupportedError("this browser has no decoder for h264");
+    if (!browser.find("VideoDecoder")) throw new UnsupportedError(UNABLE);
     const config = { codec, optimizeForLatency: true }; // without a description: Annex B
     if (!(await browser.find("VideoDecoder").isConfigSupported(config)).supported) {
-      throw new UnsupportedError(`this browser cannot decode ${codec}`);
+      throw new UnsupportedError(UNABLE);
     }
     const decoder = new (browser.find("VideoDecoder"))({
       output: (frame) => this.take(decoder, frame),
