@@ -2,10 +2,9 @@
 
 import * as browser from "./browser.js";
 import { Escapes } from "./escapes.js";
-import { Gesture, PERIOD_MS, STALL_MS } from "./gesture.js";
+import { Gesture, PERIOD_MS, PageClock, STALL_MS } from "./gesture.js";
 import { DRIVE_KEYS, Inputs, PadStops } from "./inputs.js";
 import { Lease } from "./lease.js";
-import { PageClock } from "./page-clock.js";
 import { SLOW_MS, SLOW_SPEED, driveReason } from "./reasons.js";
 import { callAll } from "./store.js";
 

@@ -9,6 +9,7 @@ export const STALL_MS = 250;
 const STEP_MS = 20; // at least, between two commands
 const EARLY_MS = 15; // a timer may be: without it every second command would be missing
 const REPEATS_MS = [50, 100]; // after a release, the zero is sent again
+const SUSPENDED_MS = 500; // between the wall clock and the page's own
 
 /** @typedef {{x: number, z: number, y: number}} Vector */
 /** @typedef {Vector & {g: number, t: number, final: boolean}} Command */
@@ -115,4 +116,25 @@ function isZero({ x, z, y }) {
 
 function round(value) {
   return Math.round(value * 1000) / 1000;
+}
+
+/** Notices that the page, or the whole machine, stood still: releases of keys may have been lost. */
+export class PageClock {
+  /** @param {number} now performance.now() @param {number} wall Date.now() */
+  constructor(now = performance.now(), wall = Date.now()) {
+    this.lookedAt = -Infinity;
+    this.base = wall - now;
+  }
+
+  /**
+   * Look at both clocks. Where the page's own stands still while the machine is suspended, only the other one shows it.
+   * @param {number} now @param {number} wall @returns {"" | "stalled" | "suspended"}
+   */
+  look(now, wall = Date.now()) {
+    const stalled = now - this.lookedAt > STALL_MS;
+    const jump = Math.abs(wall - now - this.base);
+    this.lookedAt = now;
+    this.base = wall - now;
+    return jump > SUSPENDED_MS ? "suspended" : stalled ? "stalled" : "";
+  }
 }
