@@ -146,7 +146,10 @@ class Rig:
         self.local = local or Broker(self.folder) if kind == "mqtt" or mirror else None
         self.mirror, self._scripts = mirror, scripts
         if scripts:
-            manager = {"enabled": True, "autonomy_root": "autonomy", "stop_timeout_seconds": 2.0}
+            with_paho = (
+                {"follow": {"python": sys.executable}} if "follow" in scripts else {}
+            )  # the system's may lack it
+            manager = {"enabled": True, "autonomy_root": "autonomy", "stop_timeout_seconds": 2.0, "scripts": with_paho}
             self._extra = config | {"autonomy_manager": manager | config.get("autonomy_manager", {})}
         for script in scripts:
             shutil.copytree(SCRIPTS / script, self.folder / "autonomy" / script)

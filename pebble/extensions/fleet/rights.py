@@ -42,5 +42,5 @@ WRITES: Mapping[Right, tuple[Channel | str, ...]] = {
     ),
     Right.RESET: (c.ESTOP_RESET,),
     Right.TAKE: (c.CONTROL_TAKE,),
-    Right.SYSTEM: (c.REBOOT, c.SERVICE_RESTART, c.GIT_PULL, c.REMOTE_MIRROR),
+    Right.SYSTEM: (c.REBOOT, c.SERVICE_RESTART, c.GIT_PULL, c.REMOTE_MIRROR, c.EXPANDER),
 }

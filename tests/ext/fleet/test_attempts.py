@@ -42,9 +42,9 @@ ACCOUNTS = {name: Account(roles=roles) for name, roles in PEOPLE.items()} | {
 LOOK = {"estop", "front-camera"}
 DRIVE = LOOK | {
     *("drive-values", "control", "lights-solid", "lights-flash", "audio", "audio-stream", "soundboard-command"),
-    *("autonomy-command", "mcu/u1/led", "outlets/a/power", "mip-raw", "flags/mqtt-video", "flags/mqtt-audio"),
+    *("autonomy-command", "mcu/u1/led", "outlets/a/power", "mip-raw", "flags/mqtt-video", "flags/mqtt-audio", "group"),
 }
-SYSTEM = {"flags/reboot", "flags/service-restart", "flags/git-pull", "flags/remote-mirror"}
+SYSTEM = {"flags/reboot", "flags/service-restart", "flags/git-pull", "flags/remote-mirror", "expander"}
 MAY = {
     "vera": LOOK,
     "otto": DRIVE,

@@ -55,7 +55,7 @@ def test_a_tag_that_another_program_found_has_its_place() -> None:
     square = np.array([[-half, -half], [half, -half], [half, half], [-half, half]]) + np.array([319.5, 239.5])
     payload = locations("s", [Tag(13, square, Place(0.0, 0.0))], SIZE, 0.0)
     (tag,) = tags_in(payload, 13, TagGeometry(0.25))
-    assert tag.place == pytest.approx((2.0, 0.0), abs=1e-6)
+    assert tag.place == pytest.approx((2.0, 0.0, 0.0), abs=1e-6)
     assert math.isfinite(tag.distance_m)
     assert tags_in(payload, 14, TagGeometry(0.25)) == []
     empty = TagLocations(source="s", detections=payload.detections, frame_width=0, frame_height=0, timestamp=0.0)
