@@ -135,7 +135,7 @@ class RobotStop:
         return not self._given_up and is_due
 
     def receive(self, message: Message, now: float) -> None:
-        self.live = self.live or not (message.retain or codec.is_blank(message.payload))
+        self.live = self.live or (not message.retain and bool(message.payload.strip()))  # anybody may remove a value
         if message.retain and len(message.payload) <= _STAMPED_BYTES:
             self._take_retained(message)
         if message.topic == self._status_topic:

@@ -302,7 +302,7 @@ def _line(robot: RobotStop, *, patient: bool, sent: bool) -> str:
 def _why(robot: RobotStop) -> str:
     if not robot.is_gone:
         return robot.why
-    when = f" {show.age(time.time() - robot.stamp)}" if robot.stamp else ""
+    when = time.strftime(" on %Y-%m-%d at %H:%M:%S", time.localtime(robot.stamp)) if robot.stamp else ""
     return f"it was last seen under this name{when}, is offline, and may be called otherwise now"
 
 

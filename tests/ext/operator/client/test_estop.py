@@ -510,6 +510,17 @@ def test_states_that_change_quickly_do_not_make_it_send_more_often() -> None:
     assert sent == 2
 
 
+def test_a_removed_value_is_no_sign_of_life() -> None:
+    """Of an earlier name, say, which the robot itself removes."""
+    stop = sender(GOOB)
+    receive(stop, Message(f"{GOOB}/outgoing/online", b'{"t": 1, "online": false}', retain=True), now=0.1)
+    for payload in (b"", b" "):
+        receive(stop, Message(f"{GOOB}/outgoing/capabilities", payload), now=0.2)
+        assert stop.robots[GOOB].is_gone
+    receive(stop, Message(f"{GOOB}/outgoing/online", b'{"t": 2}'), now=0.3)
+    assert not stop.robots[GOOB].is_gone
+
+
 # -- what goes out
 
 
