@@ -1,7 +1,8 @@
 """The memory transport without threads: messages travel as long as a schedule wants, twice, or not at all.
 
 Messages of one sender to one receiver stay in order, as with every transport; those of two senders may overtake each
-other. One that is older than the silence limit of transports is lost together with its connection.
+other, but nothing overtakes what was retained before the receiver subscribed. One that is older than the silence limit
+of transports is lost together with its connection.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class Network(MemoryHub):
     def _send(self, delivery: Any, client: Connection, number: int, sender: Process | None) -> None:
         delay = _TRAVEL_S + client.process.delay + (sender.delay if sender is not None else 0.0)
         link = (sender, client)
-        at = max(self.scheduler.now + delay, self._last.get(link, 0.0))
+        at = max(self.scheduler.now + delay, self._last.get(link, 0.0), self._last.get((None, client), 0.0))
         self._last[link] = at
         self.scheduler.at(at, lambda: client.process.do(lambda: client.arrive(delivery, number)))
 
