@@ -109,6 +109,11 @@ def test_a_stopped_base_gets_zeros_the_lock_and_no_goal(husky: Husky) -> None:
     assert set(husky.ros.locks(begin)) == {"True"}
     assert len(husky.ros.locks(begin)) >= 5, "it is repeated"
     assert husky.ros.rows(begin, "cancel")
+    again = time.monotonic_ns()
+    for _ in range(40):
+        husky.bridge.halt()
+        time.sleep(0.02)
+    assert len(husky.ros.locks(again)) >= 4, "who stops it again and again does not keep the lock waiting"
     reset = time.monotonic_ns()
     husky.reset()
     assert until(lambda: husky.ros.locks(reset)[-1:] == ["False"], 2)
