@@ -134,10 +134,10 @@ class CmdVel:
             self._body, self._until, self._zeros = ZERO, 0.0, ZEROS
             self._out.send(ZERO)
             self._opens = True
-            self._owe(True)
-            if latched:
-                self._cancel()
             self._send_lock()
+            if latched:
+                self._owe(True)  # another thread writes it
+                self._cancel()
             self._plan(time.monotonic())
 
     def cancel_navigation(self) -> None:
