@@ -9,6 +9,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from math import inf
 
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.services.ros1_bridge import messages
@@ -56,6 +57,7 @@ class CmdVel:
         self._heard_at: float | None = None
         self._cancelled_at = float("-inf")
         self._ends = False
+        self._due = 0.0  # when the thread sends next; infinite: not before something changes
         self._log = RateLimitedLog(log)
         self.held_back = 0  # moves that a hung base did not get
         self._out.first = lambda: ZERO
@@ -109,9 +111,10 @@ class CmdVel:
         with self._changed:
             if self._latched or self._ends:
                 return
-            self._body, self._until, self._zeros = body, time.monotonic() + valid_s, ZEROS
+            now = time.monotonic()
+            self._body, self._until, self._zeros = body, now + valid_s, ZEROS
             self._send()
-            self._changed.notify()
+            self._plan(now)
 
     def halt(self) -> None:
         """Stop the base now."""
@@ -119,7 +122,8 @@ class CmdVel:
             self._body, self._until, self._zeros = ZERO, 0.0, ZEROS
             if not self._ends:
                 self._out.send(ZERO)
-            self._changed.notify()
+            if not self._latched:  # or the repeated lock would wait as well
+                self._plan(time.monotonic())
 
     def latch(self, latched: bool) -> None:
         """Hold the base: the running command is over, others of ROS are locked out and their goals are cancelled."""
@@ -130,11 +134,11 @@ class CmdVel:
             self._body, self._until, self._zeros = ZERO, 0.0, ZEROS
             self._out.send(ZERO)
             self._opens = True
-            self._owe(True)
-            if latched:
-                self._cancel()
             self._send_lock()
-            self._changed.notify()
+            if latched:
+                self._owe(True)  # another thread writes it
+                self._cancel()
+            self._plan(time.monotonic())
 
     def cancel_navigation(self) -> None:
         """Cancel the goals of the planner, once a second at most."""
@@ -172,24 +176,30 @@ class CmdVel:
             self._body, self._until = ZERO, 0.0
         self._out.send(self._body)
 
+    def _plan(self, now: float) -> None:
+        """Set when the thread sends next, and wake it if that is sooner than it looks by itself."""
+        if self._body != ZERO:
+            due = min(now + self._period_s, self._until)
+        elif self._zeros > 0:
+            due = now + self._period_s
+        else:
+            due = now + LATCHED_S if self._latched else inf
+        if due < self._due:
+            self._changed.notify()
+        self._due = due
+
     def _run(self) -> None:
         with self._changed:
             while not self._ends:
-                self._changed.wait(self._wait_s(time.monotonic()))
-                if self._ends:
-                    return
-                if time.monotonic() < self._until:
+                now = time.monotonic()
+                if now < self._due:
+                    self._changed.wait(None if self._due == inf else self._due - now)
+                    continue
+                if now < self._until:
                     self._send()
                 elif self._latched or self._zeros > 0 or self._body != ZERO:
                     self._body, self._zeros = ZERO, max(0, self._zeros - 1)
                     self._out.send(ZERO)
                     if self._latched:
                         self._send_lock()
-
-    def _wait_s(self, now: float) -> float | None:
-        """Return how long nothing is to be sent; None: until something changes."""
-        if now < self._until:
-            return min(self._period_s, self._until - now)
-        if self._zeros > 0 or self._body != ZERO:
-            return self._period_s if self._body == ZERO else 0.0
-        return LATCHED_S if self._latched else None
+                self._plan(now)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any, ClassVar
 
 from pebble.config import Config
@@ -36,8 +37,9 @@ class Ros1Reader(Service):
         self.node = self._make_node()
         self.telemetry = Telemetry(self.node, self.section, self._publish_soon, self.counters, self.hear)
 
-    @property
+    @cached_property
     def section(self) -> Ros1:
+        """The section of the config; to find it takes longer than to send a command."""
         return self.config.section(Ros1)
 
     def _make_node(self) -> Node:
