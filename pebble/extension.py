@@ -84,10 +84,11 @@ class Stage(IntEnum):
 
 
 class Program(Struct, frozen=True):
-    """A process: its name in logs and status, and the module that it runs with ``arguments``, as ``python -m`` does.
+    """A process: its name in logs and status, and what it runs with ``arguments``.
 
-    The launcher imports the module, or ``entry``, before it forks: importing must do nothing. What that module imports
-    later, because only some robots need it, is in the memory of those robots only.
+    That is a service (``module:Class``), or a module, as ``python -m`` does. The launcher imports the module, or
+    ``entry``, before it forks: importing must do nothing. What that module imports later, because only some robots need
+    it, is in the memory of those robots only.
     """
 
     name: str
@@ -272,7 +273,7 @@ def _check_parts(extension: Extension, section: type) -> None:
         part(extension.programs)
     elif {*extension.motors.values()} - ({program.name} if program else set()):
         raise PebbleError("its motors are of a program that it does not have")
-    if program is not None and find_spec(program.module) is None:
+    if program is not None and find_spec(program.module.partition(":")[0]) is None:
         raise PebbleError(f"the module of its program, {program.module}, is not installed")
 
 

@@ -17,10 +17,10 @@ import pytest
 import typer
 
 from pebble.commands.app import application
-from pebble.config.keys import keys_text
 from pebble.extensions.checks.conform.checks import CHECKS, LAST
 from pebble.extensions.checks.conform.control import CONTROL, named
 from pebble.extensions.checks.conform.motion import MOVING
+from pebble.extensions.checks.keys import keys_text
 from tests.support import ROOT
 from tools.bounds import bounds
 

@@ -24,7 +24,7 @@ ELSEWHERE = [sys.executable, str(ROOT / "tests" / "fakes" / "other_platform.py")
 MODULES = (
     *(f"pebble.extensions.operator.commands.{name}" for name in ("topic", "estop", "watch")),
     *(f"pebble.extensions.page.commands{name}" for name in ("", ".cert", ".drive")),
-    "pebble.commands.check",
+    "pebble.extensions.checks.commands.check",
     *(
         "pebble.extensions.page.app",
         "pebble.extensions.page.serve",

@@ -13,10 +13,10 @@ import msgspec
 from msgspec.structs import fields
 
 from pebble.config.config import full_tree
-from pebble.config.keys import keys_text
 from pebble.config.reader import unwrap
 from pebble.config.tree import Root
 from pebble.config.types import Section
+from pebble.extensions.checks.keys import keys_text
 
 SCHEMA_FILE = Path("configs", "schema.json")
 KEYS_FILE = "configuration.md"

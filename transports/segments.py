@@ -9,9 +9,9 @@ SHM = Path("/dev/shm")  # noqa: S108 - where POSIX shared memory is on Linux
 YOUNG_S = 1.0  # a segment is locked within a second after its creation
 
 
-def sweep(folder: Path = SHM) -> int:
+def sweep() -> int:
     """Remove the segments of this user that no process uses any more; return how many were removed."""
-    return sum(map(_remove_if_unused, folder.glob("*.zenoh")))
+    return sum(map(_remove_if_unused, SHM.glob("*.zenoh")))
 
 
 def _remove_if_unused(segment: Path) -> bool:

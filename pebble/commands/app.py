@@ -19,11 +19,8 @@ from pebble.version import __version__
 
 log = logging.getLogger(__name__)
 
-#: The commands of the core.
-_CORE: Final = {
-    "up": Offered("pebble.commands.up:up", "run a robot", "own", 20),
-    "check": Offered("pebble.commands.check:check", "validate configs and summarise them", "own", 30),
-}
+#: The command of the core.
+_CORE: Final = {"up": Offered("pebble.commands.up:up", "run a robot", "own", 20)}
 #: The base of errors of a wrong command line: typer 0.27 has no public name for it.
 _WRONG: Any = getattr(typer, "TyperException", typer.BadParameter.__base__)
 #: The headings of the help, in order; commands of other packages stand last.

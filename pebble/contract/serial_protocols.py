@@ -21,10 +21,6 @@ class SerialProtocol(Struct, frozen=True):
     is_imu: bool = False  # every such device is an inertial sensor
     describes_itself: bool = False  # only its manifest says what the device is
 
-    @property
-    def module(self) -> str:
-        return self.service.partition(":")[0]
-
     def has_imu(self, instance: str) -> bool:
         """True if a line of this name has an inertial sensor, by the config alone, before the device is connected."""
         return self.is_imu or (self.describes_itself and instance == _IMU_INSTANCE)

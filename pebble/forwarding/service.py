@@ -31,7 +31,6 @@ class Status(Struct, frozen=True):
     gate: Gate
     mirroring: bool  # by the flag remote-mirror, which does not concern the service mqtt_mirror
     synchronized: frozenset[Side]  # whose retained messages have arrived
-    circulating: frozenset[tuple[Side, str]]  # topics that something else brings back to the side they came from
     epoch: int  # grows whenever the remote side is not connected
     subscribed: frozenset[Side]
     counts: dict[str, int]  # messages, by side and what became of them
@@ -75,7 +74,6 @@ class ForwardingService(Service, ABC):
             gate=forwarder.gate,
             mirroring=forwarder.mirroring.on,
             synchronized=frozenset(filter(forwarder.retained.synchronized, Side)),
-            circulating=frozenset(forwarder.cycles.closed_ways),
             epoch=self.epoch,
             subscribed=frozenset(filter(self.subscriptions.get, Side)),
             counts=forwarder.counters.snapshot(),

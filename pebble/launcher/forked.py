@@ -16,8 +16,9 @@ from contextlib import suppress
 from typing import NoReturn
 
 from pebble.config import Config, hand_over
-from pebble.extension import Program
+from pebble.extension import Program, part
 from pebble.runtime.parent import NOTIFY_FD, die_with_launcher
+from pebble.runtime.process import run
 
 _NOTES = 3  # the descriptor of notes, next after stdin, stdout and stderr
 _PR_SET_NAME, _NAME_BYTES = 15, 15
@@ -89,6 +90,8 @@ def _run(program: Program) -> None:
     die_with_launcher()
     ctypes.CDLL(None).prctl(_PR_SET_NAME, program.name.encode()[:_NAME_BYTES])  # ps and top show it
     sys.argv = [program.module, *program.arguments]
+    if ":" in program.module:
+        sys.exit(run(part(program.module)))
     if not hasattr(sys.modules.get(program.module), "__path__"):
         sys.modules.pop(program.module, None)  # it is __main__ now; importing it as well gives a second copy, as always
     runpy.run_module(program.module, run_name="__main__", alter_sys=True)

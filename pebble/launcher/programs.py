@@ -5,7 +5,6 @@ import logging
 import os
 from collections.abc import Iterable, Iterator
 from importlib import import_module
-from typing import Any
 
 from pebble.config import Config, SerialBridge
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
@@ -31,15 +30,17 @@ def _core(config: Config) -> Iterator[tuple[bool, Program]]:
     yield from ((True, _serial_line(config, *line)) for line in config.serial_instances().items())
     seams = ((one.observer, one.step, one.private, *one.requests) for one in config.installed)
     shares = tuple(place.partition(":")[0] for places in seams for place in places if place)
-    yield bridge.enabled, _service(config, "mqtt_bridge", may_request=True, shares=shares)
-    yield mirror is not None, _service(config, "mqtt_mirror")
+    arguments = (str(config.path),)
+    service = "pebble.services.mqtt_bridge.service:MqttBridge"
+    yield bridge.enabled, Program("mqtt_bridge", service, arguments, may_request=True, shares=shares)
+    yield mirror is not None, Program("mqtt_mirror", "pebble.services.mqtt_mirror.service:MqttMirror", arguments)
 
 
 def shared_modules(config: Config, table: Iterable[Program]) -> list[str]:
     """Return the modules to import before the first fork: modules of the programs, and shared ones."""
     programs = list(table)
     shared = dict.fromkeys(module for program in programs for module in program.shares)
-    entries = (program.entry or program.module for program in programs if program.preloaded)
+    entries = (program.entry or program.module.partition(":")[0] for program in programs if program.preloaded)
     return [*_transport_modules(config), *shared, *entries]
 
 
@@ -74,16 +75,10 @@ def program_of(instance: str) -> str:
     return f"serial_mcu_bridge:{instance}" if instance else "serial_mcu_bridge"
 
 
-def _service(config: Config, name: str, **more: Any) -> Program:
-    module = f"pebble.services.{name}"
-    return Program(name, module, (str(config.path),), entry=f"{module}.service", **more)
-
-
 def _serial_line(config: Config, instance: str, line: SerialBridge) -> Program:
-    """Return the program of a serial line, which imports the bridge of its protocol."""
+    """Return the program of a serial line: the bridge of its protocol."""
     arguments = (str(config.path), instance) if instance else (str(config.path),)
-    entry = SERIAL_PROTOCOLS[line.protocol].module
-    return Program(program_of(instance), "pebble.services.serial_mcu_bridge", arguments, Stage.DEVICE, entry=entry)
+    return Program(program_of(instance), SERIAL_PROTOCOLS[line.protocol].service, arguments, Stage.DEVICE)
 
 
 def _announcer(config: Config) -> Program:

@@ -1,4 +1,7 @@
-"""The outermost lines of a service process: arguments, logging, signals, and notes to the launcher."""
+"""The outermost lines of a service process: arguments, logging, signals, and notes to the launcher.
+
+To run one service by itself: ``python -m pebble.runtime.process MODULE:CLASS CONFIG [INSTANCE]``.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from msgspec.structs import replace
 
 from pebble.config import Config, config_of_process
 from pebble.errors import ConfigError, PebbleError
+from pebble.extension import part
 from pebble.runtime.connections import local_transport
 from pebble.runtime.environment import withhold
 from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, Reported, set_log_level, set_up_logging
@@ -34,7 +38,7 @@ def run(
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if not 1 <= len(arguments) <= 2:
-        sys.stderr.write(f"usage: python -m pebble.services.{service_class.name} CONFIG [INSTANCE]\n")
+        sys.stderr.write(f"{service_class.name} needs the arguments CONFIG [INSTANCE]\n")
         return 2
     instance = arguments[1] if len(arguments) == 2 else ""
     set_up_logging("INFO")
@@ -93,3 +97,7 @@ def exit_at_the_latest() -> None:
     """
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.setitimer(signal.ITIMER_REAL, _STOP_DEADLINE_S)
+
+
+if __name__ == "__main__":
+    sys.exit(run(part(sys.argv[1]), sys.argv[2:]))

@@ -8,7 +8,7 @@ EXTENSION = Extension(
     name="autonomy_manager",
     needs=("scripts",),
     sections={"services.autonomy_manager": "pebble.extensions.scripts.config:AutonomyManager"},
-    program=Program("autonomy_manager", _MODULE, runs_scripts=True, entry=f"{_MODULE}.service"),
+    program=Program("autonomy_manager", f"{_MODULE}.service:AutonomyManager", runs_scripts=True),
     offers=f"{_MODULE}.facts:offers",
     facts=f"{_MODULE}.facts:facts",
     completions={"SCRIPT": f"{_MODULE}.facts:complete_scripts"},

@@ -10,7 +10,7 @@ EXTENSION = Extension(
     rules="pebble.services.av_daemon.config:RULES",
     program=Program(
         "av_daemon",
-        "pebble.services.av_daemon",
+        "pebble.services.av_daemon.service:AvDaemon",
         stage=Stage.DEVICE,
         preloaded=False,
         shares=("pebble.extensions.media.frames",),

@@ -38,20 +38,21 @@ def facts(config: Config) -> Facts:
 
 def camera_programs(config: Config) -> Iterator[Program]:
     """Yield the process that sends pictures to operators while the bridge requests them."""
-    return _programs(config, "camera_publisher", config.section(AvDaemon).video.enabled)
+    return _programs(config, "camera_publisher", "CameraPublisher", config.section(AvDaemon).video.enabled)
 
 
 def microphone_programs(config: Config) -> Iterator[Program]:
     """Yield the process that sends sound to operators while the bridge requests it."""
-    return _programs(config, "audio_publisher", config.section(AvDaemon).audio.enabled)
+    return _programs(config, "audio_publisher", "AudioPublisher", config.section(AvDaemon).audio.enabled)
 
 
 def loudspeaker_programs(config: Config) -> Iterator[Program]:
     """Yield the process that plays operators' voices while the bridge requests it."""
-    return _programs(config, "audio_receiver", config.section(AvDaemon).audio.enabled)
+    return _programs(config, "audio_receiver", "AudioReceiver", config.section(AvDaemon).audio.enabled)
 
 
-def _programs(config: Config, name: str, has_device: bool) -> Iterator[Program]:
+def _programs(config: Config, name: str, service: str, has_device: bool) -> Iterator[Program]:
     if has_device and config.section(AvDaemon).enabled and config.services.mqtt_bridge.enabled:
         shares = ("pebble.extensions.media.frames", "pebble.extensions.media.sound")
-        yield Program(name, f"pebble.services.{name}", on_demand=True, preloaded=False, shares=shares)
+        place = f"pebble.services.{name}.service:{service}"
+        yield Program(name, place, on_demand=True, preloaded=False, shares=shares)

@@ -44,7 +44,7 @@ def programs(config: Config) -> list[Program]:
     runs = config.section(HomeAssistant).enabled or saved(config).exists()
     if not (runs and bridge.enabled and bridge.remote is None):
         return []
-    return [Program("homeassistant", "pebble.services.homeassistant", preloaded=False)]
+    return [Program("homeassistant", "pebble.services.homeassistant.service:HomeAssistantService", preloaded=False)]
 
 
 def facts(config: Config) -> Facts:

@@ -12,21 +12,21 @@ from pebble.runtime.service import Service, every, on
 from pebble.runtime.whole_file import write
 from pebble.services.homeassistant.config import HomeAssistant, saved
 from pebble.services.homeassistant.discovery import discovery, object_id
-from pebble.transports import Message, QoS, State, Transport
+from pebble.transports import Message, QoS, State
 
 APART_S = 5.0  # between two messages
 _TICK_S = 0.25
 
 
 class HomeAssistantService(Service):
-    """The publisher of the discovery message, and of the empty one that ends it. ``remote`` is for tests."""
+    """The publisher of the discovery message, and of the empty one that ends it."""
 
     name = "homeassistant"
 
-    def __init__(self, *arguments: Any, remote: Transport | None = None, **options: Any) -> None:
+    def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._section = self.config.section(HomeAssistant)
-        self._remote = remote or remote_transport(self.config, "homeassistant")
+        self._remote = remote_transport(self.config, "homeassistant")
         self._place = f"{self._section.prefix}/device/{object_id(self.config.base)}/config"
         self._capabilities: dict[str, Any] = {}
         self._unit = ""

@@ -7,7 +7,7 @@ EXTENSION = Extension(
     needs=("scripts", "operator"),
     sections={"services.neighbours": "pebble.services.neighbours.config:Neighbours"},
     rules="pebble.services.neighbours.config:RULES",
-    program=Program("neighbours", "pebble.services.neighbours", preloaded=False),
+    program=Program("neighbours", "pebble.services.neighbours.service:NeighboursService", preloaded=False),
     facts="pebble.services.neighbours.config:facts",
     page="docs/ext/neighbours.md",
 )

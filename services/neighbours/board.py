@@ -2,7 +2,6 @@
 
 import os
 import zlib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,14 +47,12 @@ class BoardNeighbours(NeighboursService):
             super()._announce()
 
 
-def of_board(
-    base: str, section: Neighbours, broker: Mqtt, run_dir: Path, env: Mapping[str, str] = os.environ
-) -> BoardNeighbours:
+def of_board(base: str, section: Neighbours, broker: Mqtt, run_dir: Path) -> BoardNeighbours:
     """Make the neighbours of the robot ``base`` at ``broker``; they do not run yet."""
     system, kind, name = base.split("/")
     folder = run_dir / f"{zlib.crc32(base.encode()):08x}"  # short, because of sockets in it
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     raw = {"robot": {"system": system, "type": kind, "id": name}, "transport": {"kind": "mqtt", "run_dir": str(folder)}}
-    plain: Config = parse(raw, folder=run_dir, env=env)
+    plain: Config = parse(raw, folder=run_dir, env=os.environ)
     config = replace(plain, local_mqtt=broker, services=replace(plain.services, neighbours=section))
     return BoardNeighbours(config, local_transport(config, BoardNeighbours.name))

@@ -8,7 +8,7 @@ EXTENSION = Extension(
     extra="record",
     packages=("mcap",),
     sections={"services.recorder": "pebble.extensions.recordings.config:Recorder"},
-    program=Program("recorder", "pebble.services.recorder", preloaded=False),
+    program=Program("recorder", "pebble.services.recorder.service:RobotRecorder", preloaded=False),
     checks="pebble.services.recorder.checks:checks",
     page="docs/ext/recordings.md",
 )

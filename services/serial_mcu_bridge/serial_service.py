@@ -3,13 +3,11 @@
 import threading
 import time
 from abc import ABC, abstractmethod
-from importlib import import_module
 from typing import Any, ClassVar
 
-from pebble.config import Config, SerialBridge
+from pebble.config import SerialBridge
 from pebble.contract import DRIVE
 from pebble.contract.payloads import Drive
-from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError, DeviceError
 from pebble.runtime.notes import OFTEN
 from pebble.runtime.parent import Notifier, Reported
@@ -185,10 +183,3 @@ class SerialService(Service, ABC):
         if too_long:
             self.counters.add("lines_discarded", too_long)
             self.device_log.warning("too long", "a line of the MCU was too long", times=too_long)
-
-
-def bridge_of(config: Config) -> type[SerialService]:
-    """Return the service class for the protocol in ``config``, which is the view of one instance."""
-    protocol = SERIAL_PROTOCOLS[config.services.serial_mcu_bridge.protocol]
-    bridge: type[SerialService] = getattr(import_module(protocol.module), protocol.service.partition(":")[2])
-    return bridge

@@ -8,7 +8,7 @@ EXTENSION = Extension(
     name="soundboard_handler",
     needs=("media",),
     sections={"services.soundboard_handler": f"{_MODULE}.config:SoundboardHandler"},
-    program=Program("soundboard_handler", _MODULE, entry=f"{_MODULE}.service"),
+    program=Program("soundboard_handler", f"{_MODULE}.service:SoundboardHandler"),
     offers=f"{_MODULE}.config:offers",
     page="docs/ext/soundboard.md",
 )

@@ -13,8 +13,8 @@ from pebble.services.video_stream.config import VideoStream
 def programs(config: Config) -> Iterator[Program]:
     """Yield the process that runs the streaming program while the bridge requests it."""
     if _is_requested(config):
-        module, url = "pebble.services.video_stream", config.section(VideoStream).webrtc_url
-        yield Program("video_stream", module, entry=f"{module}.service", on_demand=True, webrtc_url=url)
+        service, url = "pebble.services.video_stream.service:VideoStream", config.section(VideoStream).webrtc_url
+        yield Program("video_stream", service, on_demand=True, webrtc_url=url)
 
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:

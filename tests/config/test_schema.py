@@ -10,7 +10,7 @@ from typing import Any
 import jsonschema
 import pytest
 
-from pebble.config.keys import keys_text
+from pebble.extensions.checks.keys import keys_text
 from tools.schema import SCHEMA_FILE, schema_text
 
 ROOT = Path(__file__).resolve().parents[2]

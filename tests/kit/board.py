@@ -16,8 +16,9 @@ from types import TracebackType
 from typing import Any, Self
 
 from pebble.config import Config
+from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
+from pebble.extension import part
 from pebble.runtime.process import view_of
-from pebble.services.serial_mcu_bridge.serial_service import bridge_of
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.boards.mcu_wire import M, Received
 from tests.kit.robot import ROBOT, Listener, LocalNetwork, Running
@@ -200,7 +201,8 @@ class SerialRig:
         line = {"enabled": True, "protocol": protocol, "serial": {"port": str(self.folder / name)}, **section}
         config = view_of(self.network.config(self.folder, {"instances": {name: line}}, robot=self._robot), name)
         transport = self.network.robots_transport(config, f"serial-{name}")
-        running = self.lines[name] = Running(bridge_of(config)(config, transport, instance=name))
+        service = part(SERIAL_PROTOCOLS[protocol].service)
+        running = self.lines[name] = Running(service(config, transport, instance=name))
         self._ends.callback(running.stop)
         return running
 

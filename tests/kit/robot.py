@@ -22,6 +22,8 @@ import msgspec
 from pebble.config import Config, load, parse
 from pebble.contract import Channel
 from pebble.errors import PebbleError
+from pebble.extension import part
+from pebble.runtime import process
 from pebble.runtime import service as service_module
 from pebble.runtime.connections import local_transport
 from pebble.service import Service
@@ -176,15 +178,20 @@ class Running:
 
 
 def main(module: str, arguments: tuple[str, ...], environment: dict[str, str]) -> None:
-    """Become ``python -m module`` with these arguments, in a process that has imported most of what it needs."""
+    """Become ``python -m module``, or a service, in a process that has imported most of what it needs."""
     os.environ.clear()
     os.environ.update(environment)
     sys.argv = [module, *arguments]
+    if ":" in module:
+        sys.exit(process.run(part(module)))
     runpy.run_module(module, run_name="__main__", alter_sys=True)
 
 
 class Program(Forked):
-    """``python -m module`` with these arguments and this process's environment; ended with what made it."""
+    """A module, or the service ``module:Class``, with these arguments and this process's environment.
+
+    It is ended with what made it.
+    """
 
     def __init__(self, module: str, *arguments: str) -> None:
         super().__init__("tests.kit.robot", module, arguments, dict(os.environ))

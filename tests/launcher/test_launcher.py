@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from pebble.config import Config, load, parse
+from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError
 from pebble.extension import Stage
 from pebble.launcher.launcher import Launcher
@@ -378,14 +379,20 @@ TABLES: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "a page": ({"web_handler": ON}, MQTT, "announcer web_handler"),
     "no page": ({"web_handler": OFF}, MQTT, "announcer"),
 }
-#: Of a program: its module, arguments and stage, whether it may request others, and whether it is imported beforehand.
+#: Of a program: its service or module, arguments and stage, whether it may request others, and is imported beforehand.
 PROGRAMS: dict[str, tuple[str, tuple[str, ...], Stage, bool, bool]] = {
     "zenoh_hub": ("pebble.launcher.announcer", ("None",), Stage.LOCAL_TRANSPORT, False, True),
-    "serial_mcu_bridge:arm": ("pebble.services.serial_mcu_bridge", ("None", "arm"), Stage.DEVICE, False, True),
-    "mqtt_bridge": ("pebble.services.mqtt_bridge", ("None",), Stage.CONNECTION, True, True),
-    "av_daemon": ("pebble.services.av_daemon", ("None",), Stage.DEVICE, False, False),
-    "camera_publisher": ("pebble.services.camera_publisher", ("None",), Stage.CONNECTION, False, False),
-    "video_stream": ("pebble.services.video_stream", ("None",), Stage.CONNECTION, False, True),
+    "serial_mcu_bridge:arm": (SERIAL_PROTOCOLS["goob_base_v1"].service, ("None", "arm"), Stage.DEVICE, False, True),
+    "mqtt_bridge": ("pebble.services.mqtt_bridge.service:MqttBridge", ("None",), Stage.CONNECTION, True, True),
+    "av_daemon": ("pebble.services.av_daemon.service:AvDaemon", ("None",), Stage.DEVICE, False, False),
+    "camera_publisher": (
+        "pebble.services.camera_publisher.service:CameraPublisher",
+        ("None",),
+        Stage.CONNECTION,
+        False,
+        False,
+    ),
+    "video_stream": ("pebble.services.video_stream.service:VideoStream", ("None",), Stage.CONNECTION, False, True),
     "web_handler": ("pebble.extensions.page.run", ("None",), Stage.CONNECTION, False, False),
 }
 

@@ -1,4 +1,4 @@
-"""Checks of a machine, of a broker, of a running robot, and of a robot's conformance to the contract."""
+"""Checks of a config, of a machine, of a broker, of a running robot, and of a robot's conformance to the contract."""
 
 from pebble.extension import Command, Extension
 
@@ -6,6 +6,9 @@ EXTENSION = Extension(
     name="checks",
     needs=("operator", "fleet", "page"),
     commands={
+        "check": Command(
+            "pebble.extensions.checks.commands.check:check", "validate configs and summarise them", "own", 30
+        ),
         "doctor": Command(
             "pebble.extensions.checks.commands.doctor:doctor",
             "find what is wrong with a machine, robot or broker",

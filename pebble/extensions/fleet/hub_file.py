@@ -1,7 +1,6 @@
 """The file of ``pebble fleet hub``: a Zenoh hub for several robots, on a machine of its own."""
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -34,17 +33,17 @@ class HubFile(ZenohSection, frozen=True, kw_only=True):
     ] = 1000
 
 
-def load_hub(path: Path, env: Mapping[str, str] = os.environ) -> tuple[HubFile, Path]:
+def load_hub(path: Path) -> tuple[HubFile, Path]:
     """Read the file; return it and its run directory. Raises ConfigError with all problems."""
     path = path.absolute()
     raw = decode(read_text(path), path.name)
-    reader = Reader(path.parent, env, CHECKS, file=path)
+    reader = Reader(path.parent, os.environ, CHECKS, file=path)
     hub = reader.section(HubFile, plain(raw, reader.notes))
     if not hub.listen:
         reader.notes.problem(("listen",), 'is missing: a hub is reached there, such as ["tls/0.0.0.0:7447"]')
     if reader.notes.problems:
         raise ConfigError(list(dict.fromkeys(f"{path.name}: {problem}" for problem in reader.notes.problems)))
-    return hub, hub.run_dir or default_run_folder(f"hub {path}", env)
+    return hub, hub.run_dir or default_run_folder(f"hub {path}", os.environ)
 
 
 def settings_of(hub: HubFile, run_dir: Path) -> ZenohSettings:

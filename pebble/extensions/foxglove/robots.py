@@ -109,7 +109,6 @@ class Robots:
             if not self._server.declared(below):
                 self._server.declare(protobuf_spec(below, made, self._schemas))
             self._server.publish(below, stamped(made, time_of(payload, at_ns)), at_ns, remember=remember)
-        if converted is not None and not converted.beside:
             return
         data = as_object(payload)
         if data is None:

@@ -1,6 +1,6 @@
 """Speech-like sound computed from the sample's number alone: for robots without a microphone, and for tests.
 
-Syllables of voiced harmonics under three formants, some with a hiss before them, with pauses between words.
+Syllables of a gliding voice, with pauses between words.
 """
 
 from functools import lru_cache
@@ -17,10 +17,6 @@ _SYLLABLES = 50  # in one period: 200 ms each, as people speak
 _PAUSE_EVERY = 6  # syllables
 _PEAK = 12_000  # of 32,767
 _HIGHEST_HZ = 4_000  # of the harmonics
-_ATTACK_S, _HISS_S = 0.03, 0.05
-# The first three formants in Hz of a, e, i, o, u (Peterson and Barney 1952, men, rounded).
-_VOWELS = ((730, 1090, 2440), (530, 1840, 2480), (270, 2290, 3010), (570, 840, 2410), (300, 870, 2240))
-_FORMANT_WIDTH_HZ = 90.0
 
 
 class Speech:
@@ -41,37 +37,19 @@ def _period(rate: int) -> NDArray[np.int16]:
     edges = [rate * PERIOD_S * number // _SYLLABLES for number in range(_SYLLABLES + 1)]
     sound = np.zeros(edges[-1], np.float32)
     for number in range(_SYLLABLES):
-        vowel, pitch, glide, loud, hissing = map(float, noise(number, 5))
-        if number % _PAUSE_EVERY == _PAUSE_EVERY - 1:
-            continue
-        part = sound[edges[number] : edges[number + 1]]
-        part += _voice(len(part), rate, _VOWELS[int(vowel * len(_VOWELS))], 95 + 60 * pitch, 0.4 * glide - 0.2) * (
-            0.5 + 0.5 * loud
-        )
-        if hissing > 0.5:
-            begin = part[: int(_HISS_S * rate)]
-            hiss = np.diff(noise(1000 + number, len(begin) + 1))  # the difference takes the low tones away
-            begin += (hiss * np.hanning(len(begin)) * 0.3).astype(np.float32)
-    loudest = float(np.abs(sound).max())
-    period = np.asarray(sound * (_PEAK / loudest), np.int16)
+        pitch, glide, loud = map(float, noise(number, 3))
+        if number % _PAUSE_EVERY < _PAUSE_EVERY - 1:
+            part = sound[edges[number] : edges[number + 1]]
+            part += (0.5 + 0.5 * loud) * _syllable(len(part), rate, 95 + 60 * pitch, 0.4 * glide - 0.2)
+    period = np.asarray(sound * (_PEAK / float(np.abs(sound).max())), np.int16)
     period.flags.writeable = False
     return period
 
 
-def _voice(count: int, rate: int, formants: tuple[int, ...], pitch_hz: float, glide: float) -> NDArray[np.float32]:
-    """Return a vowel that swells and fades; its pitch rises by ``glide`` × itself until its end."""
+def _syllable(count: int, rate: int, pitch_hz: float, glide: float) -> NDArray[np.float32]:
+    """Return harmonics that swell and fade; their pitch rises by ``glide`` × itself until the end."""
     time = np.arange(count) / rate
-    length = count / rate
-    phase = 2 * np.pi * pitch_hz * (time + glide * time**2 / (2 * length))
+    phase = 2 * np.pi * pitch_hz * (time + glide * time**2 / (2 * time[-1]))
     highest = min(_HIGHEST_HZ, 0.45 * rate) / (pitch_hz * (1 + max(0.0, glide)))
-    voice = np.zeros(count)
-    for harmonic in range(1, int(highest) + 1):
-        voice += _loudness(harmonic * pitch_hz, formants) * np.sin(harmonic * phase)
-    swell = np.clip(np.minimum(time, length - time) / _ATTACK_S, 0, 1)
-    return np.asarray(voice * np.sin(swell * np.pi / 2) ** 2, np.float32)
-
-
-def _loudness(frequency: float, formants: tuple[int, ...]) -> float:
-    """Return how strongly the mouth passes a frequency on: resonances above a slope of 6 dB per octave."""
-    resonance = sum(1 / (1 + ((frequency - formant) / _FORMANT_WIDTH_HZ) ** 2) for formant in formants)
-    return float((0.05 + resonance) * 100 / frequency)
+    harmonics = (np.sin(number * phase) / number for number in range(1, int(highest) + 1))
+    return np.asarray(sum(harmonics) * np.hanning(count), np.float32)

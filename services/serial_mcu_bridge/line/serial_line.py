@@ -21,6 +21,7 @@ _FIRST_RETRY_S, _LAST_RETRY_S = 0.1, 1.0
 _RETRY_WRITE_S = 0.002  # while bytes are being sent; a drive line takes 1.4 ms at 115200 baud
 _DRAIN_S = 0.3  # for the last stop line to be sent
 _PATH_CHECK_S = 1.0
+_READ_S = 0.1  # longest wait for bytes of the device
 
 
 class LineState(Enum):
@@ -36,7 +37,6 @@ class _Opening(NamedTuple):
     path: str
     baud: int
     boot_s: float
-    read_timeout_s: float
     retry_s: float
 
 
@@ -64,14 +64,13 @@ class SerialLine:
         on_state: Callable[[LineState, str], None] = lambda _state, _problem: None,
         drive_timeout_s: float = 0.75,
         boot_s: float = 0.5,
-        read_timeout_s: float = 0.1,
         retry_s: float = _LAST_RETRY_S,
         end: bytes = b"\n",
     ) -> None:
         self.opened = 0  # how often the device was opened
         self.refused = 0  # lines refused because there was no device
         self.received = 0  # chunks of bytes from the device since it was opened and has booted
-        self._opening = _Opening(path, baud, boot_s, read_timeout_s, retry_s)
+        self._opening = _Opening(path, baud, boot_s, retry_s)
         self._on_bytes, self._on_state = on_bytes, on_state
         self._thread = threading.Thread(target=self._run, name=f"pebble-serial {path}", daemon=True)
         self._wakeup = WakeupPipe()
@@ -222,8 +221,8 @@ class SerialLine:
     def _poll_timeout(self, until_ready: float) -> float:
         """Return how long to wait for input before writing again, in seconds."""
         if self._state is LineState.BOOTING:
-            return max(_RETRY_WRITE_S, min(self._opening.read_timeout_s, until_ready))
-        return _RETRY_WRITE_S if self.output.sending or self.output.outbox.waiting else self._opening.read_timeout_s
+            return max(_RETRY_WRITE_S, min(_READ_S, until_ready))
+        return _RETRY_WRITE_S if self.output.sending or self.output.outbox.waiting else _READ_S
 
     def _receive(self, chunk: bytes) -> None:
         if chunk and self._state is LineState.READY:

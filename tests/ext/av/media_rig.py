@@ -20,7 +20,7 @@ from tests.support import until
 
 
 class MediaProgram(ProgramRobot):
-    """``python -m pebble.services.<name>`` of a robot with ``kind`` inside, and what it reports there.
+    """The service called ``name`` of a robot with ``kind`` inside, and what it reports there.
 
     ``section`` of services.mqtt_bridge.media holds the ``options``; operators' requests come on ``request``.
     """
@@ -40,7 +40,7 @@ class MediaProgram(ProgramRobot):
         return self
 
     def start(self) -> None:
-        self.process = self.run(f"pebble.services.{self.name}")
+        self.process = self.run(f"pebble.services.{self.name}.service:{self.name.title().replace('_', '')}")
 
     def ask(self, **request: Any) -> None:
         """What the bridge passes on from operators."""

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from pebble.config import parse
-from pebble.runtime.process import view_of
+from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
+from pebble.extension import part
 from pebble.services.serial_mcu_bridge.devices.described_bridge import DescribedBridge
 from pebble.services.serial_mcu_bridge.imu.bridge import ImuBridge
-from pebble.services.serial_mcu_bridge.serial_service import bridge_of
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.boards.mcu_wire import STATION
@@ -25,18 +23,14 @@ from tests.support import Broker, until
     [("goob_base_v1", MotorBridge), ("pebble_serial_v1", DescribedBridge), ("imu_mpu6050_v1", ImuBridge)],
 )
 def test_a_protocol_has_its_service(protocol: str, service: type) -> None:
-    line = {"enabled": True, "protocol": protocol, "serial": {"port": "/dev/x"}}
-    section: dict[str, Any] = {"instances": {"one": line}}
-    raw = {"robot": {"id": "rover"}, "services": {"serial_mcu_bridge": section}}
-    config = parse(raw, folder=Path("/"), env={})
-    assert bridge_of(view_of(config, "one")) is service
+    assert part(SERIAL_PROTOCOLS[protocol].service) is service
 
 
 def test_a_terminated_process_withdraws_its_device(local: Broker, tmp_path: Path) -> None:
     mcu = ScriptedMcu(tmp_path / "port", STATION, sends_hello=True)
     line = {"enabled": True, "protocol": "pebble_serial_v1", "serial": {"port": str(mcu.link)}}
     with mcu, ProgramRobot("mqtt", local.port, {"serial_mcu_bridge": {"instances": {"sockets": line}}}) as robot:
-        process = robot.run("pebble.services.serial_mcu_bridge", "sockets")
+        process = robot.run(SERIAL_PROTOCOLS["pebble_serial_v1"].service, "sockets")
         robot.world.described("hs105-sta")
         mcu.send(wire.frame(wire.STATE, b"\1\1\0", 2))
         assert robot.world.got("outlets/o1/status")

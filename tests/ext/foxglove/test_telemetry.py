@@ -49,7 +49,7 @@ def test_each_payload_gets_the_schema_that_foxglove_has_for_it(broker: Broker, r
     runs = AutonomyStatus(running=True, timestamp=t / 1e3, file="apriltag-follow", label="Follow a tag")
     sent = {LOGS: record, WHEEL_ODOMETRY: odometry, APRILTAG_LOCATIONS: tags, APRILTAG_DATA: followed}
     sent[AUTONOMY_STATUS] = runs
-    names = ["logs/log", "wheel-odometry/pose", "apriltag-locations/annotations", "apriltag-data/scene"]
+    names = ["logs/log", "wheel-odometry/pose", "apriltag-locations/annotations"]
     topics = [f"{GOOB}/outgoing/{name}" for name in (*names, "apriltag-data", "autonomy-status/words")]
     with live(broker) as server:
         watcher = Watcher(server.address)
@@ -63,14 +63,10 @@ def test_each_payload_gets_the_schema_that_foxglove_has_for_it(broker: Broker, r
         for topic in topics:
             watcher.subscribe(topic)
         assert until(publish_all, 20, step=0.05)
-    log, pose, drawn, scene, data, words = (watcher.of(topic)[0] for topic in topics)
+    log, pose, drawn, data, words = (watcher.of(topic)[0] for topic in topics)
     assert (log.level, log.name, log.message, log.timestamp.ToMilliseconds()) == (3, "bridge", "careful", t)
     assert (pose.frame_id, pose.pose.position.x) == ("goob/odom", 1.5)
     assert [(point.x, point.y) for point in drawn.points[0].points] == [(64, 96), (192, 96), (192, 192), (64, 192)]
-    (entity,) = scene.entities
-    place = entity.cubes[0].pose.position
-    assert (entity.frame_id, place.x, place.y) == ("goob", pytest.approx(0, abs=1e-9), pytest.approx(-2))
-    assert entity.timestamp.ToMilliseconds() == t
     assert data["distance_m"] == 2.0
     assert words == {"words": "goob drives itself: Follow a tag"}
 

@@ -42,7 +42,7 @@ class Stream(ProgramRobot):
         bridge = {"enabled": True, "remote_mqtt": REMOTE}
         self.raw["services"] = {"mqtt_bridge": bridge, "video_stream": {"enabled": True, **section}}
         self.write()
-        self.process = self.run("pebble.services.video_stream")
+        self.process = self.run("pebble.services.video_stream.service:VideoStream")
 
     def pids(self) -> list[int]:
         """The process ids of the program and of what it started."""

@@ -103,7 +103,8 @@ def test_without_driving_the_robot_has_no_motors() -> None:
 
 def test_a_robot_without_a_base_imports_nothing_of_it() -> None:
     script = (
-        "import sys, pebble.launcher.programs, pebble.commands.check; from pebble.config import load; "
+        "import sys, pebble.launcher.programs, pebble.extensions.checks.commands.check; "
+        "from pebble.config import load; "
         f"load({str(ROOT / 'configs' / 'goob.json')!r}); "
         "print(sorted(name for name in sys.modules if name.startswith(('xmlrpc', 'pebble.services.ros1_bridge'))))"
     )

@@ -59,7 +59,7 @@ class Soundboard(ProgramRobot):
     def start(self) -> Self:
         """Start the service; returns once it has published what it is doing."""
         count = len(self.statuses), len(self.catalogues)
-        self.process = self.run("pebble.services.soundboard_handler")
+        self.process = self.run("pebble.services.soundboard_handler.service:SoundboardHandler")
         assert until(lambda: len(self.statuses) > count[0] and len(self.catalogues) > count[1], 20)
         return self
 

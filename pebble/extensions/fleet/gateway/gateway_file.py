@@ -1,7 +1,6 @@
 """The file of ``pebble fleet gateway``: the robots' hub, the operators' MQTT broker, and which robots to carry."""
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -52,13 +51,13 @@ class GatewayFile(Section, frozen=True, kw_only=True):
         return self.mqtt or (None if self.neighbours else Mqtt())
 
 
-def load_gateway(path: Path, env: Mapping[str, str] = os.environ) -> tuple[GatewayFile, str, Path]:
+def load_gateway(path: Path) -> tuple[GatewayFile, str, Path]:
     """Read the file; return it with the gateway's name and its run directory.
 
     Raises ConfigError with all problems.
     """
     path = path.absolute()
-    reader = Reader(path.parent, env, (*CHECKS, *RULES), file=path)
+    reader = Reader(path.parent, os.environ, (*CHECKS, *RULES), file=path)
     problem = reader.notes.problem
     gateway = reader.section(GatewayFile, plain(decode(read_text(path), path.name), reader.notes))
     operators = gateway.operators
@@ -74,7 +73,7 @@ def load_gateway(path: Path, env: Mapping[str, str] = os.environ) -> tuple[Gatew
     _check_neighbours(reader.notes, gateway)
     if reader.notes.problems:
         raise ConfigError(list(dict.fromkeys(f"{path.name}: {problem}" for problem in reader.notes.problems)))
-    return gateway, name, default_run_folder(f"gateway {path}", env)
+    return gateway, name, default_run_folder(f"gateway {path}", os.environ)
 
 
 def _check_sides(notes: Notes, gateway: GatewayFile, operators: Mqtt | None) -> None:

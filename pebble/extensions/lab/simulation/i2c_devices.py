@@ -28,18 +28,11 @@ class Mpu6050:
     ``bias_dps`` is the gyroscope's reading at rest. ``now`` returns the time in seconds of any clock.
     """
 
-    def __init__(
-        self,
-        now: Callable[[], float],
-        motion: RobotMotion | None = None,
-        *,
-        bias_dps: Vector = (1.2, -0.8, 0.45),
-        seed: int = 1,
-    ) -> None:
+    def __init__(self, now: Callable[[], float], motion: RobotMotion | None = None) -> None:
         self.tilt_deg = (0.0, 0.0)
-        self.bias_dps = bias_dps
+        self.bias_dps: Vector = (1.2, -0.8, 0.45)
         self._now, self._motion = now, motion
-        self._noise = random.Random(seed)  # noqa: S311 - repeatable
+        self._noise = random.Random(1)  # noqa: S311 - repeatable
         self._moved_at, self._speed_mm_s = now(), 0.0
         self._pointer = 0
         self._registers = bytearray(128)  # asleep, at the smallest ranges

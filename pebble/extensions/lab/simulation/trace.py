@@ -83,9 +83,9 @@ class Trace:
             self._file = None
 
 
-def read_trace(path: Path, start: int = 0) -> list[Entry]:
-    """Read the entries of a trace file from byte ``start`` on."""
-    return [msgspec.json.decode(line, type=Entry) for line in complete_lines(path, start)[0]]
+def read_trace(path: Path) -> list[Entry]:
+    """Read the entries of a trace file."""
+    return [msgspec.json.decode(line, type=Entry) for line in complete_lines(path)[0]]
 
 
 def complete_lines(path: Path, start: int = 0) -> tuple[list[bytes], int]:

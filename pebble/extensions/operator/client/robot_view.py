@@ -8,7 +8,7 @@ from typing import Any
 from pebble import contract as c
 from pebble.contract import codec
 from pebble.contract.levels import link_of, silent_after
-from pebble.contract.payloads import AutonomyStatus, Drive, EstopState, LinkLevel, LinkState, Orientation
+from pebble.contract.payloads import AutonomyStatus, Drive, EstopState, LinkLevel, LinkState
 from pebble.errors import PayloadError
 from pebble.extensions.operator.client import assumed
 from pebble.extensions.operator.client.announced import announced
@@ -113,7 +113,6 @@ class RobotView:
         self.autonomy: AutonomyStatus | None = None
         self.volts: float | None = None
         self.charging: bool | None = None
-        self.attitude: Orientation | None = None  # of the newest sample of its inertial sensor
 
     @property
     def name(self) -> str:
@@ -151,8 +150,6 @@ class RobotView:
             self.volts = payload.value
         elif channel is c.CHARGING_STATUS:
             self.charging = payload.value
-        elif channel is c.IMU:
-            self.attitude = payload.value.orientation_deg
         elif channel is c.AUTONOMY_STATUS:
             self.autonomy = payload
         else:
@@ -328,4 +325,4 @@ class RobotView:
 
 
 _FOR_STOPS = (c.ONLINE, c.CAPABILITIES, c.ESTOP_STATE)
-_DECODED = (c.ONLINE, *SYNONYMS, c.CHARGING_LEVEL, c.CHARGING_STATUS, c.IMU, c.AUTONOMY_STATUS)
+_DECODED = (c.ONLINE, *SYNONYMS, c.CHARGING_LEVEL, c.CHARGING_STATUS, c.AUTONOMY_STATUS)

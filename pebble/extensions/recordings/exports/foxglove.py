@@ -70,10 +70,10 @@ class _Export:
                 return
         else:
             converted = self._telemetry.convert(topic, payload)
-        if converted is not None:
-            self._add(message, converted)
-        if converted is None or converted.beside:
+        if converted is None:
             self._add_json(message)
+        else:
+            self._add(message, converted)
 
     def _add(self, message: Recorded, converted: Converted) -> None:
         made, topic = converted.message, f"{message.channel.topic}/{converted.ending}"

@@ -16,7 +16,7 @@ import msgspec
 from pebble import contract as c
 from pebble.contract import codec
 from pebble.contract.channels import channel_of
-from pebble.contract.payloads import Corners, LogRecord, TagData, TagLocations, VideoOverlays
+from pebble.contract.payloads import Corners, LogRecord, TagLocations, VideoOverlays
 from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.media.packets import PBAT, PBVD, Picture, PictureKind
 from pebble.extensions.recordings.stamps import CLOCK_FROM_NS, stamp_ns
@@ -35,8 +35,6 @@ _LINE_LOOP, _LINE_STRIP = 2, 3  # types of PointsAnnotation
 _YELLOW: Final = {"r": 1.0, "g": 0.85, "b": 0.0, "a": 1.0}
 _THICKNESS, _FONT_SIZE = 2.0, 14.0  # pixels
 _MILLIMETRES: Final = 1000.0
-_TAG_EDGE_M, _TAG_DEPTH_M = 0.15, 0.01  # of the box that stands for a tag, whose true size is not published
-_TAG_SHOWN_S: Final = 1  # a tag is published ten times a second
 
 
 class Converted(NamedTuple):
@@ -44,7 +42,6 @@ class Converted(NamedTuple):
 
     message: Any
     ending: str
-    beside: bool = False  # the JSON that it was made of says more, and goes out as well
 
 
 class Schemas:
@@ -158,7 +155,6 @@ class Telemetry:
             c.WHEEL_ODOMETRY: self._odometry,
             c.LOCALIZATION_POSE: self._localization,
             c.APRILTAG_LOCATIONS: self._tags,
-            c.APRILTAG_DATA: self._followed,
             c.VIDEO_OVERLAYS: self._overlays,
         }
 
@@ -217,23 +213,6 @@ class Telemetry:
             drawn.label(str(tag.marker_id), tag.center_norm)
         return Converted(drawn.annotations, "annotations")
 
-    def _followed(self, topic: str, payload: bytes) -> Converted:
-        """Convert the followed tag to a box near the robot, x ahead, y to the left; empty while it is not seen."""
-        tag: TagData = codec.decode(c.APRILTAG_DATA, payload)
-        scene = self._make("SceneUpdate")
-        if tag.detected and tag.distance_m is not None and tag.angle_rad is not None:
-            x, y = tag.distance_m * math.cos(tag.angle_rad), -tag.distance_m * math.sin(tag.angle_rad)
-            entity = scene.entities.add(frame_id=_id(topic), id="tag")
-            entity.lifetime.FromSeconds(_TAG_SHOWN_S)
-            box = entity.cubes.add(color=_YELLOW, size={"x": _TAG_DEPTH_M, "y": _TAG_EDGE_M, "z": _TAG_EDGE_M})
-            box.pose.position.x, box.pose.position.y, box.pose.orientation.w = x, y, 1.0
-            label = entity.texts.add(text=str(tag.marker_id), color=_YELLOW, font_size=_TAG_EDGE_M, billboard=True)
-            label.pose.position.x, label.pose.position.y, label.pose.position.z = x, y, _TAG_EDGE_M
-            label.pose.orientation.w = 1.0
-        else:
-            scene.deletions.add(id="tag")
-        return Converted(scene, "scene", beside=True)
-
     def _overlays(self, _topic: str, payload: bytes) -> Converted:
         overlays: VideoOverlays = codec.decode(c.VIDEO_OVERLAYS, payload)
         drawn = _Drawing(self._make("ImageAnnotations"), overlays.frame_width, overlays.frame_height)
@@ -266,13 +245,8 @@ def is_h264(payload: bytes) -> bool:
 
 
 def stamped(message: Any, ns: int) -> bytes:
-    """Return the message with this time, as bytes.
-
-    A scene has no time itself; its parts have it.
-    """
-    parts = [message] if "timestamp" in message.DESCRIPTOR.fields_by_name else [*message.entities, *message.deletions]
-    for part in parts:
-        part.timestamp.FromNanoseconds(ns)
+    """Return the message with this time, as bytes."""
+    message.timestamp.FromNanoseconds(ns)
     return bytes(message.SerializeToString())
 
 

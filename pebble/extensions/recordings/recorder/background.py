@@ -1,14 +1,15 @@
 """The recorder's threads beside the writer: they make files durable, and finish them."""
 
+import ctypes
 import logging
 import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Final
 
 from pebble.extensions.recordings.recorder.lane import OpenFile
-from pebble.extensions.recordings.recorder.memory import return_free_pages
 from pebble.runtime.whole_file import sync_file
 
 log = logging.getLogger(__name__)
@@ -68,3 +69,13 @@ def _logged(job: Callable[[], None]) -> None:
         job()
     except Exception:  # one file must not keep the others from being finished
         log.exception("a recording could not be finished")
+
+
+def return_free_pages() -> None:
+    """Return unused pages of the heap to the system, with glibc.
+
+    Glibc keeps them unless they are at the heap's end, so that a process which passes on messages of many sizes takes
+    several megabytes more than it needs (measured: 7 of a recorder's 31 MB, once its files were rotated).
+    """
+    with suppress(AttributeError):  # musl
+        ctypes.CDLL(None).malloc_trim(0)

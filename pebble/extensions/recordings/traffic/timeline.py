@@ -62,12 +62,7 @@ class Timeline(Struct, rename={"from_ms": "from"}):
 
 
 def timeline(
-    paths: list[Path],
-    scratch: Path,
-    robot: str,
-    since_ns: int,
-    until_ns: int,
-    progress: Progress = lambda _what, _share: None,
+    paths: list[Path], scratch: Path, robot: str, since_ns: int, until_ns: int, progress: Progress
 ) -> Timeline:
     """Return a robot's day from the recordings ``paths``; missing indexes are made. Raises RecordingError."""
     found = sources(paths, scratch, progress)

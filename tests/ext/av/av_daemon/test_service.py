@@ -33,7 +33,7 @@ class Robot(ProgramRobot):
     def __init__(self, kind: str, port: int, section: dict[str, Any]) -> None:
         super().__init__(kind, port, {"av_daemon": {"enabled": True, "restart_delay_seconds": 0.1, **section}})
         self.run_dir = self.config.run_dir()
-        self.daemon = self.run("pebble.services.av_daemon")
+        self.daemon = self.run("pebble.services.av_daemon.service:AvDaemon")
 
     @property
     def status(self) -> dict[str, Any]:

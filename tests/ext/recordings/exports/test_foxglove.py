@@ -17,12 +17,11 @@ from mcap.reader import make_reader
 from mcap.records import Channel as McapChannel
 from mcap.records import Schema
 
-from pebble.contract import APRILTAG_DATA, APRILTAG_LOCATIONS, LOGS, VIDEO_OVERLAYS, WHEEL_ODOMETRY, codec
+from pebble.contract import APRILTAG_LOCATIONS, LOGS, VIDEO_OVERLAYS, WHEEL_ODOMETRY, codec
 from pebble.contract.channels import Channel as ContractChannel
 from pebble.contract.payloads import (
     LogRecord,
     OverlayLabel,
-    TagData,
     TagDetection,
     TagLocations,
     VideoOverlays,
@@ -200,26 +199,6 @@ def test_tags_and_overlays_are_drawn_in_pixels(tmp_path: Path) -> None:
     for one in (drawn, over):
         (text,) = one.texts
         assert (text.text, text.position.x, text.position.y) == ("7", 128, 144)
-
-
-def test_the_tag_that_is_followed_is_a_scene_beside_its_json(tmp_path: Path) -> None:
-    stamp = T0_MS / 1e3
-    seen = TagData(detected=True, timestamp=stamp, marker_id=7, distance_m=2.0, angle_rad=math.pi / 6)
-    file, counts = converted(
-        tmp_path, [of(APRILTAG_DATA, seen), of(APRILTAG_DATA, TagData(detected=False, timestamp=stamp))]
-    )
-    assert counts == {"SceneUpdate": 2, "json": 2}
-    shown, gone = file.of("/apriltag-data/scene")
-    (entity,), (deletion,) = shown.entities, gone.deletions
-    place = entity.cubes[0].pose.position
-    assert (entity.frame_id, place.x, place.y) == (
-        "goob",
-        pytest.approx(math.sqrt(3)),
-        pytest.approx(-1),
-    )  # to the right
-    assert (entity.texts[0].text, entity.id, deletion.id) == ("7", "tag", "tag")
-    assert {entity.timestamp.ToNanoseconds(), deletion.timestamp.ToNanoseconds()} == {T0_NS}
-    assert [one["detected"] for one in file.of("/apriltag-data")] == [True, False]
 
 
 @pytest.mark.parametrize(

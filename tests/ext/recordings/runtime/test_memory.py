@@ -14,7 +14,7 @@ from tests.support import ROOT
 _TEST = """
 import os
 from tests.own_memory import own_mb
-from pebble.extensions.recordings.recorder.memory import return_free_pages
+from pebble.extensions.recordings.recorder.background import return_free_pages
 
 blocks = [bytes(2000) for _ in range(20_000)]
 last = blocks.pop()

@@ -59,7 +59,7 @@ class ManagerRig(ProgramRobot):
             with self.log.open("a") as log:
                 self.process = Child([sys.executable, "-m", *command, str(self.path)], cwd=ROOT, stderr=log)
         else:
-            self.process = Program("pebble.services.autonomy_manager", str(self.path))
+            self.process = Program("pebble.services.autonomy_manager.service:AutonomyManager", str(self.path))
         assert until(lambda: len(self.world.on("autonomy-files")) > before and self.listed(), 20), self.logged()
 
     def end(self, number: signal.Signals = signal.SIGTERM) -> None:

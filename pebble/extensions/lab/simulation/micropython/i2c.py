@@ -21,22 +21,22 @@ class Bus:
 
     def __init__(self) -> None:
         self._devices: dict[int, Device] = {}
-        self._failing: dict[int, int] = {}
+        self._failing: set[int] = set()
 
     def attach(self, address: int, device: Device) -> None:
         self._devices[address] = device
 
-    def fail(self, address: int, code: int = errno.EIO) -> None:
-        """Make every later transfer with ``address`` raise OSError ``code`` (EIO, ETIMEDOUT, …)."""
-        self._failing[address] = code
+    def fail(self, address: int) -> None:
+        """Make every later transfer with ``address`` raise OSError (EIO)."""
+        self._failing.add(address)
 
     def restore(self, address: int) -> None:
-        self._failing.pop(address, None)
+        self._failing.discard(address)
 
     def device(self, address: int) -> Device:
         """Return the device at ``address``. Raises OSError: ENODEV if there is none."""
         if address in self._failing:
-            raise failure(self._failing[address])
+            raise failure(errno.EIO)
         if address not in self._devices:
             raise failure(errno.ENODEV)
         return self._devices[address]

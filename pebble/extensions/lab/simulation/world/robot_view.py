@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import msgspec
 
@@ -23,10 +23,9 @@ class RobotView:
     Raises DeviceError for a file or robot that is wrong, NotRunningError while the world does not run.
     """
 
-    def __init__(self, device: str, width: int, height: int, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(self, device: str, width: int, height: int) -> None:
         self._path, self._robot = split_device(device)
         world = open_world(self._path, self._robot)
-        self._clock_ns = clock_ns
         self._latency_ns = round(world.camera.latency_ms * 1e6)
         self._renderer = Renderer(world, self._robot, width, height)
         self._tracks: Mapping[str, Track] = {}
@@ -40,7 +39,7 @@ class RobotView:
         """Choose the moment of the next picture; return it, monotonic ns. Raises NotRunningError."""
         self._tracks = self._page.tracks()
         track = self._tracks.get(self._robot)
-        if track is None or self._clock_ns() - track.newest.ns > STALE_S * 1e9:
+        if track is None or time.monotonic_ns() - track.newest.ns > STALE_S * 1e9:
             raise self._not_running()
         self._at_ns = track.newest.ns - self._latency_ns
         return self._at_ns

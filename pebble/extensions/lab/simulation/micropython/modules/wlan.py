@@ -18,11 +18,9 @@ class Radio:
     ``rejoins``: the driver rejoins by itself, as both ports do by default.
     """
 
-    def __init__(
-        self, now: Callable[[], float], platform: Platform, *, join_s: float = JOIN_S, rejoins: bool = True
-    ) -> None:
+    def __init__(self, now: Callable[[], float], platform: Platform) -> None:
         self.platform: Platform = platform
-        self.join_s, self.rejoins = join_s, rejoins
+        self.join_s, self.rejoins = JOIN_S, True
         self._now = now
         self._active = self._wanted = False
         self._in_range = True

@@ -52,7 +52,7 @@ def check(
         pebble check --keys | grep recorder
     """
     if keys:
-        from pebble.config.keys import keys_text  # few checks need it
+        from pebble.extensions.checks.keys import keys_text  # few checks need it
 
         typer.echo(keys_text(), nl=False)
         return 0
