@@ -86,9 +86,9 @@ class Stage(IntEnum):
 class Program(Struct, frozen=True):
     """A process: its name in logs and status, and what it runs with ``arguments``.
 
-    That is a service (``module:Class``), or a module, as ``python -m`` does. The launcher imports the module, or
-    ``entry``, before it forks: importing must do nothing. What that module imports later, because only some robots need
-    it, is in the memory of those robots only.
+    That is a service (``module:Class``), or a module, as ``python -m`` does. The launcher imports the module before
+    it forks: importing must do nothing. What that module imports later, because only some robots need it, is in the
+    memory of those robots only.
     """
 
     name: str
@@ -101,7 +101,6 @@ class Program(Struct, frozen=True):
     on_demand: bool = False  # runs only while it is requested
     plain: bool = False  # it reports nothing to the launcher, so it is ready once it runs
     preloaded: bool = True  # False: its imports are needed by few, and would cost every process their memory
-    entry: str = ""  # what the package that is run begins with; "": the module is no package
     shares: tuple[str, ...] = ()  # modules that several programs use, imported before the first fork
     has_sockets: bool = False  # opens sockets in the run directory, whose path must then be short
     stop_timeout_s: float = 10.0  # after this an on-demand program that was released is killed

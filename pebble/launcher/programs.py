@@ -40,7 +40,7 @@ def shared_modules(config: Config, table: Iterable[Program]) -> list[str]:
     """Return the modules to import before the first fork: modules of the programs, and shared ones."""
     programs = list(table)
     shared = dict.fromkeys(module for program in programs for module in program.shares)
-    entries = (program.entry or program.module.partition(":")[0] for program in programs if program.preloaded)
+    entries = (program.module.partition(":")[0] for program in programs if program.preloaded)
     return [*_transport_modules(config), *shared, *entries]
 
 

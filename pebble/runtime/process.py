@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import signal
 import sys
-from collections.abc import Callable
 
 from msgspec.structs import replace
 
@@ -26,16 +25,8 @@ _STOP_DEADLINE_S = 3.0
 log = logging.getLogger(__name__)
 
 
-def run(
-    service_class: type[Service],
-    arguments: list[str] | None = None,
-    *,
-    choose: Callable[[Config], type[Service]] | None = None,
-) -> int:
-    """Run a service as this process, with the arguments ``CONFIG [INSTANCE]``; return the exit code.
-
-    ``choose`` returns the class for a config; ``service_class`` is then the base of all.
-    """
+def run(service_class: type[Service], arguments: list[str] | None = None) -> int:
+    """Run a service as this process, with the arguments ``CONFIG [INSTANCE]``; return the exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if not 1 <= len(arguments) <= 2:
         sys.stderr.write(f"{service_class.name} needs the arguments CONFIG [INSTANCE]\n")
@@ -47,7 +38,7 @@ def run(
         withhold(config.password_variables)
         set_log_level(config.log_level)
         view = view_of(config, instance)
-        return _serve(service_class if choose is None else choose(view), view, instance)
+        return _serve(service_class, view, instance)
     except PebbleError as error:
         for line in str(error).splitlines():
             log.error("%s", line)

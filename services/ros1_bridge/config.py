@@ -21,7 +21,6 @@ from pebble.extension import Facts, Program, Stage
 
 NONE = "none"
 _PATH: Path = ("services", "ros1_bridge")
-_MODULE = "pebble.services.ros1_bridge"
 
 RosName = Annotated[
     str, Meta(pattern=r"^/?[A-Za-z]\w*(/[A-Za-z]\w*)*$(?!\n)", extra={"expected": "a name of ROS such as /cmd_vel"})
@@ -266,8 +265,8 @@ def programs(config: Config) -> list[Program]:
     section = config.section(Ros1)
     if not section.enabled:
         return []
-    name = "ros1_bridge" if section.drives else "ros1_reader"
-    return [Program(name, _MODULE, stage=Stage.DEVICE, entry=f"{_MODULE}.service")]
+    name, service = ("ros1_bridge", "Ros1Bridge") if section.drives else ("ros1_reader", "Ros1Reader")
+    return [Program(name, f"pebble.services.ros1_bridge.service:{service}", stage=Stage.DEVICE)]
 
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:

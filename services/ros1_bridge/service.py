@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any, ClassVar
 
-from pebble.config import Config
 from pebble.contract import Channel
 from pebble.contract.payloads import Drive
 from pebble.errors import DeviceError
@@ -19,11 +18,6 @@ from pebble.services.ros1_bridge.node import Node
 from pebble.services.ros1_bridge.telemetry import PUBLISHES, Telemetry
 
 _CHECK_S = 0.5
-
-
-def service_of(config: Config) -> type[Service]:
-    """Return the class of the service: if driving is not enabled, one that only reads."""
-    return Ros1Bridge if config.section(Ros1).drive.enabled else Ros1Reader
 
 
 class Ros1Reader(Service):
