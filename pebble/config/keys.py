@@ -18,7 +18,7 @@ def keys_text() -> str:
 
 
 def _chapters(kind: type[Section], path: str, places: dict[type[Section], str]) -> Iterator[str]:
-    """Yield one table per section, depth first; a section class used in several places is described at the first."""
+    """Yield one table per section, depth first. A class that several sections share has one table, at the first."""
     places[kind] = path
     to_describe: list[tuple[type[Section], str]] = []
     rows = []
@@ -43,7 +43,7 @@ def _chapters(kind: type[Section], path: str, places: dict[type[Section], str]) 
 
 
 def _suffix_of(field: FieldInfo) -> str:
-    """Return the text that marks a field of several sections: by name, or in a list."""
+    """Return the text that follows a key with several sections: ``.<name>`` for a table, ``[]`` for a list, or ""."""
     return {dict: ".<name>", tuple: "[]"}.get(get_origin(unwrap(field.type)[0]), "")
 
 

@@ -57,7 +57,7 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
 
 
 def _transport(reader: Reader, transport: TransportSection, path: Path) -> TransportSection:
-    """Check the encryption of a Zenoh robot that other machines reach: certificates decide who may connect."""
+    """Check that a Zenoh robot which other machines reach is encrypted: certificates decide who may connect."""
     encrypted = next((endpoint for endpoint in transport.listen if endpoint.startswith(_TLS)), None)
     if transport.allowed_names is not None and not any(
         endpoint.startswith(_TLS) for endpoint in (*transport.listen, *transport.connect)
@@ -104,9 +104,10 @@ def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
 
 
 def _without_uplink(notes: Notes, root: Root) -> Root:
-    """Let a bridge without a remote host, as in the original's examples, use the robot's own broker.
+    """Return ``root`` with the robot's own broker as the bridge's remote broker, if no remote host is set.
 
-    Operators connect to that broker. A Zenoh robot has none, and runs without a bridge.
+    The original's examples have none: operators connect to the robot's broker. A Zenoh robot has no broker, and runs
+    without a bridge.
     """
     bridge, transport = root.services.mqtt_bridge, root.transport
     if not bridge.enabled or bridge.remote_mqtt.host or (bridge.remote is not None and bridge.remote.kind != "mqtt"):
