@@ -1,4 +1,4 @@
-"""Files that others may have made: who may put another one, or a link, in the place of a path; and reading them."""
+"""Decides which users can replace a file or folder, and reads only what they cannot replace."""
 
 import errno
 import os
@@ -21,11 +21,12 @@ class Owner(NamedTuple):
 
 
 def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Owner:
-    """Return the one user besides root who may change what lies in ``folder``, or root; it need not be there yet.
+    """Return the only user besides root who can change the content of ``folder``, or root if none can.
 
-    It may be a file as well. ``nameless``: users without an entry count, too; in a container they are those of the
-    machine around it. Raises PebbleError where several users may, for a link on the way that a user besides root can
-    change, and for what should be ``there`` and is not: its owner may have removed it since it was read.
+    ``folder`` may be a file, and need not exist yet. ``nameless``: users without an entry count, too; in a container
+    they are those of the machine around it. Raises PebbleError if several users can, or if the path has a link that a
+    user besides root can change. With ``there`` it also raises if ``folder`` does not exist: its owner may have removed
+    it since it was read.
     """
     place, owner = Path("/"), Owner(0, 0)
     system = place.lstat().st_uid  # in a user namespace root's files may seem to be of another user
@@ -55,7 +56,7 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
 
 
 def others_in(folder: Path) -> str:
-    """Return why another user than this one and root may change what lies in ``folder``; empty: none may."""
+    """Return why a user other than this one and root may change the content of ``folder``; empty if none may."""
     try:
         uid = owner_of(folder).uid
     except PebbleError as error:
@@ -64,7 +65,7 @@ def others_in(folder: Path) -> str:
 
 
 def _has_name(uid: int) -> bool:
-    """True if the user has an entry, or is one whom such a user may be in a container."""
+    """True if the user has an entry in the user database, or is a user of a container by /etc/subuid."""
     import pwd  # which Windows lacks
 
     with suppress(KeyError):
@@ -76,13 +77,13 @@ def _has_name(uid: int) -> bool:
 
 
 def _is_shared(found: os.stat_result) -> bool:
-    """True if others than the owner can replace what is in a folder; in a sticky folder they cannot."""
+    """True if users other than the owner can replace files in the folder. In a sticky folder they cannot."""
     writers = stat.S_IWOTH | (stat.S_IWGRP if found.st_gid else 0)
     return bool(found.st_mode & writers) and stat.S_ISDIR(found.st_mode) and not found.st_mode & stat.S_ISVTX
 
 
 def is_open(folder: Path) -> bool:
-    """True if every user may make files in the folder, as in /tmp, though not remove those of others."""
+    """True if every user may make files in the folder, but not remove those of others, as in /tmp."""
     try:
         found = folder.stat()
     except OSError:
@@ -91,7 +92,7 @@ def is_open(folder: Path) -> bool:
 
 
 def open_plain(file: Path) -> BinaryIO:
-    """Open a file to read it; a FIFO or a device might never end. Raises OSError."""
+    """Open a plain file to read it. Raises OSError, also for a FIFO or a device, which might never end."""
     opened = open(file, "rb", opener=lambda path, flags: os.open(path, flags | getattr(os, "O_NONBLOCK", 0)))  # noqa: SIM115
     if stat.S_ISREG(os.fstat(opened.fileno()).st_mode):
         return opened
@@ -100,7 +101,7 @@ def open_plain(file: Path) -> BinaryIO:
 
 
 def read_plain(file: Path, most: int = 1 << 28) -> bytes:
-    """Return the content of a plain file. Raises OSError, also for more than ``most`` bytes: holes cost nothing."""
+    """Return the content of a plain file. Raises OSError, also if it is larger than ``most`` bytes."""
     with open_plain(file) as opened:
         if os.fstat(opened.fileno()).st_size > most:
             raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(file))
@@ -120,7 +121,7 @@ def read_for(place: Path, file: Path) -> bytes:
 
 @contextmanager
 def as_user(owner: Owner) -> Iterator[None]:
-    """Take the rights of a user, and only these, for a while; of a process with one thread, which root has started."""
+    """Take the rights of a user, and only these, in the ``with`` block. For a process of root with one thread."""
     before, groups = Owner(os.geteuid(), os.getegid()), os.getgroups()
     _take(*_rights_of(owner))
     try:
@@ -137,7 +138,7 @@ def _take(owner: Owner, groups: list[int]) -> None:
 
 
 def _rights_of(owner: Owner) -> tuple[Owner, list[int]]:
-    """Return the user with the folder's group, if it is one of the user's: a folder has it from the one above, too."""
+    """Return the user with the folder's group, if the user is in that group, and the user's groups."""
     import pwd  # which Windows lacks
 
     with suppress(KeyError):  # a user without an entry has no groups

@@ -30,7 +30,7 @@ def run(
 ) -> int:
     """Run a service as this process, with the arguments ``CONFIG [INSTANCE]``; return the exit code.
 
-    ``choose`` returns the class for a config; ``service_class`` is then the base of all.
+    ``choose`` returns the class to run for a config; ``service_class`` is then their common base class.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if not 1 <= len(arguments) <= 2:
@@ -77,7 +77,7 @@ def _serve(service_class: type[Service], config: Config, instance: str) -> int:
 
 
 def view_of(config: Config, instance: str) -> Config:
-    """Return the config of a serial line: its entry replaces the section of all lines."""
+    """Return the config as the process of a serial line sees it: its entry replaces the section of all lines."""
     if not instance:
         return config
     instances = config.serial_instances()
@@ -87,9 +87,9 @@ def view_of(config: Config, instance: str) -> Config:
 
 
 def exit_at_the_latest() -> None:
-    """End the process after 3 s even if stopping hangs; hardware that moves has its own deadline besides.
+    """End the process after 3 s even if stopping hangs. Hardware that moves also has its own deadline.
 
-    The kernel does it, because this is called in signal handlers, where starting a thread may wait for ever.
+    The kernel ends it: this is called in signal handlers, where starting a thread may wait for ever.
     """
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.setitimer(signal.ITIMER_REAL, _STOP_DEADLINE_S)

@@ -1,4 +1,7 @@
-"""A check of a source that sends punctually: it must not repeat itself, nor come at a wrong rate. Pure."""
+"""Checks a source that should send punctually: its contents must not repeat themselves, nor come at a wrong rate.
+
+Pure.
+"""
 
 from collections import deque
 from collections.abc import Hashable
@@ -11,10 +14,13 @@ _TOLERANCE = 0.2  # of the rate that was asked
 
 
 class SourceCheck:
-    """The record of the newest contents of a source, and of its rate. One thread writes, any reads."""
+    """A record of a source's newest contents and of its rate. One thread writes, any thread reads."""
 
     def __init__(self, asked_hz: float = 0.0, *, remembered: int = 1) -> None:
-        """Make a record. ``asked_hz``: 0 if every rate is right; ``remembered``: recent contents that are not new."""
+        """Make a record.
+
+        ``asked_hz``: the right rate, 0 for any; ``remembered``: how many recent contents are compared.
+        """
         self.content: Hashable = None  # the newest
         self.same_s = 0.0  # for so long no new content has come
         self.changes = 0  # so often a new content has come
@@ -31,12 +37,12 @@ class SourceCheck:
         return self.same_s >= REPEATS_S
 
     def clear(self) -> None:
-        """Forget all: the source was opened again."""
+        """Forget the source's history, because it was opened again."""
         self.same_s, self.changes, self.wrong_hz, self._window = 0.0, 0, None, None
         self._recent.clear()
 
     def take(self, content: Hashable, now: float, *, counts: bool = True) -> None:
-        """Note a content. ``counts`` is False while contents may repeat themselves, as those of a sensor at rest."""
+        """Note a content. ``counts``: False while contents may repeat themselves, as those of a sensor at rest do."""
         if content not in self._recent:
             self.changes += bool(self._recent)
             self._recent.append(content)
@@ -47,7 +53,7 @@ class SourceCheck:
         self.content, self._at = content, now
 
     def count(self, times: int, now: float) -> None:
-        """Note the number of contents since the last call."""
+        """Add ``times`` contents that have come since the last call."""
         if self._window is None:
             self._window, self._count = now + _SETTLE_S, -1
         if now < self._window:
