@@ -24,7 +24,7 @@ _FORMANT_WIDTH_HZ = 90.0
 
 
 class Speech:
-    """Samples of any rate in Hz, and the same on every channel. The same number gives the same sample, everywhere."""
+    """A source of samples of any rate in Hz, equal on all channels. A number gives the same sample everywhere."""
 
     def __init__(self, rate: int, channels: int = 1) -> None:
         self.rate, self.channels = rate, channels
@@ -59,7 +59,7 @@ def _period(rate: int) -> NDArray[np.int16]:
 
 
 def _voice(count: int, rate: int, formants: tuple[int, ...], pitch_hz: float, glide: float) -> NDArray[np.float32]:
-    """Return a vowel that swells and fades; its pitch rises by ``glide`` × itself until its end."""
+    """Return a vowel that swells and fades, while its pitch rises by the factor 1 + ``glide``."""
     time = np.arange(count) / rate
     length = count / rate
     phase = 2 * np.pi * pitch_hz * (time + glide * time**2 / (2 * length))
@@ -72,6 +72,6 @@ def _voice(count: int, rate: int, formants: tuple[int, ...], pitch_hz: float, gl
 
 
 def _loudness(frequency: float, formants: tuple[int, ...]) -> float:
-    """Return how strongly the mouth passes a frequency on: resonances above a slope of 6 dB per octave."""
+    """Return how well the mouth transmits a frequency: resonances above a slope of 6 dB per octave."""
     resonance = sum(1 / (1 + ((frequency - formant) / _FORMANT_WIDTH_HZ) ** 2) for formant in formants)
     return float((0.05 + resonance) * 100 / frequency)

@@ -1,4 +1,4 @@
-"""The segments of shared memory that frames are in: what this process has mapped, and whether another one has room."""
+"""The segments of shared memory that hold frames: those mapped by this process, and the room for another."""
 
 import os
 from pathlib import Path
