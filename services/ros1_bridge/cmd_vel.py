@@ -1,6 +1,7 @@
-"""The commands to the base: the newest one repeatedly while it is valid, then zeros.
+"""Sends commands to the base: the newest one repeatedly while it is valid, then zeros.
 
-While it is stopped: zeros and a lock. It has a deadline and a thread of its own: a service that hangs moves nothing.
+While the robot is stopped it sends zeros and a lock. It has a deadline and a thread of its own, so that the base stops
+when the service hangs.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ class CmdVel:
 
     @property
     def bases(self) -> set[str]:
-        """The names of the nodes that listen."""
+        """Names of the nodes that receive the commands."""
         return self._out.names
 
     @property
@@ -91,7 +92,7 @@ class CmdVel:
 
     @property
     def hangs(self) -> bool:
-        """True if the base has sent odometry, and does not any more."""
+        """True if the base has sent odometry, but no longer does."""
         return self._heard_at is not None and time.monotonic() - self._heard_at > SILENT_S
 
     def hear(self) -> None:
@@ -122,7 +123,10 @@ class CmdVel:
             self._changed.notify()
 
     def latch(self, latched: bool) -> None:
-        """Hold the base: the running command is over, others of ROS are locked out and their goals are cancelled."""
+        """Lock or unlock the base.
+
+        A lock ends the running command, keeps other ROS programs from driving, and cancels their goals.
+        """
         with self._changed:
             if latched is self._latched:
                 return
@@ -154,7 +158,7 @@ class CmdVel:
             self._save(owed)
 
     def _first_lock(self) -> bytes | None:
-        """Return what a new subscriber of the lock gets; called on the thread of sockets."""
+        """Return the first message for a new subscriber of the lock, if any; called on the thread of sockets."""
         if not self._opens:
             return None
         if not self._latched:
@@ -187,7 +191,7 @@ class CmdVel:
                         self._send_lock()
 
     def _wait_s(self, now: float) -> float | None:
-        """Return how long nothing is to be sent; None: until something changes."""
+        """Return the seconds until the next message is to be sent; None: until something changes."""
         if now < self._until:
             return min(self._period_s, self._until - now)
         if self._zeros > 0 or self._body != ZERO:
