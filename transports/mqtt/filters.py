@@ -1,8 +1,8 @@
-"""The filters of one MQTT connection: those subscribed to at the broker (T11), and the one for own messages (T7). Pure.
+"""The filters of one MQTT connection: those subscribed to at the broker (T11), and the filter for own messages (T7).
 
-A broker may send a message once per matching filter. Measured on mosquitto 2.0.11: MQTT 5 always does, 3.1.1 never, and
-bridge mode does for retained messages only. Overlapping filters are therefore merged into one that covers them;
-messages that it matches in excess are sorted out by exact matching on arrival.
+Pure. A broker may send a message once per matching filter. Measured on mosquitto 2.0.11: MQTT 5 always does, 3.1.1
+never, and bridge mode does for retained messages only. Overlapping filters are therefore merged into one that covers
+them; the messages that it matches in excess are sorted out by exact matching on arrival.
 """
 
 import threading
@@ -47,7 +47,7 @@ def cover(first: str, second: str) -> str:
 
 
 class BrokerFilters:
-    """The filters a client has subscribed to at its broker; no two of them overlap."""
+    """The filters that a client has subscribed to at its broker; no two of them overlap."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()  # to be held: it guards the filters, and their connection
@@ -92,7 +92,8 @@ class BrokerFilters:
 class OwnMessageFilter:
     """A filter that recognises own retained messages that come back, and retained messages that come twice.
 
-    For as-published connections, where retained and live messages look alike (T7): check those with ``retain`` set.
+    It is for as-published connections, where retained and live messages look alike (T7). Check messages with
+    ``retain``.
     """
 
     def __init__(self) -> None:
@@ -102,7 +103,7 @@ class OwnMessageFilter:
         self._repeats: set[str] = set()  # topics whose retained message will come a second time
 
     def begin(self) -> None:
-        """Start a new connection: every retained message is new again, except our own."""
+        """Start a new connection, on which every retained message is new, except our own."""
         self._seen.clear()
         self._repeats.clear()
 
@@ -116,7 +117,7 @@ class OwnMessageFilter:
         self._repeats.update(topic for topic in seen if overlap(topic, filter_))
 
     def is_echo(self, message: Message) -> bool:
-        """True if this is our own retained message, sent back to us; else forgets ours, which is outdated."""
+        """True if this is our own retained message, sent back to us; else forget ours, which is outdated."""
         if message.topic not in self._own:
             return False
         if self._own.get(message.topic) == _digest(message):
@@ -125,7 +126,7 @@ class OwnMessageFilter:
         return False
 
     def is_repeat(self, message: Message) -> bool:
-        """True, once, if the broker sends a retained message again due to `subscribe_again`; remembers each message."""
+        """True, once, if the broker repeats a retained message because of `subscribe_again`. Remembers each message."""
         seen, digest = self._seen.get(message.topic), _digest(message)
         self._seen[message.topic] = digest
         if seen != digest or message.topic not in self._repeats:

@@ -1,4 +1,4 @@
-"""Packets from a broker on one MQTT connection: read in batches, and made into messages that have an age."""
+"""Reads packets from a broker on one MQTT connection, in batches, and makes messages with an age of them."""
 
 import logging
 from typing import Protocol
@@ -27,16 +27,16 @@ _LACKS = {reasons.NO_RETAIN: Result.RETAIN_REFUSED, reasons.NO_QOS: Result.QOS_R
 
 
 class Sink(Protocol):
-    """The owner of a connection, called on the network thread with its lock held: it must neither wait nor publish."""
+    """The receiver of packets, called on the network thread with the connection's lock: it must not wait or publish."""
 
     policy: TopicPolicy
 
     def note_refusal(self, topic: str, why: str) -> None:
-        """Note that the broker does not take a message of this topic (MQTT 5)."""
+        """Note that the broker does not accept messages of this topic (MQTT 5)."""
 
 
 class Incoming:
-    """The listener of a connection's client, under the connection's lock. ``where``: the broker's address in words."""
+    """The listener of a connection's client; under the connection's lock. ``where``: the broker's address in words."""
 
     def __init__(
         self,
@@ -99,7 +99,7 @@ class Incoming:
             age.waiting.empty(age.received_at)
 
     def _read_piece(self, client: Client, now: float, most: int) -> int:
-        """Read up to ``most`` packets, from the bytes left over or else from the socket; return their bytes.
+        """Read up to ``most`` packets from the bytes left over, or else from the socket; return how many bytes.
 
         Afterwards `more` is True if there may be more packets. Raises Lost.
         """
@@ -119,7 +119,7 @@ class Incoming:
         return unread - left
 
     def _receive(self, client: Client, now: float) -> int:
-        """Take a piece out of the socket and return its number of bytes; note how many bytes there were."""
+        """Take a piece out of the socket, and note its size for the messages' ages; return its number of bytes."""
         age, waiting = self.age, self.age.waiting
         age.received_at = now
         if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:
@@ -135,7 +135,7 @@ class Incoming:
 
     @property
     def lost(self) -> Lost:
-        """The error of a connection that the other side has closed, with the reason."""
+        """Error for a connection that the other side has closed, with the reason."""
         why, id_ = self.reason or f"{self.where} closed the connection", self._settings.client_id
         if id_ is not None and self.accepted is not None and self._taken_over:
             why += f' (does another client use the client id "{id_}"? a broker lets in only the newest)'
@@ -200,7 +200,7 @@ class Incoming:
             self.age.delay.acknowledged(sent_at, now)
 
     def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
-        """Make a message of a publication. Hot."""
+        """Make a message of a PUBLISH packet, with its age, and keep it for delivery. Hot."""
         age, retain = self.age, bool(first & RETAIN)
         if retain:
             age.has_retained = True

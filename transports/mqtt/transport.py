@@ -36,7 +36,7 @@ _IDLE_S = 60.0  # the connection wakes up earlier, for its pings
 
 
 class _Run:
-    """One run of the network thread, and requests of other threads to it."""
+    """One run of the network thread, with the requests of other threads to it."""
 
     def __init__(self, target: Callable[[_Run], None], name: str) -> None:
         self.stopping = threading.Event()
@@ -72,7 +72,7 @@ class MqttTransport(Transport):
 
     @property
     def not_taken(self) -> Mapping[str, tuple[str, float]]:
-        """Topics on which the broker takes no messages: why, and when that was last in the log."""
+        """Topics that the broker does not accept: why, and when that was last logged."""
         return self._refused.not_taken
 
     @property
@@ -112,7 +112,7 @@ class MqttTransport(Transport):
         self._network.thread.start()
 
     def _close(self, will: Message | None) -> None:
-        """End the network thread, without waiting if it is connecting: then it ends by itself, within HANDSHAKE_S."""
+        """End the network thread. If it is connecting, do not wait: it ends by itself within HANDSHAKE_S."""
         run = self._network
         if run is None:
             return
@@ -225,7 +225,7 @@ class MqttTransport(Transport):
             stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
 
     def _run_connection(self, run: _Run) -> None:
-        """Run one connection from its start to its end; raises Lost unless it ends by `close`."""
+        """Run one connection from its start to its end. Raises Lost unless `close` has ended it."""
         self._dialler.begin()
         connection = self._dialler.connect(self, self.counters, run.stopping)
         run.renewal = ""
@@ -266,7 +266,7 @@ class MqttTransport(Transport):
             raise
 
     def _note_loss(self, connection: Connection, lost: Lost) -> None:
-        """Note which messages the broker may have closed the connection for."""
+        """Note the messages for which the broker may have closed the connection."""
         written = None if isinstance(lost, Silent) else connection.written_before_loss()
         with self._publishing:
             self._refused.note_loss(connection.where, written, time.monotonic())
@@ -285,7 +285,7 @@ class MqttTransport(Transport):
         self._dialler.reported = limits
 
     def _synchronize(self, connection: Connection, stopping: threading.Event) -> None:
-        """Query which of our retained messages the broker has, subscribe, and send those that it lacks."""
+        """Ask which of our retained messages the broker has, subscribe, and send those that it lacks."""
         self._renew()
         self._own_message_filter.begin()
         if self._dialler.stalled:
@@ -307,7 +307,7 @@ class MqttTransport(Transport):
         self._dialler.stalled = False
 
     def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
-        """Return own topics that need not be sent again: the broker has our newest message, or others publish there.
+        """Return the own topics that need not be sent again: the broker has our newest value, or one by others.
 
         Also sets ``went_back``. The messages have arrived when a ping is answered, because they have QoS 0.
         """
@@ -343,7 +343,7 @@ class MqttTransport(Transport):
         return retained
 
     def _accepts(self, connection: Connection, message: Message) -> bool:
-        """True if the broker takes this retained message, as far as is known."""
+        """True if the broker accepts this retained message, as far as is known."""
         return connection.takes(message) and self._refused.accepts(message)
 
     def _await(

@@ -21,7 +21,10 @@ _LOST_SESSIONS_LIMIT = 1000  # sessions whose return would be noticed
 
 
 class HubView(msgspec.Struct, frozen=True):
-    """The hubs that are there. ``version`` changes with every event, ``connection`` only when a hub appears."""
+    """A view of the hubs that are present.
+
+    ``version`` changes with every event, ``connection`` only when a hub appears.
+    """
 
     version: int
     connection: int
@@ -29,7 +32,7 @@ class HubView(msgspec.Struct, frozen=True):
 
 
 class HubWatch:
-    """A watch for hubs, and for connections that were down. Level-triggered: a waiter gets the newest view."""
+    """A watch for hubs, and for connections that were interrupted. A waiter always gets the newest view."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -49,7 +52,7 @@ class HubWatch:
         session.info.declare_transport_events_listener(connections, history=True)
 
     def wait(self, seen: int, timeout: float | None) -> HubView | None:
-        """Wait at most ``timeout`` seconds for a version that is not ``seen``, and return the view; None if closed."""
+        """Return the view once its version is not ``seen``, or after ``timeout`` seconds; None if closed."""
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._view.version != seen, timeout)
             return None if self.closed else self._view
@@ -72,7 +75,7 @@ class HubWatch:
                 self._change(hubs=self._view.hubs - {name})
 
     def _on_connection(self, event: zenoh.TransportEvent) -> None:
-        """Note a session that comes back under its id: it was running, and we have missed its messages."""
+        """Note that a session has come back under its id: it was running, and we have missed its messages."""
         session = str(event.transport.zid)
         with self._changed:
             if event.kind == zenoh.SampleKind.DELETE:
@@ -111,7 +114,7 @@ class Barrier:
     def synchronize(self, expected: Callable[[], dict[str, str]], timeout: float) -> dict[str, int]:
         """Wait up to ``timeout`` seconds for all ``expected`` siblings (name to a description for logs).
 
-        Returns how many retained messages each of them has sent, by name.
+        Return how many retained messages each of them has sent, by name.
         """
         end = time.monotonic() + timeout
         pause, longest = _PAUSE_S

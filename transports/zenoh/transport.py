@@ -109,7 +109,10 @@ class ZenohTransport(Transport):
             presence.ready()
 
     def _start_client(self) -> bool:
-        """Try until a hub answers: a session in client mode cannot open without one."""
+        """Try until a hub answers, because a session in client mode cannot open without one.
+
+        True if it has opened.
+        """
         account = self.settings.account
         hub = [] if self.settings.connect else [self.settings.run_dir / HUB_SOCKET]
         config = session_config(self.settings, "client", listen=[], connect=hub)
@@ -204,7 +207,7 @@ class ZenohTransport(Transport):
         self._opened.set()
 
     def _follow(self, view: HubView, seen: int, linked: int) -> int:
-        """Process a change of hubs or connections; return the hub connection that works now, 0 for none."""
+        """Process a change of hubs or connections; return the number of the working hub connection, 0 for none."""
         if not view.hubs:
             self.problem = f"the hub of {self.settings.run_dir} is away"
             self._set_state(State.CONNECTING)
@@ -216,7 +219,7 @@ class ZenohTransport(Transport):
         return linked
 
     def _connect_hub(self) -> bool:
-        """Send the hub our will and what it lacks, and query its retained messages."""
+        """Send our will and missing messages to the hub, and ask for its retained messages."""
         session = self._session
         self._set_state(State.CONNECTING)
         if session is None or not self._send_hello(session):
@@ -228,7 +231,7 @@ class ZenohTransport(Transport):
         return True
 
     def _send_hello(self, session: zenoh.Session) -> bool:
-        """Store the will at the hub and send messages that it lacks, until it lacks none that it has room for."""
+        """Store our will at the hub, and send messages until it lacks none that it has room for."""
         end = time.monotonic() + HUB_ANSWER_S
         sent: set[str] = set()
         while (left := end - time.monotonic()) > 0:  # looked at once: Zenoh refuses what is not positive
@@ -254,7 +257,7 @@ class ZenohTransport(Transport):
             return owed
 
     def _refresh(self) -> None:
-        """Query all retained messages, as on a new connection, because connections have been down."""
+        """Ask for all retained messages, as on a new connection, because connections were interrupted."""
         with self._connecting:
             if self._session is None:
                 return
