@@ -1,4 +1,4 @@
-"""The poses of a robot during the last second, and at any moment in between."""
+"""The poses of a robot in the last second, and interpolated between them."""
 
 import math
 from bisect import bisect_right
@@ -15,7 +15,7 @@ class RobotPose(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """A pose and when it was valid, monotonic nanoseconds."""
+    """A pose, with its time in monotonic nanoseconds."""
 
     ns: int
     pose: RobotPose
@@ -32,7 +32,7 @@ class Track:
         return self.samples[-1]
 
     def at(self, ns: int) -> RobotPose:
-        """Return the pose at ``ns``, interpolated; the oldest or newest one for a time outside the samples."""
+        """Return the pose at ``ns``, interpolated; for a time outside of the samples the oldest or newest."""
         after = bisect_right(self.samples, ns, key=lambda sample: sample.ns)
         if after in (0, len(self.samples)):
             return self.samples[max(0, after - 1)].pose
