@@ -40,7 +40,7 @@ def schema_text() -> str:
 
 
 def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
-    """Allow comments and retired keys; a section's default consists of the defaults of its keys."""
+    """Allow comments and retired keys; set each section's default to the defaults of its keys."""
     properties = definition["properties"]
     for field in fields(kind):
         choices = [choice for meta in unwrap(field.type)[1] for choice in (meta.extra or {}).get("choices", ())]

@@ -31,7 +31,7 @@ class Ground(Protocol):
     """The ground under a robot."""
 
     def move(self, start: Pose, end: Pose) -> Pose:
-        """Return where a robot is that drives from ``start`` to ``end``: less far, if something is in its way."""
+        """Return the pose that a robot reaches on its way from ``start`` to ``end``: something may stop it."""
 
     def place(self, pose: Pose) -> None:
         """Note that the robot was lifted and put down at ``pose``."""
