@@ -38,7 +38,7 @@ STARTUP_S = 1.0  # for start-up work to finish
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The course of the comparison: ``seconds`` in each round and under each load, in turns of a second."""
+    """The course of the comparison: ``seconds`` per round and load, in turns of a second."""
 
     seconds: float = 12.5
     rounds: int = 20
@@ -70,7 +70,7 @@ def run(settings: Settings, console: Console) -> Shown:
 
 @contextmanager
 def running(variants: Sequence[str], *, reports: bool) -> Iterator[dict[str, DrivenRobot]]:
-    """Start fresh robots, which are ready; with ``reports`` they forward those of their MCUs."""
+    """Start fresh robots and yield them once they are ready; with ``reports`` they forward their MCUs' reports."""
     with ExitStack() as stack:
         driven = {kind: stack.enter_context(driven_robot(kind, reports=reports)) for kind in variants}
         for robot in driven.values():
@@ -80,7 +80,7 @@ def running(variants: Sequence[str], *, reports: bool) -> Iterator[dict[str, Dri
 
 
 def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cell]:
-    """Measure fresh robots that forward reports, and fresh ones that do not, each in turns of a second."""
+    """Yield the results of fresh robots with and without reports of their MCUs, each measured in turns of a second."""
     passes = max(1, round(settings.seconds))
     for load in in_turn((UNLOADED, COMMANDS), number):
         reports, turns = load == UNLOADED, list[tuple[str, Turn]]()

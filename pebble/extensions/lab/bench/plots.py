@@ -1,4 +1,4 @@
-"""Draws the pictures of comparisons: distributions, and lines. matplotlib is imported only to draw."""
+"""Draws the charts of comparisons: distributions, and lines. matplotlib is imported only to draw."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SETTINGS: dict[Any, Any] = {
 
 
 def curves(name: str, caption: str, cells: Sequence[Cell]) -> list[Picture]:
-    """Return the distributions, a panel for each condition: the share of all messages that arrived within a time."""
+    """Return charts of distributions, a panel for each condition: the share of messages that arrived within a time."""
     known = [cell for cell in cells if len(cell.samples) >= _LEAST]
     caption = f"{caption}. Share of all messages, lost ones included, within the time"
     return [Picture(name, caption, partial(_curves, known, caption))] if known else []
@@ -56,7 +56,7 @@ def _curves(cells: Sequence[Cell], title: str) -> Figure:
 
 
 def lines(name: str, caption: str, cells: Sequence[Cell], *, over: str) -> list[Picture]:
-    """Return lines through the medians as the parameter ``over`` grows; one panel for each measure."""
+    """Return charts of the medians as lines over the parameter ``over``; one panel for each measure."""
     known = [cell for cell in cells if cell.samples]
     return [Picture(name, caption, partial(_lines, known, caption, over))] if known else []
 
@@ -145,7 +145,7 @@ def log_axis(axes: Axes, which: str, label: str, low: float, high: float) -> Non
 
 
 def around(values: Sequence[float]) -> tuple[float, float]:
-    """Return the ends of a logarithmic axis with some margin around all positive values."""
+    """Return the ends of a logarithmic axis that holds all positive values with some margin."""
     positive = [value for value in values if 0 < value < math.inf] or [1.0]
     return 0.75 * min(positive), 1.4 * max(positive)
 

@@ -50,7 +50,7 @@ def bridge(remote_port: int, local_port: int, base: str) -> None:
 
 
 def serial_bridge(local_port: int, base: str, device: str, *, reports: bool) -> None:
-    """Write a line for each drive command, and with ``reports`` publish each one of the touch sensors."""
+    """Write a line for each drive command; with ``reports`` publish the touch sensors' reports."""
     port = serial.Serial(device, _BAUD, timeout=_READ_S)
 
     def drive(message: MQTTMessage) -> None:
