@@ -1,4 +1,4 @@
-"""Samples of the wheels' hall sensors in a POSIX shared memory: where the original's `wheel-odometry` reads them."""
+"""Samples of the hall sensors of the wheels, in a POSIX shared memory that the original's `wheel-odometry` reads."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CHECK_NS = 1_000_000_000  # how soon it is made again, and how often that is tr
 class HallMemory:
     """A ring of ``slots`` samples called ``name``. It is made for the first sample, and stays when its writer ends.
 
-    A reader maps it once and reads on while its number grows: so one that exists is used again, and continued.
+    A reader maps it once, and reads on while its number grows: so an existing one is used again, and continued.
     """
 
     def __init__(self, name: str, slots: int = 2048) -> None:
@@ -38,7 +38,10 @@ class HallMemory:
         self._problem = ""
 
     def write(self, at_ns: int, values: tuple[int, int, int], charging: bool | None) -> None:
-        """Add a sample of the time ``at_ns`` on CLOCK_MONOTONIC. Without a memory it is lost, which is logged once."""
+        """Add a sample at ``at_ns`` on CLOCK_MONOTONIC.
+
+        If the memory cannot be made it is lost, which is logged once.
+        """
         if at_ns >= self._check_at_ns:
             self._check_at_ns = at_ns + _CHECK_NS
             self._keep()
@@ -59,7 +62,7 @@ class HallMemory:
             os.close(descriptor)
 
     def _keep(self) -> None:
-        """Open the memory, also after it was removed, as Python's own SharedMemory does when a reader ends."""
+        """Open the memory if it is not open, or was removed, as Python's SharedMemory does when a reader ends."""
         if self._opened is not None and self._in_place(self._opened[0]):
             return
         self.close()
@@ -80,7 +83,7 @@ class HallMemory:
         return os.path.samestat(found, os.fstat(descriptor))
 
     def _open(self) -> tuple[int, mmap.mmap, memoryview]:
-        """Create the memory, or open an existing one. It appears whole, as a reader keeps what it maps too early."""
+        """Create the memory, or open an existing one; it appears only when complete, for readers map it once."""
         flags, made = os.O_RDWR | os.O_CLOEXEC, False
         try:
             descriptor = os.open(self._path, flags | os.O_NOFOLLOW)
@@ -102,7 +105,7 @@ class HallMemory:
         return descriptor, memory, memoryview(memory).cast("Q")
 
     def _mapped(self, descriptor: int) -> mmap.mmap:
-        """Return the memory behind ``descriptor``, if it is ours alone. Raises OSError."""
+        """Return the mapped memory behind ``descriptor``, if only this user can use it. Raises OSError."""
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
