@@ -21,7 +21,7 @@ _PASSED_ON = {"MJPG": "mjpeg", "YUYV": "yuyv"}  # frames that may travel as the 
 
 
 class V4l2Camera:
-    """A camera by its device. MJPEG of the camera is shared as it is, unless ``capture_format`` is ``raw``.
+    """A camera by its device. Its MJPEG is shared unchanged, unless ``capture_format`` is ``raw``.
 
     A read that hangs cannot be interrupted; OpenCV's timeout ends it after 3 s.
     """
@@ -72,7 +72,7 @@ class V4l2Camera:
         return capture
 
     def _choose_format(self, video: CameraCapture) -> str:
-        """Return the format of the frames: the camera's own if readers can decode it and OpenCV leaves it alone."""
+        """Return the frames' format: the camera's own if readers can decode it and OpenCV passes it unchanged."""
         code = int(self._capture.get(self._cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
         has = code.to_bytes(4, "little").decode("latin-1")
         wanted = video.capture_format
@@ -114,7 +114,7 @@ class V4l2Camera:
 
 
 def is_device(name: str) -> bool:
-    """True if it is a camera of this machine; other names are of files and network streams."""
+    """True if this names a camera of this machine; other names are files and network streams."""
     return name.isdecimal() or name.startswith("/dev/")
 
 
