@@ -1,4 +1,4 @@
-"""Robots of a broker for Foxglove: their channels, declared as topics appear, and their telemetry."""
+"""The robots of a broker for Foxglove: channels, declared when topics appear, and telemetry."""
 
 import asyncio
 import logging
@@ -53,7 +53,7 @@ class Robots:
 
     @property
     def refused(self) -> int:
-        """Return how many payloads could not be shown: no JSON, damaged, or a picture that builds on a missing one."""
+        """Return how many payloads could not be shown: not JSON, damaged, or a picture that builds on a missing one."""
         return self._refused + sum(feed.refused for feed in self._feeds.values())
 
     def receive(self, message: Message, at: float) -> None:

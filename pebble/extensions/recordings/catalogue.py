@@ -1,4 +1,4 @@
-"""The contents of recordings, read from their summaries where they have some."""
+"""The contents of recordings, read from their summaries if they have one."""
 
 import json
 from collections import Counter
@@ -42,9 +42,9 @@ class FileInfo:
 
 
 def look_at(path: Path, *, whole: bool = False, since_ns: int = 0, until_ns: int = FOREVER_NS) -> FileInfo:
-    """Return a file's contents from its summary, or by reading it completely. Raises RecordingError.
+    """Return a file's contents, from its summary or by reading all of it. Raises RecordingError.
 
-    It is read completely if it has no summary or with ``whole``. Only messages from ``since_ns`` to before ``until_ns``
+    All of it is read if it has no summary, or with ``whole``. Only messages from ``since_ns`` to before ``until_ns``
     count.
     """
     try:
@@ -126,7 +126,7 @@ class Query:
 
 
 def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> None:
-    """Raise RecordingError if no recording of ``places`` has this robot or topic, as it may be mistyped.
+    """Raise RecordingError if no recording of ``places`` has the robot or topic of the query: it may be mistyped.
 
     If a file cannot be read completely, its names are unknown; then nothing is raised, since the file's problem is
     reported.

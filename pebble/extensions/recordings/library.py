@@ -1,4 +1,4 @@
-"""Recordings as one stream of messages in the order of time, in however many files."""
+"""One stream of messages, in the order of time, from any number of recordings."""
 
 from collections.abc import Iterable, Iterator
 from functools import partial
@@ -56,7 +56,7 @@ def merged(
     chooses: Chooses = lambda _channel: True,
     damages: Damages | None = None,
 ) -> Iterator[Recorded]:
-    """Yield the messages of all files from ``since_ns`` to before ``until_ns``, by the time of their arrival.
+    """Yield the messages of all files from ``since_ns`` to before ``until_ns``, in the order of their arrival.
 
     A file is open only while its messages are due; chunks outside the period are not decompressed. Damage of the read
     parts is put into ``damages``. Raises RecordingError.

@@ -165,7 +165,7 @@ def _mend_all(folder: Folder) -> int:
 
 
 def _archive_of(path: Path) -> Path:
-    """Return the recorder's folder above a file, which has folders for years, months and days."""
+    """Return the recorder's folder above a file, whose folders are years, months and days."""
     folder = path.resolve().parent
     while _DATE.fullmatch(folder.name):
         folder = folder.parent

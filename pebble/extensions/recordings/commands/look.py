@@ -106,10 +106,10 @@ def _print_topics(counts: Counter[str]) -> None:
 def _looked_at(
     places: list[Path], since: str | None, until: str | None, *, check: bool, inside: bool = False
 ) -> tuple[list[FileInfo], list[str]]:
-    """Return the files of a period by their times, and a line for each that cannot be read completely.
+    """Return the files of a period in the order of time, and a line for each that cannot be read completely.
 
-    Files are read completely with ``check``, or if that takes only seconds; else their summaries count. ``inside``:
-    count only messages of the period, for which files that reach beyond it are read.
+    Files are read completely with ``check``, or if that takes only seconds; otherwise their summaries count.
+    ``inside``: count only messages of the period, for which files that reach beyond it are read.
     """
     since_ns, until_ns = period(since, until)
     counted_ns = {"since_ns": since_ns, "until_ns": until_ns} if inside else {}

@@ -1,4 +1,4 @@
-"""Copies of recordings: the readable part of a damaged or unfinished one, or one without some of its messages."""
+"""Copies of recordings: the readable part of a damaged or unfinished one, or all but some of its messages."""
 
 import errno
 import os
@@ -171,13 +171,13 @@ def _refuse_part(file: RecordingFile, metadata: dict[str, dict[str, str]]) -> No
 
 
 def _state(path: Path) -> tuple[int, ...]:
-    """Return a value that differs if the file is replaced or written to."""
+    """Return a value that changes if the file is replaced or written to."""
     about = path.stat()
     return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns
 
 
 def _check(part: Path, made: Rewritten) -> None:
-    """Read a copy again before it replaces the source. Raises RecordingError."""
+    """Read a copy once more before it replaces the source. Raises RecordingError."""
     with RecordingFile(part) as file:
         messages = sum(len(file.messages(chunk)) for chunk in file.chunks)
         if messages != made.messages or file.damage.report():

@@ -1,4 +1,4 @@
-"""The finisher of files beside the writer: of complete ones, and of those that a kill or a full disk left."""
+"""Finishes files beside the writer: complete ones, and those that a kill or a full disk left unfinished."""
 
 import logging
 from collections.abc import Callable
@@ -39,7 +39,10 @@ def _damaged_path(path: Path) -> Path:
 
 
 class Finisher:
-    """A queue of files to finish, for ``background``. ``event`` records what became of a file that was left."""
+    """A queue of files to finish, for ``background``.
+
+    ``event`` records the result for a file that was left unfinished.
+    """
 
     def __init__(self, background: Background, event: Callable[..., None], on_finished: Callable[[], None]) -> None:
         self._background, self._event, self._on_finished = background, event, on_finished
@@ -100,7 +103,7 @@ class Finisher:
         self._event("damaged", file=path.name, why=why)
 
     def _later(self, path: Path, error: OSError) -> None:
-        """Keep a file readable as it is until there is room; log that once."""
+        """Leave a file as it is until there is room, still readable; log that once."""
         if path not in self._unfinished:
             log.warning("%s is not finished yet: %s", path.name, error.strerror or error)
         self._unfinished.add(path)

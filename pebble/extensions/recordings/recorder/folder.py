@@ -1,4 +1,4 @@
-"""The folder of recordings: names and numbers of its files, its lock, and what may be deleted. One recorder uses it."""
+"""The folder of recordings: its files' names and numbers, its lock, and files to delete. One recorder uses it."""
 
 import errno
 import logging
@@ -98,7 +98,7 @@ class Folder:
 
     @classmethod
     def is_in_use(cls, root: Path) -> bool:
-        """True if a recorder writes there, or may without being noticed."""
+        """True if a recorder writes in ``root``, or might without being noticed."""
         with as_owner(root):
             if not (root / LOCK).exists():
                 return False

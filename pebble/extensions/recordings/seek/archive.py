@@ -1,4 +1,4 @@
-"""A folder of recordings, queried for one robot at one time: its state, its messages, its picture."""
+"""An archive: a folder of recordings, from which a robot's state, messages and picture at a time are read."""
 
 import re
 import time
@@ -29,7 +29,7 @@ _NAME: Final = re.compile(r"(?P<stamp>\d{8}T\d{6}Z)-\d{6,}\.(?P<lane>.+?)\.mcap(
 
 
 class _Named(NamedTuple):
-    """The facts in the name of a recorder's file; files of other programs have none."""
+    """The facts in a file name that a recorder made; None for files of other programs."""
 
     path: Path
     lane: str  # "": any
@@ -51,7 +51,7 @@ class Archive:
             self._open.popitem()[1].close()
 
     def messages(self, robot: str, since_ns: int, until_ns: int) -> list[Recorded]:
-        """Return the messages that a robot published and was sent, from ``since_ns`` to before ``until_ns``."""
+        """Return the messages from and to a robot, from ``since_ns`` to before ``until_ns``."""
         found: list[Recorded] = []
         for file in self.files(robot, since_ns, until_ns):
             for chunk in _within(file, file.channels_of(robot), since_ns, until_ns):
@@ -108,7 +108,7 @@ class Archive:
         return sorted(found[:LOG_LINES], key=lambda message: message.log_ns)
 
     def pictures(self, robot: str, at_ns: int) -> list[Recorded]:
-        """Return the last picture before ``at_ns``, preceded by those it needs; empty if there is none."""
+        """Return the last picture before ``at_ns`` after those that it builds on; empty if there is none."""
         chain: list[Recorded] = []
         size = 0
         for message in self._pictures_before(robot, at_ns):
@@ -124,7 +124,7 @@ class Archive:
         return []
 
     def next_ns(self, robot: str, at_ns: int) -> int | None:
-        """Return the time of the robot's next message from ``at_ns`` on; None if there is none."""
+        """Return the time of the first message of the robot from ``at_ns`` on; None if there is none."""
         found: int | None = None
         for file in sorted(self.files(robot, at_ns, 1 << 63), key=lambda file_: file_.first_ns):
             if found is not None and file.first_ns >= found:
@@ -135,7 +135,7 @@ class Archive:
         return found
 
     def files(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[SeekableFile]:
-        """Return the opened files that may hold messages of a robot in a period, in the order of time."""
+        """Return the files that may hold messages of a robot in a period, opened, in the order of time."""
         lane = lane_of(f"{robot}/", is_media=True)
         found = []
         for named in self._list():
@@ -155,7 +155,7 @@ class Archive:
         yield from (file for file in files if file is not None)
 
     def unread(self) -> dict[Path, str]:
-        """Return, for each file that was looked at, what could not be read."""
+        """Return what could not be read, by file, of the files that were opened."""
         return self._failed | {path: file.problem for path, file in self._open.items() if file.problem}
 
     # -- files
@@ -172,7 +172,7 @@ class Archive:
         return self._named
 
     def _opened(self, path: Path) -> SeekableFile | None:
-        """Return a file, opened; None if it has gone or is no recording."""
+        """Return a file, opened; None if it is gone or is no recording."""
         file = self._open.pop(path, None)
         try:
             if file is not None and file.is_replaced():

@@ -1,4 +1,4 @@
-"""The days of an archive, with their contents, from the summaries of its files."""
+"""The days of an archive with their contents, from the summaries of its files."""
 
 import json
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ _MOST_DAYS: Final = 31  # of one chunk
 class Day(Struct):
     """A day (UTC). ``first``, ``last``: epoch milliseconds. ``gaps``: times that were not recorded.
 
-    ``driven``: for about how many seconds each robot was sent drive commands, in steps of the recording's chunks.
+    ``driven``: by robot, about how many seconds it was sent drive commands, in steps of the recording's chunks.
     ``unread``: a line for each file that cannot be read completely, on the day of its last change.
     """
 
@@ -38,7 +38,7 @@ class Day(Struct):
 
 
 class Days:
-    """A table of days, which remembers the contents of files that do not change any more."""
+    """The table of days. It remembers the contents of files that no longer change."""
 
     def __init__(self, archive: Archive) -> None:
         self._archive = archive

@@ -1,4 +1,4 @@
-"""A recording that is read at any place; the last used chunks stay decompressed."""
+"""A recording that is read at any place. The chunks used last stay decompressed."""
 
 import os
 from collections import OrderedDict
@@ -26,7 +26,7 @@ class SeekableFile(RecordingFile):
         return {robot for channel in self.channels.values() if (robot := robot_of(channel)) is not None}
 
     def channels_of(self, robot: str) -> frozenset[int]:
-        """Return a robot's channels and, in files of the last version, the channel of all other topics."""
+        """Return a robot's channels and, in files of the last version, the common channel of other topics."""
         return frozenset(
             number
             for number, channel in self.channels.items()
@@ -51,5 +51,5 @@ class SeekableFile(RecordingFile):
 
 
 def is_carried(channel: Channel) -> bool:
-    """True if the message was copied to the begin of the file, and is older than the file."""
+    """True if the message was copied to the beginning of the file, and is older than the file."""
     return channel.metadata.get("retained") == CARRIED

@@ -27,7 +27,7 @@ _EVENTS: Final = """
 
 
 class RecorderEvents(Struct):
-    """The events that recorders noted about themselves."""
+    """The events that recorders noted about their own work."""
 
     gaps: list[Gap]
     starts: list[int]  # ns; what was before is not known

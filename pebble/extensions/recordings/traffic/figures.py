@@ -36,7 +36,7 @@ _TALL: Final = 30  # a highest bar of so many times the lowest makes the axis lo
 
 
 class Figure(Struct, frozen=True):
-    """A drawing, with the text that a new reader needs."""
+    """A drawing with a text that explains it to a new reader."""
 
     number: str  # in the paper
     title: str
@@ -45,7 +45,7 @@ class Figure(Struct, frozen=True):
 
 
 def figures(robot: RobotTraffic) -> list[Figure]:
-    """Return the figures that a robot has data for."""
+    """Return the figures for which a robot has data."""
     drawn = [_outages(robot), _latency(robot), _bandwidth(robot)]
     return [figure for figure in drawn if figure is not None]
 

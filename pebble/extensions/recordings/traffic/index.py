@@ -1,6 +1,6 @@
 """The index of a recording: a row for each message, without payloads, in ``NAME.parquet`` beside ``NAME.mcap``.
 
-It may be deleted: it is made again when needed. :data:`COLUMNS` are its columns; its rows are ordered by robot and
+It may be deleted: it is made again when needed. :data:`COLUMNS` lists its columns; its rows are ordered by robot and
 time. Its metadata (``parquet_kv_metadata``) hold the state of the recording from which it was made.
 """
 # ruff: noqa: S608  (what is put into queries are names of files and texts, in quotes)
@@ -78,7 +78,7 @@ _COPY: Final = """
 
 
 class About(Struct):
-    """The facts of an index about its recording."""
+    """The facts about a recording that its index holds."""
 
     recording: str  # its name
     size: int  # of the file, when it was indexed
@@ -92,7 +92,7 @@ def index_path(recording: Path) -> Path:
 
 
 def about(index: Path, connection: DuckDBPyConnection) -> About | None:
-    """Return the facts in an index; None for another file. Raises RecordingError if it cannot be read."""
+    """Return these facts from an index; None for another file. Raises RecordingError if it cannot be read."""
     found = dict(connection.execute(f"SELECT key, value FROM parquet_kv_metadata({quoted(index)})").fetchall())
     try:
         texts = {key.decode(): value.decode() for key, value in found.items()}
@@ -114,7 +114,7 @@ def is_of(index: Path, recording: Path, connection: DuckDBPyConnection) -> bool:
 def write_index(recording: Path, index: Path, scratch: Path, advance: Advance = lambda _share: None) -> None:
     """Index a recording in any state.
 
-    ``advance`` is called with the share of the file that is done. Raises RecordingError, OSError.
+    ``advance`` is called with how much of the file is done (0 to 1). Raises RecordingError, OSError.
     """
     state = recording.stat()
     part = index.with_name(f".{index.name}.{os.getpid()}")

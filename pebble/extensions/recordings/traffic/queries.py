@@ -191,7 +191,7 @@ class RobotQueries:
         return traffic.Latency(count, median, p95, self._histogram(p1, p99)) if count else None
 
     def _histogram(self, p1_ms: float, p99_ms: float) -> traffic.Histogram:
-        """Return the counts up to a little above the 99th percentile.
+        """Return the histogram of latencies, up to a little above the 99th percentile.
 
         The first bin begins at 0, or below if the robot's clock is ahead.
         """

@@ -66,7 +66,7 @@ def write_report(
 
 
 def remarks(traffic: Traffic) -> list[str]:
-    """Return the remarkable facts, a sentence each."""
+    """Return remarks about unusual facts, a sentence each."""
     found = []
     if traffic.gaps:
         found.append(f"Nothing was recorded {_times(len(traffic.gaps))}; these times are left out of outages.")

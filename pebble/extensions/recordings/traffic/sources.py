@@ -1,4 +1,4 @@
-"""The indexes that an analysis needs: existing ones, and new ones where they are missing."""
+"""The indexes for an analysis: existing ones, and new ones for recordings without."""
 # ruff: noqa: S608  (what is put into queries are names of files in quotes)
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _OLD: Final = "index"  # the folder in which the last version had its index
 
 
 class Sources(Struct):
-    """The indexes of recordings, and their contents."""
+    """The indexes of recordings, with what they contain."""
 
     indexes: list[Path] = field(default_factory=list)
     robots: list[str] = field(default_factory=list)
@@ -41,9 +41,8 @@ class Sources(Struct):
 def sources(places: Iterable[Path], scratch: Path, progress: Progress = lambda _what, _share: None) -> Sources:
     """Return the indexes of all recordings in ``places``, files or folders.
 
-    Missing indexes are made: beside the recording if its folder can be written, else, as for files that are still being
-    written, below ``scratch``. Recordings in a folder that were deleted after they had been indexed count. Raises
-    RecordingError.
+    Missing indexes are made: beside the recording if its folder can be written, otherwise, as for files that are still
+    being written, below ``scratch``. Recordings that were indexed and then deleted count, too. Raises RecordingError.
     """
     found = Sources()
     scratch.mkdir(parents=True, exist_ok=True)

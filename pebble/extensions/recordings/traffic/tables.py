@@ -1,4 +1,4 @@
-"""The tables of an analysis, for its report and as CSV files. Times are UTC."""
+"""The tables of an analysis, for its report and for CSV files. Times are UTC."""
 
 import csv
 from collections.abc import Sequence
@@ -94,5 +94,5 @@ def write_csv(table: Table, folder: Path) -> Path:
 
 
 def _cell(value: Any) -> Any:
-    """Return a cell that no spreadsheet takes for a formula, since anyone may choose the names in topics."""
+    """Return a cell that no spreadsheet takes for a formula: names in topics come from anybody."""
     return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value
