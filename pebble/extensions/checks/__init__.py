@@ -1,4 +1,4 @@
-"""Checks of a machine, of a broker, of a running robot, and of a robot's conformance to the contract."""
+"""Checks of a machine, a broker, a running robot, and a robot's conformance to the contract."""
 
 from pebble.extension import Command, Extension
 

@@ -1,4 +1,4 @@
-"""Probes of a broker: what it retains, for which subscriptions, and in which order it delivers it."""
+"""Probes of a broker's retained messages: which it keeps, which subscriptions get them, and in which order."""
 
 from __future__ import annotations
 

@@ -120,9 +120,9 @@ def _doctor(here: Here) -> str:
 
 
 def _status(here: Here) -> str:
-    """Return what the robot publishes and retains on its own transport.
+    """Return the messages that the robot publishes and retains on its own transport.
 
-    It is read as the robot's user, as root may not.
+    They are read as the robot's user, because root may not.
     """
     if here.config is None:
         raise PebbleError("the config cannot be read")
@@ -152,7 +152,7 @@ def _versions(here: Here) -> str:
 
 
 def _files(*patterns: str) -> Part:
-    """Return the part that consists of all files that match, below the root."""
+    """Return a part with all files that match, below the root."""
 
     def part(here: Here) -> str:
         files = sorted({file for pattern in patterns for file in here.places.root.glob(pattern)})
@@ -173,7 +173,7 @@ def _described(path: Path) -> str:
 
 
 def _programs(*commands: tuple[str, ...]) -> Part:
-    """Return the part that consists of the output of these commands."""
+    """Return a part with the output of these commands."""
     return lambda _here: "".join(output_of(*command, seconds=_PROGRAM_S) for command in commands)
 
 

@@ -1,4 +1,4 @@
-"""The checks of a running robot, as a table: what each needs to reach, and what runs it."""
+"""The table of checks of a running robot, with the connections that each needs."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def heartbeats(robot: RobotUnderTest) -> CheckResult:
 
 
 def _gap(side: RobotSide) -> float:
-    """Return the longest gap between the newest heartbeats; inf until there are enough."""
+    """Return the longest gap between the newest heartbeats; inf if there are too few."""
     newest = side.heartbeats[-_IN_A_ROW:]
     gaps = [after - before for before, after in pairwise(newest)]
     return max(gaps) if len(newest) == _IN_A_ROW else math.inf

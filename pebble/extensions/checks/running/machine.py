@@ -57,7 +57,7 @@ def unit_of(properties: Mapping[str, str]) -> CheckResult:
 
 
 def slot(robot: RobotUnderTest) -> CheckResult:
-    """Check that the slot which runs is the active one, and complete."""
+    """Check that the running slot is the active one, and complete."""
     places = robot.places
     if not places.slots.is_dir() or not (places.slots / "active").is_symlink():
         return skipped("it is not installed in slots")
@@ -85,7 +85,7 @@ def clock(_robot: RobotUnderTest) -> CheckResult:
 
 
 def disk(robot: RobotUnderTest) -> CheckResult:
-    """Check that there is room to go on saving stops, people and the audit."""
+    """Check that the disk has room for stops, people and the audit."""
     folder = Path(os.path.normpath(robot.config.state_dir()))  # a config may name it by ../..
     existing = next(place for place in (folder, *folder.parents) if place.exists())
     room = os.statvfs(existing)
@@ -142,7 +142,7 @@ def _status(host: str, port: int, context: ssl.SSLContext | None) -> int:
 
 
 def _trusting(certificate: Path | None) -> tuple[ssl.SSLContext | None, float | None]:
-    """Return a TLS context that trusts this certificate only, under any name, and the days until it ends."""
+    """Return a TLS context that trusts only this certificate, under any name, and the days until it expires."""
     if certificate is None:
         return None, None
     context = ssl.create_default_context(cafile=str(certificate))
