@@ -36,7 +36,7 @@ def main(arguments: list[str]) -> int:
 
 
 def settings_or_all_problems(config: Config) -> WebSettings:
-    """Return the settings of the page.
+    """Return the settings of the page. Raises ConfigError.
 
     The error names all problems at once, also a missing user.
     """

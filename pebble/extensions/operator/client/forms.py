@@ -1,4 +1,4 @@
-"""The form of a script: its settings, and which values they accept. Pure.
+"""The form of a script: its settings, and the values that they accept. Pure.
 
 Used by the manager that starts scripts, by scripts, and by operators' programs (paper A.8.11).
 """
@@ -27,7 +27,7 @@ Value = str | int | float | bool | None
 
 
 class SettingError(ValueError):
-    """A value that a setting does not accept. The text is for the sender of the value."""
+    """An error: a setting does not accept a value. The text is for the sender of the value."""
 
 
 class Setting(Struct, frozen=True, kw_only=True):
@@ -178,7 +178,7 @@ def _option(setting: Setting, raw: Any) -> str:
 
 
 def _text(key: str, raw: Any) -> str:
-    """Return a word for the command line that cannot be taken for an option."""
+    """Return a word for the command line that does not look like an option."""
     if isinstance(raw, bool) or not isinstance(raw, str | int | float):
         raise SettingError(f"{key} must be text")
     text = str(raw)
@@ -192,7 +192,7 @@ def _text(key: str, raw: Any) -> str:
 
 
 def shown(raw: object) -> str:
-    """Return a command's text, made fit for a status and a log."""
+    """Return a command's text in a form fit for a status and a log."""
     return "".join(letter if letter.isprintable() else "?" for letter in str(raw)[:_SHOWN])
 
 

@@ -1,4 +1,4 @@
-"""The scripts of a robot, as its autonomy_manager publishes them, and the commands that start and stop them."""
+"""The scripts of a robot, as its autonomy_manager publishes them, and commands to start and stop them."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -36,7 +36,7 @@ class RobotScripts:
 
     @property
     def answer_s(self) -> float:
-        """Return how long to wait for a changed status before a command counts as ignored."""
+        """Return how long to wait for another status before a command counts as ignored."""
         return max(_STARTS_S, self.robot.pace.answer_s)
 
     def subscribe(self, transport: Transport) -> None:

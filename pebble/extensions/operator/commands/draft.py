@@ -23,7 +23,7 @@ class Draft:
 
 
 def draft(names: Names, name: str, text: str, *, retain: bool | None, qos: int | None, force: bool) -> Draft:
-    """Complete a message by the contract. Raises PebbleError for a retained command, unless forced or empty."""
+    """Return a message completed by the contract. Raises PebbleError for a retained command, unless forced or empty."""
     topic = check_topic(names.topic(name))
     channel = names.channel(topic)
     payload = _payload(text)

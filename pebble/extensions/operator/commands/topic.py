@@ -228,7 +228,7 @@ def _refuse_stopped(robot: RobotEstop | None) -> None:
 
 
 def _estop(transport: Transport, names: Names, topic: str) -> RobotEstop | None:
-    """Return the retained emergency stop of the robot that ``topic`` belongs to; None if it matches several."""
+    """Return the emergency stop of the robot to which ``topic`` belongs; None if it matches several."""
     address = parse_topic(topic)
     base = names.base if address is None else address.identity.base
     if is_pattern(base):

@@ -48,7 +48,7 @@ _export_decoder = msgspec.json.Decoder(ExportRequest)
 
 @dataclass(slots=True)
 class _Timeline:
-    """A timeline, or its making. ``made``: JSON; that of before while a newer one is being made."""
+    """A timeline, or the job that makes it. ``made``: JSON; while a newer one is being made, that of before."""
 
     paths: list[str]
     active: bool
@@ -75,7 +75,7 @@ class _Export:
 
 
 class BadQuestionError(PebbleError):
-    """A missing or invalid parameter. Example: ``at: a number of milliseconds is needed``."""
+    """An error: a parameter is missing or invalid. Example: ``at: a number of milliseconds is needed``."""
 
 
 class Recordings:
@@ -103,9 +103,9 @@ class Recordings:
         self._scratch.cleanup()
 
     async def timeline(self, day: str, robot: str, *, again: bool = False) -> bytes | float:
-        """Return the timeline as JSON, or the share of the work that is done. Raises PebbleError.
+        """Return the timeline as JSON or, while it is made, how much is done (0 to 1). Raises PebbleError.
 
-        After a failure the work is done again only with ``again``, or for other recordings.
+        After a failure it is made again only with ``again``, or for other recordings.
         """
         key, period = (day, robot), _period_of(day)
         paths, active = await self.process.ask(questions.files, robot, *period)
@@ -204,7 +204,7 @@ def routes() -> list[Route]:
 
 
 def _answered(answers: _Answers) -> Callable[[Request], Awaitable[Response]]:
-    """Answer only with a session, and answer every error in one line."""
+    """Return a route that answers only with a session, and answers every error in one line."""
 
     async def endpoint(request: Request) -> Response:
         if login.session_of(request) is None:
