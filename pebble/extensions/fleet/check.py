@@ -1,4 +1,4 @@
-"""Differences between a fleet's table and its files, and certificates that end soon, a line each."""
+"""Finds differences between a fleet's table and its files, and certificates that expire soon; a line each."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -35,7 +35,7 @@ class HubFile(ZenohSection, frozen=True, kw_only=True):
 
 
 def load_hub(path: Path, env: Mapping[str, str] = os.environ) -> tuple[HubFile, Path]:
-    """Read the file; return it and its run directory. Raises ConfigError with all problems."""
+    """Return the hub in a file, and its run directory. Raises ConfigError with all problems."""
     path = path.absolute()
     raw = decode(read_text(path), path.name)
     reader = Reader(path.parent, env, CHECKS, file=path)

@@ -335,7 +335,7 @@ def _init_again(place: Path, host: str | None, level: str | None, plain: bool | 
 
 @contextmanager
 def _changing(folder_: Path | None, *, any_rules: bool = False) -> Iterator[tuple[Path, Fleet]]:
-    """Lock a fleet for a change. Raises PebbleError.
+    """Yield a fleet and its folder, locked for a change. Raises PebbleError.
 
     ``any_rules``: also a fleet that still uses mosquitto's plugin.
     """
@@ -416,7 +416,7 @@ def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, 
 
 
 def _left(lines: Iterable[str]) -> int:
-    """Print the places where a change does not count yet; return the command's exit code."""
+    """Print the places where a change does not apply yet; return the command's exit code."""
     code = 0
     for line in lines:
         typer.echo(f"pebble: {shown(line)}", err=True)

@@ -148,7 +148,10 @@ def _running(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def _accounts(fleet: Fleet, robots: list[str], boards: list[str]) -> Fleet:
-    """Give each robot an account as a neighbour of the others, and each board one at the broker. Raises FleetError."""
+    """Return the fleet with an account for each robot, as a neighbour of the others, and for each board at the broker.
+
+    Raises FleetError.
+    """
     bases = {name: f"pebble/robots/{name}" for name in (*robots, *boards)}
     for name, times in Counter((*robots, *boards)).items():
         if times > 1:
@@ -190,7 +193,7 @@ def _write_robot(place: Path, fleet: Fleet, name: str, others: list[str]) -> Non
 
 
 def _folder_of(place: Path, name: str) -> Path:
-    """Return the folder that is to be copied to a robot."""
+    """Return the folder to be copied to a robot."""
     its = place / ROBOTS / name
     its.mkdir(parents=True, exist_ok=True)
     write(its / certificates.CA_CERT, read_plain(place / certificates.CA_CERT), 0o644, FleetError)

@@ -53,7 +53,7 @@ class GatewayFile(Section, frozen=True, kw_only=True):
 
 
 def load_gateway(path: Path, env: Mapping[str, str] = os.environ) -> tuple[GatewayFile, str, Path]:
-    """Read the file; return it with the gateway's name and its run directory.
+    """Return the gateway in a file, its name and its run directory.
 
     Raises ConfigError with all problems.
     """

@@ -1,4 +1,4 @@
-"""Scripts that run on a board's MicroPython, and the interpretation of their output."""
+"""Scripts that run on a board's MicroPython, and readers of their output."""
 
 import re
 from dataclasses import dataclass
@@ -58,7 +58,7 @@ class BoardInfo:
 
 
 def check_answer(answer: str, board: Board) -> BoardInfo:
-    """Parse the output of :data:`IDENTIFY`. Raises PebbleError if it is not from ``board``."""
+    """Return the report in the output of :data:`IDENTIFY`. Raises PebbleError if it is not from ``board``."""
     found = _ANSWER.search(answer)
     if found is None:
         raise PebbleError(f"unexpected answer from the board: {answer.strip()[-200:]!r}")

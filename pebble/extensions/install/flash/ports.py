@@ -19,7 +19,7 @@ _RESET_PULSE_S = 0.1
 
 
 def described() -> list[str]:
-    """Return one line per serial port: its path, the USB device's own name, and its ids."""
+    """Return a line per serial port: its path, the USB device's own name, and its ids."""
     lines = []
     for port in sorted(list_ports.comports()):
         name = " ".join(filter(None, (port.manufacturer, port.product))) or port.description
@@ -64,8 +64,8 @@ def break_in(port: str, ask: Callable[[str], None], *, pulse: bool, timeout_s: f
     """Stop the program on the board, so that MicroPython's prompt answers.
 
     Our firmware accepts Ctrl-C only in the first second after a reset: later, no byte on the line may stop it, and its
-    watchdog would reset the board during the copy. So the board is reset: by the line's RTS where it is wired
-    (``pulse``), else by the user, whom ``ask`` prompts. Raises DeviceError when no prompt appears.
+    watchdog would reset the board during the copy. So the board is reset: by the line's RTS if that is wired
+    (``pulse``), else by the user, whom ``ask`` prompts. Raises DeviceError if no prompt appears.
     """
     begin, asked = time.monotonic(), False
     if pulse:

@@ -1,4 +1,4 @@
-"""Collects the files of firmware/ that a robot needs, and the command that compiles each."""
+"""Finds the files of firmware/ that a robot needs, and the command that compiles each."""
 
 import ast
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ def main_file(firmware: Firmware, root: Path | None = None) -> Path:
 
 
 def modules(firmware: Firmware, root: Path | None = None) -> list[Path]:
-    """Return all modules that main.py imports, directly or not, relative to firmware/; nothing else is copied.
+    """Return all modules that main.py imports, also indirectly, relative to firmware/; only these are copied.
 
     Raises PebbleError if there is no main.py.
     """

@@ -21,7 +21,10 @@ _CHUNK = 4096
 
 
 def at_broker(config: Config, timeout_s: float = HEARTBEAT_S) -> str:
-    """Wait for a live heartbeat; a retained one is from before the reset. Raises DeviceError with what to check."""
+    """Wait for a live heartbeat, and return a line about it. Raises DeviceError with what to check.
+
+    A retained heartbeat does not count: it is from before the reset.
+    """
     broker = config.local_mqtt
     received: queue.Queue[Message] = queue.Queue()
     settings = mqtt_settings(broker, reconnect_max_s=LOCAL_RECONNECT_S)
@@ -52,7 +55,10 @@ def _alive(payload: bytes) -> bool:
 
 
 def on_serial_port(port: str, firmware: Firmware, timeout_s: float = REPORT_S) -> str:
-    """Wait for the firmware's report on its serial line. Raises DeviceError with what was received instead."""
+    """Wait for the firmware's report on its serial line, and return a line about it.
+
+    Raises DeviceError with what was received instead.
+    """
     is_report = firmware.is_report
     assert is_report is not None  # noqa: S101 - robots with a broker are verified there
     end = time.monotonic() + timeout_s

@@ -1,4 +1,4 @@
-"""The devices of this machine: boards, to which nothing is sent, cameras, and the parts that a robot lacks."""
+"""Finds the devices of this machine: boards, to which it sends nothing, cameras, and parts that a robot lacks."""
 
 import re
 import shutil
@@ -83,7 +83,7 @@ def _received(port: str, baud: int, seconds: float) -> bytes:
 
 
 def _understood(received: bytes) -> tuple[str | None, str] | None:
-    """Return the protocol and what was received, in words; None if nothing makes sense at this speed."""
+    """Return the protocol, and what was received in words; None if nothing makes sense at this speed."""
     if b"\0" in received:
         return ("pebble_serial_v1", "frames") if any(map(_is_frame, received.split(b"\0"))) else None
     lines = [line.strip() for line in received.split(b"\n") if line.strip()]

@@ -35,7 +35,7 @@ def say(text: str, indent: int = 0) -> None:
 
 
 def asked(job: Job) -> Job:
-    """Return the job with the answers from the terminal; a wrong answer is asked for again."""
+    """Return the job with the answers from the terminal. A wrong answer is asked for again."""
     first = [] if job.config is not None else [_ask_name]
     for number, ask in enumerate([*first, _ask_board, _ask_camera, _ask_broker, _ask_page], start=1):
         job = _answered(job, number, ask)
@@ -122,7 +122,7 @@ def _ask_page(job: Job, number: str) -> _Given:
 
 
 def _with_passwords(job: Job) -> Job:
-    """Return the job with the passwords that are still needed, asked for."""
+    """Return the job with the passwords that it still needs, after asking for them."""
     answers, secrets = job.answers, job.secrets
     if needs_login(answers):
         text, default = f"   Password of {answers.account} at the broker", None

@@ -26,7 +26,7 @@ COMMANDS = (
 
 
 def answers_of(config: Config, places: Places) -> Answers:
-    """Return the answers for which setup would write this config."""
+    """Return the answers from which setup would write this config."""
     services, devices = config.services, config.section(AvDaemon)
     line, video, remote = services.serial_mcu_bridge, devices.video, services.mqtt_bridge.remote_mqtt
     has_board = line.enabled and line.serial.port is not None

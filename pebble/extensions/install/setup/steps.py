@@ -1,4 +1,4 @@
-"""The steps that set up a robot, in their order. Each is checked first, and done only if it is necessary."""
+"""The steps that set up a robot, in order. Each is checked first, and done only if it is necessary."""
 
 import json
 import os
@@ -67,7 +67,7 @@ def load_config(places: Places) -> Config | None:
 
 @dataclass(frozen=True)
 class Job:
-    """The data on which all steps depend. ``config``: the existing one."""
+    """The data of all steps. ``config``: the existing one."""
 
     system: System
     config: Config | None
@@ -136,7 +136,7 @@ class Job:
                 yield self._new_password("password of the page at the robot's broker", page)
 
     def _new_password(self, what: str, file: Path, *, known: bool = True) -> Step:
-        """Return the step that writes a new password. ``known``: one in the file is of this broker, so it stays."""
+        """Return the step that writes a new password. ``known``: the one in the file is of this broker, so it stays."""
         write = partial(self.system.write, file)
         return Step(what, lambda: known and file.exists(), lambda: write(f"{new_password()}\n".encode()))
 
@@ -233,13 +233,13 @@ class Job:
     # -- doing them
 
     def left(self) -> list[Step]:
-        """Return the steps that still have to be done. Raises PebbleError."""
+        """Return the steps that are still to be done. Raises PebbleError."""
         return [step for step in self.steps() if not step.is_done()]
 
     def do(self, steps: list[Step]) -> bool:
-        """Do the steps, then restart the services that read the written files.
+        """Do the steps, then restart the services that read the written files; return True if the robot was started.
 
-        Returns True if the robot was started. Raises SetupError at the first failure.
+        Raises SetupError at the first failure.
         """
         unfinished = self.places.unfinished
         services = {service for step in steps for service in step.restarts}

@@ -31,7 +31,7 @@ _WHEEL = re.compile(r"pebble_robot-[0-9A-Za-z.+]+-py3-none-any\.whl")
 
 
 class ReleaseError(PebbleError):
-    """A release that is refused; the message says why."""
+    """An error: a release is refused. The message says why."""
 
 
 class Release(msgspec.Struct, frozen=True):
@@ -119,7 +119,7 @@ def _read(path: Path) -> bytes:
 
 
 def _bytes(text: str) -> bytes:
-    """Decode base64, in its one canonical form."""
+    """Return decoded base64, which must be in its one canonical form."""
     data = base64.b64decode(text, validate=True)
     if base64.b64encode(data).decode() != text:
         raise binascii.Error("another form of the same bytes")
