@@ -24,7 +24,7 @@ from pebble.transports.segments import SHM
 
 
 def picture(size: tuple[int, int], frame: Frame) -> bytes:
-    """Return rows of BGR, padded to a multiple of four bytes each, as GStreamer has them."""
+    """Return rows of BGR, each padded to a multiple of four bytes, as GStreamer needs them."""
     pixels = frame.picture()
     if (sent := pixels.shape[1::-1]) != size:
         sys.exit(f"the camera sends pictures of {sent}, and the config says {size}")

@@ -37,7 +37,7 @@ class Options(Struct, kw_only=True):
 class Companion:
     """The place of another robot, seen from this one. Each odometry has a frame of its own, so only motions count.
 
-    ``ahead_m`` and ``left_m``: where the other one stands at the first call, heading as this one does.
+    ``ahead_m`` and ``left_m``: the other robot's place at the first call, when both head in the same direction.
     """
 
     def __init__(self, ahead_m: float, left_m: float) -> None:
@@ -54,7 +54,7 @@ class Companion:
 
 
 def _motion(before: Pose, now: Pose) -> tuple[complex, float]:
-    """Return the step in the frame of ``before``, and the turn; none at a jump."""
+    """Return the step in the frame of ``before``, and the turn; both 0 at a jump."""
     step = complex(now.x_m - before.x_m, now.y_m - before.y_m)
     if abs(step) > JUMP_M:
         return 0j, 0.0
