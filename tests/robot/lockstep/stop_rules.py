@@ -4,7 +4,7 @@
   ended it. Excused: what a killed bridge forgets.
 * A stop with a name passes to all owners as often as it came, and one without a name once, except around a loss of the
   connection of stops, where equal bytes cannot be told apart.
-* An owner that has shown that a stop was reset gets no copy of it.
+* An owner that has shown that a stop was reset gets no copy of it while it remembers the stop's name.
 * What is repeated is the newest stop that its owner has not shown, names its owner, and ends when that has withdrawn
   its emergency stop; in the end nothing is repeated, and a new stop stops every owner.
 """
@@ -48,7 +48,8 @@ class StopRules:
     def begin(self) -> None:
         """A new life of the bridge, which remembers nothing."""
         self._came: Counter[str] = Counter()  # by name
-        self._came_at: dict[str, float] = {}
+        self._came_at: dict[str, float] = {}  # by name, the newest copy
+        self._came_first: dict[str, float] = {}  # by name: when the first copy came, which may not have passed
         self._passed: Counter[str] = Counter()  # by name: to all owners
         self._first: dict[str, float] = {}  # by name: when it passed first
         self._seen: dict[str, EstopState] = {}  # by owner: what the bridge knows
@@ -70,8 +71,10 @@ class StopRules:
         """The bridge has something of the operators'."""
         if message.topic == _STOP and message.payload.strip() and not message.retain:
             stop = codec.decode(ESTOP, message.payload).stop
-            self._came[str(stop)] += stop is not UNSET
             self._came_at[str(stop)] = self._scheduler.now
+            if stop is not UNSET:
+                self._came[str(stop)] += 1
+                self._came_first.setdefault(str(stop), self._scheduler.now)
 
     def learns(self, message: Message) -> None:
         """The bridge has something of the robot's."""
@@ -87,6 +90,7 @@ class StopRules:
         same = before is not None and before.boot == state.boot
         if before is not None and same and not state.latched and (before.latched or state.count > before.count):
             self._over |= {shown for shown in self._shown if shown[0] == owner}
+        self._over = {over for over in self._over if over[0] != owner or over[1] in state.recent}
         self._shown |= {(owner, name) for name in state.recent}
 
     def shows(self, owner: str, payload: bytes) -> None:
@@ -128,10 +132,11 @@ class StopRules:
         self._check(
             self._scheduler.now - since < _REPEAT_S, "a stop is repeated to an owner that has withdrawn its own"
         )
-        came = self._first.setdefault(name, self._scheduler.now)  # if nothing passed: it had no connection to the robot
-        shown = (first for other, first in self._first.items() if (owner, other) in self._shown)
-        newest = max(came, *shown, 0.0)
-        missed = any(first > newest for first in self._first.values())
+        self._first.setdefault(name, self._scheduler.now)  # if nothing passed: it had no connection to the robot
+        firsts = self._first | self._came_first
+        shown = (first for other, first in firsts.items() if (owner, other) in self._shown)
+        newest = max(firsts[name], *shown, 0.0)
+        missed = any(first > newest for first in firsts.values())
         self._check(not missed, "an older stop is repeated in place of a newer one")
 
     # -- what must hold at any time
