@@ -53,8 +53,8 @@ def offer(path: Path, parser: str, reader: FrameReader, data: Callable[[Frame], 
                 process.stdin.write(data(frame))
                 process.stdin.flush()
     finally:
-        for left in SHM.glob(f"shmpipe.{process.pid:5}.*"):
-            left.unlink()
+        for leftover in SHM.glob(f"shmpipe.{process.pid:5}.*"):
+            leftover.unlink()
 
 
 def main(config_path: str) -> None:

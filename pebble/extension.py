@@ -293,8 +293,8 @@ def lacking(raw: Any) -> Iterator[Missing]:
 
 def keys_of_missing(installed: Iterable[Extension]) -> list[str]:
     """Return the config keys of our extensions that are not among ``installed``."""
-    known = {key for extension in installed for key in extension.sections}
-    return [key for keys in OURS.values() for key in keys if key not in known]
+    present = {key for extension in installed for key in extension.sections}
+    return [key for keys in OURS.values() for key in keys if key not in present]
 
 
 def value_at(raw: Any, *keys: str) -> Any:
@@ -413,8 +413,8 @@ def _failed(extension: Extension, hook: str, why: str) -> ConfigError:
 def _of_package(name: str) -> Extension:
     offered = _offered()
     if name not in offered:
-        known = ", ".join(sorted(offered)) or "none"
-        raise PebbleError(f'no installed package offers it (a file is written with ".py"); known are {known}')
+        names = ", ".join(sorted(offered)) or "none"
+        raise PebbleError(f'no installed package offers it (a file is written with ".py"); known are {names}')
     return _checked(part(offered[name]))
 
 

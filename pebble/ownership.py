@@ -34,13 +34,13 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
     while names:
         place /= names.pop(0)
         try:
-            found = place.lstat()
+            status = place.lstat()
         except OSError as error:  # it is missing, or not to be seen by this user
             if there:
                 raise PebbleError(f"{place}: {error.strerror}") from None
             break
-        uid = 0 if found.st_uid == system or not (nameless or _has_name(found.st_uid)) else found.st_uid
-        if stat.S_ISLNK(found.st_mode):
+        uid = 0 if status.st_uid == system or not (nameless or _has_name(status.st_uid)) else status.st_uid
+        if stat.S_ISLNK(status.st_mode):
             if owner.uid or uid:
                 raise PebbleError(f"{place} is a link of user {uid or owner.uid}: name the folder itself")
             target = place.readlink()
@@ -49,9 +49,9 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
             return owner_of(place.parent.joinpath(target, *names), nameless=nameless, there=there)
         if owner.uid not in (0, uid):
             raise PebbleError(f"{place} belongs to user {uid}, and lies in a folder of user {owner.uid}: move it")
-        if uid == 0 and _is_shared(found):
+        if uid == 0 and _is_shared(status):
             raise PebbleError(f"{place} belongs to root, and others may write there: chmod go-w it, or chown it")
-        owner = Owner(uid, found.st_gid)
+        owner = Owner(uid, status.st_gid)
     return owner
 
 
@@ -85,10 +85,10 @@ def _is_shared(found: os.stat_result) -> bool:
 def is_open(folder: Path) -> bool:
     """True if every user may make files in the folder, but not remove those of others, as in /tmp."""
     try:
-        found = folder.stat()
+        status = folder.stat()
     except OSError:
         return False
-    return stat.S_ISDIR(found.st_mode) and bool(found.st_mode & stat.S_IWOTH)
+    return stat.S_ISDIR(status.st_mode) and bool(status.st_mode & stat.S_IWOTH)
 
 
 def open_plain(file: Path) -> BinaryIO:

@@ -158,8 +158,8 @@ def forked(work: Callable[[], object], seconds: float | None = None) -> bool:
         os.close(descriptor)
         return bool(ended) and os.waitpid(pid, 0)[1] == 0
     finally:
-        while left := set(children()) - others:
-            for child in left:
+        while orphans := set(children()) - others:
+            for child in orphans:
                 os.kill(child, signal.SIGKILL)
                 os.waitpid(child, 0)
 
@@ -238,8 +238,8 @@ class Trial:
                 self.functions[self.file_of(code.co_filename), code.co_qualname, code.co_firstlineno].append(function)
         gc.freeze()
         for file, text in self.texts.items():
-            found = script_mutants(file, text) if file.endswith(".js") else mutants(file, text)
-            drawn = sorted(found, key=lambda mutant: crc32(mutant[0]["name"].encode(), self.options.seed))
+            possible = script_mutants(file, text) if file.endswith(".js") else mutants(file, text)
+            drawn = sorted(possible, key=lambda mutant: crc32(mutant[0]["name"].encode(), self.options.seed))
             report(file, len(drawn), [self.attempt(*mutant) for mutant in drawn[: self.options.n or None]])
         return True
 

@@ -81,11 +81,11 @@ class Config(Root, frozen=True, kw_only=True):
         """Return the enabled serial lines, one process each, by instance name; ``""`` is the section itself."""
         section = self.services.serial_mcu_bridge
         lines: dict[str, SerialBridge] = {"": section, **section.instances}
-        known = {*OF_CORE, *(protocol for extension in self.installed for protocol in extension.protocols)}
+        protocols = {*OF_CORE, *(protocol for extension in self.installed for protocol in extension.protocols)}
         return {
             name: line
             for name, line in lines.items()
-            if line.enabled and line.serial.port is not None and line.protocol in known
+            if line.enabled and line.serial.port is not None and line.protocol in protocols
         }
 
     def hall_memory(self, line: SerialBridge) -> str | None:

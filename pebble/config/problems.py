@@ -33,7 +33,7 @@ class Notes:
 
     def doubt(self, path: Path, text: str) -> None:
         """Note a problem, unless one is already noted at this place or around it, which may be the cause."""
-        if not any(known.path == path[: len(known.path)] for known in self.problems):
+        if not any(note.path == path[: len(note.path)] for note in self.problems):
             self.problem(path, text)
 
     def warning(self, path: Path, text: str) -> None:
@@ -78,8 +78,8 @@ def show_path(path: Path) -> str:
 def holds(raw: Any, path: Path) -> bool:
     """True if there is a value at ``path``."""
     for step in path:
-        known = range(len(raw)) if isinstance(raw, list) else raw if isinstance(raw, Mapping) else ()
-        if step not in known:
+        steps = range(len(raw)) if isinstance(raw, list) else raw if isinstance(raw, Mapping) else ()
+        if step not in steps:
             return False
         raw = raw[step]
     return True

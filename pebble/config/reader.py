@@ -59,20 +59,20 @@ class Reader:
 
         A refused value is replaced by the default, a missing required one by None.
         """
-        known = _known(kind)
+        keys = _known(kind)
         if not isinstance(raw, dict):
-            is_switch = self._other_forms and "enabled" in known and switch(raw) is not None
+            is_switch = self._other_forms and "enabled" in keys and switch(raw) is not None
             raw = {"enabled": raw} if is_switch else self._otherwise(kind, raw, path, {} if path else NODEFAULT)
         values: dict[str, Any] = {}
         for written, value in () if raw is _WRONG else raw.items():
-            key = self._key(kind, known, written, (*path, written))
-            field = known.get(key)
+            key = self._key(kind, keys, written, (*path, written))
+            field = keys.get(key)
             if field is None or value in ("", None) or (self._other_forms and value == [] and field.default):
                 continue
             result = self._value(field.type, value, (*path, written), _default(field))
             if result is not _WRONG:
                 values[field.name] = result
-        for field in known.values():
+        for field in keys.values():
             if field.required and field.name not in values:
                 values[field.name] = self._missing(field, (*path, field.encode_name))
         return self._checked(kind(**values), path)

@@ -29,7 +29,9 @@ def _core(config: Config) -> Iterator[tuple[bool, Program]]:
     bridge, mirror = config.services.mqtt_bridge, config.transport.mqtt_mirror
     yield True, _announcer(config)
     yield from ((True, _serial_line(config, *line)) for line in config.serial_instances().items())
-    seams = ((one.observer, one.step, one.private, *one.requests) for one in config.installed)
+    seams = (
+        (extension.observer, extension.step, extension.private, *extension.requests) for extension in config.installed
+    )
     shares = tuple(place.partition(":")[0] for places in seams for place in places if place)
     yield bridge.enabled, _service(config, "mqtt_bridge", may_request=True, shares=shares)
     yield mirror is not None, _service(config, "mqtt_mirror")

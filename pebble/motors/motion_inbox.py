@@ -107,8 +107,8 @@ class MotionInbox:
             sender = self._control.sender(request)
             waiting = self._requests.pop(sender, None)
             if len(self._requests) >= _REQUESTS:
-                known = self._control.knows
-                del self._requests[next(key for key, received in self._requests.items() if not known(received.request))]
+                knows = self._control.knows
+                del self._requests[next(key for key, received in self._requests.items() if not knows(received.request))]
                 self.dropped += 1
             over = not request.ends() and (over or (waiting is not None and waiting.over))
             self._requests[sender] = ReceivedRequest(request, over, now)

@@ -34,9 +34,9 @@ class LineSplitter:
 
     def rest(self) -> bytes:
         """Return the unfinished line at the end of the stream."""
-        left = self._tail
+        unfinished = self._tail
         self.reset()
-        return left
+        return unfinished
 
     def reset(self) -> None:
         """Forget an unfinished line, because the stream starts again."""

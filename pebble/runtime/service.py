@@ -337,8 +337,8 @@ class Service:
 
     def _remark(self, channel: Channel, sender: str, text: str) -> None:
         """Log a remark about a command that its sender may not have meant, once a minute for each sender."""
-        known = f", from {sender[:_SENDER_SHOWN]!a}" if sender else ""
-        self._remarks.warning(channel.metric + known, "%s%s: %s", channel.metric, known, text)
+        origin = f", from {sender[:_SENDER_SHOWN]!a}" if sender else ""
+        self._remarks.warning(channel.metric + origin, "%s%s: %s", channel.metric, origin, text)
 
     def _on_state(self, state: State) -> None:
         if state is State.CONNECTED:

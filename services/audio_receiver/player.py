@@ -89,13 +89,13 @@ class Player:
         return child
 
     def _write(self, child: Child, data: bytes) -> None:
-        left = memoryview(data)
+        unwritten = memoryview(data)
         deadline = time.monotonic() + _STUCK_S
         poll = select.poll()
         poll.register(self._pipe, select.POLLOUT)
-        while left and not self._stopping.is_set():
+        while unwritten and not self._stopping.is_set():
             try:
-                left = left[os.write(self._pipe, left) :]
+                unwritten = unwritten[os.write(self._pipe, unwritten) :]
             except BlockingIOError:
                 poll.poll(_POLL_MS)
             except OSError:

@@ -250,11 +250,11 @@ class Catalogue:
 def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
     """Return the ``files`` of `autonomy-files`, without forms if they would make it too long."""
     entries: list[dict[str, object]] = []
-    left = _LONGEST_FILES
+    room = _LONGEST_FILES
     for script in scripts:
         configs = form(script.settings)
-        left -= len(msgspec.json.encode(configs))
-        configs = configs if left >= 0 else []
+        room -= len(msgspec.json.encode(configs))
+        configs = configs if room >= 0 else []
         entries.append({"file": script.file, "label": script.label, "configs": configs, **_first_seen(script, configs)})
     return entries
 

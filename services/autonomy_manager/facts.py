@@ -41,9 +41,9 @@ def facts(config: Config) -> Facts:
         from pebble.services.autonomy_manager.catalogue import Catalogue  # few checks need it
     except ModuleNotFoundError:  # a system without fcntl runs no robots
         return Facts()
-    found: list[dict[str, Script]] = []
-    Catalogue(config, asks=False).scan(found.append)
-    return Facts(table=tuple(("script", name, _fitness(config, script)) for name, script in found[-1].items()))
+    scans: list[dict[str, Script]] = []
+    Catalogue(config, asks=False).scan(scans.append)
+    return Facts(table=tuple(("script", name, _fitness(config, script)) for name, script in scans[-1].items()))
 
 
 def _fitness(config: Config, script: Script) -> str:

@@ -48,12 +48,12 @@ class CaptureProgram:
         """Return the program's new output, at least one byte. Raises DeviceError if the program has ended or hangs."""
         deadline = time.monotonic() + self._silence_s
         while True:
-            left = deadline - time.monotonic()
-            if left <= 0:
+            remaining_s = deadline - time.monotonic()
+            if remaining_s <= 0:
                 if self._child.wait(0.0) is not None:  # and what it left behind holds its output open
                     raise DeviceError(self._end())
                 raise DeviceError(f"{self.name} hangs: nothing came for {self._silence_s:.0f} s{self._last_error()}")
-            ready = dict(self._poll.poll(left * 1000))
+            ready = dict(self._poll.poll(remaining_s * 1000))
             if self._err in ready:
                 self._read_errors()
             if self._out in ready:

@@ -218,10 +218,10 @@ class MemoryTransport(Transport):
                 return
             self._attached = self._hub.era
             self._hub.attach(self)
-            known = set(self._hub.retained)
+            retained_topics = set(self._hub.retained)
             for subscription in self._subscriptions:
                 self._send_retained(subscription)
-        self._initial_sync(known)
+        self._initial_sync(retained_topics)
 
 
 TRANSPORT = MemoryTransport

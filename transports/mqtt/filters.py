@@ -22,28 +22,28 @@ def overlap(first: str, second: str) -> bool:
     begin, other_begin = beginning(first), beginning(second)
     if not (begin.startswith(other_begin) or other_begin.startswith(begin)):
         return False
-    left, right = first.split("/"), second.split("/")
-    if "$" in (left[0][:1], right[0][:1]) and left[0] != right[0]:
+    first_levels, second_levels = first.split("/"), second.split("/")
+    if "$" in (first_levels[0][:1], second_levels[0][:1]) and first_levels[0] != second_levels[0]:
         return False  # wildcards do not match a first level with a $
-    for a, b in zip(left, right, strict=False):
-        if a == "#" or b == "#":
+    for first_level, second_level in zip(first_levels, second_levels, strict=False):
+        if first_level == "#" or second_level == "#":
             return True
-        if a != b and "+" not in (a, b):
+        if first_level != second_level and "+" not in (first_level, second_level):
             return False
-    longer = max(left, right, key=len)
-    shorter = min(len(left), len(right))
-    return len(left) == len(right) or longer[shorter] == "#"
+    longer = max(first_levels, second_levels, key=len)
+    shorter = min(len(first_levels), len(second_levels))
+    return len(first_levels) == len(second_levels) or longer[shorter] == "#"
 
 
 def cover(first: str, second: str) -> str:
     """Return a filter that matches everything that either of two overlapping filters matches, level by level."""
-    left, right = first.split("/"), second.split("/")
+    first_levels, second_levels = first.split("/"), second.split("/")
     levels: list[str] = []
-    for a, b in zip(left, right, strict=False):
-        if a == "#" or b == "#":
+    for first_level, second_level in zip(first_levels, second_levels, strict=False):
+        if first_level == "#" or second_level == "#":
             return "/".join([*levels, "#"])
-        levels.append(a if a == b else "+")
-    return "/".join(levels if len(left) == len(right) else [*levels, "#"])
+        levels.append(first_level if first_level == second_level else "+")
+    return "/".join(levels if len(first_levels) == len(second_levels) else [*levels, "#"])
 
 
 class BrokerFilters:

@@ -84,9 +84,9 @@ class Incoming:
         Several pieces may have come, and TLS unpacks one after the other.
         """
         age, began_with, size = self.age, self._packets, 0
-        while (left := began_with + _BATCH - self._packets) > 0:
+        while (packets_left := began_with + _BATCH - self._packets) > 0:
             before = self._packets
-            size += self._read_piece(client, now, left)
+            size += self._read_piece(client, now, packets_left)
             if not self.more or self._packets == before:
                 break
             now = clock.since_boot()
@@ -106,17 +106,17 @@ class Incoming:
         unread = self._left or self._receive(client, now)
         self.age.update(now, client.socket)
         try:
-            self._left = left = client.read(most)
+            self._left = bytes_left = client.read(most)
         except MalformedError as error:
             raise Lost(f"{self.where} does not speak MQTT: {error}") from None
         if self._refusal is not None:
             raise self._refusal
         if self.reason:
             client.close()
-        self.more = left > 0 or not client.drained
+        self.more = bytes_left > 0 or not client.drained
         if self.more:
-            self.age.waiting.read(unread - left)
-        return unread - left
+            self.age.waiting.read(unread - bytes_left)
+        return unread - bytes_left
 
     def _receive(self, client: Client, now: float) -> int:
         """Take a piece out of the socket, and note its size for the messages' ages; return its number of bytes."""

@@ -167,8 +167,8 @@ class InFlightTable:
 
     def sent(self, message: Message, mid: int, now: float) -> None:
         """Note that ``message`` was written with the id ``mid``. Hot."""
-        size, known = len(message.payload), self._accepted.get(message.topic)
-        if known is None or size > known[1]:
+        size, largest = len(message.payload), self._accepted.get(message.topic)
+        if largest is None or size > largest[1]:
             _note(self._written, message.topic, now, size)
         if message.qos is QoS.DELIVERED:
             self._unacked[mid] = (message.topic, now)
@@ -280,8 +280,8 @@ class InFlightTable:
 
 def _note(table: dict[str, tuple[float, int]], topic: str, at: float, size: int) -> None:
     """Note a message in ``table``, if there is room and no message as large is noted there."""
-    known = table.get(topic)
-    if (known is None and len(table) < TOPICS) or (known is not None and size > known[1]):
+    noted = table.get(topic)
+    if (noted is None and len(table) < TOPICS) or (noted is not None and size > noted[1]):
         table[topic] = at, size
 
 

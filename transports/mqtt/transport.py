@@ -290,20 +290,20 @@ class MqttTransport(Transport):
         self._own_message_filter.begin()
         if self._dialler.stalled:
             self._let_catch_up(connection, stopping)
-        known = self._query_own(connection, stopping)
+        known_topics = self._query_own(connection, stopping)
         with self._filters.lock:
             self._connection = connection
             subscribed = connection.subscribe([(filter_, self._no_local(filter_)) for filter_ in self._filters])
             copied = connection.ping()
         self._await(connection, subscribed, stopping, self._deliver_all)
         self._await(connection, copied, stopping, self._deliver_all)
-        self._initial_sync(known)
+        self._initial_sync(known_topics)
 
     def _let_catch_up(self, connection: Connection, stopping: threading.Event) -> None:
         """Wait before subscribing, because a broker that was suspended first forwards old messages of others."""
         end = time.monotonic() + _CATCH_UP_S
-        while not stopping.is_set() and (left := end - time.monotonic()) > 0:
-            connection.pump(left, ignore)
+        while not stopping.is_set() and (remaining_s := end - time.monotonic()) > 0:
+            connection.pump(remaining_s, ignore)
         self._dialler.stalled = False
 
     def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
@@ -360,10 +360,10 @@ class MqttTransport(Transport):
             since, answer_s = max(asked_at, connection.incoming.age.arriving_at), _ANSWER_S
             if connection.pings.is_thin:
                 since, answer_s = max(since, connection.incoming.answered_at), connection.pings.silence_limit_s
-            left = since + answer_s - clock.since_boot()
-            if left < 0:
+            remaining_s = since + answer_s - clock.since_boot()
+            if remaining_s < 0:
                 raise Silent(f"{connection.where} does not answer")
-            connection.pump(left, receive)
+            connection.pump(remaining_s, receive)
 
     def _deliver_all(self, messages: list[Message]) -> None:
         subscriptions = self._subscriptions

@@ -119,14 +119,14 @@ class Barrier:
         end = time.monotonic() + timeout
         pause, longest = _PAUSE_S
         answers: dict[str, int] = {}
-        while wanted := self._missing(expected(), answers):
-            left = end - time.monotonic()
-            if left <= 0:
-                names = ", ".join(sorted(wanted.values()))
+        while missing := self._missing(expected(), answers):
+            remaining_s = end - time.monotonic()
+            if remaining_s <= 0:
+                names = ", ".join(sorted(missing.values()))
                 log.warning("%s did not answer within %.1f s and will not be waited for again", names, timeout)
-                self._silent |= wanted.keys()
+                self._silent |= missing.keys()
                 break
-            if not self._ask(set(wanted), answers, left):
+            if not self._ask(set(missing), answers, remaining_s):
                 time.sleep(pause)
                 pause = min(2 * pause, longest)
         self._silent -= set(answers)

@@ -234,10 +234,10 @@ class ZenohTransport(Transport):
         """Store our will at the hub, and send messages until it lacks none that it has room for."""
         end = time.monotonic() + HUB_ANSWER_S
         sent: set[str] = set()
-        while (left := end - time.monotonic()) > 0:  # looked at once: Zenoh refuses what is not positive
+        while (remaining_s := end - time.monotonic()) > 0:  # looked at once: Zenoh refuses what is not positive
             with self._publishing:  # which takes a moment on a busy machine
                 hello = self._hub.hello()
-            lacking = self._hub.greet(session, hello, left)
+            lacking = self._hub.greet(session, hello, remaining_s)
             if lacking is None:
                 return False
             if not self._send_lacking(session, lacking - sent):  # it had no room for what it lacks again

@@ -69,10 +69,10 @@ def fit(runs: Sequence[Run], noise: Noise, step_mm: tuple[float, float], track_m
         differences, slopes = _equations(runs, noise, wheels)
         wheels = wheels + np.linalg.lstsq(slopes, differences, rcond=None)[0]
     differences, _ = _equations(runs, noise, wheels)
-    rest = iter(np.abs(differences))
+    residuals = iter(np.abs(differences))
     sigma, mm = [], []
     for run in runs:
-        way, turn = (0.0 if run.mm is None else float(next(rest))), float(next(rest))
+        way, turn = (0.0 if run.mm is None else float(next(residuals))), float(next(residuals))
         sigma.append(max(way, turn))
         mm.append(math.hypot(way * _way_mm(run, noise), turn * _turn_rad(run, noise, wheels[2]) * wheels[2] / 2))
     left, right, track = map(float, wheels)

@@ -154,8 +154,8 @@ def write_rules(folder: Path, fleet: Fleet, passwords: Mapping[str, broker_files
 
     Accounts without a password cannot log in.
     """
-    known = {name: passwords[name] for name in fleet.accounts if name in passwords}
-    for name, text in ((PASSWORDS, broker_files.passwords_text(known)), (ACL, broker_files.acl_text(fleet))):
+    stored = {name: passwords[name] for name in fleet.accounts if name in passwords}
+    for name, text in ((PASSWORDS, broker_files.passwords_text(stored)), (ACL, broker_files.acl_text(fleet))):
         write(folder / name, text.encode(), 0o600, FleetError)
 
 

@@ -147,13 +147,13 @@ class AccountAdmission(Admission):
         """
         if not account:
             return hello
-        known = self.accounts.get(account)
-        if known is None or not self.owns(account, hello.name):
+        rules = self.accounts.get(account)
+        if rules is None or not self.owns(account, hello.name):
             self.log(account, "hello", "its session must be named after an account that is known")
             return None
-        offered = hello.own if known.retains else {}
-        own = {key: digest for key, digest in offered.items() if _any(known.retains, key_to_topic(key))}
-        return replace(hello, will=self._of_account(account, known, hello.will), own=own)
+        offered = hello.own if rules.retains else {}
+        allowed = {key: digest for key, digest in offered.items() if _any(rules.retains, key_to_topic(key))}
+        return replace(hello, will=self._of_account(account, rules, hello.will), own=allowed)
 
     def owns(self, account: str, session: str) -> bool:
         return not account or session.startswith(account + wire.OF)

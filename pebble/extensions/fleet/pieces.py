@@ -16,8 +16,8 @@ def of_broker(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str,
     server = fleet.brokers[0]
     login = {"host": server.host, "port": server.port, "username": name, "password": secret}
     link = login | {"tls": {"enabled": True, "ca_cert": certificates.CA_CERT}}
-    found = {"local_mqtt": link} if board else {"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": link}}}
-    return {**_who(fleet, name), **found}
+    part = {"local_mqtt": link} if board else {"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": link}}}
+    return {**_who(fleet, name), **part}
 
 
 def of_certificate(fleet: Fleet, name: str) -> dict[str, Any]:

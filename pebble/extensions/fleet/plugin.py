@@ -28,12 +28,12 @@ def convert(folder: Path, fleet: Fleet) -> tuple[Fleet, list[str]]:
     except (ValueError, KeyError, TypeError):
         raise FleetError(f"{file} is no file of the dynamic-security plugin: restore it from a copy") from None
     after = replace(fleet, rules="files")
-    known = {
+    hashed = {
         name: Hashed(client["salt"], client["password"], client["iterations"])
         for name, client in clients.items()
         if _gets_in(name, client)
     }
-    write_rules(folder, after, known)
+    write_rules(folder, after, hashed)
     save(folder, after)
     return after, list(_left_out(fleet, clients))
 

@@ -105,10 +105,10 @@ class Robots:
         remember = message.retain or (channel is not None and channel.default_retain)
         converted = self._telemetry.convert(topic, payload)
         if converted is not None:
-            made, below = converted.message, f"{topic}/{converted.ending}"
-            if not self._server.declared(below):
-                self._server.declare(protobuf_spec(below, made, self._schemas))
-            self._server.publish(below, stamped(made, time_of(payload, at_ns)), at_ns, remember=remember)
+            protobuf, subtopic = converted.message, f"{topic}/{converted.ending}"
+            if not self._server.declared(subtopic):
+                self._server.declare(protobuf_spec(subtopic, protobuf, self._schemas))
+            self._server.publish(subtopic, stamped(protobuf, time_of(payload, at_ns)), at_ns, remember=remember)
         if converted is not None and not converted.beside:
             return
         data = as_object(payload)

@@ -131,4 +131,4 @@ def _usual_places(robot: str, env: Mapping[str, str]) -> list[Path]:
     usual = Robot(id=robot)
     identity = Identity(*levels) if len(levels) == 3 else Identity(usual.system, usual.type, usual.id)
     bare = {name: value for name, value in env.items() if name not in ("XDG_RUNTIME_DIR", "RUNTIME_DIRECTORY")}
-    return list(dict.fromkeys(default_run_folder(identity.base, known) for known in (env, bare)))
+    return list(dict.fromkeys(default_run_folder(identity.base, variables) for variables in (env, bare)))

@@ -44,8 +44,8 @@ class Child:
 
     def pipe(self, name: str) -> IO[bytes]:
         """Return our end of a stream for which ``subprocess.PIPE`` was given."""
-        found: IO[bytes] = getattr(self._process, name)
-        return found
+        stream: IO[bytes] = getattr(self._process, name)
+        return stream
 
     def signal(self, number: int) -> None:
         """Send a signal to the program's group, if the program still runs."""

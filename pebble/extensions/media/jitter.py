@@ -247,9 +247,9 @@ class JitterBuffer:
 
     def _leave_out(self, received: ReceivedSound, excess: float) -> ReceivedSound:
         """Return the packet to play without ``excess`` seconds, its beginning faded over from ``received``."""
-        newest, left = received, excess
-        while self._waiting and left > len(newest.samples) / newest.rate - _ROUNDING_S:
-            left -= len(newest.samples) / newest.rate
+        newest, remaining_s = received, excess
+        while self._waiting and remaining_s > len(newest.samples) / newest.rate - _ROUNDING_S:
+            remaining_s -= len(newest.samples) / newest.rate
             newest = self._decode(self._first()) or newest
             self.counters.add("skipped")
         return _faded_over(received, newest)

@@ -210,8 +210,8 @@ class SoundDecoder:
         """Return the codec's estimate of one more frame; None if it makes none."""
         if self._opus is None:
             return None
-        made = self._opus.conceal()
-        return made if len(made) else None
+        samples = self._opus.conceal()
+        return samples if len(samples) else None
 
     def _samples(self, sound: Sound) -> Samples:
         if self._opus is None:

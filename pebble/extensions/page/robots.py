@@ -140,17 +140,19 @@ class Robots:
         taken, and only with ``large``. The others, and what does not fit into this message, wait for the next.
         """
         dirty, interest.dirty = interest.dirty, set()
-        taken, has_large, left = [], False, MAX_STATE_BYTES
+        taken, has_large, room = [], False, MAX_STATE_BYTES
         for ref, metric in sorted(dirty, key=lambda key: key[0] != interest.watched):
-            kept = self._find(ref, metric)
-            size = 0 if kept is None else len(bytes(kept.raw))
-            if left <= 0 or (size > LARGE_BYTES and (has_large or not large)):
+            stored = self._find(ref, metric)
+            size = 0 if stored is None else len(bytes(stored.raw))
+            if room <= 0 or (size > LARGE_BYTES and (has_large or not large)):
                 interest.dirty.add((ref, metric))
                 continue
             has_large = has_large or size > LARGE_BYTES
-            left -= size
-            taken.append((ref, metric, None, 0.0) if kept is None else (ref, metric, kept.raw, 1000 * (now - kept.at)))
-        interest.more = left <= 0
+            room -= size
+            taken.append(
+                (ref, metric, None, 0.0) if stored is None else (ref, metric, stored.raw, 1000 * (now - stored.at))
+            )
+        interest.more = room <= 0
         return tuple(taken), has_large
 
     def _find(self, ref: str, metric: str) -> _Value | None:

@@ -133,19 +133,19 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
     """
     if query.robot is None and not query.topics:
         return
-    found: list[Channel] = []
+    channels: list[Channel] = []
     for path in paths:
         try:
             with RecordingFile(path) as file:
                 for _ in file.read(chooses=lambda _channel: False) if file.statistics is None else ():
                     pass
-                found += file.channels.values()
+                channels += file.channels.values()
                 if file.problem:
                     return
         except RecordingError:
             return
-    check_name("robot", query.robot, {robot for channel in found if (robot := robot_of(channel))}, places)
-    topics = {channel.topic for channel in found if query.robot in (None, robot_of(channel))}
+    check_name("robot", query.robot, {robot for channel in channels if (robot := robot_of(channel))}, places)
+    topics = {channel.topic for channel in channels if query.robot in (None, robot_of(channel))}
     for filter_ in query.topics:
         if not any(_matches(filter_, topic) for topic in topics):
             check_name("topic", filter_, {topic for topic in topics if not topic.startswith("$")}, places)

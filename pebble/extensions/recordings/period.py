@@ -82,14 +82,14 @@ def _until(text: str, since_ns: int | None, now: datetime) -> int:
 
 def _latest(option: str, text: str, now: datetime) -> int:
     moments = _times_of_day(_clock(option, text), now, range(-2, 1))
-    ns, moment = max(known for known in _known(moments, now.tzinfo) if known[0] <= _ns(now))
+    ns, moment = max(time for time in _known(moments, now.tzinfo) if time[0] <= _ns(now))
     _check_shown(option, text, moment, now.tzinfo)
     return ns
 
 
 def _first_after(option: str, text: str, since_ns: int, now: datetime) -> int:
     moments = _times_of_day(_clock(option, text), _at(since_ns, now.tzinfo), range(3))
-    ns, moment = min(known for known in _known(moments, now.tzinfo) if known[0] > since_ns)
+    ns, moment = min(time for time in _known(moments, now.tzinfo) if time[0] > since_ns)
     _check_shown(option, text, moment, now.tzinfo)
     return ns
 

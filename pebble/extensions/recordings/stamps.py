@@ -37,10 +37,10 @@ def stamp_ns(payload: bytes) -> int:
     first = payload[:1]
     if first == b"{":
         try:
-            found = _stamped.decode(payload)
+            stamps = _stamped.decode(payload)
         except (ValueError, RecursionError):  # msgspec's are ValueErrors
             return 0
-        return _in_ns(found.timestamp if found.t is None else found.t)
+        return _in_ns(stamps.timestamp if stamps.t is None else stamps.t)
     header = _media_header(payload[:_MEDIA_HEAD]) if first == b"P" else None
     return 0 if header is None else _in_ns(header.captured_ms, 10**6)
 

@@ -145,12 +145,12 @@ class _Removal:
         self._call_in(_ARRIVE_S, again)
 
     def _check(self) -> None:
-        left = [topic for topics in self._found for topic in topics]
-        left += [one.filter for one in self._subscriptions if one.refused]
+        remaining = [topic for topics in self._found for topic in topics]
+        remaining += [subscription.filter for subscription in self._subscriptions if subscription.refused]
         self._end()
-        if left:
+        if remaining:
             text = "%s, its earlier name, stays at a broker: this account may not remove %s and %d more topics"
-            log.warning(text, self._name, min(left), len(left) - 1)
+            log.warning(text, self._name, min(remaining), len(remaining) - 1)
         elif self._removed:  # the next start looks again: a broker may publish a will later
             log.info("removed %d retained messages of its earlier name %s", self._removed, self._name)
         else:
@@ -166,8 +166,8 @@ class _Removal:
         self._end()
         self._found = [set() for _ in self._sides]
         try:
-            for transport, found in zip(self._sides, self._found, strict=True):
-                received = partial(note, found)
+            for transport, topics in zip(self._sides, self._found, strict=True):
+                received = partial(note, topics)
                 self._subscriptions.append(transport.subscribe(filter_, received, echo=False, direct=True))
         except TransportError as error:
             log.warning("what is left of its earlier name %s stays: %s", self._name, error)

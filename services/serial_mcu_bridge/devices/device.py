@@ -51,7 +51,7 @@ class Device:
         interfaces = tuple(map(self._renamed, manifest.interfaces))
         self.payload: McuManifest = Manifest(manifest.hello, interfaces).payload()
         self.claims: Claims = claims(self.payload, self._robots_channel)
-        self.routes = {one.id: self._route(one) for one in interfaces}
+        self.routes = {interface.id: self._route(interface) for interface in interfaces}
 
     @property
     def has_motion(self) -> bool:

@@ -276,6 +276,6 @@ class SerialLine:
         end = time.monotonic() + seconds
         poller = select.poll()
         poller.register(self._wakeup, select.POLLIN)
-        while not self._closing and (left := end - time.monotonic()) > 0:
-            if poller.poll(1000 * left):
+        while not self._closing and (remaining_s := end - time.monotonic()) > 0:
+            if poller.poll(1000 * remaining_s):
                 self._wakeup.clear()

@@ -151,9 +151,9 @@ class _Reader:
             raise PayloadError(f"{raw[:40]!r} is not UTF-8") from None
 
     def end(self) -> None:
-        left = len(self._data) - self._at
-        if left:
-            raise PayloadError(f"{left} bytes too many")
+        unread = len(self._data) - self._at
+        if unread:
+            raise PayloadError(f"{unread} bytes too many")
 
 
 _LENGTH = struct.Struct("<B")

@@ -89,7 +89,7 @@ def pack(fields: Sequence[Field], values: Mapping[str, Any]) -> bytes:
 
 @lru_cache(maxsize=256)
 def _layout(types: tuple[FieldType, ...]) -> struct.Struct:
-    return struct.Struct("<" + "".join(_CODES[one] for one in types))
+    return struct.Struct("<" + "".join(_CODES[kind] for kind in types))
 
 
 def _value(field: Field, raw: Any) -> Any:

@@ -77,27 +77,27 @@ class HallMemory:
 
     def _in_place(self, descriptor: int) -> bool:
         try:
-            found = self._path.lstat()
+            status = self._path.lstat()
         except OSError:
             return False
-        return os.path.samestat(found, os.fstat(descriptor))
+        return os.path.samestat(status, os.fstat(descriptor))
 
     def _open(self) -> tuple[int, mmap.mmap, memoryview]:
         """Create the memory, or open an existing one; it appears only when complete, for readers map it once."""
-        flags, made = os.O_RDWR | os.O_CLOEXEC, False
+        flags, is_new = os.O_RDWR | os.O_CLOEXEC, False
         try:
             descriptor = os.open(self._path, flags | os.O_NOFOLLOW)
         except FileNotFoundError:
-            descriptor, made = os.open(self._path.parent, flags | os.O_TMPFILE, _MODE), True
+            descriptor, is_new = os.open(self._path.parent, flags | os.O_TMPFILE, _MODE), True
         try:
             memory = self._mapped(descriptor)
             form = (_MAGIC, _VERSION, self._slots, 0)
-            *found, newest = _HEADER.unpack_from(memory)
-            if tuple(found) == form:  # its readers go on
+            *header, newest = _HEADER.unpack_from(memory)
+            if tuple(header) == form:  # its readers go on
                 self._number = max(self._number, newest)
             else:
                 _HEADER.pack_into(memory, 0, *form, self._number)
-            if made:  # with a descriptor, so that Python follows the link
+            if is_new:  # with a descriptor, so that Python follows the link
                 os.link(f"/proc/self/fd/{descriptor}", self._path, src_dir_fd=descriptor)
         except BaseException:
             os.close(descriptor)
@@ -110,11 +110,11 @@ class HallMemory:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise OSError("is written by another process") from None
-        found = os.fstat(descriptor)
-        if found.st_uid != os.geteuid():
+        status = os.fstat(descriptor)
+        if status.st_uid != os.geteuid():
             raise PermissionError(errno.EPERM, "belongs to another user")
-        if found.st_size not in (0, self._size):
-            raise OSError(f"has {found.st_size} bytes, and {self._slots} slots need {self._size}: remove it")
-        if not found.st_size:
+        if status.st_size not in (0, self._size):
+            raise OSError(f"has {status.st_size} bytes, and {self._slots} slots need {self._size}: remove it")
+        if not status.st_size:
             os.posix_fallocate(descriptor, 0, self._size)  # so that no write into it can be fatal
         return mmap.mmap(descriptor, self._size)

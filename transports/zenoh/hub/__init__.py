@@ -110,8 +110,8 @@ class ZenohHub:
             self._worker.close()
         if self._lock is not None:
             if self._lock.in_place:  # else they may be another hub's
-                for left in (HUB_SOCKET, HUB_SOCKET + ".lock"):
-                    (self._settings.run_dir / left).unlink(missing_ok=True)
+                for name in (HUB_SOCKET, HUB_SOCKET + ".lock"):
+                    (self._settings.run_dir / name).unlink(missing_ok=True)
             self._lock.release()
         self._session = self._worker = self._lock = None
 

@@ -55,7 +55,7 @@ class HubStore:
 
         A later value, or removal, by another client stays.
         """
-        return [key for key, own in hello.own.items() if self._differs(key, own, hello.name)]
+        return [key for key, digest in hello.own.items() if self._differs(key, digest, hello.name)]
 
     def _differs(self, key: str, own: int | None, name: str) -> bool:
         retained = self._retained.get(key)

@@ -66,8 +66,8 @@ class Printer:
         if self._as_json:
             typer.echo(json.dumps({"ok": not bad, **more, "checks": self.rows}, ensure_ascii=False))
         else:
-            left = f", skipped: {counts['skipped']}" if counts["skipped"] else ""
-            typer.echo(f"checks: {len(self.rows)}, warnings: {counts['warn']}, failures: {counts['failed']}{left}")
+            skipped = f", skipped: {counts['skipped']}" if counts["skipped"] else ""
+            typer.echo(f"checks: {len(self.rows)}, warnings: {counts['warn']}, failures: {counts['failed']}{skipped}")
         return int(bad > 0)
 
 

@@ -76,15 +76,15 @@ def _shown(robot: Observer) -> list[tuple[float, list[float]]]:
 
 def _travelled(robot: Observer) -> list[tuple[float, list[float]]]:
     """Return the odometry's speeds as those of a left and a right wheel (m/s), each with its time."""
-    found = []
+    speeds = []
     for record in robot.of(c.WHEEL_ODOMETRY):
         value: dict[str, Any] = record.value.value if record.value else {}
         ahead: Any = value.get("linear_speed_mps")
         turn: Any = value.get("angular_speed_radps")
         if _are_wheels([ahead, turn]):
             metres, swing = round(float(ahead), 2), _HALF_TRACK_M * round(float(turn), 2)
-            found.append((record.at, [metres - swing, metres + swing]))
-    return found
+            speeds.append((record.at, [metres - swing, metres + swing]))
+    return speeds
 
 
 def _moves(robot: Observer, since: float) -> list[float] | None:

@@ -72,15 +72,15 @@ class Report:
 def make(places: Places, file: Path | None = None) -> Report:
     """Collect all parts, with this machine's secrets masked. A part that fails is named in the index."""
     here = _here(places, file or places.config)
-    known = secrets_of(places, here.config, [here.file])
-    report = Report(unread=known.unread)
+    secrets = secrets_of(places, here.config, [here.file])
+    report = Report(unread=secrets.unread)
     for name, part in PARTS.items():
         try:
-            report.parts[name] = known.hidden(without_secrets(part(here)))[:_LONGEST_PART]
+            report.parts[name] = secrets.hidden(without_secrets(part(here)))[:_LONGEST_PART]
         except Exception as error:  # noqa: BLE001 - what is broken is why there is a report: the rest is in it
             kind = "" if isinstance(error, PebbleError) else f"{type(error).__name__}: "
-            report.missing[name] = known.hidden(without_secrets(kind + " ".join(str(error).split())))
-    report.parts = {"index.txt": known.hidden(_index(report, known)), **report.parts}
+            report.missing[name] = secrets.hidden(without_secrets(kind + " ".join(str(error).split())))
+    report.parts = {"index.txt": secrets.hidden(_index(report, secrets)), **report.parts}
     return report
 
 

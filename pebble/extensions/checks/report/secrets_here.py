@@ -75,9 +75,9 @@ def secrets_of(places: Places, config: Config | None, more: Collection[Path] = (
                     values += [(value, str(file)) for value in values_in(file.name, read_plain(file))]
         except (OSError, PebbleError):
             unread.add(str(file))
-    known = frozenset(value for value, _ in values if len(value) >= _SHORTEST)
+    maskable = frozenset(value for value, _ in values if len(value) >= _SHORTEST)
     short = {where for value, where in values if len(value) < _SHORTEST}
-    return Secrets(known, tuple(sorted(unread)), tuple(sorted(short)))
+    return Secrets(maskable, tuple(sorted(unread)), tuple(sorted(short)))
 
 
 def values_in(name: str, raw: bytes) -> Iterator[str]:

@@ -182,14 +182,14 @@ def remove(name: _Name, folder_: _Folder = None) -> int:
     with _changing(folder_) as (place, fleet):
         account = _account(place, fleet, name)
         after = fleet.without(name)
-        left = list(_remove_from_pages(fleet, name)) if not set(account.roles) & set(ProgramRole) else []
-        left += applying.copies(Path(_shown(place)), after)
+        unfinished = list(_remove_from_pages(fleet, name)) if not set(account.roles) & set(ProgramRole) else []
+        unfinished += applying.copies(Path(_shown(place)), after)
         try:
             how = applying.apply(place, after)
             typer.echo(f"{name} is removed and disconnected ({how})")
         except FleetError as error:
-            left += [*str(error).splitlines(), f"{name} may still get in there: give this command again"]
-    return _left(left)
+            unfinished += [*str(error).splitlines(), f"{name} may still get in there: give this command again"]
+    return _left(unfinished)
 
 
 def zenoh(
@@ -271,15 +271,15 @@ def apply_(folder_: _Folder = None) -> int:
         pebble fleet apply
     """
     with _changing(folder_, any_rules=True) as (place, fleet):
-        left = list[str]()
+        unfinished = list[str]()
         if fleet.rules == "plugin":
-            fleet, left = plugin.convert(place, fleet)
+            fleet, unfinished = plugin.convert(place, fleet)
         if applying.obeys_plugin(place):
-            left += applying.conf_differences(place, fleet)
+            unfinished += applying.conf_differences(place, fleet)
         else:
             typer.echo(f"{_shown(place)} knows {len(fleet.accounts)} accounts ({applying.apply(place, fleet)})")
-        left += applying.copies(Path(_shown(place)), fleet)
-    return _left(left)
+        unfinished += applying.copies(Path(_shown(place)), fleet)
+    return _left(unfinished)
 
 
 def check_(folder_: _Folder = None) -> int:

@@ -59,10 +59,10 @@ class BoardInfo:
 
 def check_answer(answer: str, board: Board) -> BoardInfo:
     """Return the report in the output of :data:`IDENTIFY`. Raises PebbleError if it is not from ``board``."""
-    found = _ANSWER.search(answer)
-    if found is None:
+    match = _ANSWER.search(answer)
+    if match is None:
         raise PebbleError(f"unexpected answer from the board: {answer.strip()[-200:]!r}")
-    name, *numbers, mpy_text, binary, rom, machine = found.groups()
+    name, *numbers, mpy_text, binary, rom, machine = match.groups()
     version, mpy = ".".join(numbers), int(mpy_text)
     if name != "micropython":
         raise PebbleError(f"the board runs {name}; install MicroPython with --micropython FILE")

@@ -31,21 +31,21 @@ def described() -> list[str]:
 
 def hint() -> str:
     """Return the list of ports for an error message."""
-    found = described()
-    if not found:
+    ports = described()
+    if not ports:
         return "no board is plugged in (some USB cables carry power only: try another)"
-    return "available ports:\n" + "\n".join(f"  {line}" for line in found)
+    return "available ports:\n" + "\n".join(f"  {line}" for line in ports)
 
 
 def check(port: str) -> None:
     """Raise DeviceError, with the available ports, unless ``port`` can be opened."""
     path = Path(port)
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError as error:
         why = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be used: {error.strerror}"
         raise DeviceError(f"--port {port}: {why}; {hint()}") from None
-    if not stat.S_ISCHR(found.st_mode):
+    if not stat.S_ISCHR(status.st_mode):
         raise DeviceError(f"--port {port}: is not a serial port; {hint()}")
     if not os.access(path, os.R_OK | os.W_OK):
         raise DeviceError(f"--port {port}: permission denied: sudo usermod -aG dialout $USER, then log in again")

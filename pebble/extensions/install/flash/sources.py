@@ -28,14 +28,14 @@ def modules(firmware: Firmware, root: Path | None = None) -> list[Path]:
     main = main_file(firmware, root)
     if not main.is_file():
         raise PebbleError(f"{firmware.name} has no firmware yet: {main} does not exist")
-    found: set[Path] = set()
+    imported: set[Path] = set()
     waiting = [main]
     while waiting:
         for path in _imported(waiting.pop(), root):
-            if path not in found:
-                found.add(path)
+            if path not in imported:
+                imported.add(path)
                 waiting.append(root / path)
-    return sorted(found)
+    return sorted(imported)
 
 
 def _imported(file: Path, root: Path) -> Iterator[Path]:

@@ -31,8 +31,10 @@ class Tools:
     """A runner of each tool as a module of this Python, independently of PATH; ``programs`` replaces some of them."""
 
     def __init__(self, programs: dict[str, Sequence[str]] | None = None) -> None:
-        own: dict[str, Sequence[str]] = {name: (sys.executable, "-Pm", module) for name, module in _MODULES.items()}
-        self._programs = own | (programs or {})
+        defaults: dict[str, Sequence[str]] = {
+            name: (sys.executable, "-Pm", module) for name, module in _MODULES.items()
+        }
+        self._programs = defaults | (programs or {})
         self._given = set(programs or {})
 
     def check(self, names: Sequence[str]) -> None:

@@ -35,9 +35,9 @@ def at_broker(config: Config, timeout_s: float = HEARTBEAT_S) -> str:
             raise DeviceError(f"local_mqtt: this machine cannot connect to {broker.host}:{broker.port}: {why}")
         transport.subscribe(ONLINE.topic(config.base), received.put, qos=QoS.LATEST)
         end = time.monotonic() + timeout_s
-        while (left := end - time.monotonic()) > 0:
+        while (remaining_s := end - time.monotonic()) > 0:
             with suppress(queue.Empty):
-                message = received.get(timeout=left)
+                message = received.get(timeout=remaining_s)
                 if not message.retain and _alive(message.payload):
                     return "the robot is online"
     raise DeviceError(

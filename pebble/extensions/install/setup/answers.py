@@ -125,12 +125,12 @@ def combined(earlier: Answers, given: Mapping[str, Any]) -> Answers:
 
     Raises AnswersError with a line for each mistake.
     """
-    known = asdict(earlier)
-    for key, others in _DEPENDING.items():
-        if key in given and given[key] != known[key]:
-            known |= dict.fromkeys(others)
+    fields = asdict(earlier)
+    for key, dependent in _DEPENDING.items():
+        if key in given and given[key] != fields[key]:
+            fields |= dict.fromkeys(dependent)
     try:
-        answers = msgspec.convert(known | dict(given), Answers)
+        answers = msgspec.convert(fields | dict(given), Answers)
     except msgspec.ValidationError as error:
         raise AnswersError(f"answers: {error}") from None
     if wrong := [*_mistakes(earlier, answers)]:

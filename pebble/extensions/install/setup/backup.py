@@ -112,8 +112,8 @@ def _files(places: Places, config: Config) -> Iterator[Path]:
     without = [_here(places, folder) for _, folder in _left_out(config)]
     for folder in (places.etc, places.state, _here(places, config.state_dir())):
         yield from _below(folder, without)
-    own = (config.folder / name for name in config.extensions if name.endswith(".py"))
-    named = [places.broker, people_of(config), *values_of(config, Path), *own]
+    owner_extensions = (config.folder / name for name in config.extensions if name.endswith(".py"))
+    named = [places.broker, people_of(config), *values_of(config, Path), *owner_extensions]
     if places.broker.is_file():
         named += map(Path, _BROKER_FILES.findall(places.broker.read_text(encoding="utf-8", errors="replace")))
     for path in named:

@@ -75,8 +75,8 @@ def _ask_board(job: Job, number: str) -> _Given:
     typer.echo("\n   Listening to serial ports…")
     boards = {board.port: board for board in detect.boards(detect.SERIAL_PORTS)}
     choices = [*((board.port, board.text) for board in boards.values()), (NONE, "no board now")]
-    known = next((board.port for board in boards.values() if board.baud), NONE)
-    port = _choose(f"{number} Which board drives the motors?", choices, job.answers.port or known)
+    heard_port = next((board.port for board in boards.values() if board.baud), NONE)
+    port = _choose(f"{number} Which board drives the motors?", choices, job.answers.port or heard_port)
     if port == NONE:
         return {"port": NONE}
     board = boards.get(port)
@@ -103,8 +103,8 @@ def _ask_broker(job: Job, number: str) -> _Given:
     if answers.is_far:
         default = answers.broker_user or str(answers.id)
         given["broker_user"] = str(typer.prompt("   The robot's account there", default=default))
-        known = answers.broker_ca or ""
-        ca = str(typer.prompt("   File with its authority, ca.pem (empty: a public one)", default=known))
+        present = answers.broker_ca or ""
+        ca = str(typer.prompt("   File with its authority, ca.pem (empty: a public one)", default=present))
         given["broker_ca"] = str(Path(ca).absolute()) if ca else None
     return given
 

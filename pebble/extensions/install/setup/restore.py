@@ -88,12 +88,12 @@ def _content(file: Path) -> bytes:
 def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
     """Return the backup's files without foreign files, and without mosquitto's, which setup makes itself."""
     folder = f"{places.broker_folder.relative_to(places.root)}/"
-    made = [f"{folder}{name}" for name in own_broker.LINKS]
+    links = [f"{folder}{name}" for name in own_broker.LINKS]
     broker = str(places.broker.relative_to(places.root))
     kept = {
         name: saved
         for name, saved in files.items()
-        if name not in made and (name.startswith(folder) or not name.startswith("etc/mosquitto/"))
+        if name not in links and (name.startswith(folder) or not name.startswith("etc/mosquitto/"))
     }
     if broker in files:
         kept[broker] = Saved(own_broker.conf_text(places, own_broker.fleet_of("robot", "", places.people)), 0o644)

@@ -126,12 +126,12 @@ class Job:
 
     def _passwords(self) -> Iterator[Step]:
         file, page = self.places.etc / BROKER_PASSWORD, self.places.etc / PAGE_PASSWORD
-        given = self.secrets.broker_password
-        if given is not None and self.answers.broker != HERE:
-            yield self._file("password of the robot at its broker", file, f"{given}\n".encode())
+        typed = self.secrets.broker_password
+        if typed is not None and self.answers.broker != HERE:
+            yield self._file("password of the robot at its broker", file, f"{typed}\n".encode())
         if self.answers.broker == HERE:
-            known = self.config is None or self.has_login
-            yield self._new_password("password of the robot at its own broker", file, known=known)
+            keeps_password = self.config is None or self.has_login
+            yield self._new_password("password of the robot at its own broker", file, known=keeps_password)
             if self.answers.page:
                 yield self._new_password("password of the page at the robot's broker", page)
 
@@ -175,9 +175,9 @@ class Job:
         )._replace(restarts=(BROKER_SERVICE,))
 
     def _other_broker(self) -> Iterator[Step]:
-        own = self.places.broker
-        if own.exists():
-            yield Step("the robot's own broker ends", lambda: False, own.unlink, (BROKER_SERVICE,))
+        broker_conf = self.places.broker
+        if broker_conf.exists():
+            yield Step("the robot's own broker ends", lambda: False, broker_conf.unlink, (BROKER_SERVICE,))
         if self.answers.broker_ca in (None, self.earlier.broker_ca):
             return
         given = Path(str(self.answers.broker_ca))

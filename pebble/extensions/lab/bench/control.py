@@ -141,9 +141,9 @@ class Participants(Processes):
             folder.mkdir()
             if kind == "zenoh":
                 where: Any = ZenohSettings(run_dir=folder / "z", **settings)  # short: paths of Unix sockets
-                own = _json(ZenohSettings(run_dir=where.run_dir))
+                hub_settings = _json(ZenohSettings(run_dir=where.run_dir))
                 hub = self.add(
-                    Program("hub", python("pebble.extensions.lab.rig.hub", own), folder / "hub.log"), BROKERS
+                    Program("hub", python("pebble.extensions.lab.rig.hub", hub_settings), folder / "hub.log"), BROKERS
                 )
                 hub.wait_until((where.run_dir / "hub.sock").exists, _READY_S)
                 stream: tuple[str, object] = ("zenoh-shm", where.run_dir)

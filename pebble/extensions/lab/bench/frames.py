@@ -157,5 +157,5 @@ def table(results: Results) -> Table:
 
 def _beside(cell: Cell, *names: str) -> str:
     """Return a cell's figures in one line."""
-    known = [cell.middle(name) for name in names if name in cell.figures]
-    return " / ".join(f"{value:.0f}" if value >= 20 else f"{value:.1f}" for value in known)
+    values = [cell.middle(name) for name in names if name in cell.figures]
+    return " / ".join(f"{value:.0f}" if value >= 20 else f"{value:.1f}" for value in values)

@@ -159,10 +159,10 @@ class MqttReader:
     def read(self, timeout: float) -> np.ndarray | None:
         end = time.monotonic() + timeout
         while not self._arrived:
-            left = end - time.monotonic()
-            if left <= 0:
+            remaining_s = end - time.monotonic()
+            if remaining_s <= 0:
                 return None
-            self._client.loop(left)
+            self._client.loop(remaining_s)
         return np.frombuffer(self._arrived.popleft(), np.uint8)
 
 

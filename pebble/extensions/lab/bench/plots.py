@@ -31,9 +31,9 @@ _SETTINGS: dict[Any, Any] = {
 
 def curves(name: str, caption: str, cells: Sequence[Cell]) -> list[Picture]:
     """Return charts of distributions, a panel for each condition: the share of messages that arrived within a time."""
-    known = [cell for cell in cells if len(cell.samples) >= _LEAST]
+    shown_cells = [cell for cell in cells if len(cell.samples) >= _LEAST]
     caption = f"{caption}. Share of all messages, lost ones included, within the time"
-    return [Picture(name, caption, partial(_curves, known, caption))] if known else []
+    return [Picture(name, caption, partial(_curves, shown_cells, caption))] if shown_cells else []
 
 
 def _curves(cells: Sequence[Cell], title: str) -> Figure:
@@ -57,8 +57,8 @@ def _curves(cells: Sequence[Cell], title: str) -> Figure:
 
 def lines(name: str, caption: str, cells: Sequence[Cell], *, over: str) -> list[Picture]:
     """Return charts of the medians as lines over the parameter ``over``; one panel for each measure."""
-    known = [cell for cell in cells if cell.samples]
-    return [Picture(name, caption, partial(_lines, known, caption, over))] if known else []
+    shown_cells = [cell for cell in cells if cell.samples]
+    return [Picture(name, caption, partial(_lines, shown_cells, caption, over))] if shown_cells else []
 
 
 def _lines(cells: Sequence[Cell], title: str, over: str) -> Figure:

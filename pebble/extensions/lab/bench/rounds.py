@@ -73,17 +73,17 @@ def add_round(results: Results, measured: Iterable[Cell]) -> None:
 
     Their figures that are whole numbers are counts, which add up; others are averaged.
     """
-    known = {_key(cell): cell for cell in results.cells}
+    by_key = {_key(cell): cell for cell in results.cells}
     for key, parts in grouped(list(measured), _key).items():
-        cell = known.get(key)
+        cell = by_key.get(key)
         if cell is None:
             cell = msgspec.structs.replace(parts[0], rounds=[], figures={})
             results.cells.append(cell)
         cell.rounds.append([sample for part in parts for sample in part.samples])
         for name in parts[0].figures:
             values = [value for part in parts for value in part.figures[name]]
-            whole = all(isinstance(value, int) for value in values)
-            cell.figures.setdefault(name, []).append(sum(values) if whole else fmean(values))
+            are_counts = all(isinstance(value, int) for value in values)
+            cell.figures.setdefault(name, []).append(sum(values) if are_counts else fmean(values))
 
 
 def _key(cell: Cell) -> tuple[str, str, frozenset[object]]:

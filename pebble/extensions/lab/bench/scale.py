@@ -81,13 +81,13 @@ def table(results: Results) -> Table:
     """Return CPU, memory and latency for each number of boards."""
     heads = ["boards", "CPU %", "broker %", "boards' %", "PSS MB", "p50 ms", "p99 ms", "n", "lost"]
     grid = plain_table("Page server with one viewer: CPU of one core, memory, latency of a value", heads)
-    for found in (cell for cell in results.cells if cell.measure == LATENCY):
-        boards = found.params["boards"]
-        used = [results.find(PAGE, CPU, process=name, boards=boards) for name in PROCESSES]
+    for delay in (cell for cell in results.cells if cell.measure == LATENCY):
+        boards = delay.params["boards"]
+        cpu = [results.find(PAGE, CPU, process=name, boards=boards) for name in PROCESSES]
         memory = results.find(PAGE, MEMORY, boards=boards)
         grid.add_row(
-            str(boards), *(digits(cell.percentile(50)) if cell else "" for cell in (*used, memory)),
-            digits(found.percentile(50)), digits(found.percentile(99)), str(len(found.samples)), str(found.lost),
+            str(boards), *(digits(cell.percentile(50)) if cell else "" for cell in (*cpu, memory)),
+            digits(delay.percentile(50)), digits(delay.percentile(99)), str(len(delay.samples)), str(delay.lost),
         )  # fmt: skip
     return grid
 

@@ -54,8 +54,8 @@ def serial_bridge(local_port: int, base: str, device: str, *, reports: bool) -> 
     port = serial.Serial(device, _BAUD, timeout=_READ_S)
 
     def drive(message: MQTTMessage) -> None:
-        wanted = json.loads(message.payload)
-        left, right = (max(-1.0, min(1.0, wanted["z"] + side * wanted["x"])) for side in (1, -1))
+        command = json.loads(message.payload)
+        left, right = (max(-1.0, min(1.0, command["z"] + side * command["x"])) for side in (1, -1))
         port.write(b"M %.3f %.3f\n" % (left, right))
 
     local = StockClient(drive, [(DRIVE.topic(base), 1)], at_once=False).open(local_port)

@@ -163,14 +163,14 @@ def _late(robot: Robot, joins: int) -> Iterator[Cell]:
 
 def _retained_topics(transport: Transport) -> set[str]:
     """Return the topics with a retained message. It waits for a pause, since no message is marked as the last."""
-    found: list[Message] = []
+    messages: list[Message] = []
     with transport:
-        transport.subscribe(_EVERYTHING, found.append, direct=True)
+        transport.subscribe(_EVERYTHING, messages.append, direct=True)
         topics, before = set[str](), -1
         while before < len(topics):
             before = len(topics)
             time.sleep(_QUIET_S)
-            topics = {message.topic for message in found if message.retain}
+            topics = {message.topic for message in messages if message.retain}
     return topics
 
 

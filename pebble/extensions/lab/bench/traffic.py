@@ -95,8 +95,8 @@ def analysed(settings: Settings) -> Analysed:
     with tempfile.TemporaryDirectory(prefix="pebble-traffic-") as scratch:
         recordings = Path(scratch) / "recordings"
         record(recordings, settings.idle_s, settings.session_s)
-        found = sources([recordings], Path(scratch))
-        return {robot.robot.rpartition("/")[2]: robot for robot in analyse(found, Path(scratch)).robots}
+        indexed = sources([recordings], Path(scratch))
+        return {robot.robot.rpartition("/")[2]: robot for robot in analyse(indexed, Path(scratch)).robots}
 
 
 def record(folder: Path, idle_s: float, session_s: float) -> None:

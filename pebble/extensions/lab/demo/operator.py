@@ -316,7 +316,7 @@ class Operator:
         A robot that is stopped, or was driven a moment ago, refuses to start a script.
         """
         now = time.monotonic()
-        for robot in [one for one in robots if one.base in self._drawing]:
+        for robot in [candidate for candidate in robots if candidate.base in self._drawing]:
             runs = robot.autonomy is not None and robot.autonomy.running
             if not runs and not robot.stopped_by and self.visitors.rests(robot, now):
                 self._command(robot, AutonomyCommand(action="start", file=TRAIL))

@@ -76,4 +76,4 @@ def qr_lines(text: str) -> Iterator[str]:
     if len(dark) % 2:
         dark = np.pad(dark, ((0, 1), (0, 0)))
     for upper, lower in zip(dark[::2], dark[1::2], strict=True):
-        yield "".join(_BLOCKS[bool(one), bool(other)] for one, other in zip(upper, lower, strict=True))
+        yield "".join(_BLOCKS[bool(above), bool(below)] for above, below in zip(upper, lower, strict=True))

@@ -301,9 +301,9 @@ def children(pid: int) -> list[int]:
 
     Not every kernel has /proc/PID/task/TID/children.
     """
-    found = []
+    pids = []
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
             if int((process / "stat").read_text().rpartition(")")[2].split()[1]) == pid:
-                found.append(int(process.name))
-    return sorted(found)
+                pids.append(int(process.name))
+    return sorted(pids)

@@ -165,12 +165,12 @@ class Robot(SimulatedRobot):
     def processes(self) -> dict[str, int]:
         """Return the process ids of the launcher, its children (a hub among them) and the local broker, by name."""
         names = {name[:15]: name for name in self._programs()}  # as long as they are in the kernel
-        found = {"launcher": self.launcher.pid}
+        pids = {"launcher": self.launcher.pid}
         for pid in children(self.launcher.pid):
             with suppress(OSError):  # it has just ended
                 comm = Path(f"/proc/{pid}/comm").read_text().strip()
-                found[names.get(comm, comm)] = pid
-        return found if self.local_broker is None else found | {"mosquitto": self.local_broker.pid}
+                pids[names.get(comm, comm)] = pid
+        return pids if self.local_broker is None else pids | {"mosquitto": self.local_broker.pid}
 
     def complete(self) -> bool:
         """True if all programs of the robot run, including on-demand ones."""

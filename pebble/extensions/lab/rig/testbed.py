@@ -52,9 +52,9 @@ class LinuxRobot(Robot):
     running: Testbed
 
     def __init__(self, running: Testbed, name: str) -> None:
-        own = _config(name)
+        config = _config(name)
         remote, folder = (HOST, running.broker_port), running.folder / name
-        super().__init__(running, own["transport"]["kind"], remote, name=name, folder=folder)
+        super().__init__(running, config["transport"]["kind"], remote, name=name, folder=folder)
         self.has_scripts = name == "goob"
         self.local_port = running.local_broker.port
         self.port, self._trace = port_path(running.world, name), trace_path(running.world, name)
@@ -62,7 +62,7 @@ class LinuxRobot(Robot):
         self.played = folder / "played"
         self._imu = folder / "imu"  # a serial port
         self.instances: dict[str, Config] = {}
-        self._own = own | {"services": own["services"] | {"av_daemon": {}}}
+        self._own = config | {"services": config["services"] | {"av_daemon": {}}}
         raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
         camera = {"video": {"device": f"{running.room_file}#{name}"}}
         self._services = {

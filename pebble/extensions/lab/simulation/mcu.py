@@ -71,11 +71,11 @@ def actions(mcu: PtyMcu) -> dict[str, Callable[[], None]]:
 
 
 def _run_commands(mcu: PtyMcu, end: EndSignal) -> None:
-    known = actions(mcu)
+    commands = actions(mcu)
     for line in sys.stdin:
-        action = known.get(line.strip())
+        action = commands.get(line.strip())
         if action is None:
-            sys.stderr.write(f"unknown command {line.strip()}; known: {', '.join(known)}\n")
+            sys.stderr.write(f"unknown command {line.strip()}; known: {', '.join(commands)}\n")
         else:
             action()
     end.set()

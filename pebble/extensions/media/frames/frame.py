@@ -84,12 +84,12 @@ class Frame:
 def picture(data: Bytes, info: FrameInfo, width: int | None = None) -> Bytes:
     """Return the picture in ``data``: (height, width, 3), BGR. Raises PayloadError if it is no picture."""
     if info.format == "mjpeg":
-        found = _jpeg(data, info, width)
+        pixels = _jpeg(data, info, width)
     elif info.format in PICTURE_FORMATS:
-        found = _raw(data, info)
+        pixels = _raw(data, info)
     else:
         raise PayloadError(f'a frame of format "{info.format}" is no picture')
-    return found if width is None or width == found.shape[1] else _resized(found, width)
+    return pixels if width is None or width == pixels.shape[1] else _resized(pixels, width)
 
 
 def _raw(data: Bytes, info: FrameInfo) -> Bytes:
@@ -135,12 +135,12 @@ def _jpeg(data: Bytes, info: FrameInfo, width: int | None) -> Bytes:
     scale = _scale(info.width, width)
     flags = {1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}
     try:
-        found = cv2.imdecode(data, flags.get(scale, cv2.IMREAD_REDUCED_COLOR_8))
+        pixels = cv2.imdecode(data, flags.get(scale, cv2.IMREAD_REDUCED_COLOR_8))
     except cv2.error:  # an empty or undecodable buffer
-        found = None
-    if found is None:
+        pixels = None
+    if pixels is None:
         raise PayloadError(f"{data.size} bytes are no JPEG")
-    return np.asarray(found)
+    return np.asarray(pixels)
 
 
 def _scale(has: int, wanted: int | None) -> int:

@@ -230,9 +230,9 @@ class FrameReader:
         mapped = memory.mappings()
         if any(file.endswith(segment) for _, _, file in mapped):
             return ""  # as before: only the connection was lost
-        if (left := sum(end - start for start, end, _ in mapped)) > MAPPED_LIMIT:
+        if (total := sum(end - start for start, end, _ in mapped)) > MAPPED_LIMIT:
             return (
-                f"writers of {self._names.stream} were restarted so often that {left >> 20} MiB of their memory are "
+                f"writers of {self._names.stream} were restarted so often that {total >> 20} MiB of their memory are "
                 "lost until this process is restarted: from now on it gets frames as bytes"
             )
         needed = size + METADATA

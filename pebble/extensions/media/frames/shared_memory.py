@@ -38,8 +38,8 @@ class SharedPool:
 
     def segment(self) -> str:
         """Return the name of its file in /dev/shm; "" if Zenoh does not report it."""
-        found = _segment(repr(self._provider.alloc(1, policy=self._policy)))
-        return f"{found[1]}.zenoh" if found else ""
+        match = _segment(repr(self._provider.alloc(1, policy=self._policy)))
+        return f"{match[1]}.zenoh" if match else ""
 
     def allocate(self, size: int) -> Chunk | None:
         """Return memory for a frame of ``size`` bytes; None if no slot is free."""

@@ -114,8 +114,8 @@ def _calibrate() -> int:
 
 def zenoh_version() -> str:
     """Return Zenoh's version, from the name of its folder: `importlib.metadata` takes several MB of memory."""
-    found = sorted(Path(zenoh.__file__).parent.parent.glob("eclipse_zenoh-*.dist-info"))
-    return found[-1].name.removeprefix("eclipse_zenoh-").removesuffix(".dist-info") if found else ""
+    folders = sorted(Path(zenoh.__file__).parent.parent.glob("eclipse_zenoh-*.dist-info"))
+    return folders[-1].name.removeprefix("eclipse_zenoh-").removesuffix(".dist-info") if folders else ""
 
 
 def _offsets(buffer: Buffer) -> set[int]:

@@ -141,10 +141,10 @@ class RobotStop:
         if message.topic == self._status_topic:
             self.driveable = driveable_of(message.payload)
             return
-        known = self.estop.has_capabilities
+        had_capabilities = self.estop.has_capabilities
         if not self.estop.receive(message):
             return
-        if self.estop.has_capabilities and not known:
+        if self.estop.has_capabilities and not had_capabilities:
             self.next, self._names_due = now, self.estop.named  # its topics may be others
         self._boots.update(
             {owner: self.estop.states[owner].boot for owner in self.estop.owners if self._lists_it(owner)}

@@ -354,9 +354,11 @@ def _status(target: Target, *, every: bool) -> int:
             )
             transport.ask([topic for robot in discovery.all_robots() for topic in robot.estop.missing])
         if is_remote:
-            found, began = discovery.all_robots, time.monotonic()
+            robots_now, began = discovery.all_robots, time.monotonic()
             wait_for(lambda: not discovery.awaits_heartbeat(time.monotonic() - began), float("inf"))
-            wait_for(lambda: not any(robot.liveness.received_at and robot.estop.lacks for robot in found()), _ANSWER_S)
+            wait_for(
+                lambda: not any(robot.liveness.received_at and robot.estop.lacks for robot in robots_now()), _ANSWER_S
+            )
         robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
     for robot in robots:
         _print_states(robot.estop, robot.driveable, silent=is_remote and robot.liveness.received_at is None)

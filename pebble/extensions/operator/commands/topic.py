@@ -76,8 +76,8 @@ def list_(
         listing = show.Listing(names)
         listener = Listener(transport, [filter_ or ("#" if target.robot is None else f"{names.base}/#")])
         end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            message = listener.next(left)
+        while (remaining_s := end - time.monotonic()) > 0:
+            message = listener.next(remaining_s)
             if message is not None:
                 listing.add(message, time.monotonic())
         show.print_listing(listing, time.monotonic(), time.time())

@@ -117,8 +117,8 @@ class Recordings:
         await self._forget()
         if timeline.job.why:
             raise PebbleError(timeline.job.why)
-        made = timeline.take()
-        return timeline.job.done if made is None else made
+        json_text = timeline.take()
+        return timeline.job.done if json_text is None else json_text
 
     async def export(self, wanted: ExportRequest) -> str:
         """Start an export; return its id. Raises PebbleError, and BusyError while another one runs."""
@@ -229,9 +229,9 @@ async def _days(_: Request, recordings: Recordings) -> Response:
 
 
 async def _timeline(request: Request, recordings: Recordings) -> Response:
-    asked = request.query_params
-    made = await recordings.timeline(asked.get("day", ""), _robot(request), again=asked.get("again") == "1")
-    return JSONResponse({"indexing": made}, 202) if isinstance(made, float) else _json(made)
+    parameters = request.query_params
+    result = await recordings.timeline(parameters.get("day", ""), _robot(request), again=parameters.get("again") == "1")
+    return JSONResponse({"indexing": result}, 202) if isinstance(result, float) else _json(result)
 
 
 async def _begin_export(request: Request, recordings: Recordings) -> Response:

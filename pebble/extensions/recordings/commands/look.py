@@ -80,7 +80,7 @@ def search(
     """Print the messages that match, in the order of time."""
     since_ns, until_ns = period(since, until)
     query = Query(None if robot is None else base_of(robot), tuple(topic or ()), text)
-    paths, found, damages = files(places), 0, Damages()
+    paths, matches, damages = files(places), 0, Damages()
     catalogue.check_names(query, paths, places)
     for message in merged(paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages):
         if not query.accepts(message):
@@ -89,10 +89,10 @@ def search(
         line = one_line(show.body(message.payload, _ONE_LINE))
         topic_ = one_line(shown(message.channel.topic))
         typer.echo(f"{local_time(message.log_ns, fraction=True)}  {topic_}{flag}  {line}")
-        found += 1
-        if found == count:
+        matches += 1
+        if matches == count:
             break
-    typer.echo(f"{found:,} messages", err=True)
+    typer.echo(f"{matches:,} messages", err=True)
     return report_unread(problems(damages))
 
 
@@ -154,10 +154,10 @@ def _state(info: FileInfo) -> str:
 
 
 def _print_events(paths: Iterable[Path]) -> None:
-    found = list(catalogue.events(path for path in paths if ".media." not in path.name))
-    if found:
+    events = list(catalogue.events(path for path in paths if ".media." not in path.name))
+    if events:
         typer.echo("\nWhat happened to the recording:")
-    for event in found:
+    for event in events:
         name, at = event.pop("event"), event.pop("t", 0)
         since, until = event.pop("since", None), event.pop("until", None)
         if isinstance(since, int) and isinstance(until, int):

@@ -309,7 +309,7 @@ class RecordingFile:
 
     def _unpacked(self, chunk: Chunk, chooses: Chooses) -> tuple[list[Recorded], tuple[int, int] | None]:
         """Return the chosen messages of a chunk, and the sequence numbers of its first and last message."""
-        found: list[Recorded] = []
+        messages: list[Recorded] = []
         first, last = -1, -1
         chosen: dict[int, Channel | None] = {}  # by channel number; None: not chosen
         unnamed: set[int] = set()
@@ -328,17 +328,19 @@ class RecordingFile:
                     chosen[channel_number] = channel if channel.topic == OLD_OTHER or chooses(channel) else None
                 if channel_number in unnamed:
                     self.damage.unnamed += 1
-                taken = chosen[channel_number]
-                if taken is not None:
-                    found.append(Recorded(taken, sequence, log_ns, publish_ns, data[begin + MESSAGE.size : end]))
+                channel_or_none = chosen[channel_number]
+                if channel_or_none is not None:
+                    messages.append(
+                        Recorded(channel_or_none, sequence, log_ns, publish_ns, data[begin + MESSAGE.size : end])
+                    )
             # Old files have all topics without a channel on one: they are chosen by the topic inside the message.
             if any(channel is not None and channel.topic == OLD_OTHER for channel in chosen.values()):
-                found = [message for message in map(_with_own_topic, found) if chooses(message.channel)]
+                messages = [message for message in map(_with_own_topic, messages) if chooses(message.channel)]
         except DamageError as error:
             self.damage.add(chunk.at, error, chunk.messages)
             return [], None
-        found.sort(key=_time)
-        return found, (first, last) if first >= 0 else None
+        messages.sort(key=_time)
+        return messages, (first, last) if first >= 0 else None
 
     def _opened(self, chunk: Chunk, chooses: Chooses, opened: list[int]) -> Iterator[Recorded]:
         opened[0] += chunk.length

@@ -45,10 +45,10 @@ def rewrite(source: Path, target: Path, *, keeps: Keeps = lambda _message: True)
         raise RecordingError(f"{target} exists already")
     before = _state(source)
     try:
-        made = _copy(source, part, keeps, complete=in_place)
-        if in_place and not made.left_out:
-            return made
-        _check(part, made)
+        copy = _copy(source, part, keeps, complete=in_place)
+        if in_place and not copy.left_out:
+            return copy
+        _check(part, copy)
         if _state(source) != before:
             raise RecordingError(f"{source}: was changed meanwhile")
         if target.exists() != in_place:
@@ -57,7 +57,7 @@ def rewrite(source: Path, target: Path, *, keeps: Keeps = lambda _message: True)
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
-    return made
+    return copy
 
 
 def _copy_state(source: Path, part: Path) -> None:
@@ -65,9 +65,9 @@ def _copy_state(source: Path, part: Path) -> None:
     try:
         shutil.copystat(source, part)
     except OSError:
-        found = source.stat()
-        set_mode(part, stat.S_IMODE(found.st_mode))
-        os.utime(part, ns=(found.st_atime_ns, found.st_mtime_ns))
+        status = source.stat()
+        set_mode(part, stat.S_IMODE(status.st_mode))
+        os.utime(part, ns=(status.st_atime_ns, status.st_mtime_ns))
 
 
 def copy_beside(source: RecordingFile, writer: RecordingWriter, without: Container[str] = (DAMAGE, OLD_COPY)) -> int:

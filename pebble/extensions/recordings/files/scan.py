@@ -63,16 +63,16 @@ class Scan:
         while self._at < size and not self._ended:
             record = self._record_at(self._at)
             if record is None:
-                again = self._next_chunk(max(self._at + 1, self._searched))
-                if again is None:
+                next_chunk = self._next_chunk(max(self._at + 1, self._searched))
+                if next_chunk is None:
                     self._searched = max(self._searched, size - _OVERLAP)
                     break
-                self._damage.add(self._at, f"{again - self._at:,} bytes are no record")
-                self._at = again
+                self._damage.add(self._at, f"{next_chunk - self._at:,} bytes are no record")
+                self._at = next_chunk
                 continue
-            found = Found(record[0], self._at, record[1])
-            self._at, self._ended = found.end, found.op == Op.DATA_END
-            yield found
+            found_record = Found(record[0], self._at, record[1])
+            self._at, self._ended = found_record.end, found_record.op == Op.DATA_END
+            yield found_record
         self._damage.torn = 0 if self._ended else max(0, size - self._at)
 
     def _record_at(self, at: int) -> tuple[int, int] | None:
@@ -124,11 +124,11 @@ class Scan:
     def _next_chunk(self, at: int) -> int | None:
         """Return the position of the next chunk with the right checksum."""
         while at < self._size:
-            part, found = self._read(at, _SEARCHED + _OVERLAP), -1
-            while (match := LOOKS_LIKE_CHUNK.search(part, found + 1)) is not None and match.start() < _SEARCHED:
-                found = match.start()
-                if (record := self._record_at(at + found)) is not None and self._is_whole(at + found, record[1]):
-                    return at + found
+            part, offset = self._read(at, _SEARCHED + _OVERLAP), -1
+            while (match := LOOKS_LIKE_CHUNK.search(part, offset + 1)) is not None and match.start() < _SEARCHED:
+                offset = match.start()
+                if (record := self._record_at(at + offset)) is not None and self._is_whole(at + offset, record[1]):
+                    return at + offset
             at += _SEARCHED
         return None
 

@@ -23,15 +23,15 @@ def mend(path: Path) -> Rewritten:
     RecordingError, OSError.
     """
     target = finished_path(path)
-    made = rewrite(path, target)
-    if made.is_empty:
+    copy = rewrite(path, target)
+    if copy.is_empty:
         target.unlink()
     sync_folder(path.parent)
-    if made.is_whole:
+    if copy.is_whole:
         path.unlink()
     else:
         rename(path, _damaged_path(path))
-    return made
+    return copy
 
 
 def _damaged_path(path: Path) -> Path:
@@ -79,7 +79,7 @@ class Finisher:
             self._unfinished.discard(path)
             return
         try:
-            made = mend(path)
+            copy = mend(path)
         except RecordingError as error:
             self._set_aside(path, str(error))
             return
@@ -87,10 +87,10 @@ class Finisher:
             self._later(path, error)
             return
         self._unfinished.discard(path)
-        if not made.is_whole:
-            self._event("damaged", file=path.name, why=made.unread)
-        if not made.is_empty:
-            self._event("recovered", file=path.name, messages=made.messages, missing=made.missing)
+        if not copy.is_whole:
+            self._event("damaged", file=path.name, why=copy.unread)
+        if not copy.is_empty:
+            self._event("recovered", file=path.name, messages=copy.messages, missing=copy.missing)
             self._on_finished()
 
     def _set_aside(self, path: Path, why: str) -> None:

@@ -121,7 +121,7 @@ class Folder:
 
     def entries(self) -> list[Entry]:
         """Return the recorder's files, the oldest first; links and foreign files are left out."""
-        found = []
+        entries = []
         for path in self._files():
             match = _NAME.fullmatch(path.name)
             try:
@@ -129,8 +129,8 @@ class Folder:
             except OSError:
                 continue
             if match is not None and stat.S_ISREG(about.st_mode):
-                found.append(Entry(path, int(match["number"]), match["lane"], about.st_size, about.st_mtime))
-        return sorted(found, key=lambda entry: entry.number)
+                entries.append(Entry(path, int(match["number"]), match["lane"], about.st_size, about.st_mtime))
+        return sorted(entries, key=lambda entry: entry.number)
 
     def _files(self) -> Iterator[Path]:
         for folder, _, names in os.walk(self.root):

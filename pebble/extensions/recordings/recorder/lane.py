@@ -132,14 +132,14 @@ class RawFile:
 
 
 def _metadata(item: Item) -> dict[str, str]:
-    found = {} if item.qos is None else {"qos": str(item.qos)}
+    metadata = {} if item.qos is None else {"qos": str(item.qos)}
     if item.retain is not None:
-        found["retain"] = str(int(item.retain))
+        metadata["retain"] = str(int(item.retain))
     if item.retained:
-        found["retained"] = item.retained
+        metadata["retained"] = item.retained
     if item.source:
-        found["source"] = item.source
-    return found
+        metadata["source"] = item.source
+    return metadata
 
 
 def _is_json(payload: bytes) -> bool:

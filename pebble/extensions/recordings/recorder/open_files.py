@@ -25,10 +25,10 @@ class RetainedValues:
         If the broker does not tell how it was published, a topic known to be retained stays so.
         """
         key = f"{item.source} {item.topic}"
-        known = self._values.get(key)
-        if item.retained and known is not None and not known.retained:
+        stored = self._values.get(key)
+        if item.retained and stored is not None and not stored.retained:
             return  # fetched by another connection, while a newer one had come
-        if not item.retain and not (item.retain is None and known is not None):
+        if not item.retain and not (item.retain is None and stored is not None):
             return
         if item.payload:
             self._values[key] = item._replace(retain=True)

@@ -55,8 +55,8 @@ class Recorder:
         """Start. Raises RecordingError if the folder cannot be used or the package ``mcap`` is not installed."""
         require_package()
         self.folder.take()
-        left = self._writing.mend_leftovers()
-        self.note("start", pid=os.getpid(), leftovers=left)
+        leftovers = self._writing.mend_leftovers()
+        self.note("start", pid=os.getpid(), leftovers=leftovers)
         self._background.start()
         self._thread.start()
 

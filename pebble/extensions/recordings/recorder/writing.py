@@ -75,11 +75,11 @@ class Writing:
 
         Without a lock they may be another recorder's; then they stay as they are.
         """
-        ours = self._files.paths
-        left = [entry.path for entry in self._folder.entries() if entry.is_active and entry.path not in ours]
-        for path in left if self._folder.is_locked else ():
+        open_paths = self._files.paths
+        leftovers = [entry.path for entry in self._folder.entries() if entry.is_active and entry.path not in open_paths]
+        for path in leftovers if self._folder.is_locked else ():
             self._finisher.mend(path)
-        return len(left)
+        return len(leftovers)
 
     # -- messages
 

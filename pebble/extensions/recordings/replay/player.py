@@ -71,17 +71,17 @@ class BusOutput:
 
         Its stamps are moved so that it seems as old now as it was at ``position_ns``.
         """
-        found = self._rules.outgoing(message, self._wall_ns() - position_ns)
-        if found is None:
+        outgoing = self._rules.outgoing(message, self._wall_ns() - position_ns)
+        if outgoing is None:
             self.skipped += 1
             return True
-        if not self._publish(found.message):
+        if not self._publish(outgoing.message):
             return False
         self.sent += 1
-        if found.moves is not None:
-            self._moved.pop(found.message.topic, None)
-            if found.moves:
-                self._moved[found.message.topic] = None
+        if outgoing.moves is not None:
+            self._moved.pop(outgoing.message.topic, None)
+            if outgoing.moves:
+                self._moved[outgoing.message.topic] = None
         return True
 
     def halt(self) -> None:

@@ -62,14 +62,16 @@ class ReplaySource:
         def chooses(channel: Channel) -> bool:
             return _may_be_pictures(channel) and publishes(channel)
 
-        found: dict[str, list[Recorded]] = {}
+        since_keyframe: dict[str, list[Recorded]] = {}
         paths = self._having(chooses, since_ns, at_ns)
         for message in merged(paths, since_ns=since_ns, until_ns=at_ns, chooses=chooses):
             if is_keyframe(message.payload):
-                found[message.channel.topic] = [message]
-            elif message.channel.topic in found and is_picture(message.payload):
-                found[message.channel.topic].append(message)
-        pictures = [message for messages in found.values() if len(messages) <= _PICTURES for message in messages]
+                since_keyframe[message.channel.topic] = [message]
+            elif message.channel.topic in since_keyframe and is_picture(message.payload):
+                since_keyframe[message.channel.topic].append(message)
+        pictures = [
+            message for messages in since_keyframe.values() if len(messages) <= _PICTURES for message in messages
+        ]
         return sorted(pictures, key=lambda message: message.log_ns)
 
     def _having(self, chooses: Callable[[Channel], bool], since_ns: int, until_ns: int) -> list[Path]:

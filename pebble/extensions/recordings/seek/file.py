@@ -41,13 +41,13 @@ class SeekableFile(RecordingFile):
 
     def messages_of(self, chunk: Chunk) -> list[Recorded]:
         """Return the messages of a chunk in the order of time; empty if the chunk is damaged."""
-        known = self._unpacked_chunks.get(chunk.at)
-        if known is None:
-            known = self._unpacked_chunks[chunk.at] = self.messages(chunk)
+        messages = self._unpacked_chunks.get(chunk.at)
+        if messages is None:
+            messages = self._unpacked_chunks[chunk.at] = self.messages(chunk)
             if len(self._unpacked_chunks) > _CACHED:
                 self._unpacked_chunks.popitem(last=False)
         self._unpacked_chunks.move_to_end(chunk.at)
-        return known
+        return messages
 
 
 def is_carried(channel: Channel) -> bool:

@@ -63,8 +63,8 @@ def days() -> bytes:
 
 def files(robot: str, since_ns: int, until_ns: int) -> tuple[list[str], bool]:
     """Return a robot's recordings in a period, and whether one is still being written."""
-    found = [str(file.path) for file in _archive.files(robot, since_ns, until_ns)]
-    return found, any(path.endswith(ACTIVE) for path in found)
+    paths = [str(file.path) for file in _archive.files(robot, since_ns, until_ns)]
+    return paths, any(path.endswith(ACTIVE) for path in paths)
 
 
 # -- jobs, each in a process of its own: they take long
@@ -77,8 +77,8 @@ def make_timeline_job(answer: Connection, paths: list[str], target: Path, robot:
     def work() -> str:
         places, progress = [Path(path) for path in paths], _Progress(answer)
         with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
-            made = make_timeline(places, Path(scratch), robot, *period, progress.share)
-        target.write_bytes(msgspec.json.encode(made))
+            timeline = make_timeline(places, Path(scratch), robot, *period, progress.share)
+        target.write_bytes(msgspec.json.encode(timeline))
         return ""
 
     answer_with(answer, work)

@@ -93,9 +93,9 @@ def index_path(recording: Path) -> Path:
 
 def about(index: Path, connection: DuckDBPyConnection) -> About | None:
     """Return these facts from an index; None for another file. Raises RecordingError if it cannot be read."""
-    found = dict(connection.execute(f"SELECT key, value FROM parquet_kv_metadata({quoted(index)})").fetchall())
+    metadata = dict(connection.execute(f"SELECT key, value FROM parquet_kv_metadata({quoted(index)})").fetchall())
     try:
-        texts = {key.decode(): value.decode() for key, value in found.items()}
+        texts = {key.decode(): value.decode() for key, value in metadata.items()}
         numbers = [int(texts[name]) for name in ("size", "changed_ns", "missing")]
         size, changed_ns, missing = numbers
         return About(texts["recording"], size, changed_ns, missing, texts["unread"])
@@ -107,8 +107,8 @@ def is_of(index: Path, recording: Path, connection: DuckDBPyConnection) -> bool:
     """True if the index was made from the recording in its present state."""
     if not index.is_file():
         return False
-    made, now = about(index, connection), recording.stat()
-    return made is not None and (made.size, made.changed_ns) == (now.st_size, now.st_mtime_ns)
+    facts, now = about(index, connection), recording.stat()
+    return facts is not None and (facts.size, facts.changed_ns) == (now.st_size, now.st_mtime_ns)
 
 
 def write_index(recording: Path, index: Path, scratch: Path, advance: Advance = lambda _share: None) -> None:
@@ -121,8 +121,8 @@ def write_index(recording: Path, index: Path, scratch: Path, advance: Advance = 
     with connected(scratch, memory_mb=_MEMORY_MB) as connection:
         rows = _Rows(connection)
         missing, unread = rows.read(recording, advance)
-        made = About(recording.name, state.st_size, state.st_mtime_ns, missing, unread)
-        pairs = ", ".join(f"{name}: {quoted(getattr(made, name))}" for name in About.__struct_fields__)
+        facts = About(recording.name, state.st_size, state.st_mtime_ns, missing, unread)
+        pairs = ", ".join(f"{name}: {quoted(getattr(facts, name))}" for name in About.__struct_fields__)
         try:
             connection.execute(_COPY.format(path=quoted(part), about=f"{{{pairs}}}"))
             part.replace(index)

@@ -44,19 +44,19 @@ def sources(places: Iterable[Path], scratch: Path, progress: Progress = lambda _
     Missing indexes are made: beside the recording if its folder can be written, otherwise, as for files that are still
     being written, below ``scratch``. Recordings that were indexed and then deleted count, too. Raises RecordingError.
     """
-    found = Sources()
+    indexed = Sources()
     scratch.mkdir(parents=True, exist_ok=True)
     with connected(scratch, memory_mb=_MEMORY_MB) as connection:
         for path in _indexes([place.resolve() for place in places], scratch, connection, progress):
-            made = about(path, connection)
-            if made is not None:
-                found.indexes.append(path)
-                found.missing += made.missing
-                found.unread += [f"{made.recording}: {made.unread}"] if made.unread else []
-        if found.indexes:
-            names = f"SELECT DISTINCT robot FROM {parquet(found.indexes)} WHERE robot <> '' ORDER BY robot"
-            found.robots = [robot for (robot,) in connection.execute(names).fetchall()]
-    return found
+            facts = about(path, connection)
+            if facts is not None:
+                indexed.indexes.append(path)
+                indexed.missing += facts.missing
+                indexed.unread += [f"{facts.recording}: {facts.unread}"] if facts.unread else []
+        if indexed.indexes:
+            names = f"SELECT DISTINCT robot FROM {parquet(indexed.indexes)} WHERE robot <> '' ORDER BY robot"
+            indexed.robots = [robot for (robot,) in connection.execute(names).fetchall()]
+    return indexed
 
 
 def _indexes(places: list[Path], scratch: Path, connection: DuckDBPyConnection, progress: Progress) -> Iterator[Path]:

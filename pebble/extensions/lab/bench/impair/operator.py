@@ -161,8 +161,8 @@ class TrialOperator:
 def _wait(condition: Callable[[], bool], seconds: float, meanwhile: Callable[[], None] = lambda: None) -> bool:
     """Wait for ``condition``, at most ``seconds``, calling ``meanwhile`` now and then; return whether it was met."""
     end = time.monotonic() + seconds
-    while not (met := condition()) and (left := end - time.monotonic()) > 0:
-        time.sleep(min(left, _POLL_S))
+    while not (met := condition()) and (remaining_s := end - time.monotonic()) > 0:
+        time.sleep(min(remaining_s, _POLL_S))
         meanwhile()
     return met
 

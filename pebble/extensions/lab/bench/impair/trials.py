@@ -224,10 +224,10 @@ _COLUMNS: Final[tuple[tuple[str, str, int], ...]] = (
 def table(cells: Sequence[Cell]) -> Table:
     """Return a table with a row for each subject in each trial."""
     grid = plain_table("Trials", ["trial", "subject", *(head for head, *_ in _COLUMNS)], left=2, caption=_STAND_IN)
-    for trial, some in grouped(cells, lambda cell: str(cell.params["trial"])).items():
+    for trial, of_trial in grouped(cells, lambda cell: str(cell.params["trial"])).items():
         grid.add_section()
-        for number, (subject, own) in enumerate(grouped(some, lambda cell: cell.variant).items()):
-            measured = {cell.measure: cell for cell in own}
+        for number, (subject, of_subject) in enumerate(grouped(of_trial, lambda cell: cell.variant).items()):
+            measured = {cell.measure: cell for cell in of_subject}
             values = (digits(value_of(measured[measure], percent)) for _, measure, percent in _COLUMNS)
             grid.add_row("" if number else trial, subject, *values)
     return grid

@@ -118,8 +118,8 @@ class Board:
     def pause(self, seconds: float) -> None:
         """Block the firmware for ``seconds``; timers run, and the watchdog resets the board if it expires."""
         until = self.clock.now() + seconds
-        while self.timers.running and (left := until - self.clock.now()) > 0.0:
-            self.timers.wait(min(left, self.watchdog.left()))
+        while self.timers.running and (remaining_s := until - self.clock.now()) > 0.0:
+            self.timers.wait(min(remaining_s, self.watchdog.left()))
             self.watchdog.check()
         self.clock.sleep(min(until - self.clock.now(), self.watchdog.left()))
         self.watchdog.check()

@@ -51,8 +51,8 @@ class LoopbackServers:
         """Return the addresses of a name by this machine's resolver; None if there is none at present."""
         if name not in self._addresses:
             with suppress(OSError):
-                found = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_STREAM)
-                self._addresses[name] = list(dict.fromkeys(str(address[4][0]) for address in found))[:_MOST]
+                answers = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_STREAM)
+                self._addresses[name] = list(dict.fromkeys(str(address[4][0]) for address in answers))[:_MOST]
         return self._addresses.get(name)
 
 

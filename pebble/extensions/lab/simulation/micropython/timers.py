@@ -74,9 +74,9 @@ class SoftTimers:
     def wait(self, longest_s: float) -> None:
         """Wait until the next timer has run, but at most ``longest_s``."""
         now = self._clock.now()
-        left = min(self._due.values()) - now
-        self._clock.sleep(max(0.0, min(left, longest_s)))
-        if left <= longest_s:
+        until_due_s = min(self._due.values()) - now
+        self._clock.sleep(max(0.0, min(until_due_s, longest_s)))
+        if until_due_s <= longest_s:
             self._call()
         self.on_wait()
 

@@ -43,8 +43,8 @@ class PosePage:
         self._samples: dict[str, deque[Sample]] = {name: deque(maxlen=_SAMPLES) for name in names}
         try:
             path.parent.mkdir(mode=0o700, exist_ok=True)
-            found = path.parent.lstat()
-            if found.st_uid != os.getuid() or found.st_mode & 0o022 or not path.parent.is_dir():
+            status = path.parent.lstat()
+            if status.st_uid != os.getuid() or status.st_mode & 0o022 or not path.parent.is_dir():
                 raise DeviceError(f"{path.parent}: is not a folder that only you may write, remove it")
             self._lock = os.open(path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o600)  # stays: a lock needs no end
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -36,10 +36,14 @@ class Track:
         after = bisect_right(self.samples, ns, key=lambda sample: sample.ns)
         if after in (0, len(self.samples)):
             return self.samples[max(0, after - 1)].pose
-        (start, one), (end, two) = self.samples[after - 1], self.samples[after]
+        (start, earlier), (end, later) = self.samples[after - 1], self.samples[after]
         part = (ns - start) / (end - start)
-        turn = math.remainder(two.heading - one.heading, math.tau)
-        return RobotPose(one.x + part * (two.x - one.x), one.y + part * (two.y - one.y), one.heading + part * turn)
+        turn = math.remainder(later.heading - earlier.heading, math.tau)
+        return RobotPose(
+            earlier.x + part * (later.x - earlier.x),
+            earlier.y + part * (later.y - earlier.y),
+            earlier.heading + part * turn,
+        )
 
 
 def poses_at(tracks: Mapping[str, Track], ns: int) -> dict[str, RobotPose]:

@@ -158,12 +158,12 @@ def _command(mcus: Mcus, words: list[str]) -> str:
     if len(words) < 2 or words[0] not in mcus:
         return f"begin with a robot ({', '.join(mcus)}) and a command"
     mcu, command, arguments = mcus[words[0]], words[1], words[2:]
-    known = actions(mcu)
-    if command in known and not arguments:
-        known[command]()
+    commands = actions(mcu)
+    if command in commands and not arguments:
+        commands[command]()
         return ""
     if command != "place":
-        return f"known commands: {', '.join(known)}, place X Y DEGREES"
+        return f"known commands: {', '.join(commands)}, place X Y DEGREES"
     try:
         x, y, degrees = map(float, arguments)
         mcu.place(Pose(x * 1000, y * 1000, math.remainder(math.radians(degrees), math.tau)))

@@ -215,12 +215,12 @@ def _back_to_front(plan: _Floats, layers: Sequence[int], columns: _Floats) -> li
     """Return the order in which to draw surfaces. Of crossing surfaces, the farther one is first."""
     covers = _covers(plan, np.array(layers), columns)
     distance = (plan.mean(axis=1) ** 2).sum(axis=1)
-    left, order = set(range(len(plan))), []
-    while left:
-        rest = sorted(left, key=lambda index: -distance[index])
-        free = [index for index in rest if not covers[index, rest].any()]
-        order += (chosen := free or rest[:1])
-        left.difference_update(chosen)
+    undrawn, order = set(range(len(plan))), []
+    while undrawn:
+        farthest_first = sorted(undrawn, key=lambda index: -distance[index])
+        free = [index for index in farthest_first if not covers[index, farthest_first].any()]
+        order += (chosen := free or farthest_first[:1])
+        undrawn.difference_update(chosen)
     return order
 
 

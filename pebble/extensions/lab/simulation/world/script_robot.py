@@ -94,9 +94,9 @@ class SimulatedRobot(Robot):
 
         Raises PebbleError if there is no such tag.
         """
-        for one in self._model.tags:
-            if one.id == tag:
-                return math.hypot(one.x - self._body.pose.x, one.y - self._body.pose.y)
+        for placed in self._model.tags:
+            if placed.id == tag:
+                return math.hypot(placed.x - self._body.pose.x, placed.y - self._body.pose.y)
         raise PebbleError(f"there is no tag {tag} in this world")
 
     @property

@@ -239,10 +239,11 @@ def _check_robots(robots: Mapping[str, Start], notes: Notes) -> None:
     for name, place in robots.items():
         if place.imu and place.kind != "goob":
             notes.problem(("robots", name, "imu"), f"must be false, a {place.kind} has no inertial sensor")
-    for (name, one), (other, two) in combinations(robots.items(), 2):
-        apart, least = math.hypot(one.x - two.x, one.y - two.y), one.radius_m + two.radius_m
+    for (name, start), (other_name, other_start) in combinations(robots.items(), 2):
+        apart = math.hypot(start.x - other_start.x, start.y - other_start.y)
+        least = start.radius_m + other_start.radius_m
         if apart < least:
-            notes.problem(("robots", other), f"stands {apart:.2f} m from {name}, must be {least:g} m or more")
+            notes.problem(("robots", other_name), f"stands {apart:.2f} m from {name}, must be {least:g} m or more")
 
 
 def _check_places(world: World, notes: Notes) -> None:

@@ -112,8 +112,8 @@ class ViewerRequest:
         if now - self._keyframe_at < _KEYFRAME_S:
             return []
         self._keyframe_at = now
-        known = encoding if encoding in self._encodings() else None
-        return [self._message(MediaRequest(enabled=True, encoding=known, keyframe=True))]
+        offered = encoding if encoding in self._encodings() else None
+        return [self._message(MediaRequest(enabled=True, encoding=offered, keyframe=True))]
 
     def leave(self) -> None:
         """Leave the medium running for another operator who has requested it too."""

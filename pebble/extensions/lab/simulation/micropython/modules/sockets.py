@@ -71,9 +71,9 @@ class HostNetwork:
     def _socket(self, kind: int) -> HostTcp | HostUdp:
         if len(self.open) >= MAX_SOCKETS:
             raise OSError(errno.ENFILE, "too many sockets: one is not closed")
-        made = HostTcp(self) if kind == socket.SOCK_STREAM else HostUdp(self)
-        self.open.append(made)
-        return made
+        opened = HostTcp(self) if kind == socket.SOCK_STREAM else HostUdp(self)
+        self.open.append(opened)
+        return opened
 
 
 def socket_module(make: Any) -> SimpleNamespace:
