@@ -24,9 +24,9 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
     """Return the only user besides root who can change the content of ``folder``, or root if none can.
 
     ``folder`` may be a file, and need not exist yet. ``nameless``: users without an entry count, too; in a container
-    they are those of the machine around it. Raises PebbleError if several users can, or if the path has a link that a
-    user besides root can change. With ``there`` it also raises if ``folder`` does not exist: its owner may have removed
-    it since it was read.
+    they are those of the machine around it. Raises PebbleError if several users can, for a link on the way that a user
+    besides root can change, and for a missing ``folder`` that should be ``there``: it may have been removed since it
+    was read.
     """
     place, owner = Path("/"), Owner(0, 0)
     system = place.lstat().st_uid  # in a user namespace root's files may seem to be of another user

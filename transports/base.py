@@ -450,10 +450,7 @@ class Transport(ABC):
     # -- for backends
 
     def _set_state(self, state: State) -> None:
-        """Set the state, and notify the watchers if it has changed.
-
-        A closed transport stays closed unless it is opened again.
-        """
+        """Set the state, and notify the watchers of a change. A closed transport stays closed until it is opened."""
         with self._changes.lock:
             if state is self._state or (self._state is State.CLOSED and state is State.CONNECTED):
                 return

@@ -36,10 +36,7 @@ def why_not(error: OSError, port: int) -> str:
 
 
 def port_holder(port: int) -> str:
-    """Return the process that listens at a port, as text for an error, or "".
-
-    The text begins with a blank: `` (by process 12 of user 1000: 'nc -l 8080')``.
-    """
+    """Return who listens at a port, or "": `` (by process 12 of user 1000: 'nc -l 8080')``, with the blank."""
     users = {}
     for name in ("tcp", "tcp6"):
         with suppress(OSError):

@@ -22,10 +22,7 @@ class Body:
         self.stop()
 
     def drive(self, x: float, z: float, _y: float) -> bool:
-        """Drive; return True if anything moves.
-
-        Both motors are mounted in reverse: throttle negated, sides swapped.
-        """
+        """Drive; return True if anything moves. Both motors are mounted in reverse: throttle negated, sides swapped."""
         b, a = mix(x, -z)
         self._waiting = [motor_shield.FREQUENCY, motor_shield.turn(1, b), motor_shield.turn(0, a)]
         self.refresh()

@@ -123,10 +123,7 @@ _handed_over: Config | None = None
 
 
 def hand_over(config: Config) -> None:
-    """Set the config of this process.
-
-    The launcher calls it before it forks its children, which then have the config.
-    """
+    """Set the config of this process, as the launcher does before it forks its children, which then have it."""
     global _handed_over
     _handed_over = config
 
@@ -279,10 +276,7 @@ def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
 
 
 def _is_run_from(folder: Path, base: str) -> bool:
-    """True if the newest launcher in this run directory was that of the robot with this base topic.
-
-    False if the directory cannot be read.
-    """
+    """True if this run directory can be read, and its newest launcher was that of the robot with this base topic."""
     try:
         return read_plain(folder / LAUNCHER_LOCK).decode(errors="replace").splitlines()[1:2] == [base]
     except OSError:

@@ -55,10 +55,7 @@ class Reader:
         self._rules = rules
 
     def section(self, kind: type[S], raw: Any, path: problems.Path = ()) -> S:
-        """Return a section of ``kind``, with mistakes noted.
-
-        A refused value is replaced by the default, a missing required one by None.
-        """
+        """Return a section of ``kind``. A refused value becomes the default, a missing required one None."""
         keys = _known(kind)
         if not isinstance(raw, dict):
             is_switch = self._other_forms and "enabled" in keys and switch(raw) is not None

@@ -27,8 +27,7 @@ def is_secret(key: str) -> bool:
 def without_secrets(text: str) -> str:
     """Return ``text`` with stars in place of logins in URLs, and of passwords and tokens in queries and options.
 
-    It hides too much rather than too little: in a word with ``://``, or with a colon before an @, everything before the
-    last @.
+    It rather hides too much: in a word with ``://``, or a colon before an @, everything before the last @.
     """
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))

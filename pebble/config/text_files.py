@@ -27,8 +27,7 @@ def read_text(path: Path) -> str:
 def read_password(file: Path, option: str, place: Path | None = None) -> str:
     """Return the text of the file that ``option`` names, without its final newline. Raises PebbleError.
 
-    The error does not repeat the name of the file: a user may have written the password itself. ``place`` is the file
-    that names this one.
+    The error does not repeat the file's name, which may be the password itself. ``place``: a file that names it.
     """
     try:
         return (read_text(file) if place is None else text_of(read_for(place, file))).rstrip("\n")

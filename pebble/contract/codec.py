@@ -116,9 +116,9 @@ def trim(raw: bytes) -> bytes:
 
 
 def _stop(channel: Channel, raw: bytes) -> EstopCommand:
-    """Return the stop in ``raw``. Raises PayloadError only if ``raw`` is empty, which removes a retained message.
+    """Return the stop in ``raw``, without a name if it cannot be read.
 
-    A stop whose payload cannot be read is a stop without a name.
+    Raises PayloadError only for an empty payload.
     """
     if not raw:
         raise PayloadError(f"{channel.metric}: empty")
@@ -163,10 +163,7 @@ def _unwrap(channel: Channel, plain: Any, remark: Remark) -> Any:
 
 
 def _switch(plain: Any) -> Any:
-    """Return the fields of a command that may be a boolean, an object, or either under ``value`` (paper A.8.10).
-
-    ``file``, ``config`` and ``repeat`` may stand beside ``value``.
-    """
+    """Return the fields of a command: a boolean or an object, bare or under ``value`` (paper A.8.10)."""
     if isinstance(plain, bool):
         return {"enabled": plain}
     if isinstance(plain, dict):
@@ -186,10 +183,7 @@ def _request(channel: Channel, plain: Any) -> Any:
 
 
 def _drive(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str, Any]:
-    """Return the valid fields of a drive command; a command that moves nothing is never refused.
-
-    Raises PayloadError for a wrong ``source``, ``run``, ``valid_ms`` or ``key`` in a command that moves the robot.
-    """
+    """Return the valid fields of a drive command. Raises PayloadError for wrong ones, unless it moves nothing."""
     axes = _numbers(channel, plain, remark)
     if not axes:
         keys = ", ".join([_shown(key) for key in plain][:_KEYS_SHOWN]) or "nothing"
@@ -250,10 +244,7 @@ def _numbers(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[st
 
 
 def _number(channel: Channel, name: str, value: Any) -> float | None:
-    """Return the number that ``value`` is or holds as text, else None. Raises PayloadError for NaN and infinity.
-
-    Firmware reads the same (firmware/common/payload.py).
-    """
+    """Return the number in ``value``, perhaps text, or None; PayloadError for NaN and infinity. As in firmware."""
     if isinstance(value, str):
         if "nan" in (word := value.lower()) or "inf" in word:
             raise PayloadError(f"{channel.metric}: {name} is not a finite number")

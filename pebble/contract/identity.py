@@ -101,10 +101,7 @@ def untypeable(name: str) -> str:
 
 
 def meant(names: Iterable[str], typed: str) -> str:
-    """Return the name in ``names`` that the user meant: ``typed``, or one that looks the same on the screen.
-
-    If there is none, return ``typed``.
-    """
+    """Return ``typed``, or else the name in ``names`` that looks the same on the screen, if there is one."""
     if typed.isascii():
         return typed
     alike = [name for name in names if composed(name) == composed(typed)]

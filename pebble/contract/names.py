@@ -1,8 +1,8 @@
 """The sender's account in a topic: ``incoming/by/{account}/{metric}``, where only that account can publish.
 
-A robot whose capabilities have ``named`` reads such topics. From topics without a name it takes only stops, zeros, and
-the commands that its config allows to strangers. Retained messages are ignored there. A stop with an invalid name is
-treated as a stop without a name.
+A robot whose capabilities have ``named`` reads such topics. Without a name it takes only stops, zeros, and the commands
+that its config allows to strangers. Retained messages are ignored there. A stop with an invalid name counts as one
+without.
 """
 
 import re

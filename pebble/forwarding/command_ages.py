@@ -1,8 +1,8 @@
 """Ages of commands, by the clocks of their senders.
 
 The age that pings show includes the way *up*, where messages may wait behind pictures on a thin link. A drive command
-carries its sender's clock ``t`` and a ``key``: it needs no pings once one command with this key was fast. A request for
-control has its ``id`` instead of the key.
+with its sender's clock ``t`` and a ``key`` needs no pings once one with this key was fast. A request for control has an
+``id``.
 """
 
 from math import inf

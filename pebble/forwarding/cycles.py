@@ -110,10 +110,7 @@ class Cycles:
             return Finding.SUSPECT if suspicious and due else Finding.PASS
 
     def _repeats_stop(self, side: Side, topic: str, payload: bytes) -> bool:
-        """True if an emergency stop comes back faster than a sender repeats it.
-
-        Counts the stop; stops are not probed.
-        """
+        """True if a stop comes back faster than a sender repeats it. Counts the stop; stops are not probed."""
         with self._lock:
             now, key = self._clock(), (side, payload)
             often = self._way(side, topic).count(payload, now) > SUSPICIOUS

@@ -5,9 +5,9 @@ another thread. All retained messages pass under one lock, because both sides ma
 and streams never wait for it.
 
 Retained commands are stale. A live emergency stop passes even if it was published as retained: a stop that does not
-arrive is worse than a stop that a later subscriber must recognise as old. Commands and actions are also stale when they
-have waited too long, in a process that was stopped or stuck, or at the broker. Commands that only end something never
-become stale.
+arrive is worse than one that a later subscriber must recognise as old. Commands and actions are also stale when they
+have waited too long, in a process that was stopped or stuck, or at the broker; a command that only ends something never
+is.
 """
 
 import itertools

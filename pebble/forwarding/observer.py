@@ -32,10 +32,7 @@ class Observer:
     """
 
     def start(self) -> None:
-        """Begin to observe.
-
-        Called on the service's thread, like :meth:`close`, :meth:`control` and :meth:`unconfirmed`.
-        """
+        """Begin to observe. Runs on the service's thread, like all methods but :meth:`passed` and :meth:`refused`."""
 
     def close(self) -> None:
         """Stop observing, and save what was observed."""

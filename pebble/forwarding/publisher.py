@@ -73,10 +73,7 @@ class Publisher:
     # -- cycles: what we forward to one side comes back from the other
 
     def probe_commands(self, *sides: Side) -> None:
-        """Send probes that show whether commands and actions from ``sides`` circulate.
-
-        Call this after each connection.
-        """
+        """Send probes, after each connection, that show whether commands and actions from ``sides`` circulate."""
         for side, topic in itertools.product(sides, self._subjects.probed):
             self.probe(side, topic, b"")
 

@@ -107,7 +107,7 @@ class RetainedTopics:
         """Remove the retained message of ``side`` on ``topic``, unless ``unless(topic)``; return True if it was
         removed.
 
-        No retained message passes before the removal is sent, so a message published in the meantime comes after it.
+        No retained message passes before the removal is sent, so one that is published in the meantime comes after it.
         """
         with self._lock:
             if unless(topic):

@@ -119,10 +119,7 @@ class Subjects(dict[str, Subject | None]):
         return subject
 
     def invented(self, topic: bytes) -> Kind | None:
-        """Return the kind of an incoming topic (as UTF-8) that the contract does not know; None for other topics.
-
-        Fast.
-        """
+        """Return the kind of an incoming topic (as UTF-8) that the contract does not know; else None. Fast."""
         if not topic.startswith(self._incoming):
             return None
         metric = topic[len(self._incoming) :]

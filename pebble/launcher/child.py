@@ -86,10 +86,7 @@ def _pipe(opened: list[int]) -> tuple[int, int]:
 
 
 def _fork(run: Callable[[], NoReturn]) -> int:
-    """Fork, and call ``run`` in the child; return the child's process id.
-
-    Signals are blocked meanwhile: the child has the launcher's handlers until ``run`` sets its own.
-    """
+    """Fork, with signals blocked until ``run`` has set the child's handlers; return the child's process id."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         pid = os.fork()

@@ -26,10 +26,7 @@ def _starts(mcu: Mcu) -> str:
 
 
 def _drives(mcu: Mcu) -> tuple[str, str]:
-    """Return ("yes", "no" or "unknown", the reason) for the board on a serial line.
-
-    A board that is silent at rest looks like a dead one.
-    """
+    """Return ("yes", "no" or "unknown", the reason) for a board. One that is silent at rest looks like a dead one."""
     match mcu.state:
         case "absent":
             return _NO, mcu.why or "there is no such device"

@@ -17,9 +17,9 @@ log = logging.getLogger(__name__)
 
 
 class OnDemand:
-    """The requests for on-demand programs, by the notes Wanted and Held. For one thread.
+    """The requests in the notes Wanted and Held: a program runs while one wants it and none holds it.
 
-    A program runs while some program wants it and none holds it.
+    For one thread.
     """
 
     def __init__(self, reactor: Reactor, supervisors: Iterable[ProcessSupervisor]) -> None:

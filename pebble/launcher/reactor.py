@@ -77,10 +77,7 @@ class Reactor:
         self._selector.close()
 
     def _turn(self, *waits: float | None) -> None:
-        """Run the jobs of readable descriptors, then due timers.
-
-        In this order, because a timer that checks for signs of life needs the newest.
-        """
+        """Run the jobs of readable descriptors, then timers: a timer that checks for life needs the newest signs."""
         for key, _ in self._selector.select(min([_TURN_S, *(wait for wait in waits if wait is not None)])):
             if key.fd in self._selector.get_map():  # an earlier job of this turn may have forgotten it
                 key.data()

@@ -47,10 +47,7 @@ class RestartPolicy:
         return max(0.0, self._started + START_INTERVAL_S - now)
 
     def started(self, now: float, *, plain: bool = False) -> None:
-        """Record a start.
-
-        A ``plain`` program counts as ready at once, and is not watched until its first sign of life.
-        """
+        """Record a start. A ``plain`` program counts as ready; it is watched from its first sign of life on."""
         if self.state == "stopped":  # it was asked to end: this is no restart
             self.state = "init"
         elif self.last_exit is not None:

@@ -65,10 +65,7 @@ class Control:
         return isinstance(drive.key, str) and self.lease.holds(drive.key, self.account(drive) or "")
 
     def knows(self, request: ControlRequest) -> bool:
-        """True if the sender of ``request`` has control, or is first among those that ask for it.
-
-        Any thread may ask.
-        """
+        """True if the sender of ``request`` has control, or is the first that asks for it. Any thread may ask."""
         client = self.sender(request)
         return client == self.lease.holder[:2] or client == self.lease.asker[:2]
 

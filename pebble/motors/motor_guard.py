@@ -38,8 +38,8 @@ class MotorGuard:
     """The emergency stop and the arbiter of a Linux robot's motor owner; on the service's thread.
 
     Call :meth:`begin` first, and :meth:`tick` at :attr:`due`. ``publish(state)`` is called with each new state, at most
-    four times a second. ``file`` keeps the stop across a power cut. ``barred_file`` keeps barred runs across a restart
-    of this process, which running scripts outlive as well.
+    four times a second. ``file`` keeps the stop over a power cut, ``barred_file`` barred runs over a restart of this
+    process.
     """
 
     def __init__(

@@ -286,10 +286,7 @@ class MotorOwner(Service, ABC):
 
     @every(_CHECK_S)
     def check_subscriptions(self) -> None:
-        """Stop offering the emergency stop while the broker refuses its topics.
-
-        Raises TransportError if the broker refuses a topic of drive commands.
-        """
+        """Withdraw the emergency stop while its topics are refused. TransportError for a refused drive topic."""
         if self.refused(c.DRIVE):
             raise TransportError(
                 f"the broker refuses the subscription to {self.addresses[c.DRIVE].topic}: nothing can drive this robot."
@@ -349,10 +346,7 @@ class MotorOwner(Service, ABC):
         self._arm_guard()
 
     def _publish_state(self, state: EstopState) -> None:
-        """Publish the state.
-
-        While a stop does not latch, remove it, repeatedly, as a bridge may have missed the removal.
-        """
+        """Publish the state. While a stop does not latch, remove it, repeatedly: a bridge may have missed that."""
         if self._latches:
             self.publish(c.ESTOP_STATE, state, owner=self.owner)
         else:

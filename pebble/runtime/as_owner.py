@@ -15,11 +15,10 @@ from pebble.runtime.whole_file import is_root
 
 @contextmanager
 def as_owner(folder: Path, *modules: str, make: bool = False) -> Iterator[None]:
-    """Run the ``with`` block as the owner of ``folder``, if this process is root.
+    """Run the ``with`` block as the owner of ``folder``, or of its nearest existing parent, if this process is root.
 
-    If the folder does not exist, its nearest parent that does counts. For commands, whose process has one thread.
-    ``modules`` are imported first: that user may not be able to read them. ``make``: create the folder if it is
-    missing. Raises PebbleError as :func:`owner_of`.
+    For commands, whose process has one thread. ``modules`` are imported first: that user may not be able to read them.
+    ``make``: create the folder if it is missing. Raises PebbleError as :func:`owner_of`.
     """
     if make:
         try:

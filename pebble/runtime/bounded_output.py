@@ -21,8 +21,7 @@ _clock = re.compile(rb"\d\d:\d\d:\d\d(?:[.,]\d+)? ").match
 class BoundedOutput:
     """A filter that passes at most ``rate`` lines a second of a program's output to ``write``. Times are passed in.
 
-    A line that is repeated at once is written once. A line that counts the dropped ones has the form of our programs'
-    log lines.
+    A line that is repeated at once is written once. A line that counts dropped ones looks like a line of our programs.
     """
 
     def __init__(self, write: Callable[[bytes], None], longest: int, now: float, *, rate: float = LINES_PER_S) -> None:

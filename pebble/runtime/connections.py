@@ -118,10 +118,7 @@ def _name(config: Config, kind: str, name: str) -> str:
 
 
 def _remote_settings(config: Config, remote: RemoteConnection) -> Any:
-    """Return the settings of an uplink.
-
-    With Zenoh it is a client of a hub elsewhere, apart from the local transport.
-    """
+    """Return the settings of an uplink; with Zenoh those of a client of a hub elsewhere."""
     if remote.kind != "zenoh":
         return remote.settings
     return client_of_hub(config.run_dir() / "remote", remote, remote.lease_ms, remote.account)

@@ -112,8 +112,7 @@ class Notifier:
     def request(self, program: str, request: ProgramRequest) -> bool:
         """Request or release an on-demand program.
 
-        Only programs with ``may_request`` (pebble.launcher.programs) may do so. Requests expire 5 s after the end of
-        this process.
+        Only programs with ``may_request`` (pebble.launcher.programs) may; their requests expire 5 s after their end.
         """
         if self._fd is None and not self._no_launcher_logged:
             self._no_launcher_logged = True

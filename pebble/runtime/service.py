@@ -118,10 +118,7 @@ class Service:
         """Open the hardware, before the transport is open. An exception ends the process; the launcher restarts it."""
 
     def stop(self) -> None:
-        """Leave the hardware safe.
-
-        Called however :meth:`run` ends, before the :meth:`on_stop` callbacks; not if killed.
-        """
+        """Leave the hardware safe. Called however :meth:`run` ends, before :meth:`on_stop` callbacks; not if killed."""
 
     def on_connected(self) -> None:
         """React to a new connection. The states are published afterwards."""
@@ -305,10 +302,7 @@ class Service:
         self._attempt(channel, method)
 
     def _attempt(self, channel: Channel, method: Callable[[], None]) -> None:
-        """Call a handler, and count an exception.
-
-        It must not end the service, which a retained message would end again.
-        """
+        """Call a handler, and count an exception: a retained message would otherwise end the service repeatedly."""
         try:
             method()
         except Exception:  # a message of another process must not end this one

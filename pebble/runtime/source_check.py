@@ -1,7 +1,4 @@
-"""Checks a source that should send punctually: its contents must not repeat themselves, nor come at a wrong rate.
-
-Pure.
-"""
+"""Checks that a source sends at the right rate, and that its contents do not repeat themselves. Pure."""
 
 from collections import deque
 from collections.abc import Hashable
@@ -17,10 +14,7 @@ class SourceCheck:
     """A record of a source's newest contents and of its rate. One thread writes, any thread reads."""
 
     def __init__(self, asked_hz: float = 0.0, *, remembered: int = 1) -> None:
-        """Make a record.
-
-        ``asked_hz``: the right rate, 0 for any; ``remembered``: how many recent contents are compared.
-        """
+        """Make a record. ``asked_hz``: 0 for any rate; ``remembered``: how many recent contents to compare."""
         self.content: Hashable = None  # the newest
         self.same_s = 0.0  # for so long no new content has come
         self.changes = 0  # so often a new content has come

@@ -97,10 +97,7 @@ class HomeAssistantService(Service):
             return {self._place}
 
     def _save(self, topics: set[str]) -> None:
-        """Save the topics.
-
-        Without topics the file is removed: this process is then not started next time.
-        """
+        """Save the topics. Without topics the file is removed: this process is then not started next time."""
         if topics == self._retained:
             return
         try:

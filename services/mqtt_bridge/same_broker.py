@@ -78,10 +78,9 @@ class SameBrokerProbe:
             self.report_none()
 
     def begin_round(self, remote_topic: str) -> int | None:
-        """Send a probe, and wait (for a limited time) until it would have arrived; return the round.
+        """Send a probe, wait (bounded) until it would have arrived, and return the round; None without a connection.
 
-        None if a connection was lost. The barrier is first on the side to which the probe went, then on the side where
-        it would arrive.
+        The barrier is first on the side to which the probe went, then on the side where it would arrive.
         """
         self._round += 1
         if not self.send():

@@ -107,8 +107,7 @@ class StopConnection:
     ) -> None:
         """Store the arguments; ``notices_s``: seconds after which a lost connection is noticed.
 
-        ``grace_s``: seconds for which it tries to connect. ``wanted`` returns True while this connection is worth its
-        cost.
+        ``grace_s``: seconds for which it tries to connect. ``wanted`` returns True while this is worth its cost.
         """
         self._grace_s, self._wanted = grace_s, wanted
         self._transport, self._filters, self._clock = transport, tuple(filters), clock

@@ -23,10 +23,9 @@ class Vouching:
         self._losses: Hashable = None
 
     def check(self, passes: bool, losses: Hashable, now: float) -> ControlVouched:
-        """Update and return the vouched time, every PERIOD_S.
+        """Update and return the vouched time; ``losses`` changes when a message may have been lost here.
 
-        ``losses`` changes when a message may have been lost here. A broker is late if its answer takes longer than a
-        drive command may wait.
+        Call it every PERIOD_S. A broker is late if its answer takes longer than a drive command may wait.
         """
         delivered_s = self._delivered_s()
         if not passes or losses != self._losses or delivered_s is None:

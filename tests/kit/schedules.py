@@ -150,10 +150,7 @@ class Engine:
 
 
 def shrink(schedule: Steps, fails: Callable[[Steps], bool], layouts: int = 10) -> Steps:
-    """Return the shortest schedule that still fails.
-
-    Parts are left out as long as possible, then numbers become 0.
-    """
+    """Return the shortest schedule that still fails. Parts are left out as long as possible, then numbers become 0."""
     layout, steps = schedule
     size = len(steps) // 2
     while size:

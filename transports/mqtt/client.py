@@ -49,10 +49,7 @@ class TlsLateError(TimeoutError):
 
 
 def begin_tls(plain: socket.socket, opening: Opening) -> ssl.SSLSocket:
-    """Return a non-blocking socket with TLS. It closes ``plain`` when it is closed, or if the handshake fails.
-
-    Raises OSError.
-    """
+    """Return a non-blocking socket with TLS, which closes ``plain``; so does a failed handshake. Raises OSError."""
     assert opening.context is not None  # noqa: S101 - else there is no TLS
     name = opening.settings.host.partition("%")[0]  # certificates have addresses without a network card
     sock = opening.context.wrap_socket(plain, server_hostname=name, do_handshake_on_connect=False)
@@ -124,9 +121,9 @@ def _mark(sock: socket.socket, dscp: int) -> None:
 
 
 class Client:
-    """The client of one connection. `open` waits for TCP and TLS; all other methods return at once.
+    """The client of one connection.
 
-    `read` calls ``listener``.
+    `open` waits for TCP and TLS, all else returns at once. `read` calls ``listener``.
     """
 
     def __init__(self, opening: Opening, listener: Listener, *, bridge: bool) -> None:
@@ -252,9 +249,8 @@ class Client:
     def disconnect(self) -> None:
         """Send DISCONNECT, and close the socket in a way that lets it arrive.
 
-        A connection with unread data is reset when it is closed, and a proxy on the way then resets the broker's, which
-        may lose the DISCONNECT. So bytes that come until the broker closes the connection, or for `_ENDING_S`, are read
-        and thrown away.
+        A connection with unread data is reset when it is closed, and a proxy then resets the broker's, which may lose
+        the DISCONNECT. So bytes that come until the broker closes it, or for `_ENDING_S`, are read and thrown away.
         """
         self._send(packets.DISCONNECT)
         if self.waiting:

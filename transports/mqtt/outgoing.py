@@ -260,10 +260,7 @@ class InFlightTable:
         return min(self._round_trips, default=0.0)
 
     def newest_answer(self, now: float) -> tuple[int, float]:
-        """Return the number of answered pings, and the seconds that the newest answer took.
-
-        If a ping has waited longer than that, its waiting time counts instead.
-        """
+        """Return the number of answered pings, and the seconds of the newest answer or of a longer wait for one."""
         waits = now - self._pings[0][0] if self._pings else 0.0
         return self._pong_number, max(self._newest_s, waits)
 

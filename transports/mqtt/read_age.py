@@ -43,11 +43,10 @@ class WaitingTime:
 
 
 class BrokerDelay:
-    """The time for which messages that are received now have waited at the broker, by its answers to pings.
+    """The time for which messages that are received now have waited at the broker: it answers a ping after them.
 
-    An answer comes after the messages before it. A ping that itself took long to get there, behind our own data, tells
-    nothing. The usual time of an answer is no delay: that of the shortest answer of this connection, and TCP's own
-    round trips, which do not wait for the broker.
+    A ping that itself took long to get there, behind our own data, tells nothing. The usual time of an answer is no
+    delay: that of the shortest answer of this connection, and TCP's own round trips, which do not wait for the broker.
 
     A broker that stood still then reads a packet of each client in turn: it may have answered all our pings before it
     has read the last old message of another client. So if nothing at all has come since an overdue ping was sent, the
@@ -95,10 +94,7 @@ class BrokerDelay:
             self._newest = 0.0
 
     def acknowledged(self, sent_at: float, now: float) -> None:
-        """Note that a message sent at ``sent_at`` was acknowledged.
-
-        Earlier pings were then answered, or their answers are lost.
-        """
+        """Note a PUBACK for a message sent at ``sent_at``: earlier pings were answered, or their answers are lost."""
         while self._asked and self._asked[0][1] < sent_at:
             self._asked.popleft()
         self._newest = min(self._newest, now - sent_at)

@@ -109,10 +109,7 @@ class Guard:
             self.rests, quiet = False, 0
 
     def _look(self) -> bool:
-        """Check all callbacks, and help if one takes long.
-
-        True if any has begun since the last check, or still runs.
-        """
+        """Help if a callback takes long; True if any has begun since the last check, or still runs."""
         active = self._suspects = False
         for calls in self._calls:
             begun, runs = calls.begun, calls.begun != calls.ended

@@ -22,10 +22,7 @@ GOODBYE_S = 0.3  # the longest wait for an answer when closing
 
 
 class HubConnection:
-    """The connection to a hub.
-
-    Each hub that `watch` sees begins a new one. ``name`` identifies this client's session.
-    """
+    """The connection to a hub. Each hub that `watch` sees begins a new one. ``name``: this client's session."""
 
     def __init__(
         self, client_id: str, will: Message | None, own: OwnRetained, count: Callable[[], object], account: str = ""

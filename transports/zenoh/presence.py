@@ -21,10 +21,7 @@ _LOST_SESSIONS_LIMIT = 1000  # sessions whose return would be noticed
 
 
 class HubView(msgspec.Struct, frozen=True):
-    """A view of the hubs that are present.
-
-    ``version`` changes with every event, ``connection`` only when a hub appears.
-    """
+    """The hubs that are present. ``version`` changes with every event, ``connection`` only when a hub appears."""
 
     version: int
     connection: int

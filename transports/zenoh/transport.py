@@ -109,10 +109,7 @@ class ZenohTransport(Transport):
             presence.ready()
 
     def _start_client(self) -> bool:
-        """Try until a hub answers, because a session in client mode cannot open without one.
-
-        True if it has opened.
-        """
+        """Try until a hub answers, without which a session in client mode cannot open; True if it has opened."""
         account = self.settings.account
         hub = [] if self.settings.connect else [self.settings.run_dir / HUB_SOCKET]
         config = session_config(self.settings, "client", listen=[], connect=hub)

@@ -174,10 +174,7 @@ def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> byt
 
 
 def account_of(key: str, what: str) -> str:
-    """Return the account in the key of a query; empty for this machine.
-
-    Raises ValueError for a query that no account may send.
-    """
+    """Return the account in a query's key; empty: this machine. Raises ValueError for what no account may send."""
     account = key.removeprefix(what).removeprefix("/")
     if not key.startswith(what) or "*" in account or "/" in account or OF in account:
         raise ValueError(f"{key} is no query of an account")

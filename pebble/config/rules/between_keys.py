@@ -106,8 +106,7 @@ def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
 def _without_uplink(notes: Notes, root: Root) -> Root:
     """Return ``root`` with the robot's own broker as the bridge's remote broker, if no remote host is set.
 
-    The original's examples have none: operators connect to the robot's broker. A Zenoh robot has no broker, and runs
-    without a bridge.
+    In the original's examples, operators connect to that. A Zenoh robot has no broker, and runs without a bridge.
     """
     bridge, transport = root.services.mqtt_bridge, root.transport
     if not bridge.enabled or bridge.remote_mqtt.host or (bridge.remote is not None and bridge.remote.kind != "mqtt"):

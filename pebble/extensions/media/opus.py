@@ -122,10 +122,7 @@ class OpusDecoder:
         return samples
 
     def conceal(self) -> Samples:
-        """Return an estimate of one more frame, which fades as this is called again.
-
-        Empty before the first packet.
-        """
+        """Return an estimate of one more frame, which fades as this is called again. Empty before the first packet."""
         if self._mode is None:
             return np.zeros((0, self._channels), np.int16)
         return self._decode(self._mode)

@@ -106,10 +106,7 @@ class SerialLine:
         return self._hand_over(lambda now: outbox.drive(line, now, valid_s, replaces), line if valid_s > 0 else b"")
 
     def halt(self) -> bool:
-        """Send the stop in place of a waiting drive line.
-
-        False: there is no device; opening it begins with the stop.
-        """
+        """Send the stop in place of a waiting drive line. False without a device: its opening begins with the stop."""
         return self._hand_over(lambda _now: self.output.outbox.halt(), self.output.stop)
 
     def send(self, kind: str, line: bytes) -> bool:
@@ -248,10 +245,7 @@ class SerialLine:
                 self.output.check_stall(port, now)
 
     def _finish(self, port: Port) -> None:
-        """Wait up to 0.3 s until the last stop is sent.
-
-        If the device is stuck, the stop replaces all earlier output.
-        """
+        """Wait up to 0.3 s until the last stop is sent; in a stuck device it replaces all earlier output."""
         end = time.monotonic() + _DRAIN_S
         while time.monotonic() < end:
             with self._lock:

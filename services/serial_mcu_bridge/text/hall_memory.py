@@ -38,10 +38,7 @@ class HallMemory:
         self._problem = ""
 
     def write(self, at_ns: int, values: tuple[int, int, int], charging: bool | None) -> None:
-        """Add a sample at ``at_ns`` on CLOCK_MONOTONIC.
-
-        If the memory cannot be made it is lost, which is logged once.
-        """
+        """Add a sample at ``at_ns`` on CLOCK_MONOTONIC. Without the memory it is lost, which is logged once."""
         if at_ns >= self._check_at_ns:
             self._check_at_ns = at_ns + _CHECK_NS
             self._keep()

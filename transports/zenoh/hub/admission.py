@@ -48,10 +48,7 @@ class Admission:
         return not account and bool(session)
 
     def admitted(self, record: Record) -> Record | None:
-        """Return ``record`` in the form to store; None if it must not be stored.
-
-        A refused will is left out and counted.
-        """
+        """Return ``record`` to be stored, without a refused will, which is counted; None if it must not be stored."""
         if isinstance(record, Retained):
             refused = bool(self._unretained) and _matches_any(self._unretained, key_to_topic(record.key))
             return None if refused else record

@@ -25,10 +25,7 @@ _OnQuery = Callable[[zenoh.Query], None]
 
 
 class Intake:
-    """Tasks and queries in the order of their arrival.
-
-    They are taken alternately, so that neither kind delays the other.
-    """
+    """Tasks and queries in the order of arrival, taken alternately, so that neither kind delays the other."""
 
     def __init__(self) -> None:
         self.dropped = 0  # tasks

@@ -168,10 +168,7 @@ class HubWorker:
             query.reply(wire.asked(wire.HELLO, account), wire.encode(lacking))
 
     def _end_predecessor(self, hello: wire.Hello) -> None:
-        """Publish the pending will of a restarted client's former session now.
-
-        It is not published if the client has published on its topic since.
-        """
+        """Publish a restarted client's former will now, unless the client has published on its topic since."""
         if hello.will is None:
             return
         for name in self._store.wills() - {hello.name}:

@@ -53,10 +53,7 @@ class GatewayFile(Section, frozen=True, kw_only=True):
 
 
 def load_gateway(path: Path, env: Mapping[str, str] = os.environ) -> tuple[GatewayFile, str, Path]:
-    """Return the gateway in a file, its name and its run directory.
-
-    Raises ConfigError with all problems.
-    """
+    """Return the gateway in a file, its name and its run directory. Raises ConfigError with all problems."""
     path = path.absolute()
     reader = Reader(path.parent, env, (*CHECKS, *RULES), file=path)
     problem = reader.notes.problem

@@ -34,10 +34,7 @@ class Reset:
         return all(self._free(owner) for owner in self.shown)
 
     def refusals(self) -> dict[str, str]:
-        """Return why owners are still stopped, in words.
-
-        Call this when no answer is missing, or after a timeout.
-        """
+        """Return why owners are still stopped, in words. Call this when no answer is missing, or after a timeout."""
         return {owner: self._refusal(owner) for owner in self.shown if not self._free(owner)}
 
     def _free(self, owner: str) -> bool | None:

@@ -158,10 +158,7 @@ def _section(value: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _owners(listed: object) -> tuple[str, ...]:
-    """Return the listed owners without repetitions.
-
-    An invalid list gives none: such a robot is never confirmed.
-    """
+    """Return the listed owners without repetitions. An invalid list gives none: such a robot is never confirmed."""
     if not isinstance(listed, list) or len(listed) > MAX_OWNERS:
         return ()
     if not all(isinstance(owner, str) and _valid_level(owner) for owner in listed):

@@ -267,10 +267,7 @@ class _Report:
 
 
 def _echo(line: str, *, err: bool = False) -> None:
-    """Print ``line``.
-
-    If that fails, because the reader has ended or a disk is full, the stop is sent all the same.
-    """
+    """Print ``line``. If that fails, because the reader has ended or a disk is full, the stop is sent all the same."""
     try:
         typer.echo(line, err=err)
     except OSError:

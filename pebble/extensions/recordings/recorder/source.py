@@ -53,10 +53,7 @@ class Source:
         self.check()
 
     def check(self) -> None:
-        """Record how much the transport dropped; begin and end fetching retained messages.
-
-        Called once a second.
-        """
+        """Record how much the transport dropped; begin and end fetching retained messages. Called once a second."""
         counted = self._transport.counters.snapshot()
         for name in _LOSSES:
             new = counted.get(name, 0) - self._losses.get(name, 0)

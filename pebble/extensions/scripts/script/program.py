@@ -198,10 +198,7 @@ def _connected(config: Config, path: Path) -> Transport:
 
 
 def _numbered(config: Config) -> Callable[[int], int]:
-    """Return a function that gives the run's number: the manager's, else one above its argument.
-
-    Raises ConfigError.
-    """
+    """Return a function that gives the run's number: the manager's, else one above its argument. Raises ConfigError."""
     text = os.environ.get(RUN)
     if text is None:
         return lambda above: next_run(config, above)
