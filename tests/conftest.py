@@ -122,11 +122,7 @@ def pytest_runtest_setup() -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Exclude the existing objects from garbage collection.
-
-    Searching all of them takes 0.3 s (measured), on a busy machine more, and everything in this process stands still
-    meanwhile, services and transports too.
-    """
+    """Exclude the present objects from garbage collection: a search of all stops this process for 0.3 s or more."""
     gc.enable()
     gc.collect()
     gc.freeze()

@@ -1,7 +1,4 @@
-"""The memory that a process has allocated, and its part of shared memory.
-
-Unlike PSS, other processes do not change it.
-"""
+"""The memory that a process has allocated, and its part of shared memory: unlike PSS, no other process changes it."""
 
 from pathlib import Path
 

@@ -78,10 +78,7 @@ def main() -> int:
 
 
 def _link(origin: Path, page: Path, pages: dict[Path, Path], link: re.Match[str]) -> str:
-    """Return a link of the documents in the site's form.
-
-    A link to another file becomes its text; a broken link is returned unchanged.
-    """
+    """Return a link in the site's form; a link to another file becomes its text, a broken one is unchanged."""
     folder = origin if origin.is_dir() else origin.parent
     file = (folder / link[3]).resolve()
     if file not in pages:

@@ -18,10 +18,7 @@ def text(value):
 
 
 def header(first, size):
-    """Return the first bytes of a packet: ``first``, then its size, seven bits a byte.
-
-    The top bit of a size's byte is set if more follow.
-    """
+    """Return the first bytes of a packet: ``first``, then its size, seven bits a byte and a bit that means "more"."""
     data = bytes((first,))
     while size > 127:
         data += bytes((size & 127 | 128,))

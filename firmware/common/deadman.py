@@ -4,10 +4,7 @@ from common.ticks import diff
 
 
 class DeadMan:
-    """A timer.
-
-    Call ``feed`` at every command that moves something, ``rest`` when nothing moves, ``expired`` every turn.
-    """
+    """A timer. Call ``feed`` at each command that moves something, ``rest`` at rest, ``expired`` every turn."""
 
     def __init__(self, limit_ms: int) -> None:
         self.limit_ms = limit_ms

@@ -27,10 +27,7 @@ _HOLDER = const(
 
 
 class EmergencyStop:
-    """The stop and the control.
-
-    Pass messages to ``stop`` and ``reset``, then ``save`` while the motors are off; ``tick`` every turn.
-    """
+    """The stop and the control. Pass messages to ``stop``, ``reset``, then ``save`` while motors are off; ``tick``."""
 
     def __init__(self, now: int, watchdog_ms: int, strangers: int, names) -> None:
         """Store the arguments; ``strangers``: see `Lease`. ``names``: names.py; None: accounts of senders are ""."""
@@ -65,10 +62,7 @@ class EmergencyStop:
     # -- in
 
     def stop(self, raw: memoryview | None, by: str, since: int) -> bool:
-        """Latch; return False if this stop is known already.
-
-        ``raw`` None, or what cannot be parsed, is a stop without a name.
-        """
+        """Latch; return False if this stop is known. None, or what cannot be parsed, is a stop without a name."""
         name = why = ""
         if raw is not None:
             try:

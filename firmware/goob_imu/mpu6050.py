@@ -14,9 +14,9 @@ _WHO_AM_I = const(0x75)
 
 
 class Mpu6050:
-    """The sensor at +-4 g (8192 LSB/g), +-500 degrees/s (65.5 LSB per degree/s), 100 Hz.
+    """The sensor: +-4 g, 8192 LSB/g; +-500 degrees/s, 65.5 LSB each; 100 Hz.
 
-    ``pins`` has SCL, SDA and IMU, its address.
+    ``pins``: SCL, SDA and IMU, its address.
     """
 
     def __init__(self, pins) -> None:

@@ -26,10 +26,7 @@ _IN_FLIGHT = const(7)
 
 
 class Session:
-    """A session.
-
-    Call ``step`` each turn, then ``read`` and ``write`` if it is True; ``drop`` after OSError, ValueError.
-    """
+    """A session: ``step`` each turn, then ``read`` and ``write`` if it is True; ``drop`` after OSError, ValueError."""
 
     def __init__(self, settings: dict, root: bytes, topics: tuple, plain: int, names, wrap, take) -> None:
         """Store the arguments. ``wrap`` wraps a socket in TLS; None: no TLS.

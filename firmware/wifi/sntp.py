@@ -11,10 +11,7 @@ _ERA_S = const(1 << 32)  # NTP's seconds start again in 2036
 
 
 def request(nonce: bytes) -> bytes:
-    """Return a 48-byte request, version 4, client.
-
-    The answer repeats its 8 random bytes, which a forger does not know.
-    """
+    """Return a 48-byte client request, version 4. The answer repeats its 8 random bytes; a forger cannot."""
     return b"\x23" + bytes(39) + nonce
 
 

@@ -116,10 +116,7 @@ def trim(raw: bytes) -> bytes:
 
 
 def _stop(channel: Channel, raw: bytes) -> EstopCommand:
-    """Return the stop in ``raw``, without a name if it cannot be read.
-
-    Raises PayloadError only for an empty payload.
-    """
+    """Return the stop in ``raw``, nameless if it cannot be read. Raises PayloadError only for an empty payload."""
     if not raw:
         raise PayloadError(f"{channel.metric}: empty")
     try:

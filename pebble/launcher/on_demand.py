@@ -17,10 +17,7 @@ log = logging.getLogger(__name__)
 
 
 class OnDemand:
-    """The requests in the notes Wanted and Held: a program runs while one wants it and none holds it.
-
-    For one thread.
-    """
+    """The requests in notes Wanted and Held: a program runs if one wants it and none holds it. For one thread."""
 
     def __init__(self, reactor: Reactor, supervisors: Iterable[ProcessSupervisor]) -> None:
         self._reactor = reactor

@@ -15,10 +15,7 @@ _BEHIND = 10  # chunks; further behind, it skips to the newest
 
 
 class AlsaMicrophone:
-    """A microphone by the program ``arecord``: s16le in pieces of 20 ms.
-
-    None is lost unless this process is delayed by 200 ms.
-    """
+    """A microphone by ``arecord``: s16le, 20 ms a piece; none is lost unless this process is late by 200 ms."""
 
     def __init__(self, options: AvDaemon) -> None:
         audio = options.audio

@@ -85,10 +85,7 @@ class AvDaemon(ServiceSection, frozen=True, kw_only=True):
 
 
 def _check(reader: Reader, devices: AvDaemon, path: problems.Path) -> AvDaemon:
-    """Check the sockets for programs of the original.
-
-    If their folder is missing the robot runs, and these programs wait.
-    """
+    """Check the sockets for programs of the original. Without their folder the robot runs; the programs wait."""
     sockets = devices.sockets()
     for section, file in sockets.items():
         if not file.parent.is_dir():

@@ -12,10 +12,7 @@ from pebble.services.av_daemon.config import AvDaemon
 
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
-    """Return ``value`` with pictures and sound.
-
-    They obey requests only with the bridge, which starts their programs.
-    """
+    """Return ``value`` with pictures and sound. They obey only with the bridge, which starts their programs."""
     devices, obeys = config.section(AvDaemon), config.services.mqtt_bridge.enabled
     video, audio = devices.enabled and devices.video.enabled, devices.enabled and devices.audio.enabled
     return replace(

@@ -127,10 +127,7 @@ class Step:
 
 
 def _step(quality: str, size: str, rate: str) -> Step:
-    """Return a step with the costs of JPEG.
-
-    Half the quality takes two thirds of the bytes; small pictures are denser.
-    """
+    """Return a step with JPEG's costs: half the quality is two thirds of the bytes, small pictures are denser."""
     q, s, r = Fraction(quality), Fraction(size), Fraction(rate)
     return Step(q, s, r, math.pow(q, 0.6) * math.pow(s, 1.6))
 

@@ -157,10 +157,7 @@ class NeighboursService(Service):
 
     @on(DRIVE, direct=True)
     def drive(self, drive: Drive, _arrived: float) -> None:
-        """Handle a drive command on this robot's own topic, on the transport's thread.
-
-        Any command of a person means the same here.
-        """
+        """Handle a drive command to this robot, on the transport's thread; a person's all mean the same."""
         self.post(lambda: self._visit.received(drive, self.clock()), newest_of="script" if drive.signed else "person")
 
     # -- what a visit needs

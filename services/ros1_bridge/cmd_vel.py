@@ -123,10 +123,7 @@ class CmdVel:
             self._changed.notify()
 
     def latch(self, latched: bool) -> None:
-        """Lock or unlock the base.
-
-        A lock ends the running command, keeps other ROS programs from driving, and cancels their goals.
-        """
+        """Lock or unlock the base. A lock ends the command, keeps other ROS programs out, cancels their goals."""
         with self._changed:
             if latched is self._latched:
                 return

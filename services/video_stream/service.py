@@ -13,10 +13,7 @@ _STOP_S = 2.0  # between SIGTERM and SIGKILL; the launcher kills a service after
 
 
 class VideoStream(Service):
-    """The service of a streaming program. The launcher runs it while video is requested.
-
-    The program's output goes to the robot's log.
-    """
+    """The service that runs while video is requested. The streaming program's output goes to the robot's log."""
 
     name = "video_stream"
 

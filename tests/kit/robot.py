@@ -184,10 +184,7 @@ def main(module: str, arguments: tuple[str, ...], environment: dict[str, str]) -
 
 
 class Program(Forked):
-    """A process ``python -m module`` with these arguments and this process's environment.
-
-    It ends with the object that made it.
-    """
+    """A process ``python -m module`` with these arguments and our environment. It ends with what made it."""
 
     def __init__(self, module: str, *arguments: str) -> None:
         super().__init__("tests.kit.robot", module, arguments, dict(os.environ))

@@ -121,10 +121,7 @@ def _mark(sock: socket.socket, dscp: int) -> None:
 
 
 class Client:
-    """The client of one connection.
-
-    `open` waits for TCP and TLS, all else returns at once. `read` calls ``listener``.
-    """
+    """The client of one connection. `open` waits, all else returns at once; `read` calls ``listener``."""
 
     def __init__(self, opening: Opening, listener: Listener, *, bridge: bool) -> None:
         settings = opening.settings

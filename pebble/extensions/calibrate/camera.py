@@ -116,10 +116,7 @@ def save(path: Path, lens: Lens, tag_id: int, size_m: float, family: str) -> Non
 
 
 def read_folder(folder: Path) -> Iterator[Any]:
-    """Yield the pictures of a folder, in the order of their names.
-
-    Raises PebbleError if there are none, or their sizes differ.
-    """
+    """Yield the pictures of a folder in the order of their names. PebbleError for none, or different sizes."""
     import cv2
 
     shape: tuple[int, ...] | None = None

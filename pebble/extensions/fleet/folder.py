@@ -156,10 +156,7 @@ def _refused_base(base: str, *, several: bool) -> str:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, so that only one command at a time changes it.
-
-    Raises FleetError if there is no folder.
-    """
+    """Hold the folder's lock: only one command at a time changes it. Raises FleetError if there is no folder."""
     try:
         descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | _NO_LINK, 0o600)
     except OSError as error:

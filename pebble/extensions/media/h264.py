@@ -127,10 +127,7 @@ class H264Decoder:
         self._context: av.VideoCodecContext | None = None
 
     def decode(self, unit: bytes, *, keyframe: bool) -> Pixels:
-        """Return the picture of a unit. Raises PayloadError if the unit is cut, damaged or too large.
-
-        After an error a key frame must come next.
-        """
+        """Return a unit's picture. PayloadError if it is cut, damaged or too large: then a key frame must come."""
         try:
             return self._picture(self._frame(unit, keyframe))
         except PayloadError:
@@ -174,10 +171,7 @@ class H264Decoder:
 
 
 def seal(unit: bytes) -> bytes:
-    """Return the unit with its checksum.
-
-    The checksum has seven bits to a byte, highest first, with the top bit set, so that it contains no start code.
-    """
+    """Return the unit with its checksum, in bytes of seven bits with the top bit set: no start code arises."""
     crc = zlib.crc32(unit)
     return unit + _SEAL + bytes(crc >> shift & 0x7F | 0x80 for shift in (28, 21, 14, 7, 0))
 

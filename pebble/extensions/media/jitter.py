@@ -270,10 +270,7 @@ class JitterBuffer:
         return Chunk(to_int16(estimate * gain[:, None]), last.rate, last.channels, concealed=True)
 
     def _estimated(self, last: ReceivedSound, size: int) -> Samples:
-        """Return the codec's estimate of ``size`` samples, or else the last packet, alternately backwards and forwards.
-
-        Played in this way it makes no step.
-        """
+        """Return the codec's estimate, or else the last packet, in turn backwards and forwards: without a step."""
         if self._spare is None or not len(self._spare):
             self._spare = self._decoder.conceal()
         if self._spare is not None:

@@ -35,10 +35,7 @@ class Places:
 
     @cached_property
     def state(self) -> Path:
-        """Folder of the stop, and of all that survives a power cut: ``pebble:pebble``, 0700.
-
-        ``$STATE_DIRECTORY`` of the unit.
-        """
+        """Folder of the stop and all that survives a power cut: ``pebble:pebble``, 0700; ``$STATE_DIRECTORY``."""
         return self.root / "var/lib/pebble"
 
     @cached_property

@@ -61,10 +61,7 @@ class Sieve:
         return len(self._waiting)
 
     def takes_event(self, message: Message) -> bool:
-        """Return True if an event may be sent now; else note since when an event has waited.
-
-        The events themselves wait elsewhere, in order.
-        """
+        """Return True if an event may be sent now; else note since when events wait, which is elsewhere."""
         overdue = self._event_is_overdue
         if (overdue or Rank.STATE not in self._short) and self._takes(Rank.STATE, _size(message)):
             self._event_since = inf
@@ -73,10 +70,7 @@ class Sieve:
         return False
 
     def keeps(self, subject: Subject, message: Message, forward: Forward) -> bool:
-        """Keep ``message`` for later and return True; return False if it is to be sent now.
-
-        If there is no room, it may be dropped.
-        """
+        """Keep ``message`` and return True, or drop it for lack of room; return False if it is to be sent now."""
         rank, topic = rank_of(subject, message), message.topic
         if rank is None:
             return False

@@ -159,10 +159,7 @@ class _Removal:
     def _ask(
         self, filter_: str, note: Callable[[set[str], Message], None], wait_s: float, then: Callable[[], None]
     ) -> None:
-        """Subscribe on all sides, and call ``then`` when their retained messages have arrived.
-
-        An exception does not end the bridge.
-        """
+        """Subscribe on all sides; call ``then`` after their retained messages. No exception ends the bridge."""
         self._end()
         self._found = [set() for _ in self._sides]
         try:

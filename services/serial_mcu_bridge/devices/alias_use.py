@@ -9,10 +9,7 @@ from pebble.transports import Subscription
 
 
 class AliasUse:
-    """The aliases in use.
-
-    ``begin`` starts the use of an alias and returns its subscription, if any; ``end`` ends it.
-    """
+    """The aliases in use. ``begin`` starts the use of one and returns its subscription, if any; ``end`` ends it."""
 
     def __init__(
         self,

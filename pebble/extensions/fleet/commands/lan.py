@@ -148,10 +148,7 @@ def _running(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def _accounts(fleet: Fleet, robots: list[str], boards: list[str]) -> Fleet:
-    """Return the fleet with an account for each robot, as a neighbour of the others, and for each board at the broker.
-
-    Raises FleetError.
-    """
+    """Return the fleet with accounts for robots, as neighbours, and for boards at the broker. Raises FleetError."""
     bases = {name: f"pebble/robots/{name}" for name in (*robots, *boards)}
     for name, times in Counter((*robots, *boards)).items():
         if times > 1:

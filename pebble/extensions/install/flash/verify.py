@@ -21,10 +21,7 @@ _CHUNK = 4096
 
 
 def at_broker(config: Config, timeout_s: float = HEARTBEAT_S) -> str:
-    """Wait for a live heartbeat, and return a line about it. Raises DeviceError with what to check.
-
-    A retained heartbeat does not count: it is from before the reset.
-    """
+    """Return a line about the first live heartbeat; retained ones are older than the reset. Raises DeviceError."""
     broker = config.local_mqtt
     received: queue.Queue[Message] = queue.Queue()
     settings = mqtt_settings(broker, reconnect_max_s=LOCAL_RECONNECT_S)
@@ -55,10 +52,7 @@ def _alive(payload: bytes) -> bool:
 
 
 def on_serial_port(port: str, firmware: Firmware, timeout_s: float = REPORT_S) -> str:
-    """Wait for the firmware's report on its serial line, and return a line about it.
-
-    Raises DeviceError with what was received instead.
-    """
+    """Return a line about the firmware's first report. Raises DeviceError with what was received instead."""
     is_report = firmware.is_report
     assert is_report is not None  # noqa: S101 - robots with a broker are verified there
     end = time.monotonic() + timeout_s

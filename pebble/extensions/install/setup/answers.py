@@ -70,10 +70,7 @@ class Answers(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Secrets(Struct, frozen=True, kw_only=True):
-    """Passwords that were typed or read from files.
-
-    They are shown nowhere, and written only to the files that need them.
-    """
+    """Passwords that were typed or read from files: shown nowhere, and written only to files that need them."""
 
     password: str | None = None
     broker_password: str | None = None
@@ -121,10 +118,7 @@ def read_file(file: Path) -> tuple[dict[str, Any], Secrets]:
 
 
 def combined(earlier: Answers, given: Mapping[str, Any]) -> Answers:
-    """Return the earlier answers with the given ones in their place.
-
-    Raises AnswersError with a line for each mistake.
-    """
+    """Return the earlier answers, with given ones in their place. Raises AnswersError with a line per mistake."""
     fields = asdict(earlier)
     for key, dependent in _DEPENDING.items():
         if key in given and given[key] != fields[key]:

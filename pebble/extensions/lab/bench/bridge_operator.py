@@ -175,10 +175,7 @@ def compiled(program: Path) -> Path:
 
 @contextmanager
 def driven_robot(kind: str, *, reports: bool = True) -> Iterator[DrivenRobot]:
-    """Launch a robot, connect its operator and yield both; with ``reports`` it forwards its MCU's reports.
-
-    Raises PebbleError.
-    """
+    """Yield a new robot with its operator; with ``reports`` it forwards its MCU's reports. Raises PebbleError."""
     with one_robot(kind, {STAND_IN: StandIn, FLOOR: CFloor}.get(kind, Robot), reports=reports) as robot:
         robot.launch()
         with closing(DrivenRobot(robot)) as driven:

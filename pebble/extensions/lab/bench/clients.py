@@ -65,10 +65,7 @@ class StockClient:
         return self
 
     def wait(self) -> None:
-        """Wait until the broker has acknowledged the subscriptions, or the connection if there are none.
-
-        Raises PebbleError.
-        """
+        """Wait until subscriptions, or else the connection, are acknowledged. Raises PebbleError."""
         if not self._ready.wait(_ANSWER_S):
             raise PebbleError(f"the broker acknowledged nothing within {_ANSWER_S:.0f} s")
 
@@ -155,10 +152,7 @@ class RobotSubscriber(StockClient):
 
 @contextmanager
 def ready_robot(kind: str) -> Iterator[tuple[Robot, RobotSubscriber]]:
-    """Start a robot with a camera and a microphone; yield it once its services are ready.
-
-    Raises PebbleError with its log.
-    """
+    """Yield a robot with camera and microphone whose services are ready. Raises PebbleError with its log."""
     with one_robot(kind, services=MEDIA) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
         subscriber.wait()
         robot.launch()

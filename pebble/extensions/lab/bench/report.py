@@ -114,10 +114,7 @@ def run(names: Sequence[str], folder: Path, *, quick: bool, console: Console) ->
 
 
 def _checked(folder: Path) -> Path:
-    """Return the report's path.
-
-    Raises PebbleError, before an hour of measuring, if it cannot or must not be written.
-    """
+    """Return the report's path. PebbleError, before an hour of measuring, if it cannot or must not be written."""
     if find_spec("matplotlib") is None:
         raise PebbleError("a report needs matplotlib, which is not installed: pip install 'pebble-robot[bench]'")
     check_folder(folder)

@@ -47,10 +47,7 @@ class Shown:
 
 
 def finish(shown: Shown, folder: Path, console: Console) -> int:
-    """Print and write everything; return 0 if the results are complete.
-
-    Raises PebbleError if a file cannot be written.
-    """
+    """Print and write everything; return 0 if results are complete. PebbleError if a file cannot be written."""
     results = shown.results
     results.save(file := folder / f"{results.bench}.json")  # before anything that may fail
     for table in shown.tables:

@@ -115,10 +115,7 @@ def floor_table(results: Results) -> Table:
 
 
 def launch(variant: str, joins: int) -> Iterator[Cell]:
-    """Launch a fresh robot; yield its times in seconds from just before the launcher's start.
-
-    Raises PebbleError with its log.
-    """
+    """Launch a fresh robot; yield its times in seconds from just before that. Raises PebbleError with its log."""
     kind, _, part = variant.partition(" ")
     make, services = PARTS[part]
     with (

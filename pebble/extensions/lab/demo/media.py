@@ -22,10 +22,7 @@ _ENCODINGS: dict[Medium, tuple[str, ...]] = {"video": ALL_VIDEO, "audio": ALL_SO
 
 
 class CountedMedia(MediaReceiver):
-    """The pictures and sounds of one robot, ``counted`` by encoding.
-
-    The transport's threads write, another one reads.
-    """
+    """One robot's pictures and sounds, ``counted`` by encoding. The transport's threads write, another reads."""
 
     def __init__(self, transport: Transport, base: str) -> None:
         super().__init__(transport, base)

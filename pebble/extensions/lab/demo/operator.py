@@ -279,10 +279,7 @@ class Operator:
         self._complete(step.name, step.drive, began, released, time.monotonic())
 
     def _stop_all(self, robots: Sequence[RobotView]) -> None:
-        """Drive all, stop them, try to drive, reset, and drive again.
-
-        A person's stop is left for the person to reset.
-        """
+        """Drive all, stop them, try to drive, reset, drive again. A person's stop is left to the person."""
         began = time.monotonic()
         self._begin(EMERGENCY_STOP, robots)
         self._end_trails()

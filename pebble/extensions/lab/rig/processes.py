@@ -90,10 +90,7 @@ class Program:
         self._process.wait()
 
     def wait_until(self, condition: Callable[[], bool], timeout: float, ending: threading.Event | None = None) -> None:
-        """Wait for ``condition``, or until ``ending`` is set.
-
-        Raises PebbleError on timeout, or if the program ends first.
-        """
+        """Wait for ``condition`` or ``ending``. Raises PebbleError on timeout, or if the program ends first."""
         end, ending = time.monotonic() + timeout, ending or threading.Event()
         while not condition() and not ending.wait(_STEP_S):
             if self.ended:
@@ -208,10 +205,7 @@ class Broker(Program):
         super().__init__(name, wrap(command), folder / f"{name}.log")
 
     def wait(self, ending: threading.Event | None = None) -> None:
-        """Wait until the broker answers, or ``ending`` is set.
-
-        Raises PebbleError on timeout, or if the broker has ended.
-        """
+        """Wait until the broker answers, or ``ending``. Raises PebbleError on timeout, or if it has ended."""
         self.wait_until(lambda: self._answers() and not self.ended, _BROKER_START_S, ending)
 
     def _answers(self) -> bool:

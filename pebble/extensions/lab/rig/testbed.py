@@ -138,10 +138,7 @@ class PageServer(Program):
         super().__init__("the operator page", command, folder / "page.log", self._take)
 
     def wait(self, ending: threading.Event | None = None) -> None:
-        """Wait until the page can be opened at ``url``, or ``ending`` is set.
-
-        Raises PebbleError if it cannot be opened.
-        """
+        """Wait until the page can be opened at ``url``, or ``ending``. Raises PebbleError if it cannot."""
         self.wait_until(lambda: bool(self.url), START_S, ending)
 
     def _take(self, line: bytes) -> None:

@@ -104,10 +104,7 @@ def _part(level: float) -> float:
 
 
 class Battery:
-    """A battery of ``cells`` in series.
-
-    Its voltage falls with time and motion, sags under load and rises on the charger.
-    """
+    """A battery of ``cells`` in series: falls with time and motion, sags under load, rises on the charger."""
 
     def __init__(self, cells: int) -> None:
         self.charging = False

@@ -107,10 +107,7 @@ def _raw(data: Bytes, info: FrameInfo) -> Bytes:
 
 
 def _opencv(what: str) -> Any:
-    """Return the module cv2, which takes tens of MB and is only for readers that need it.
-
-    Raises PayloadError if it is not installed.
-    """
+    """Return the module cv2: tens of MB, only for readers that need it. Raises PayloadError if it is missing."""
     try:
         return import_module("cv2")
     except ModuleNotFoundError:

@@ -239,10 +239,7 @@ class FrameReader:
         return "" if shared_memory.lockable(needed) else self._memlock_problem(needed)
 
     def _reopen_soon(self, problem: str) -> None:
-        """Let the next `read` reopen the session, without sharing if there is a ``problem``.
-
-        It cannot be reopened on this thread, which belongs to the session.
-        """
+        """Let the next `read` reopen the session, without sharing after a ``problem``: this thread cannot."""
         self.problem = problem
         self._sharing_ended.set()
         self._latest.wake()

@@ -1,7 +1,4 @@
-"""The capabilities assumed for a silent board: two of the original's boards obey drive commands without saying so.
-
-Pure.
-"""
+"""The capabilities assumed for a silent board, such as the original's that drive without saying so. Pure."""
 
 from collections.abc import Collection
 from typing import Any, Final, Literal

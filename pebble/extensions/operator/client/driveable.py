@@ -10,10 +10,7 @@ _WHY = 300  # characters
 
 
 class Driveable(NamedTuple):
-    """The robot's own judgement.
-
-    ``state``: ``yes``, ``no`` or ``unknown``; ``why``: its text, possibly not printable.
-    """
+    """The robot's judgement. ``state``: ``yes``, ``no`` or ``unknown``; ``why``: a text, perhaps not printable."""
 
     state: str
     why: str = ""

@@ -83,10 +83,7 @@ def session_of(connection: HTTPConnection) -> Session | None:
 
 
 def named(session: Session, name: str) -> Session:
-    """Return the session with the name by which a person is shown; "" changes nothing.
-
-    Used only on a server without a login.
-    """
+    """Return the session with a person's ``name``; "" changes nothing. Only on a server without a login."""
     user = printable(name).strip()
     return dataclasses.replace(session, user=user) if user else session
 

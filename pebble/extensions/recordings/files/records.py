@@ -81,10 +81,7 @@ def unpack_chunk(body: bytes) -> bytes:
 
 
 def with_own_topic(channel: Channel, payload: bytes) -> tuple[Channel, bytes]:
-    """Return channel and payload from a payload that begins with its channel's topic and metadata.
-
-    Raises DamageError.
-    """
+    """Return channel and payload of a payload that begins with topic and metadata. Raises DamageError."""
     from mcap.data_stream import ReadDataStream
     from mcap.records import Metadata
 

@@ -39,10 +39,7 @@ def _damaged_path(path: Path) -> Path:
 
 
 class Finisher:
-    """A queue of files to finish, for ``background``.
-
-    ``event`` records the result for a file that was left unfinished.
-    """
+    """A queue of files to finish, for ``background``. ``event`` records what became of an unfinished file."""
 
     def __init__(self, background: Background, event: Callable[..., None], on_finished: Callable[[], None]) -> None:
         self._background, self._event, self._on_finished = background, event, on_finished

@@ -11,10 +11,7 @@ from pebble.errors import PayloadError
 
 
 class Activity(IntEnum):
-    """Kinds of activity, by their numbers in the index.
-
-    DRIVE to AUTONOMY belong to a session (paper 4.1), a warning does not.
-    """
+    """Kinds of activity, as numbers of the index. DRIVE to AUTONOMY belong to a session (paper 4.1)."""
 
     NONE = 0
     DRIVE = 1

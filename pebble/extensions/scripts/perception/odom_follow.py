@@ -1,7 +1,4 @@
-"""A controller that follows a tag.
-
-While the tag is out of sight, it drives by odometry to its last place, for a while.
-"""
+"""A controller that follows a tag and, while it is out of sight, drives by odometry to its last place."""
 
 import math
 from typing import Any, NamedTuple

@@ -9,10 +9,7 @@ class Rate:
         self._due = float("-inf")
 
     def due(self, now: float) -> bool:
-        """True if the next turn is due.
-
-        Turns are at fixed times: comparing with the last turn would lose a part of each period.
-        """
+        """True if the next turn is due. Turns have fixed times: since the last one, a part would be lost each time."""
         self._due = min(self._due, now + 1.0 / self.hz)  # the rate was raised
         if now < self._due:
             return False

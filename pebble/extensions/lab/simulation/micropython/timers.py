@@ -8,10 +8,7 @@ from pebble.extensions.lab.simulation.micropython.clock import Clock
 
 
 class BoardReset(BaseException):
-    """A reset of the board, raised as an exception.
-
-    No firmware catches a BaseException; the runner reboots the board.
-    """
+    """A reset of the board. Firmware catches no BaseException; the runner does, and reboots the board."""
 
 
 class Watchdog:

@@ -120,10 +120,7 @@ class LockstepRobot:
         return output
 
     def drive(self, x: float, z: float) -> None:
-        """Send the line that ``serial_mcu_bridge`` makes of a drive command.
-
-        ``z`` is the throttle, ``x`` steers, + turns right.
-        """
+        """Send ``serial_mcu_bridge``'s line for a drive command: throttle ``z``, steering ``x``, + is right."""
         left, right = (min(1.0, max(-1.0, speed)) for speed in (z + x, z - x))
         self.write(b"M %.3f %.3f\n" % (round(left, 3) + 0.0, round(right, 3) + 0.0))  # + 0.0: no "-0.000"
 

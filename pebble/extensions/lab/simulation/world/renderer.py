@@ -28,10 +28,7 @@ _Floats: TypeAlias = NDArray[np.float64]
 
 
 class Renderer:
-    """A renderer of pictures of ``width`` x ``height``, BGR, of the robot ``me``.
-
-    The same calls give the same pixels.
-    """
+    """Pictures of ``width`` x ``height``, BGR, of the robot ``me``. The same calls give the same pixels."""
 
     def __init__(self, world: World, me: str, width: int, height: int) -> None:
         import cv2  # 16 MB, only where pictures are made

@@ -17,10 +17,7 @@ _ROUNDING_MM = 1e-6
 
 
 class Floor:
-    """The poses of all robots of a world.
-
-    Any thread may use it, because each robot's motion has a thread of its own.
-    """
+    """The poses of all robots of a world. Thread-safe, because each robot's motion has a thread of its own."""
 
     def __init__(self, world: World) -> None:
         self._lock = threading.Lock()

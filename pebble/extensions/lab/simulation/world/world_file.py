@@ -72,7 +72,7 @@ class Shape(Section, frozen=True, kw_only=True):
 
 
 class Drawing(Section, frozen=True, kw_only=True):
-    """A drawing of a window or a plant.
+    """A window or a plant.
 
     Its middle is at x, y, z, its front looks to ``yaw_deg``; later shapes cover earlier ones.
     """
