@@ -49,8 +49,9 @@ def _suffix_of(field: FieldInfo) -> str:
 
 def _section_of(field: FieldInfo) -> type[Section] | None:
     kind, _ = unwrap(field.type)
-    inner = get_args(kind)[-1] if get_origin(kind) is dict else get_args(kind)[0] if get_origin(kind) is tuple else kind
-    return inner if isinstance(inner, type) and issubclass(inner, Section) else None
+    if get_origin(kind) in (dict, tuple):
+        kind = get_args(kind)[get_origin(kind) is dict]  # of a table's values, or a list's entries
+    return kind if isinstance(kind, type) and issubclass(kind, Section) else None
 
 
 def _meaning(field: FieldInfo) -> str:

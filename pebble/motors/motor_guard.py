@@ -126,7 +126,8 @@ class MotorGuard:
                 drive.moves, run != PERSON or account is None, key, account or "", _ms(now)
             )
             waits = drive.moves and self._control.waits(now)
-            reason = "handover" if waits else "stranger" if strange else "latched" if self.latched else "overruled"
+            reasons = {"handover": waits, "stranger": strange, "latched": self.latched, "overruled": True}
+            reason = next(reason for reason, applies in reasons.items() if applies)
             self._counters.add(reason)
             if drive.moves or run == PERSON:  # a script's zero is only to bar older runs, which the arbiter has done
                 self._log.warning(reason, "refused a drive command: %s", self._why_refused(reason, run, key))

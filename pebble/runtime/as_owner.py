@@ -55,6 +55,6 @@ def require_own(folder: Path, does: str = "does not write there", *, there: bool
     if not is_root():
         return
     owner = owner_of(folder, nameless=False, there=there)
-    who = f"user {owner.uid}" if owner.uid else "all users" if is_open(folder) else ""
-    if who:
+    if owner.uid or is_open(folder):
+        who = f"user {owner.uid}" if owner.uid else "all users"
         raise PebbleError(f"{folder} belongs to {who}, so root {does}: run it as that user, or name another folder")

@@ -78,7 +78,9 @@ class Runner:
     @property
     def stoppable(self) -> Run | None:
         """The present run; None if it is being ended without a successor, or cannot move the robot."""
-        return (self._run if self._next is not None else self.active) if self.drives else None
+        if not self.drives:
+            return None
+        return self.active if self._next is None else self._run
 
     @property
     def config(self) -> Mapping[str, Value] | None:

@@ -94,7 +94,7 @@ class AutonomyManager(Service):
     @on(AUTONOMY_COMMAND)
     def command(self, command: AutonomyCommand) -> None:
         word = (command.action or "").strip().lower()
-        begin = True if word in _START else False if word in STOP_WORDS else command.enabled
+        begin = word in _START if word in (*_START, *STOP_WORDS) else command.enabled
         self._waiting = None
         if begin is None:
             self.log_limited.warning("command", "ignored a command that neither starts nor stops a script")

@@ -66,7 +66,7 @@ class SoundboardHandler(Service):
     def command(self, command: SoundboardCommand) -> None:
         """Play or stop a clip; ``action`` wins over ``enabled``."""
         action = (command.action or "").strip().lower()
-        play = True if action in _PLAY else False if action in STOP_WORDS else command.enabled
+        play = action in _PLAY if action in (*_PLAY, *STOP_WORDS) else command.enabled
         if play is None:
             self.log.warning("ignored a command that neither plays nor stops: %.100r", command.action)
             return

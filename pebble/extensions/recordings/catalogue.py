@@ -1,7 +1,7 @@
 """The contents of recordings, read from their summaries if they have one."""
 
 import json
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -137,8 +137,8 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
     for path in paths:
         try:
             with RecordingFile(path) as file:
-                for _ in file.read(chooses=lambda _channel: False) if file.statistics is None else ():
-                    pass
+                if file.statistics is None:  # the channels are known once all of it was read
+                    deque(file.read(chooses=lambda _channel: False), maxlen=0)
                 channels += file.channels.values()
                 if file.problem:
                     return

@@ -157,7 +157,8 @@ def boards(robot: RobotUnderTest) -> CheckResult:
     drives = robot.view.driveable
     if drives is not None and drives.state == "no":
         return failed(f"its motors are not reached: {drives.why}", _LOG)
-    unheard = [name for name in lines if not isinstance(age := _mcu(robot, name).get("heard_ms"), int) or age >= 10_000]
+    ages_ms = {name: _mcu(robot, name).get("heard_ms") for name in lines}
+    unheard = [name for name, age_ms in ages_ms.items() if not isinstance(age_ms, int) or age_ms >= 10_000]
     if unheard:
         return skipped(f"{', '.join(unheard)} sends nothing at rest, as some boards do")
     if drives is not None and drives.state == "unknown":

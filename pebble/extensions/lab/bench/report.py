@@ -146,7 +146,9 @@ def run_one(section: Section, folder: Path, quick: bool) -> str:
         end_all([program], _END_S)
     if code is None:
         return "hung and was ended"
-    return f"ended with code {code}" if code else "" if results.exists() else "measured nothing"
+    if code:
+        return f"ended with code {code}"
+    return "" if results.exists() else "measured nothing"
 
 
 def _span(seconds: float) -> str:

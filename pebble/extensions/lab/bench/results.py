@@ -112,8 +112,10 @@ class Results(msgspec.Struct, kw_only=True):
 
     def save(self, path: Path) -> None:
         """Write the file. Raises PebbleError if it cannot be written."""
-        shorter = [[[round(sample, _DIGITS) for sample in samples] for samples in cell.rounds] for cell in self.cells]
-        cells = [msgspec.structs.replace(cell, rounds=rounds) for cell, rounds in zip(self.cells, shorter, strict=True)]
+        cells = []
+        for cell in self.cells:
+            rounds = [[round(sample, _DIGITS) for sample in samples] for samples in cell.rounds]
+            cells.append(msgspec.structs.replace(cell, rounds=rounds))
         with named(path):
             path.write_bytes(msgspec.json.encode(msgspec.structs.replace(self, cells=cells)) + b"\n")
 

@@ -112,7 +112,8 @@ def arguments(settings: Sequence[Setting], values: Mapping[str, Value]) -> list[
         if value is None or not setting.arg:
             continue
         if setting.type == "bool" and setting.mode != "value":
-            words += [setting.arg] if value else [setting.arg_false] if setting.arg_false else []
+            flag = setting.arg if value else setting.arg_false
+            words += [flag] if flag else []
         else:
             words += [setting.arg, _word(value)]
     return words

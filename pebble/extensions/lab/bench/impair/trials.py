@@ -240,8 +240,11 @@ def transports(results: Results) -> Table:
     for form in FORMS:
         intervals = []
         for measure in _COMPARED.values():
-            cells = [[results.find(f"{kind} {form}", measure, trial=trial) for trial in TRIALS] for kind in _KINDS]
-            zenoh, mqtt = ([cell.samples if cell else [] for cell in some] for some in cells)
+            samples = []  # of each kind, by trial
+            for kind in _KINDS:
+                cells = [results.find(f"{kind} {form}", measure, trial=trial) for trial in TRIALS]
+                samples.append([cell.samples if cell else [] for cell in cells])
+            zenoh, mqtt = samples
             intervals.append(str(paired(zenoh, mqtt)))
         grid.add_row(form, *intervals)
     return grid
