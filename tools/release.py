@@ -147,14 +147,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--sbom", type=Path, help="goes with it; tools/sbom.py writes it")
     parser.add_argument("--into", type=Path, default=INTO)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     git = subprocess.run(["git", "log", "-1", "--format=%ct"], cwd=ROOT, capture_output=True, text=True, check=True)
     os.environ.setdefault("SOURCE_DATE_EPOCH", git.stdout.strip())
     os.umask(0o022)
     with tempfile.TemporaryDirectory() as folder:
         copied(ROOT, Path(folder))
-        version = build(Path(folder), asked.into.resolve(), asked.sbom)
-    for path in sorted(asked.into.iterdir()):
+        version = build(Path(folder), options.into.resolve(), options.sbom)
+    for path in sorted(options.into.iterdir()):
         print(f"{path.stat().st_size:>9}  {path}")
     if subprocess.run(["git", "status", "--porcelain"], cwd=ROOT, capture_output=True, check=True).stdout:
         print("These files have changes that are in no commit.")

@@ -30,13 +30,13 @@ def schema_text() -> str:
     for kind in _subclasses(Section):
         if kind.__name__ in definitions:
             _complete(definitions[kind.__name__], kind)
-    whole = {
+    schema = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "Config of a Pebble robot",
         "$ref": f"#/$defs/{Root.__name__}",
         "$defs": dict(sorted(definitions.items())),
     }
-    return json.dumps(whole, indent=1) + "\n"
+    return json.dumps(schema, indent=1) + "\n"
 
 
 def _complete(definition: dict[str, Any], kind: type[Section]) -> None:

@@ -58,9 +58,9 @@ def dial(address: Address, timeout: float | None = None, *, max_segment: int = 0
 
 def described(failures: dict[str, str]) -> str:
     """Return one line of limited length with the addresses and the reason why each failed."""
-    some = [f"{address} {why}" for address, why in list(failures.items())[:_LONGEST]]
-    more = len(failures) - len(some)
-    return "; ".join(some) + (f"; and {more} more" if more else "")
+    shown_failures = [f"{address} {why}" for address, why in list(failures.items())[:_LONGEST]]
+    hidden = len(failures) - len(shown_failures)
+    return "; ".join(shown_failures) + (f"; and {hidden} more" if hidden else "")
 
 
 class AddressRound:

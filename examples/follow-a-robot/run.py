@@ -67,12 +67,14 @@ def main(robot: Robot, options: Options) -> None:
     follower = Follower(convert(options, FollowSettings, from_attributes=True))
     companion = Companion(options.ahead_m, options.left_m)
     while True:
-        mine, its = (pose_of(seen.latest(WHEEL_ODOMETRY, POSE_AGE_S)) for seen in (robot, other))
-        if mine is None or its is None:
-            log.warning("odometry", "waits for the odometry of %s", options.robot if its is None else "this robot")
+        own_pose, other_pose = (pose_of(machine.latest(WHEEL_ODOMETRY, POSE_AGE_S)) for machine in (robot, other))
+        if own_pose is None or other_pose is None:
+            log.warning(
+                "odometry", "waits for the odometry of %s", options.robot if other_pose is None else "this robot"
+            )
             robot.stop()
         else:
-            command = follower.step(time.monotonic(), companion.place(mine, its))
+            command = follower.step(time.monotonic(), companion.place(own_pose, other_pose))
             robot.drive(command.x, command.z)
         robot.sleep(1 / options.control_rate_hz)
 

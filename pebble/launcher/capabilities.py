@@ -53,8 +53,8 @@ def capabilities(
 def _identity(config: Config) -> offers.RobotIdentity:
     robot = config.robot
     looks = {key: getattr(robot, key) for key in ("name", "description", "colour", "picture", "battery_cells")}
-    given: dict[str, Any] = {key: value for key, value in looks.items() if value is not None}
-    return offers.RobotIdentity(system=robot.system, type=robot.type, id=robot.id, **given)
+    known_looks: dict[str, Any] = {key: value for key, value in looks.items() if value is not None}
+    return offers.RobotIdentity(system=robot.system, type=robot.type, id=robot.id, **known_looks)
 
 
 def _system(config: Config, addresses: Addresses) -> offers.SystemOffer:

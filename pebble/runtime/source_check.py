@@ -58,7 +58,7 @@ class SourceCheck:
         self._count += times
         seconds = now - self._window
         if seconds >= _RATE_S:
-            rate, asked = self._count / seconds, self._asked_hz
-            off = abs(rate - asked) > max(_TOLERANCE * asked, 1 / seconds)
-            self.wrong_hz = rate if asked and off else None
+            rate, asked_hz = self._count / seconds, self._asked_hz
+            off = abs(rate - asked_hz) > max(_TOLERANCE * asked_hz, 1 / seconds)
+            self.wrong_hz = rate if asked_hz and off else None
             self._window, self._count = now, 0

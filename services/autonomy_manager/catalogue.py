@@ -51,12 +51,12 @@ def roots(config: Config, own: Path = _OWN_SCRIPTS) -> tuple[Path, ...]:
     An absolute ``autonomy_root`` is the only folder. A relative one starts at the config's folder or, as in the
     original program, two folders above a config in ``control/configs``. Pebble's own scripts come last.
     """
-    given = in_home(config.section(AutonomyManager).autonomy_root)
-    if given.is_absolute():
-        return (given,)
-    beside = [config.folder / given]
+    configured = in_home(config.section(AutonomyManager).autonomy_root)
+    if configured.is_absolute():
+        return (configured,)
+    beside = [config.folder / configured]
     if config.folder.parts[-2:] == ("control", "configs"):
-        beside.append(config.folder.parent.parent / given)
+        beside.append(config.folder.parent.parent / configured)
     return (*beside, own)
 
 

@@ -106,11 +106,11 @@ class V4l2Camera:
 
     def _draw(self, target: Bytes) -> None:
         wanted = target.reshape(self._info.height, self._info.width, 3)
-        got = self._retrieve(wanted)
-        if got.shape != wanted.shape:
+        picture = self._retrieve(wanted)
+        if picture.shape != wanted.shape:
             raise DeviceError(f"{self._name} changed the size of its pictures")
-        if not np.shares_memory(got, wanted):  # not every backend of OpenCV writes into the array given to it
-            np.copyto(wanted, got)
+        if not np.shares_memory(picture, wanted):  # not every backend of OpenCV writes into the array given to it
+            np.copyto(wanted, picture)
 
 
 def is_device(name: str) -> bool:

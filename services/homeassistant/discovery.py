@@ -45,12 +45,12 @@ def discovery(base: str, capabilities: dict[str, Any], expose: Collection[str] =
     """Return the message. ``unit``: the unit of the battery's level, ``v`` or ``%``; "" if unknown."""
     name, identity = object_id(base), section_of(capabilities, "identity")
     online = c.ONLINE.topic(base)
-    there = {"avty_t": online, "avty_tpl": f"{{{{ 'offline' if {_ONLINE} else 'online' }}}}"}
+    availability = {"avty_t": online, "avty_tpl": f"{{{{ 'offline' if {_ONLINE} else 'online' }}}}"}
     components: dict[str, Component] = {}
     # Without availability: an absent tracker would be unavailable, not away.
-    here = {"p": "device_tracker", "name": "Presence", "stat_t": online, "src_type": "router"}
-    components["presence"] = here | {"val_tpl": f"{{{{ 'not_home' if {_ONLINE} else 'home' }}}}"}
-    components |= {key: value | there for key, value in _components(base, capabilities, expose, unit)}
+    presence = {"p": "device_tracker", "name": "Presence", "stat_t": online, "src_type": "router"}
+    components["presence"] = presence | {"val_tpl": f"{{{{ 'not_home' if {_ONLINE} else 'home' }}}}"}
+    components |= {key: value | availability for key, value in _components(base, capabilities, expose, unit)}
     for key, component in components.items():
         component["uniq_id"] = f"{name}_{key}"
     message = {

@@ -59,9 +59,9 @@ class Leftovers:
             return False
         filter_ = self._filters[self._next]
         self._next += 1
-        asked = self._remote.subscribe(filter_, self._note_remote, echo=False, direct=True)
-        self._subscriptions.append(asked)
-        if asked.refused:  # it will refuse the others as well
+        subscription = self._remote.subscribe(filter_, self._note_remote, echo=False, direct=True)
+        self._subscriptions.append(subscription)
+        if subscription.refused:  # it will refuse the others as well
             self._next = len(self._filters)
         return True
 
@@ -71,9 +71,9 @@ class Leftovers:
         ``remove(topic, unless=…)`` removes one message, unless there is a reason not to, and returns True if it did.
         """
         self._close()
-        gone = [topic for topic in sorted(self._at_remote) if remove(topic, unless=self._stays)]
+        removed = [topic for topic in sorted(self._at_remote) if remove(topic, unless=self._stays)]
         self._on_robot = None
-        return gone
+        return removed
 
     def _stays(self, topic: str) -> bool:
         on_robot = self._on_robot or set()

@@ -146,5 +146,5 @@ def _addressed(stop: EstopCommand, owner: str) -> bytes:
 
 
 def _encoded(command: EstopCommand, **fields: Any) -> bytes:
-    kept = {"by": command.by or UNSET, "why": command.why or UNSET}
-    return codec.encode(ESTOP, msgspec.structs.replace(command, **(kept | fields)))
+    sender = {"by": command.by or UNSET, "why": command.why or UNSET}
+    return codec.encode(ESTOP, msgspec.structs.replace(command, **(sender | fields)))

@@ -195,19 +195,19 @@ class MqttBridge(ForwardingService):
         if self.forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
             self._look_later()
             return
-        asked = self._leftovers.ask_next()
+        is_waiting = self._leftovers.ask_next()
         pause = self._uplink.pause(ASK_S)
-        wait, then = (pause, self._look_for_leftovers) if asked else (INITIAL_SYNC_S, self._remove_leftovers)
+        wait, then = (pause, self._look_for_leftovers) if is_waiting else (INITIAL_SYNC_S, self._remove_leftovers)
         self._leftover_timer = self.call_at(self.clock() + wait, then)
 
     def _remove_leftovers(self) -> None:
         if self.forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
             self._look_later()
             return
-        gone = self._leftovers.remove(partial(self.forwarder.retained.remove, Side.REMOTE))
-        if gone:
-            few = ", ".join(topic[:_LOGGED] for topic in gone[:3]) + (", …" if len(gone) > 3 else "")
-            self.log.info("removed %d retained topics that the robot no longer has: %s", len(gone), few)
+        removed = self._leftovers.remove(partial(self.forwarder.retained.remove, Side.REMOTE))
+        if removed:
+            few = ", ".join(topic[:_LOGGED] for topic in removed[:3]) + (", …" if len(removed) > 3 else "")
+            self.log.info("removed %d retained topics that the robot no longer has: %s", len(removed), few)
 
     def connected(self, side: Side, epoch: int) -> None:
         if side is Side.REMOTE:

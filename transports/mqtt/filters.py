@@ -112,8 +112,8 @@ class OwnMessageFilter:
 
     def subscribe_again(self, filter_: str) -> None:
         """Expect the retained messages that ``filter_`` matches to be sent once more."""
-        seen = list(self._seen) if is_pattern(filter_) else [filter_] if self._seen.has(filter_) else []
-        self._repeats.update(topic for topic in seen if overlap(topic, filter_))
+        topics = list(self._seen) if is_pattern(filter_) else [filter_] if self._seen.has(filter_) else []
+        self._repeats.update(topic for topic in topics if overlap(topic, filter_))
 
     def is_echo(self, message: Message) -> bool:
         """True if this is our own retained message, sent back to us; else forget ours, which is outdated."""
@@ -126,9 +126,9 @@ class OwnMessageFilter:
 
     def is_repeat(self, message: Message) -> bool:
         """True, once, if the broker repeats a retained message because of `subscribe_again`. Remembers each message."""
-        seen, digest = self._seen.get(message.topic), _digest(message)
+        known_digest, digest = self._seen.get(message.topic), _digest(message)
         self._seen[message.topic] = digest
-        if seen != digest or message.topic not in self._repeats:
+        if known_digest != digest or message.topic not in self._repeats:
             return False
         self._repeats.discard(message.topic)
         return True

@@ -139,9 +139,9 @@ class Incoming:
         why, id_ = self.reason or f"{self.where} closed the connection", self._settings.client_id
         if id_ is not None and self.accepted is not None and self._taken_over:
             why += f' (does another client use the client id "{id_}"? a broker lets in only the newest)'
-        if asked := self._in_flight.asked:
-            more = f" and {len(asked) - _SHOWN} more" if len(asked) > _SHOWN else ""
-            why += f", asked to deliver {', '.join(asked[:_SHOWN])}{more}"
+        if filters := self._in_flight.asked:
+            more = f" and {len(filters) - _SHOWN} more" if len(filters) > _SHOWN else ""
+            why += f", asked to deliver {', '.join(filters[:_SHOWN])}{more}"
         return Lost(why)
 
     # -- called by the client

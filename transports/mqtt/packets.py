@@ -316,8 +316,8 @@ class Reader:
         if body[1]:
             self._listener.on_refused(body[1])
             return
-        given = properties(body[2 : 2 + self._properties_size(body)])
-        accepted = Accepted(*map(given.get, (_MAXIMUM_PACKET, _RECEIVE_MAXIMUM, _MAXIMUM_QOS, _RETAIN_AVAILABLE)))
+        values = properties(body[2 : 2 + self._properties_size(body)])
+        accepted = Accepted(*map(values.get, (_MAXIMUM_PACKET, _RECEIVE_MAXIMUM, _MAXIMUM_QOS, _RETAIN_AVAILABLE)))
         if accepted.receive_maximum is not None:
             self._quota.begin(accepted.receive_maximum)
         self._listener.on_accepted(accepted)

@@ -33,11 +33,11 @@ class SocketPoll:
                 self._write = write
                 self._poll.modify(self._sock, select.POLLIN | (select.POLLOUT if write else 0))
             readable = writable = woken = False
-            for descriptor, seen in self._poll.poll(ceil(seconds * 1000)):
+            for descriptor, events in self._poll.poll(ceil(seconds * 1000)):
                 if descriptor == self._wake:
                     woken = True
                 else:
-                    readable, writable = bool(seen & ~select.POLLOUT), bool(seen & select.POLLOUT)
+                    readable, writable = bool(events & ~select.POLLOUT), bool(events & select.POLLOUT)
         if woken:
             self._wakeup.clear()
         return readable, writable, woken

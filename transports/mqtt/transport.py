@@ -170,8 +170,8 @@ class MqttTransport(Transport):
                 return
             for name in names:
                 self._own_message_filter.subscribe_again(name)
-            asked = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
-            acks = [asked, connection.ping(), connection.unsubscribe(names)]
+            answer = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
+            acks = [answer, connection.ping(), connection.unsubscribe(names)]
         for ack in acks:
             ack.wait(deadline - time.monotonic())
 

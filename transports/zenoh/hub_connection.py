@@ -74,11 +74,11 @@ class HubConnection:
 
     def hello(self) -> bytes:
         """Return a hello message with our will and the digests of our retained messages."""
-        gone: dict[str, int | None] = {topic_to_key(topic): None for topic in self._removed}
+        removals: dict[str, int | None] = {topic_to_key(topic): None for topic in self._removed}
         retained: dict[str, int | None] = {
             topic_to_key(topic): wire.digest(message.payload) for topic, message in self._own.items() if message.payload
         }
-        return wire.encode(wire.Hello(self.name, self.retained_count, self._will, gone | retained))
+        return wire.encode(wire.Hello(self.name, self.retained_count, self._will, removals | retained))
 
     def greet(self, session: zenoh.Session, hello: bytes, timeout: float) -> set[str] | None:
         """Send a hello; return the topics that the hub lacks, or None if no hub answers in time."""

@@ -134,7 +134,7 @@ class Barrier:
 
     def _ask(self, wanted: set[str], answers: dict[str, int], left: float) -> bool:
         done = threading.Event()
-        asked = wanted if self._by_name else ["*"]
+        names = wanted if self._by_name else ["*"]
         ended: list[None] = []
 
         def take(reply: zenoh.Reply) -> None:
@@ -145,10 +145,10 @@ class Barrier:
 
         def end() -> None:
             ended.append(None)
-            if len(ended) == len(asked):
+            if len(ended) == len(names):
                 done.set()
 
-        for name in asked:
+        for name in names:
             self._session.get(
                 SYNC + name,
                 zenoh.handlers.Callback(take, end, indirect=False),

@@ -171,19 +171,19 @@ class ZenohTransport(Transport):
     def _run(self) -> None:
         if self.settings.client and not self._start_client():
             return
-        seen, linked = 0, 0  # version of the newest view handled; its connection that works, 0: none
+        version, linked = 0, 0  # version of the newest view handled; its connection that works, 0: none
         self._wait_for_siblings_once()
         watch = self._hub.watch
-        while (view := watch.wait(seen, _RETRY_S if watch.hubs and not linked else None)) is not None:
+        while (view := watch.wait(version, _RETRY_S if watch.hubs and not linked else None)) is not None:
             try:
-                linked = self._follow(view, seen, linked)
+                linked = self._follow(view, version, linked)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 if self._hub.watch.closed:
                     return
                 log.exception("%s: unexpected failure of the connection to the hub", self.client_id)
                 linked = 0
                 self._hub.watch.wait_closed(HUB_ANSWER_S)
-            seen = view.version
+            version = view.version
 
     def _synchronize(self, timeout: float) -> dict[str, int]:
         """Wait until all siblings know our declarations; return how many retained messages each has sent."""

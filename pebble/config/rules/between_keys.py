@@ -178,14 +178,16 @@ def _tls(reader: Reader, tls: Tls, path: Path) -> Tls:
 
 
 def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
-    given = [key for key in ("password", "password_file", "password_env") if getattr(mqtt, key) is not None]
-    if len(given) > 1:
-        reader.notes.problem((*path, given[1]), f"is a second password beside {given[0]}, leave one of them")
+    password_keys = [key for key in ("password", "password_file", "password_env") if getattr(mqtt, key) is not None]
+    if len(password_keys) > 1:
+        reader.notes.problem(
+            (*path, password_keys[1]), f"is a second password beside {password_keys[0]}, leave one of them"
+        )
         return mqtt
     if mqtt.username is not None and len(mqtt.username.encode()) > _LONGEST_TEXT:
         reader.notes.problem((*path, "username"), f"is longer than MQTT carries, {_LONGEST_TEXT} bytes")
-    if given and mqtt.username is None:
-        reader.notes.warning((*path, given[0]), "is not sent: there is no username")
+    if password_keys and mqtt.username is None:
+        reader.notes.warning((*path, password_keys[0]), "is not sent: there is no username")
     password: str | None = mqtt.password
     if mqtt.password_env is not None:
         password = _variable(reader, mqtt.password_env, (*path, "password_env"))
@@ -197,7 +199,7 @@ def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
     if password is None:
         return mqtt
     if len(password.encode()) > _LONGEST_TEXT:
-        reader.notes.problem((*path, *given), f"holds more than MQTT carries, {_LONGEST_TEXT} bytes")
+        reader.notes.problem((*path, *password_keys), f"holds more than MQTT carries, {_LONGEST_TEXT} bytes")
     return replace(mqtt, password=Secret(password))
 
 

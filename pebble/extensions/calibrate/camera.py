@@ -52,7 +52,7 @@ def collect(
 
     ``still``: every picture counts. Otherwise the tag must be at rest, and 15 well-spread places are enough.
     """
-    taken: dict[View, Floats] = {}
+    by_view: dict[View, Floats] = {}
     size, resting = (0, 0), 0
     before: Floats | None = None
     for picture in pictures:
@@ -64,16 +64,16 @@ def collect(
         rests = before is not None and float(np.abs(tag.corners - before).max()) < _STILL_PX
         resting, before = resting + 1 if rests else 0, tag.corners
         view = view_of(tag, size) if still or resting >= _STILL_PICTURES else None
-        if view is None or view in taken:
+        if view is None or view in by_view:
             continue
-        taken[view] = tag.corners
-        missing = [name for names in (_ROWS, _COLUMNS, _DISTANCES) for name in names if name not in {*chain(*taken)}]
+        by_view[view] = tag.corners
+        missing = [name for names in (_ROWS, _COLUMNS, _DISTANCES) for name in names if name not in {*chain(*by_view)}]
         person.tell(
-            f"{len(taken)} of {LEAST_PICTURES}: {' '.join(view)}; next: {', '.join(missing) or 'another place'}"
+            f"{len(by_view)} of {LEAST_PICTURES}: {' '.join(view)}; next: {', '.join(missing) or 'another place'}"
         )
-        if not still and len(taken) >= LEAST_PICTURES and not missing:
+        if not still and len(by_view) >= LEAST_PICTURES and not missing:
             break
-    return list(taken.values()), size
+    return list(by_view.values()), size
 
 
 def solve(corners: list[Floats], size: tuple[int, int], size_m: float) -> Lens:

@@ -143,8 +143,8 @@ class People:
         rows = self._rows("SELECT name, role, salt, hash FROM people WHERE name = ?", looked_up)
         stored_name, role, salt, expected = rows[0] if rows else ("", "", b"no such person..", self._no_hash)
         typed = password[: 2 * MAX_PASSWORD]  # so long may one be whose accents are letters of their own
-        given = [_hash(spelling, salt) for spelling in _spellings(typed)]
-        is_right = any(hmac.compare_digest(digest, expected) for digest in given)
+        hashes = [_hash(spelling, salt) for spelling in _spellings(typed)]
+        is_right = any(hmac.compare_digest(digest, expected) for digest in hashes)
         if not is_right or not stored_name or len(normalize("NFC", typed)) > MAX_PASSWORD:
             return None
         self._addresses.give_back(network_of(address))

@@ -62,8 +62,8 @@ class Resampler:
         count = max(0, ceil((windows * self._up - self._at) / self._down))
         at = self._at + self._down * np.arange(count, dtype=np.int64)
         phases = at % self._up * len(self._filter) // self._up
-        seen = np.lib.stride_tricks.sliding_window_view(held, self._taps, axis=0)[at // self._up]
-        mixed = np.einsum("nck,nk->nc", seen, self._filter[phases], optimize=False)
+        views = np.lib.stride_tricks.sliding_window_view(held, self._taps, axis=0)[at // self._up]
+        mixed = np.einsum("nck,nk->nc", views, self._filter[phases], optimize=False)
         self._at += self._down * count - windows * self._up
         self._tail = held[windows:]
         return to_int16(mixed)

@@ -353,14 +353,14 @@ class Control:
             await self._websocket.send_text(encode(self._waiting.popleft()))
         drivers = {key for key in self._interest.dirty if key[1] == "web/driver"}
         self._interest.dirty -= drivers
-        taken, large = self._server.robots.take(self._interest, now, large=self._large_due)
+        changed, large = self._server.robots.take(self._interest, now, large=self._large_due)
         self._large_due = self._large_due and not large
         if self._interest.more:
             self._wake.set()
-        values = taken + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)
-        gone, self._interest.gone = tuple(self._interest.gone), set()
-        if values or gone:
-            await self._websocket.send_text(encode(m.State(now=1000 * time.time(), set=values, gone=gone)))
+        values = changed + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)
+        removed, self._interest.gone = tuple(self._interest.gone), set()
+        if values or removed:
+            await self._websocket.send_text(encode(m.State(now=1000 * time.time(), set=values, gone=removed)))
         await self._send_logs()
 
     def _driver(self, ref: str) -> m.DriverView:

@@ -216,8 +216,8 @@ def _capabilities(payload: Any) -> Any:
     value = _inner(payload)
     if not isinstance(value, dict):
         return {}
-    kept = {name: section for name, section in value.items() if _is(_SECTIONS.get(name, Any), section)}
-    return payload if kept == value and value is not payload else {"value": kept}
+    valid = {name: section for name, section in value.items() if _is(_SECTIONS.get(name, Any), section)}
+    return payload if valid == value and value is not payload else {"value": valid}
 
 
 _SHOWN: dict[str, Callable[[Any], Any]] = {

@@ -106,8 +106,8 @@ class StaticFiles:
 
     def _renewed(self, name: str, match: re.Match[bytes], query: bytes) -> bytes:
         path = match[1]
-        whole = posixpath.normpath(posixpath.join(posixpath.dirname(name), path.decode()))
-        return match[0] if whole in self._first else match[0].replace(path, path + b"?" + query)
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(name), path.decode()))
+        return match[0] if target in self._first else match[0].replace(path, path + b"?" + query)
 
 
 def root_of(request: Request) -> str:

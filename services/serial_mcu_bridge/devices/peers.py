@@ -40,7 +40,9 @@ class PeerDevices:
 
     def left_over(self, now: float) -> list[str]:
         """Forget the devices that were not confirmed in time, and return their uids."""
-        gone = [uid for uid, device in self._of.items() if device.confirm_by is not None and device.confirm_by <= now]
-        for uid in gone:
+        unconfirmed = [
+            uid for uid, device in self._of.items() if device.confirm_by is not None and device.confirm_by <= now
+        ]
+        for uid in unconfirmed:
             del self._of[uid]
-        return gone
+        return unconfirmed

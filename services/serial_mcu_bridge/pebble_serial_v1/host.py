@@ -154,9 +154,9 @@ class Session:
     def feed(self, chunk: bytes, now: float) -> list[Event]:
         """Return the events of the frames that ``chunk`` completes. Never raises."""
         events = [event for stuffed in self._splitter.feed(chunk) if stuffed for event in self._receive(stuffed, now)]
-        more = self._splitter.discarded_lines - self._too_long
-        self._too_long += more
-        return events + [RefusedInput("too long", f"a frame of more than {FRAME_LIMIT} bytes")] * more
+        discarded = self._splitter.discarded_lines - self._too_long
+        self._too_long += discarded
+        return events + [RefusedInput("too long", f"a frame of more than {FRAME_LIMIT} bytes")] * discarded
 
     def tick(self, now: float, wall_ms: int) -> list[Event]:
         """Return the events that are due: requests for the manifest, pings and timeouts."""

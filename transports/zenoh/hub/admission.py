@@ -59,7 +59,7 @@ class Admission:
 
     def takes(self, topic: str) -> bool:
         """True if a will on this topic is accepted."""
-        return next((taken for filter_, taken in self._wills if matches(filter_, topic)), True)
+        return next((is_taken for filter_, is_taken in self._wills if matches(filter_, topic)), True)
 
     def refuse_will(self, will: Will, why: str) -> None:
         """Count a refused will, and log the first refusal of its client."""

@@ -38,7 +38,7 @@ class WillTimes:
 
     def take_due(self, now: float) -> list[str]:
         """Remove and return the clients whose wills are due."""
-        taken = [name for name, due in self._due.items() if now >= due]
-        for name in taken:
+        due_names = [name for name, due in self._due.items() if now >= due]
+        for name in due_names:
             del self._due[name]
-        return taken
+        return due_names

@@ -58,9 +58,9 @@ def rights(trial: BrokerTrial) -> CheckResult:
     elif why := _why_unread(trial, reader):
         return failed(why, fix)
     trial.qos = int(has_qos_1 and granted == b"\x01")
-    kept = _kept(trial)
-    trial.retains = kept is not None
-    if kept is not None and not kept.retain:
+    retained_message = _kept(trial)
+    trial.retains = retained_message is not None
+    if retained_message is not None and not retained_message.retain:
         return failed("what it retains comes without the retain flag: a command of yesterday looks new", OTHER)
     lacks = [
         *([] if trial.qos else ["it has no QoS 1: events and answers may be lost on the way"]),

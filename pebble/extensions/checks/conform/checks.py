@@ -137,16 +137,16 @@ def sizes(robot: Observer) -> CheckResult:
 
 
 def retained(robot: Observer) -> CheckResult:
-    there = {record.metric for record in robot.retained()}
+    metrics = {record.metric for record in robot.retained()}
     live = {record.metric: record.channel for record in robot.records if record.channel and record.payload}
     must = {metric for metric, channel in live.items() if channel.default_retain and channel not in _REPEATED}
-    if lacks := must - there:
+    if lacks := must - metrics:
         fix = "publish it with the retain flag: who connects later lacks it"
         return failed(f"not retained: {some_of(sorted(lacks))}", fix)
     of_manifests = {metric for metric, channel in live.items() if channel is c.MCU_VALUE}  # which decide it
-    stale = {metric for metric in there & live.keys() if not live[metric].default_retain} - of_manifests
+    stale = {metric for metric in metrics & live.keys() if not live[metric].default_retain} - of_manifests
     fix = "publish it without the retain flag: it is news only once"
-    return _none_of(stale, fix, f"{len(there)} states", "retained: ")
+    return _none_of(stale, fix, f"{len(metrics)} states", "retained: ")
 
 
 def stale_commands(robot: Observer) -> CheckResult:

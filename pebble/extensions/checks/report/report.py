@@ -108,9 +108,9 @@ def _index(report: Report, known: Secrets) -> str:
 def _config(here: Here) -> str:
     """Return the config file and the config with its defaults, with secrets masked."""
     written = masked(plain(decode(read_text(here.file), here.file.name), Notes()))
-    whole: dict[str, Any] = {"file": str(here.file), "written": written}
-    whole |= {"problems": here.problem.splitlines()} if here.config is None else {"resolved": resolved(here.config)}
-    return json.dumps(whole, indent=1, ensure_ascii=False)
+    config: dict[str, Any] = {"file": str(here.file), "written": written}
+    config |= {"problems": here.problem.splitlines()} if here.config is None else {"resolved": resolved(here.config)}
+    return json.dumps(config, indent=1, ensure_ascii=False)
 
 
 def _doctor(here: Here) -> str:

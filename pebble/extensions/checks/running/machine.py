@@ -89,11 +89,11 @@ def disk(robot: RobotUnderTest) -> CheckResult:
     folder = Path(os.path.normpath(robot.config.state_dir()))  # a config may name it by ../..
     existing = next(place for place in (folder, *folder.parents) if place.exists())
     room = os.statvfs(existing)
-    free, whole = room.f_bavail * room.f_frsize, room.f_blocks * room.f_frsize
-    text = f"{free / 1e9:.1f} of {whole / 1e9:.1f} GB are free at {folder}"
+    free, size = room.f_bavail * room.f_frsize, room.f_blocks * room.f_frsize
+    text = f"{free / 1e9:.1f} of {size / 1e9:.1f} GB are free at {folder}"
     if room.f_flag & os.ST_RDONLY:
         return failed(f"{folder} is read-only: no stop survives a power cut", "sudo mount -o remount,rw /")
-    if free < max(_LEAST_FREE, _LEAST_SHARE * whole):
+    if free < max(_LEAST_FREE, _LEAST_SHARE * size):
         return failed(text, f"du -xh --max-depth=1 {folder.parent} | sort -h; journalctl --vacuum-size=50M")
     if room.f_files and not room.f_favail:
         return failed(f"{folder}: no file can be made any more", f"du -x --inodes {folder.parent} | sort -n | tail")

@@ -127,10 +127,10 @@ def add(
         pebble fleet add page-1 --role page
         pebble fleet add goob-lan --role neighbour --base pebble/robots/goob
     """
-    given = tuple(dict.fromkeys(split_names(roles)))
-    bases = tuple(base or ((f"pebble/robots/{name}",) if given == (ProgramRole.ROBOT,) else ()))
+    role_names = tuple(dict.fromkeys(split_names(roles)))
+    bases = tuple(base or ((f"pebble/robots/{name}",) if role_names == (ProgramRole.ROBOT,) else ()))
     database = "" if people is None else str(people.absolute())
-    account = Account(roles=given, bases=bases, plain=plain, people=database)
+    account = Account(roles=role_names, bases=bases, plain=plain, people=database)
     with _changing(folder_) as (place, fleet):
         if why := folder.refused(fleet, name, account):
             raise FleetError(why)
@@ -138,7 +138,7 @@ def add(
             raise FleetError(f"{place} has {folder.MAX_ACCOUNTS} accounts already: remove one, or make another fleet")
         after = fleet.with_account(name, account)
         secret = new_password()
-        is_neighbour = given == (ProgramRole.NEIGHBOUR,)  # which is at a hub, and nowhere else
+        is_neighbour = role_names == (ProgramRole.NEIGHBOUR,)  # which is at a hub, and nowhere else
         if is_neighbour:
             require_packages("pebble fleet")
             after = replace(after, hubs="here" if fleet.hubs == "none" else fleet.hubs)
@@ -239,9 +239,9 @@ def certificate(
         if is_hub and not hosts:
             raise FleetError(f"{name} is a hub: name where others reach it, `pebble fleet certificate {name} HOST`")
         of_brokers = certificates.hosts_of(host for server in fleet.brokers for host in applying.names_of(server))
-        asked = set(certificates.hosts_of(hosts)) if hosts else set[str]()
-        if taken := asked & {*fleet.accounts, *(() if is_hub else of_brokers)} - {name}:
-            raise FleetError(f"{name} cannot be {min(taken)}: that is a broker of this fleet, or another account")
+        host_names = set(certificates.hosts_of(hosts)) if hosts else set[str]()
+        if conflicts := host_names & {*fleet.accounts, *(() if is_hub else of_brokers)} - {name}:
+            raise FleetError(f"{name} cannot be {min(conflicts)}: that is a broker of this fleet, or another account")
         files = certificates.of_account(place, name, hosts or ())
         _print_certificate(place, fleet, name, files)
     return 0

@@ -102,19 +102,19 @@ _PASSWORD, _BROKER_PASSWORD = "password_file", "broker_password_file"
 def read_file(file: Path) -> tuple[dict[str, Any], Secrets]:
     """Read a file of answers, and the passwords in the files that it names. Raises PebbleError."""
     try:
-        given = msgspec.json.decode(read_text(file), type=dict[str, Any])
+        written = msgspec.json.decode(read_text(file), type=dict[str, Any])
     except OSError as error:
         raise AnswersError(f"--answers {file}: {error.strerror}") from None
     except (msgspec.MsgspecError, NotTextError) as error:
         raise AnswersError(f"{file}: {error}: write an object with the keys {', '.join(KEYS)}") from None
-    given = {key: value for key, value in given.items() if not key.startswith("//")}
-    if unknown := [key for key in given if key not in KEYS]:
+    written = {key: value for key, value in written.items() if not key.startswith("//")}
+    if unknown := [key for key in written if key not in KEYS]:
         raise AnswersError(f"{file}: {unknown[0]}: unknown key; there are {', '.join(KEYS)}")
-    files = {key: given.pop(key) for key in (_PASSWORD, _BROKER_PASSWORD) if key in given}
+    files = {key: written.pop(key) for key in (_PASSWORD, _BROKER_PASSWORD) if key in written}
     passwords = {key: read_password(Path(str(named)), key, file) for key, named in files.items()}
     if _PASSWORD in passwords:
         usable(passwords[_PASSWORD])
-    return given, Secrets(password=passwords.get(_PASSWORD), broker_password=passwords.get(_BROKER_PASSWORD))
+    return written, Secrets(password=passwords.get(_PASSWORD), broker_password=passwords.get(_BROKER_PASSWORD))
 
 
 def combined(earlier: Answers, given: Mapping[str, Any]) -> Answers:
@@ -181,7 +181,7 @@ def require(answers: Answers, secrets: Secrets, *, has_login: bool, has_people: 
         "user": answers.user is not None or not needs_user(answers, has_people=has_people),
         "password_file": secrets.password is not None or not needs_user(answers, has_people=has_people) or has_user,
     }
-    if missing := [key for key, there in is_there.items() if not there]:
+    if missing := [key for key, has_answer in is_there.items() if not has_answer]:
         raise AnswersError("\n".join(f"{key} is missing: {KEYS[key]}" for key in missing))
 
 

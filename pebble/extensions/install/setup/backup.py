@@ -170,14 +170,14 @@ def _database(file: Path) -> bytes:
     """Return a consistent copy of a database, by SQLite's backup. Raises BackupError if it is damaged."""
     try:
         with (
-            closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as there,
-            closing(sqlite3.connect(":memory:")) as here,
+            closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as original,
+            closing(sqlite3.connect(":memory:")) as copy,
         ):
-            there.backup(here)
-            ((result,),) = here.execute("PRAGMA quick_check(1)").fetchall()
+            original.backup(copy)
+            ((result,),) = copy.execute("PRAGMA quick_check(1)").fetchall()
             if result != "ok":
                 raise BackupError(f"{file}: is damaged: {result}")
-            return here.serialize()
+            return copy.serialize()
     except sqlite3.Error as error:
         raise BackupError(f"{file}: is no whole database: {error}") from None
 

@@ -90,16 +90,16 @@ def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
     folder = f"{places.broker_folder.relative_to(places.root)}/"
     links = [f"{folder}{name}" for name in own_broker.LINKS]
     broker = str(places.broker.relative_to(places.root))
-    kept = {
+    allowed = {
         name: saved
         for name, saved in files.items()
         if name not in links and (name.startswith(folder) or not name.startswith("etc/mosquitto/"))
     }
     if broker in files:
-        kept[broker] = Saved(own_broker.conf_text(places, own_broker.fleet_of("robot", "", places.people)), 0o644)
-    if any(name.startswith(folder) for name in kept) and f"{folder}{FLEET}" not in kept:
+        allowed[broker] = Saved(own_broker.conf_text(places, own_broker.fleet_of("robot", "", places.people)), 0o644)
+    if any(name.startswith(folder) for name in allowed) and f"{folder}{FLEET}" not in allowed:
         raise SetupError(f"the backup has files of a broker, and no {folder}{FLEET}: it was changed")
-    return kept
+    return allowed
 
 
 def _beyond(value: Any, *keys: str) -> Iterator[str]:

@@ -180,13 +180,13 @@ class Job:
             yield Step("the robot's own broker ends", lambda: False, broker_conf.unlink, (BROKER_SERVICE,))
         if self.answers.broker_ca in (None, self.earlier.broker_ca):
             return
-        given = Path(str(self.answers.broker_ca))
+        ca_file = Path(str(self.answers.broker_ca))
         try:
-            content = certificates.only_certificates(read_plain(given))
+            content = certificates.only_certificates(read_plain(ca_file))
         except OSError as error:
-            raise SetupError(f"broker_ca: {given}: {error.strerror}") from None
+            raise SetupError(f"broker_ca: {ca_file}: {error.strerror}") from None
         if not content:
-            raise SetupError(f"broker_ca: {given} holds no certificate")
+            raise SetupError(f"broker_ca: {ca_file} holds no certificate")
         yield self._file("authority of the broker", self.places.etc / BROKER_CA, content)
 
     def _certificate(self) -> Iterator[Step]:

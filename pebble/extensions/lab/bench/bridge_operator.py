@@ -96,8 +96,10 @@ class DrivenRobot(StockClient):
     def wait_until_ready(self) -> None:
         """Wait until the robot is ready. Raises PebbleError if it does not become so."""
         robot = self.robot
-        with closing(RobotSubscriber(robot.remote_port, BASE)) as seen:
-            robot.expect(lambda: None not in (seen.ready_ns, seen.first_heartbeat_ns), "it is not ready", _UP_S)
+        with closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
+            robot.expect(
+                lambda: None not in (subscriber.ready_ns, subscriber.first_heartbeat_ns), "it is not ready", _UP_S
+            )
         running = robot.processes()
         self._parts = {part: [running[name]] for part, name in SERVICES.items() if name in running}
         if len(self._parts) < len(SERVICES):
@@ -143,9 +145,9 @@ class StandIn(Robot):
     """A robot as a user would build it without us."""
 
     def launch(self) -> None:
-        rest = (*self.broker_ports[::-1], self.base, self.port, *(["--reports"] if self.reports else []))
+        arguments = (*self.broker_ports[::-1], self.base, self.port, *(["--reports"] if self.reports else []))
         for part in ("bridge", "serial"):
-            self.start(f"the {self.name}'s {part}", [*self.command(), part, *map(str, rest)])
+            self.start(f"the {self.name}'s {part}", [*self.command(), part, *map(str, arguments)])
 
     def command(self) -> list[str]:
         return python("pebble.extensions.lab.bench.stand_in")

@@ -59,9 +59,9 @@ def serial_bridge(local_port: int, base: str, device: str, *, reports: bool) -> 
         port.write(b"M %.3f %.3f\n" % (left, right))
 
     local = StockClient(drive, [(DRIVE.topic(base), 1)], at_once=False).open(local_port)
-    rest = b""
+    unfinished = b""
     while True:  # without pyserial's own readline, which reads byte by byte
-        *lines, rest = (rest + port.read(max(1, min(port.in_waiting, _PIECE)))).split(b"\n")
+        *lines, unfinished = (unfinished + port.read(max(1, min(port.in_waiting, _PIECE)))).split(b"\n")
         for line in lines if reports else ():
             fields = dict(token.split("=", 1) for token in line.decode().split() if "=" in token)
             if all(name in fields for name in _TOUCH):

@@ -161,8 +161,8 @@ def media_table(robots: Analysed) -> Table:
     heads = [f"{family} {value}" for family in (VIDEO, AUDIO) for value in ("median", "p95")]
     table = plain_table("Table 4.1: media, kbit/s of active seconds", ["robot", "", *heads], left=2)
     for name, paper in TABLE_4_1.items():
-        here = [robots[name].of(family) if name in robots else None for family in (VIDEO, AUDIO)]
-        shown = [("–", "–") if row is None else (f"{row.median_kbps:.2f}", f"{row.p95_kbps:.2f}") for row in here]
+        measured = [robots[name].of(family) if name in robots else None for family in (VIDEO, AUDIO)]
+        shown = [("–", "–") if row is None else (f"{row.median_kbps:.2f}", f"{row.p95_kbps:.2f}") for row in measured]
         table.add_row(name, "paper", *(f"{value:.2f}" for value in paper))
         table.add_row("", "here", *chain(*shown))
     return table

@@ -144,8 +144,8 @@ class Demo:
     def _index(self) -> None:
         """Request the data that Recordings shows first, now and then, so that the server has it ready for visitors."""
         while not self._ending.wait(_INDEX_S):
-            asked = f"archive/timeline?day={datetime.now(UTC):%Y-%m-%d}&robot={_GOOB.base}"
-            with suppress(OSError), urlopen(self._page_url + asked, timeout=_INDEX_S):  # noqa: S310 - its own page
+            path = f"archive/timeline?day={datetime.now(UTC):%Y-%m-%d}&robot={_GOOB.base}"
+            with suppress(OSError), urlopen(self._page_url + path, timeout=_INDEX_S):  # noqa: S310 - its own page
                 pass
 
     def _invite(self) -> None:
@@ -209,8 +209,8 @@ def _pebble() -> str:
     program = Path(sys.executable).with_name("pebble")
     if not program.exists():
         return f"{shlex.quote(sys.executable)} -m pebble"
-    here = Path.cwd()
-    return shlex.quote(str(program.relative_to(here) if program.is_relative_to(here) else program))
+    folder = Path.cwd()
+    return shlex.quote(str(program.relative_to(folder) if program.is_relative_to(folder) else program))
 
 
 def print_line(console: Console, line: str) -> None:

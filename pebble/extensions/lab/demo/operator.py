@@ -340,11 +340,11 @@ class Operator:
 
     def _follow(self, robot: RobotView) -> None:
         """Start the script, drive for a moment, and wait until it has arrived."""
-        seen: deque[TagData] = deque(maxlen=1)
+        tags: deque[TagData] = deque(maxlen=1)
 
         def receive(message: Message) -> None:
             with suppress(PayloadError):
-                seen.append(codec.decode(c.APRILTAG_DATA, message.payload))
+                tags.append(codec.decode(c.APRILTAG_DATA, message.payload))
 
         def scripted() -> bool:
             """True if the robot reports that no person drives in place of its script."""
@@ -353,7 +353,7 @@ class Operator:
 
         def distance_m() -> float:
             """Return the robot's distance from the tag; infinite if the robot does not see the tag."""
-            return math.inf if not seen or seen[0].distance_m is None else seen[0].distance_m
+            return math.inf if not tags or tags[0].distance_m is None else tags[0].distance_m
 
         self.show(f"STARTS: {FOLLOW}, {robot.name} plays {CLIP} and drives to tag {TAG_ID} by itself")
         config = {"tag_id": TAG_ID, "tag_size_m": TAG_SIZE_M, "target_distance_m": DISTANCE_M}
@@ -363,7 +363,7 @@ class Operator:
             stack.callback(self._command, robot, AutonomyCommand(action="stop"))
             self._command(robot, AutonomyCommand(action="start", file=FOLLOW, config=config))
             self._publish(c.SOUNDBOARD_COMMAND.topic(robot.base), sound)
-            self._until(lambda: bool(seen) and scripted(), _START_S)
+            self._until(lambda: bool(tags) and scripted(), _START_S)
             self._wait(_APPROACH_S)
             self.show(f"TAKES OVER: drives {robot.name}, {FOLLOW} is overruled")
             took_over = time.monotonic()

@@ -39,10 +39,10 @@ class View:
                 self._step = line.removeprefix("operator ")  # it is one of the steps
             now = time.monotonic()
             for robot in self._robots:
-                seen = self._operator.discovery.robots.get(robot.base)
-                if seen is not None and seen.capabilities and robot.name not in self._known:
+                discovered = self._operator.discovery.robots.get(robot.base)
+                if discovered is not None and discovered.capabilities and robot.name not in self._known:
                     self._known.add(robot.name)
-                    self._print(now, f"{robot.name} is online: {robot.runs_on}, {seen.transport} inside")
+                    self._print(now, f"{robot.name} is online: {robot.runs_on}, {discovered.transport} inside")
             if self._operator.activity != self._step:
                 self._step = self._operator.activity
                 self._print(now, f"operator: {self._step}")

@@ -59,9 +59,9 @@ class Mpu6050:
     def read(self, count: int) -> bytes:
         if not self._registers[_PWR_MGMT_1] & _SLEEP:
             self._registers[_ACCEL_XOUT_H : _ACCEL_XOUT_H + 14] = self._sample()
-        got = bytes(self._registers[(self._pointer + offset) % 128] for offset in range(count))
+        values = bytes(self._registers[(self._pointer + offset) % 128] for offset in range(count))
         self._pointer = (self._pointer + count) % 128
-        return got
+        return values
 
     # -- the sensors
 

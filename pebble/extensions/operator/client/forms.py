@@ -139,15 +139,15 @@ def _bool(key: str, raw: Any) -> bool:
 
 
 def _numeric(setting: Setting, raw: Any) -> int | float:
-    whole = setting.type == "int"
+    is_integer = setting.type == "int"
     if isinstance(raw, bool) or not isinstance(raw, int | float | str):
-        raise SettingError(f"{setting.key} must be a {'whole ' if whole else ''}number")
+        raise SettingError(f"{setting.key} must be a {'whole ' if is_integer else ''}number")
     if isinstance(raw, str):
-        if not (_integer if whole else _number)(raw):
-            raise SettingError(f"{setting.key} must be a {'whole ' if whole else ''}number")
-        return int(raw) if whole else _finite(setting.key, raw)
+        if not (_integer if is_integer else _number)(raw):
+            raise SettingError(f"{setting.key} must be a {'whole ' if is_integer else ''}number")
+        return int(raw) if is_integer else _finite(setting.key, raw)
     number = _finite(setting.key, raw)
-    if not whole:
+    if not is_integer:
         return number
     if not number.is_integer() or abs(number) >= 1e15:
         raise SettingError(f"{setting.key} must be a whole number")

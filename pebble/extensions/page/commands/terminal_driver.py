@@ -53,8 +53,8 @@ class TerminalDriver:
     def filters(self) -> list[str]:
         """Filters of the topics that :meth:`receive` needs. Within the robot there is no link."""
         channels = (c.ESTOP_STATE, c.CONTROL_STATE, c.CAPABILITIES, c.ONLINE, c.CHARGING_LEVEL, c.AUTONOMY_STATUS)
-        more = [*([c.LINK] if self._heartbeat else []), *([c.DRIVE] if self._assumes else [])]
-        return [channel.filter(self.robot.base) for channel in (*channels, *more)]
+        further = [*([c.LINK] if self._heartbeat else []), *([c.DRIVE] if self._assumes else [])]
+        return [channel.filter(self.robot.base) for channel in (*channels, *further)]
 
     def receive(self, message: Message, now: float, wall: float) -> None:
         self.robot.receive(channel_of(message.topic.removeprefix(f"{self.robot.base}/")), message, now, wall)

@@ -110,9 +110,9 @@ class _Output(BufferedIOBase):
         self._writer, self._file = writer, file
 
     def write(self, data: bytes) -> int:  # type: ignore[override]
-        rest = memoryview(data)
-        while rest:
-            rest = rest[self._file.write(rest) :]
+        unwritten = memoryview(data)
+        while unwritten:
+            unwritten = unwritten[self._file.write(unwritten) :]
         self.size += len(data)
         if data[:1] == _CHUNK:  # the package writes a chunk in one call, and holds back no message
             self.messages = self._writer.messages

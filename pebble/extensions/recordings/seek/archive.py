@@ -166,10 +166,10 @@ class Archive:
         if now - self._listed_at >= LIST_S:
             self._named = sorted(_named(path) for path in recordings_in(self.folder) if path.is_file())
             self._listed_at = now
-            there = {named.path for named in self._named}
-            for path in [path for path in self._open if path not in there]:
+            paths = {named.path for named in self._named}
+            for path in [path for path in self._open if path not in paths]:
                 self._open.pop(path).close()
-            self._failed = {path: why for path, why in self._failed.items() if path in there}
+            self._failed = {path: why for path, why in self._failed.items() if path in paths}
         return self._named
 
     def _opened(self, path: Path) -> SeekableFile | None:

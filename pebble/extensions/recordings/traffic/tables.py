@@ -33,9 +33,9 @@ def media_bandwidth(traffic: Traffic) -> Table:
     ]  # fmt: skip
     rows = []
     for robot in traffic.robots:
-        both = robot.of(VIDEO), robot.of(AUDIO)
-        if any(both):
-            cells = [(None, None) if row is None else (row.median_kbps, row.p95_kbps) for row in both]
+        bandwidths = robot.of(VIDEO), robot.of(AUDIO)
+        if any(bandwidths):
+            cells = [(None, None) if row is None else (row.median_kbps, row.p95_kbps) for row in bandwidths]
             rows.append([robot.robot, *cells[0], *cells[1]])
     return Table("table-4-1-media-bandwidth", "Table 4.1: bandwidth of media, of active seconds", columns, rows)
 

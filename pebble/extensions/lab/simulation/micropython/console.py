@@ -62,9 +62,9 @@ class Console:
         while len(typed) < count:
             self._wait()
             self.interrupted()
-        taken = typed[:count]
+        chunk = typed[:count]
         del typed[:count]
-        return taken
+        return chunk
 
     def write(self, data: Any) -> int:
         """Write to the host; return how many bytes it has received, or will receive."""

@@ -93,11 +93,11 @@ class ViewerRequest:
             return []
         if now < self._began_at + self._waits_s():
             return []
-        self.settled, asked = True, [self._ask(now)]
+        self.settled, messages = True, [self._ask(now)]
         if not self._is_up:
             self._is_up = self._raised = True
-            asked.insert(0, self._flag_message(up=True))
-        return asked
+            messages.insert(0, self._flag_message(up=True))
+        return messages
 
     def _waits_s(self) -> float:
         """Return how long to wait for a payload, which shows that the medium is running."""

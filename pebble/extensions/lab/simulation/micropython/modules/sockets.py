@@ -153,15 +153,15 @@ class HostTcp(_HostSocket, Stream):
         if not self._network.radio.connected:
             return None
         try:
-            got = self._sock.recv(size)
-            self._network.problem = "" if got else "the broker closed the connection"
+            chunk = self._sock.recv(size)
+            self._network.problem = "" if chunk else "the broker closed the connection"
         except _LATER:
-            got = None
+            chunk = None
         except OSError as error:
             self._network.problem = error.strerror or str(error)
             raise (as_on_a_board(error) if isinstance(error, ssl.SSLError) else error) from None
-        self._network.unread = got is not None and len(got) == size
-        return got
+        self._network.unread = chunk is not None and len(chunk) == size
+        return chunk
 
     def _send(self, data: bytes) -> int | None:
         if not self._network.radio.connected:

@@ -21,19 +21,19 @@ class Stream(ABC):
         """Return the available bytes, at most ``size``; None if there are none, b"" at the end."""
         data = b""
         while len(data) < size:
-            got = self._receive(size - len(data))
-            if not got:
-                return data or got
-            data += got
+            chunk = self._receive(size - len(data))
+            if not chunk:
+                return data or chunk
+            data += chunk
         return data
 
     def readinto(self, buffer: Any) -> int | None:
         view = memoryview(buffer).cast("B")
-        got = self.read(len(view))
-        if got is None:
+        chunk = self.read(len(view))
+        if chunk is None:
             return None
-        view[: len(got)] = got
-        return len(got)
+        view[: len(chunk)] = chunk
+        return len(chunk)
 
     def write(self, data: Any) -> int | None:
         """Return how many bytes were sent; None if none."""
