@@ -25,8 +25,7 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
 
     ``folder`` may be a file, and need not exist yet. ``nameless``: users without an entry count, too; in a container
     they are those of the machine around it. Raises PebbleError if several users can, for a link on the way that a user
-    besides root can change, and for a missing ``folder`` that should be ``there``: it may have been removed since it
-    was read.
+    besides root can change, and for a missing one that should be ``there``: it may have been removed since.
     """
     place, owner = Path("/"), Owner(0, 0)
     system = place.lstat().st_uid  # in a user namespace root's files may seem to be of another user

@@ -1,7 +1,7 @@
 """Ages of commands, by the clocks of their senders.
 
 The age that pings show includes the way *up*, where messages may wait behind pictures on a thin link. A drive command
-with its sender's clock ``t`` and a ``key`` needs no pings once one with this key was fast. A request for control has an
+with its sender's clock ``t`` and a ``key`` needs no pings once one with this key was fast; a request for control has an
 ``id``.
 """
 

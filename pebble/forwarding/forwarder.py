@@ -6,8 +6,7 @@ and streams never wait for it.
 
 Retained commands are stale. A live emergency stop passes even if it was published as retained: a stop that does not
 arrive is worse than one that a later subscriber must recognise as old. Commands and actions are also stale when they
-have waited too long, in a process that was stopped or stuck, or at the broker; a command that only ends something never
-is.
+have waited, in a process that was stopped or stuck, or at the broker; one that only ends something never is.
 """
 
 import itertools

@@ -104,8 +104,7 @@ class RetainedTopics:
         return self._reconciliation.value(topic)
 
     def remove(self, side: Side, topic: str, *, unless: Callable[[str], bool]) -> bool:
-        """Remove the retained message of ``side`` on ``topic``, unless ``unless(topic)``; return True if it was
-        removed.
+        """Remove the retained message of ``side`` on ``topic``, unless ``unless(topic)``; True if it was removed.
 
         No retained message passes before the removal is sent, so one that is published in the meantime comes after it.
         """

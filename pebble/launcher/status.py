@@ -116,10 +116,8 @@ class StatusPublisher:
     ) -> Status:
         """Return the status message. ``webrtc_url``: the address of the pictures that operator pages show."""
         driveable = self._driveable.assessment({name: service.state for name, service in states.items()})
-        optional = {"mcu": mcus or None, "driveable": driveable, "webrtc_url": webrtc_url}
-        return Status(
-            t=_now_ms(), value={"services": states, **{name: part for name, part in optional.items() if part}}
-        )
+        parts = {"mcu": mcus or None, "driveable": driveable, "webrtc_url": webrtc_url}
+        return Status(t=_now_ms(), value={"services": states, **{key: part for key, part in parts.items() if part}})
 
     def _state(self, supervisor: ProcessSupervisor) -> ServiceState:
         policy = supervisor.policy

@@ -38,8 +38,7 @@ class MotorGuard:
     """The emergency stop and the arbiter of a Linux robot's motor owner; on the service's thread.
 
     Call :meth:`begin` first, and :meth:`tick` at :attr:`due`. ``publish(state)`` is called with each new state, at most
-    four times a second. ``file`` keeps the stop over a power cut, ``barred_file`` barred runs over a restart of this
-    process.
+    four times a second. ``file`` keeps the stop over a power cut, ``barred_file`` barred runs over a restart.
     """
 
     def __init__(
@@ -126,8 +125,7 @@ class MotorGuard:
                 drive.moves, run != PERSON or account is None, key, account or "", _ms(now)
             )
             waits = drive.moves and self._control.waits(now)
-            reasons = {"handover": waits, "stranger": strange, "latched": self.latched, "overruled": True}
-            reason = next(reason for reason, applies in reasons.items() if applies)
+            reason = "handover" if waits else "stranger" if strange else "latched" if self.latched else "overruled"
             self._counters.add(reason)
             if drive.moves or run == PERSON:  # a script's zero is only to bar older runs, which the arbiter has done
                 self._log.warning(reason, "refused a drive command: %s", self._why_refused(reason, run, key))

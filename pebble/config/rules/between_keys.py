@@ -178,16 +178,14 @@ def _tls(reader: Reader, tls: Tls, path: Path) -> Tls:
 
 
 def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
-    password_keys = [key for key in ("password", "password_file", "password_env") if getattr(mqtt, key) is not None]
-    if len(password_keys) > 1:
-        reader.notes.problem(
-            (*path, password_keys[1]), f"is a second password beside {password_keys[0]}, leave one of them"
-        )
+    keys = [key for key in ("password", "password_file", "password_env") if getattr(mqtt, key) is not None]
+    if len(keys) > 1:
+        reader.notes.problem((*path, keys[1]), f"is a second password beside {keys[0]}, leave one of them")
         return mqtt
     if mqtt.username is not None and len(mqtt.username.encode()) > _LONGEST_TEXT:
         reader.notes.problem((*path, "username"), f"is longer than MQTT carries, {_LONGEST_TEXT} bytes")
-    if password_keys and mqtt.username is None:
-        reader.notes.warning((*path, password_keys[0]), "is not sent: there is no username")
+    if keys and mqtt.username is None:
+        reader.notes.warning((*path, keys[0]), "is not sent: there is no username")
     password: str | None = mqtt.password
     if mqtt.password_env is not None:
         password = _variable(reader, mqtt.password_env, (*path, "password_env"))
@@ -199,7 +197,7 @@ def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
     if password is None:
         return mqtt
     if len(password.encode()) > _LONGEST_TEXT:
-        reader.notes.problem((*path, *password_keys), f"holds more than MQTT carries, {_LONGEST_TEXT} bytes")
+        reader.notes.problem((*path, *keys), f"holds more than MQTT carries, {_LONGEST_TEXT} bytes")
     return replace(mqtt, password=Secret(password))
 
 

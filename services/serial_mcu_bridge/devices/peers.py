@@ -40,9 +40,7 @@ class PeerDevices:
 
     def left_over(self, now: float) -> list[str]:
         """Forget the devices that were not confirmed in time, and return their uids."""
-        unconfirmed = [
-            uid for uid, device in self._of.items() if device.confirm_by is not None and device.confirm_by <= now
-        ]
-        for uid in unconfirmed:
+        late = [uid for uid, peer in self._of.items() if peer.confirm_by is not None and peer.confirm_by <= now]
+        for uid in late:
             del self._of[uid]
-        return unconfirmed
+        return late

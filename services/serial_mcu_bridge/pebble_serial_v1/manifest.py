@@ -102,10 +102,9 @@ def parse_hello(payload: bytes) -> Hello:
 
 
 def parse_describe(payload: bytes, base: str = "") -> Manifest:
-    """Return the manifest in ``payload``. Raises PayloadError that says what is wrong.
+    """Return the manifest in ``payload``. PayloadError says what is wrong: bytes missing, invalid topic levels, …
 
-    It may lack bytes or have too many, hold invalid topic levels, and so on. ``base`` is the beginning of the robot's
-    topics: names that are too long below it are refused, too.
+    ``base`` is the beginning of the robot's topics: names that are too long below it are refused, too.
     """
     reader = _Reader(payload)
     hello = _hello(reader)
