@@ -74,10 +74,7 @@ class RobotState:
         return (self.capabilities.get("drive") or {}).get("control") is True
 
     def key(self, own_id):
-        """Return the keys of all owners that gave control to this id.
-
-        "" if the first owner by name, which decides, did not.
-        """
+        """Return the keys of all owners that gave control to this id; "" if the first by name, who decides, did not."""
         keys = [
             str(control.get("key") or "") if control.get("id") == own_id else ""
             for _, control in sorted(self.known(self.controls).items())

@@ -20,7 +20,7 @@ class Robot:
     def __init__(self, robot_id, named, saved):
         """Store the arguments.
 
-        ``named``: commands need an account; ``saved``: the text that ``save`` wrote last, or None.
+        ``named``: commands need an account; ``saved``: the text that ``save`` wrote, or None.
         """
         self.base = "pebble/robots/" + robot_id
         self.named = named
