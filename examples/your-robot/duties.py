@@ -18,10 +18,7 @@ class Robot:
     """
 
     def __init__(self, robot_id, named, saved):
-        """Store the arguments.
-
-        ``named``: commands need an account; ``saved``: the text that ``save`` wrote, or None.
-        """
+        """``named``: commands need an account; ``saved``: what ``save`` has written last, or None."""
         self.base = "pebble/robots/" + robot_id
         self.named = named
         self.stop = EmergencyStop(saved, self.save, named)
@@ -39,7 +36,7 @@ class Robot:
         }
 
     def connected(self):
-        """Publish everything again, because the broker may be another one."""
+        """Publish everything again: the broker may be another one."""
         value = {"t": self.epoch_ms(), "schema": "pebble-capabilities/v1", "value": self.capabilities}
         self.publish("capabilities", value, 1)
         self.stop.is_new = True
@@ -54,7 +51,7 @@ class Robot:
         self.move(0, 0, 0)
 
     def receive(self, topic, payload, retained):
-        """Handle a message below incoming/. A retained one is stale: it would be carried out at every start."""
+        """Take one message below incoming/. A retained one is stale: it would be carried out at every start."""
         if retained:
             return
         metric = topic[len(self.base + "/incoming/") :]
@@ -100,7 +97,7 @@ class Robot:
             self.move(clamp(z + x, -1, 1), clamp(z - x, -1, 1), clamp(valid_ms, 0, DEAD_MAN_MS))
 
     def tick(self):
-        """End what is over, and publish what has changed. Call this 50 times a second."""
+        """Call it 50 times a second: it ends what is over, and publishes what has changed."""
         if self.now() >= self.wheels_until:
             self.halt()
         holder = self.control.holder

@@ -17,10 +17,10 @@ _CAPABILITIES = const(
 
 
 def describe(epoch_ms: int, root: bytes, name: str, stops, charging: bytes, axes: bytes) -> bytes:
-    """Return the payload; ``root`` is the base of the topics, ``name`` the robot's name for people, or empty.
+    """Make the payload; ``root`` is the base of the topics, ``name`` what people call it; empty: nothing else.
 
-    ``stops`` is the `EmergencyStop`. ``charging``: whether it reports that status, in JSON. ``axes``: those besides x
-    and z, likewise.
+    ``stops`` is the `EmergencyStop`. ``charging``: whether it reports that status, in JSON. ``axes``: those besides
+    x and z, likewise.
     """
     can, cannot = b"true", b"false"
     named = b',"name":' + json.dumps(name).encode() if name else b""

@@ -1,4 +1,4 @@
-"""Reads drive-values messages, and computes wheel speeds from them (paper A.8.3), in a few hundred bytes. Pure."""
+"""Drive-values messages and the wheel speeds they ask for (paper A.8.3), in a few hundred bytes. Pure."""
 
 import json
 
@@ -14,10 +14,10 @@ _WATCHDOG_MS = const(60_000)  # longer than any: larger numbers are cut, because
 
 
 def load(raw: memoryview | bytes):
-    """Return parsed JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError.
+    """Parse JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError.
 
-    Around it may be what programs add: a byte order mark, white space, a C string's NUL and the rest of its buffer.
-    There everything but printable ASCII is removed, with which every JSON text begins and ends.
+    Around it may be what programs add: a byte order mark, white space, a C string's NUL and the rest of its buffer. All
+    of UTF-8 but printable ASCII is left out there, by which every JSON text begins and ends.
     """
     size = len(raw)
     if size > _MAX_BYTES:
@@ -44,11 +44,11 @@ def load(raw: memoryview | bytes):
 
 
 def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int, str] | None:
-    """Return ``(x, z, y, run, valid_ms, key)`` from bare or wrapped JSON; None if the command is refused.
+    """Return ``(x, z, y, run, valid_ms, key)`` from bare or wrapped JSON. None: refused.
 
-    Axes are limited to -1..1; missing ones, and those that are no number, are 0; NaN and infinity are refused. The
-    other values are as the arbiter needs them. Wrong ones, or a wrong ``source``, refuse a command that moves anything,
-    but never a stop.
+    Axes are within -1..1; missing ones, and those that are no number, are 0; NaN and infinity are refused. The others
+    are as the arbiter needs them. Wrong ones, or a wrong ``source``, refuse a command that moves anything, but never a
+    stop.
     """
     try:
         body = load(raw)
@@ -107,7 +107,7 @@ def _axis(body: dict, name: str) -> float:
 
 
 def _number(text: str) -> float:
-    """Return the number in ``text``; 0 if Linux would read none: a board's float() also accepts 1_0, "." and "e5"."""
+    """Return 0 for what is none, as Linux reads it: a board's float() also accepts 1_0, and "." and "e5" as 0."""
     if "nan" in text or "inf" in text:
         raise ValueError
     if text.strip("0123456789+-.e") or not text.split("e")[0].strip("+-."):
@@ -124,5 +124,5 @@ def clamp(value: float) -> float:
 
 
 def mix(x: float, z: float) -> tuple[float, float]:
-    """Return left and right wheel speed, -1..1, + = forward; ``x`` steers, + = right; ``z`` is the throttle."""
+    """Return left and right wheel, -1..1, + = forward, for steering ``x``, + = right, and throttle ``z``, + = ahead."""
     return clamp(z + x), clamp(z - x)
