@@ -24,7 +24,7 @@ from pebble.transports.segments import SHM
 
 
 def picture(size: tuple[int, int], frame: Frame) -> bytes:
-    """Return rows of BGR, padded to a multiple of four bytes each, as GStreamer has them."""
+    """Return rows of BGR, each padded to a multiple of four bytes, as GStreamer needs them."""
     pixels = frame.picture()
     if (sent := pixels.shape[1::-1]) != size:
         sys.exit(f"the camera sends pictures of {sent}, and the config says {size}")
@@ -53,8 +53,8 @@ def offer(path: Path, parser: str, reader: FrameReader, data: Callable[[Frame], 
                 process.stdin.write(data(frame))
                 process.stdin.flush()
     finally:
-        for left in SHM.glob(f"shmpipe.{process.pid:5}.*"):
-            left.unlink()
+        for leftover in SHM.glob(f"shmpipe.{process.pid:5}.*"):
+            leftover.unlink()
 
 
 def main(config_path: str) -> None:

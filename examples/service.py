@@ -13,7 +13,7 @@ UPTIME = Channel(metric="uptime", kind=Kind.EVENT, payload=dict)
 
 
 class Uptime(Service):
-    """One process, one thread: no lock, and no word of MQTT or Zenoh."""
+    """The service: one process, one thread, no lock, and no word of MQTT or Zenoh."""
 
     name = "uptime"
     publishes = (UPTIME,)

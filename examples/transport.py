@@ -44,7 +44,7 @@ class Datagrams(Transport):
         return True
 
     def _declare(self, subscription: Subscription) -> None:
-        """Do nothing: every datagram comes here anyway."""
+        """Do nothing: every datagram arrives here anyway."""
 
     def _undeclare(self, subscription: Subscription) -> None:
         """Do nothing, as above."""

@@ -43,7 +43,7 @@ def main() -> int:
 
 
 def _use_utf8() -> None:
-    """Start again in UTF-8 mode if the locale has another encoding: names of robots stand in names of files."""
+    """Start again in UTF-8 mode if the locale has another encoding: file names hold names of robots."""
     if sys.getfilesystemencoding() != "utf-8" and not sys.flags.utf8_mode:
         os.environ["PYTHONUTF8"] = "1"  # for the programs that this one starts
         os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])  # noqa: S606
@@ -59,7 +59,7 @@ def _fail(*lines: str) -> int:
 
 
 def _flushes(stream: TextIO) -> bool:
-    """True if the buffer was written; else it is discarded, because the interpreter would try again at its end."""
+    """True if the buffer was written. Otherwise it is discarded: the interpreter would try again at its end."""
     try:
         stream.flush()
     except OSError:
@@ -87,7 +87,7 @@ def _without_secrets(text: str) -> str:
 
 
 def _print_error(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Print a traceback as Python does, without secrets: its texts may come from a command line."""
+    """Print a traceback as Python does, but without secrets, which may come from the command line."""
     from traceback import format_exception
 
     sys.stderr.write(_without_secrets("".join(format_exception(kind, error, trace))))

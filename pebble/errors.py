@@ -2,7 +2,7 @@
 
 
 class PebbleError(Exception):
-    """The base class. Only the CLI and the outermost lines of a process catch it; users read its text."""
+    """The base class. Only the command line and the outermost lines of a process catch it; users read its text."""
 
 
 class ConfigError(PebbleError):
@@ -32,4 +32,4 @@ class DeviceError(PebbleError):
 
 
 class NotRunningError(DeviceError):
-    """A device that a program stands in for, which does not run; it may be started later."""
+    """An error for a device that is simulated by a program which does not run; it may be started later."""

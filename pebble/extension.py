@@ -1,8 +1,8 @@
-"""Extensions: optional parts of a robot, from us, from packages of others, or from a file of the owner.
+"""Extensions: optional parts of a robot, from us, from packages of others, or from a file of the robot's owner.
 
 An extension is one object, ``EXTENSION``, that a package or a file declares. It names its parts as ``module:name``, and
-these are imported where they are used: a robot that records nothing imports nothing of the recorder.
-docs/my-first-extension.md shows one.
+they are imported where they are used: a robot that records nothing imports nothing of the recorder.
+docs/my-first-extension.md shows an example.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ OURS: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 class Stage(IntEnum):
-    """Programs of one stage stop together; the highest stage stops first."""
+    """A stage of stopping: programs of one stage stop together, those of the highest stage first."""
 
     LOCAL_TRANSPORT = 0  # what the others publish through
     ANNOUNCER = 1  # publishes how the others ended
@@ -166,7 +166,7 @@ class Missing(Struct, frozen=True):
 
 
 def part(place: str) -> Any:
-    """Return what ``module:name`` names, or the module of a place without a name."""
+    """Return the object that ``module:name`` names, or the module of a place without a name."""
     module, _, name = place.partition(":")
     loaded = import_module(module)
     return getattr(loaded, name) if name else loaded
@@ -174,7 +174,7 @@ def part(place: str) -> Any:
 
 @cache
 def ours() -> tuple[Extension, ...]:
-    """Return our extensions that are installed with all that they need, in the order of ``OURS``."""
+    """Return our extensions that are installed with everything they need, in the order of ``OURS``."""
     installed: dict[str, Extension] = {}
     for module in OURS:
         extension = _declared(module)
@@ -185,7 +185,7 @@ def ours() -> tuple[Extension, ...]:
 
 
 def _declared(module: str) -> Extension | None:
-    """Return the extension of one of our modules; None: it is not installed."""
+    """Return the extension that our ``module`` declares; None if it is not installed."""
     try:
         extension: Extension = import_module(module).EXTENSION
     except ModuleNotFoundError as error:
@@ -226,7 +226,7 @@ def named(
 
 @contextmanager
 def _in_time() -> Iterator[None]:
-    """Raise PebbleError in a block that imports a stranger's module and takes too long. Main thread only."""
+    """Raise PebbleError if importing a stranger's module in the ``with`` block takes too long. Main thread only."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -250,7 +250,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _check_parts(extension: Extension, section: type) -> None:
-    """Raise PebbleError for mistakes that would keep the robot from starting, or a stop from being confirmed."""
+    """Raise PebbleError for a mistake that would keep the robot from starting, or a stop from being confirmed."""
     lacks = {*extension.needs} - {other.name for other in ours()}
     if lacks:
         raise PebbleError(f"it needs {' and '.join(sorted(lacks))}")
@@ -277,7 +277,7 @@ def _check_parts(extension: Extension, section: type) -> None:
 
 
 def lacking(raw: Any) -> Iterator[Missing]:
-    """Yield those of our extensions that the config uses and that are not installed.
+    """Yield those of our extensions that the config uses but this machine lacks.
 
     The config uses an extension if it has a section of the extension that is not disabled.
     """
@@ -292,9 +292,9 @@ def lacking(raw: Any) -> Iterator[Missing]:
 
 
 def keys_of_missing(installed: Iterable[Extension]) -> list[str]:
-    """Return the keys of a config that belong to those of our extensions that are not among ``installed``."""
-    known = {key for extension in installed for key in extension.sections}
-    return [key for keys in OURS.values() for key in keys if key not in known]
+    """Return the config keys of our extensions that are not among ``installed``."""
+    present = {key for extension in installed for key in extension.sections}
+    return [key for keys in OURS.values() for key in keys if key not in present]
 
 
 def value_at(raw: Any, *keys: str) -> Any:
@@ -305,14 +305,14 @@ def value_at(raw: Any, *keys: str) -> Any:
 
 
 def lacking_packages(extension: Extension) -> list[str]:
-    """Return the modules of other packages that an extension needs and this Python lacks."""
+    """Return the modules of other packages that an extension needs, and that this Python does not have."""
     return [name for name in extension.packages if find_spec(name) is None]
 
 
 def refuse_claims(core: Extension, extensions: Iterable[Extension]) -> None:
     """Raise ConfigError if two extensions add the same section, command, protocol or name; it names both.
 
-    ``core`` declares those of the core.
+    ``core`` declares what the core has.
     """
     owners: dict[tuple[str, str], int] = {}
     listed = (core, *extensions)  # one may be listed twice
@@ -333,7 +333,7 @@ def refuse_claims(core: Extension, extensions: Iterable[Extension]) -> None:
 
 
 def packages() -> Iterator[Extension]:
-    """Yield the extensions of installed packages, for the command line. One that cannot be loaded is logged."""
+    """Yield the extensions of installed packages, for the command line. A broken one is logged and skipped."""
     for name in _offered():
         try:
             with _in_time():
@@ -346,7 +346,7 @@ def packages() -> Iterator[Extension]:
 
 
 def motors_of(extensions: Iterable[Extension], config: Any) -> dict[str, str]:
-    """Return the programs of the motor owners that extensions add to a robot, by the owner's name."""
+    """Return the programs that own motors among those that extensions add, by the owner's name."""
     running = {program.name for program in programs_of(extensions, config)}
     owners = {owner: program for extension in extensions for owner, program in extension.motors.items()}
     return {owner: program for owner, program in owners.items() if program in running}
@@ -379,7 +379,7 @@ def _programs(extension: Extension, config: Any) -> Iterator[Program]:
 
 
 def items(extension: Extension, hook: str, kind: type[T], *arguments: Any) -> list[T]:
-    """Return the list that a function of an extension returns; errors as in :func:`call`."""
+    """Return the list that the function ``hook`` of an extension returns; raises the same errors as :func:`call`."""
     returned: list[T] = call(extension, hook, list, *arguments, finish=list)
     for item in returned:
         if not isinstance(item, kind):
@@ -413,14 +413,14 @@ def _failed(extension: Extension, hook: str, why: str) -> ConfigError:
 def _of_package(name: str) -> Extension:
     offered = _offered()
     if name not in offered:
-        known = ", ".join(sorted(offered)) or "none"
-        raise PebbleError(f'no installed package offers it (a file is written with ".py"); known are {known}')
+        names = ", ".join(sorted(offered)) or "none"
+        raise PebbleError(f'no installed package offers it (a file is written with ".py"); known are {names}')
     return _checked(part(offered[name]))
 
 
 @cache
 def _offered() -> Mapping[str, str]:
-    """Return the places of the extensions that installed packages offer, by name."""
+    """Return the extensions of installed packages by name, as ``module:name``."""
     from importlib.metadata import entry_points  # several MB, only for robots with an extension of others
 
     return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
@@ -429,7 +429,7 @@ def _offered() -> Mapping[str, str]:
 def _of_file(path: Path) -> Extension:
     """Return the extension in an owner's file. Its module is named after the file, so ``lamp:Lamp`` is found.
 
-    A file without the word EXTENSION is one program, run with the path of the config, and not imported here.
+    A file without the word EXTENSION is a program: it is run with the path of the config, and not imported here.
     """
     if not path.is_file():
         raise PebbleError(f"there is no file {path}")

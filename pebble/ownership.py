@@ -1,4 +1,4 @@
-"""Files that others may have made: who may put another one, or a link, in the place of a path; and reading them."""
+"""Decides which users can replace a file or folder, and reads only what they cannot replace."""
 
 import errno
 import os
@@ -21,11 +21,11 @@ class Owner(NamedTuple):
 
 
 def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Owner:
-    """Return the one user besides root who may change what lies in ``folder``, or root; it need not be there yet.
+    """Return the only user besides root who can change the content of ``folder``, or root if none can.
 
-    It may be a file as well. ``nameless``: users without an entry count, too; in a container they are those of the
-    machine around it. Raises PebbleError where several users may, for a link on the way that a user besides root can
-    change, and for what should be ``there`` and is not: its owner may have removed it since it was read.
+    ``folder`` may be a file, and need not exist yet. ``nameless``: users without an entry count, too; in a container
+    they are those of the machine around it. Raises PebbleError if several users can, for a link on the way that a user
+    besides root can change, and for a missing one that should be ``there``: it may have been removed since.
     """
     place, owner = Path("/"), Owner(0, 0)
     system = place.lstat().st_uid  # in a user namespace root's files may seem to be of another user
@@ -33,13 +33,13 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
     while names:
         place /= names.pop(0)
         try:
-            found = place.lstat()
+            status = place.lstat()
         except OSError as error:  # it is missing, or not to be seen by this user
             if there:
                 raise PebbleError(f"{place}: {error.strerror}") from None
             break
-        uid = 0 if found.st_uid == system or not (nameless or _has_name(found.st_uid)) else found.st_uid
-        if stat.S_ISLNK(found.st_mode):
+        uid = 0 if status.st_uid == system or not (nameless or _has_name(status.st_uid)) else status.st_uid
+        if stat.S_ISLNK(status.st_mode):
             if owner.uid or uid:
                 raise PebbleError(f"{place} is a link of user {uid or owner.uid}: name the folder itself")
             target = place.readlink()
@@ -48,14 +48,14 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
             return owner_of(place.parent.joinpath(target, *names), nameless=nameless, there=there)
         if owner.uid not in (0, uid):
             raise PebbleError(f"{place} belongs to user {uid}, and lies in a folder of user {owner.uid}: move it")
-        if uid == 0 and _is_shared(found):
+        if uid == 0 and _is_shared(status):
             raise PebbleError(f"{place} belongs to root, and others may write there: chmod go-w it, or chown it")
-        owner = Owner(uid, found.st_gid)
+        owner = Owner(uid, status.st_gid)
     return owner
 
 
 def others_in(folder: Path) -> str:
-    """Return why another user than this one and root may change what lies in ``folder``; empty: none may."""
+    """Return why a user other than this one and root may change the content of ``folder``; empty if none may."""
     try:
         uid = owner_of(folder).uid
     except PebbleError as error:
@@ -64,7 +64,7 @@ def others_in(folder: Path) -> str:
 
 
 def _has_name(uid: int) -> bool:
-    """True if the user has an entry, or is one whom such a user may be in a container."""
+    """True if the user has an entry in the user database, or is a user of a container by /etc/subuid."""
     import pwd  # which Windows lacks
 
     with suppress(KeyError):
@@ -76,22 +76,22 @@ def _has_name(uid: int) -> bool:
 
 
 def _is_shared(found: os.stat_result) -> bool:
-    """True if others than the owner can replace what is in a folder; in a sticky folder they cannot."""
+    """True if users other than the owner can replace files in the folder. In a sticky folder they cannot."""
     writers = stat.S_IWOTH | (stat.S_IWGRP if found.st_gid else 0)
     return bool(found.st_mode & writers) and stat.S_ISDIR(found.st_mode) and not found.st_mode & stat.S_ISVTX
 
 
 def is_open(folder: Path) -> bool:
-    """True if every user may make files in the folder, as in /tmp, though not remove those of others."""
+    """True if every user may make files in the folder, but not remove those of others, as in /tmp."""
     try:
-        found = folder.stat()
+        status = folder.stat()
     except OSError:
         return False
-    return stat.S_ISDIR(found.st_mode) and bool(found.st_mode & stat.S_IWOTH)
+    return stat.S_ISDIR(status.st_mode) and bool(status.st_mode & stat.S_IWOTH)
 
 
 def open_plain(file: Path) -> BinaryIO:
-    """Open a file to read it; a FIFO or a device might never end. Raises OSError."""
+    """Open a plain file to read it. Raises OSError, also for a FIFO or a device, which might never end."""
     opened = open(file, "rb", opener=lambda path, flags: os.open(path, flags | getattr(os, "O_NONBLOCK", 0)))  # noqa: SIM115
     if stat.S_ISREG(os.fstat(opened.fileno()).st_mode):
         return opened
@@ -100,7 +100,7 @@ def open_plain(file: Path) -> BinaryIO:
 
 
 def read_plain(file: Path, most: int = 1 << 28) -> bytes:
-    """Return the content of a plain file. Raises OSError, also for more than ``most`` bytes: holes cost nothing."""
+    """Return the content of a plain file. Raises OSError, also if it is larger than ``most`` bytes."""
     with open_plain(file) as opened:
         if os.fstat(opened.fileno()).st_size > most:
             raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(file))
@@ -120,7 +120,7 @@ def read_for(place: Path, file: Path) -> bytes:
 
 @contextmanager
 def as_user(owner: Owner) -> Iterator[None]:
-    """Take the rights of a user, and only these, for a while; of a process with one thread, which root has started."""
+    """Take the rights of a user, and only these, in the ``with`` block. For a process of root with one thread."""
     before, groups = Owner(os.geteuid(), os.getegid()), os.getgroups()
     _take(*_rights_of(owner))
     try:
@@ -137,7 +137,7 @@ def _take(owner: Owner, groups: list[int]) -> None:
 
 
 def _rights_of(owner: Owner) -> tuple[Owner, list[int]]:
-    """Return the user with the folder's group, if it is one of the user's: a folder has it from the one above, too."""
+    """Return the user with the folder's group, if the user is in that group, and the user's groups."""
     import pwd  # which Windows lacks
 
     with suppress(KeyError):  # a user without an entry has no groups

@@ -1,4 +1,4 @@
-"""What holds for every test."""
+"""Fixtures and hooks for every test."""
 
 import atexit
 import gc
@@ -79,7 +79,7 @@ _LONG = (
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:
-    """One for this test alone; in some folders there is one for a whole module."""
+    """Yield a broker for this test alone; in some folders there is one for a whole module."""
     running = Broker(tmp_path)
     yield running
     running.stop()
@@ -87,7 +87,7 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
 
 @pytest.fixture
 def brokers(tmp_path: Path) -> Iterator[tuple[Broker, Broker]]:
-    """Two, of which a test ends one."""
+    """Yield two brokers; a test ends one of them."""
     first, second = Broker(tmp_path), Broker(tmp_path)
     yield first, second
     first.kill()
@@ -109,21 +109,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _place(path: Path) -> int:
-    """When a module begins."""
+    """Return when a module begins, as a sort key."""
     return next((at for at, part in enumerate(_LONG) if part in path.as_posix()), len(_LONG))
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup() -> None:
-    """What robots save in one worker is nothing to those of another one."""
+    """Give each worker other state folders, so that robots do not find those of another worker."""
     own = Path(_FOLDER, "state", str(os.getpid()))
     own.mkdir(parents=True, exist_ok=True)
     os.environ["XDG_STATE_HOME"] = str(own)
 
 
 def pytest_collection_finish() -> None:
-    """Garbage is looked for among what tests make, not among all there are: that takes 0.3 s (measured), on a busy
-    machine more, and everything in this process, services and transports too, stands still meanwhile."""
+    """Exclude the present objects from garbage collection: a search of all stops this process for 0.3 s or more."""
     gc.enable()
     gc.collect()
     gc.freeze()
@@ -142,7 +141,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 def _processes_left() -> dict[int, str]:
-    """Return command lines and tests of processes that tests have left behind, by pid; of Linux only."""
+    """Return the command lines and tests of processes that tests have left behind, by pid; on Linux only."""
     deadline = time.monotonic() + _ENDING_S
     while left := {pid: text for pid in _pids() if (text := _described(pid))}:
         if time.monotonic() > deadline:
@@ -167,7 +166,7 @@ def _described(pid: int) -> str:
 
 
 def _remove_segments() -> None:
-    """Zenoh leaves files of shared memory behind, however its processes end, and keeps those of this one locked."""
+    """Remove files of shared memory that Zenoh leaves behind; those of this process stay locked."""
     for _, _, path in memory.mappings():
         Path(path).unlink(missing_ok=True)
     if any(segments.SHM.glob("*.zenoh")):

@@ -1,4 +1,4 @@
-"""Whether this user may lock enough memory for frames in shared memory, as ``pebble doctor`` sees it."""
+"""The mark of tests that lock memory for frames: skipped where this user may not, as ``pebble doctor`` judges."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""The memory that a process has allocated, and its share of shared memory: unlike its PSS, no other one changes it."""
+"""The memory that a process has allocated, and its part of shared memory: unlike PSS, no other process changes it."""
 
 from pathlib import Path
 
 
 def own_mb(pid: int) -> float:
-    """0 for a process that has ended."""
+    """Return the process's own memory in MB; 0 if it has ended."""
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     except (FileNotFoundError, ProcessLookupError):

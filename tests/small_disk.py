@@ -1,4 +1,4 @@
-"""A file system of a few megabytes, which a test fills, takes away and brings back."""
+"""A file system of a few megabytes, which a test fills, removes and brings back."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 class SmallDisk:
-    """Mounted at ``root`` from :meth:`mount` on, which only root may do."""
+    """The file system, mounted at ``root`` from :meth:`mount` on, which only root may do."""
 
     def __init__(self, root: Path, *, mebibytes: int = 2) -> None:
         self.root, self._size = root, mebibytes
@@ -17,7 +17,7 @@ class SmallDisk:
         root.mkdir(exist_ok=True)
 
     def mount(self, *options: str) -> None:
-        """An empty one; over the one that is there, which is hidden."""
+        """Mount an empty one, over an earlier one, which is hidden."""
         words = [
             "mount",
             "-t",
@@ -31,7 +31,7 @@ class SmallDisk:
         self._mounts += 1
 
     def unmount(self) -> None:
-        """Its open files stay usable, as on a stick that is pulled out and back."""
+        """Unmount it. Open files stay usable, as on a stick that is pulled out."""
         subprocess.run(["umount", "-l", str(self.root)], check=True)
         self._mounts -= 1
 
@@ -48,7 +48,7 @@ class SmallDisk:
 
     @contextmanager
     def read_only(self) -> Iterator[None]:
-        """Refuse each write meanwhile, as after an error of the medium."""
+        """Refuse each write during the block, as after an error of the medium."""
         for how in ("ro", "rw"):
             subprocess.run(["mount", "-o", f"remount,{how}", str(self.root)], check=True)
             if how == "ro":

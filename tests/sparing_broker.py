@@ -1,4 +1,4 @@
-"""Stands before a real broker, and hands out retained messages for exact names only, or none after a long one."""
+"""A proxy of a real broker that sends retained messages for exact names only, or nothing after a long packet."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _NO_BRIDGE_MODE = b"\x20\x02\x00\x01"
 
 
 class SparingBroker:
-    """``by_name``: what is retained comes for exact names, not for wildcards.
+    """The proxy. ``by_name``: retained messages are sent for exact names, not for wildcards.
 
-    ``longest``: bytes of a packet; a longer one, and what comes after it on its connection, never arrives.
-    ``segment``: bytes of TCP that the newest client takes at once.
+    ``longest``: bytes of a packet; a longer one, and what comes after it on its connection, never arrives. ``segment``:
+    bytes of TCP that the newest client takes at once.
     """
 
     def __init__(self, to: int, *, by_name: bool = False, longest: int = 1 << 28) -> None:
@@ -64,7 +64,7 @@ class SparingBroker:
 
 
 async def packet_of(reader: asyncio.StreamReader) -> tuple[int, bytes, bytes]:
-    """Its first byte, all of it, and what follows its length."""
+    """Return a packet's first byte, the whole packet, and what follows its length."""
     head, size, shift = await reader.readexactly(2), 0, 0
     while head[-1] > 127:
         size, shift = size | (head[-1] & 127) << shift, shift + 7

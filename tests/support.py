@@ -1,4 +1,4 @@
-"""Helpers of many tests: wait for a condition, free ports, real brokers, child processes that end with pytest."""
+"""Helpers of many tests: waiting, free ports, real brokers, and child processes that end with pytest."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ THOROUGH = bool(os.environ.get("PEBBLE_THOROUGH"))
 
 
 def cases(some: int, all_: int) -> int:
-    """How many cases a test with random inputs tries."""
+    """Return how many cases a test with random inputs tries."""
     return all_ if THOROUGH else some
 
 
 def further(*values: Any) -> Any:
-    """Parameters of a rule that other ones of the same test prove as well; ``make test THOROUGH=1`` tries them, too."""
+    """Return parameters of a rule that other rows prove as well, marked to run with ``make test THOROUGH=1``."""
     return pytest.param(*values, marks=pytest.mark.thorough)
 
 
 def some(all_: Iterable[T], step: int) -> list[T]:
-    """Each ``step``-th of many parameters of a test; all of them if asked to be thorough."""
+    """Return every ``step``-th of a test's parameters; all of them if asked to be thorough."""
     return list(all_)[:: 1 if THOROUGH else step]
 
 
@@ -54,7 +54,7 @@ needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root makes other
 
 @contextmanager
 def beside(work: Callable[[], object], ending: threading.Event) -> Iterator[None]:
-    """Let ``work`` run on a thread of its own; it returns once ``ending`` is set."""
+    """Run ``work`` on another thread during the block; it must return once ``ending`` is set."""
     thread = threading.Thread(target=work)
     thread.start()
     try:
@@ -65,9 +65,10 @@ def beside(work: Callable[[], object], ending: threading.Event) -> Iterator[None
 
 
 def until(condition: Callable[[], object], timeout: float = 10.0, *, step: float = 0.003) -> bool:
-    """Wait until ``condition()`` is true; False when ``timeout`` seconds went by without it.
+    """Wait until ``condition()`` is true; return False if that takes more than ``timeout`` seconds.
 
-    The pauses between two looks grow from ``step``: many tests wait at the same time, and looking uses the processors.
+    The pauses between two checks grow from ``step``: many tests wait at the same time, and checking takes processor
+    time.
     """
     end = time.monotonic() + timeout
     while time.monotonic() < end:
@@ -79,7 +80,7 @@ def until(condition: Callable[[], object], timeout: float = 10.0, *, step: float
 
 
 class Clock:
-    """One that stands still between two changes of ``now``."""
+    """A clock that stands still between two changes of ``now``."""
 
     now = 1000.0
 
@@ -88,7 +89,7 @@ class Clock:
 
 
 def quarters(values: Sequence[float]) -> list[float]:
-    """The medians of the quarters of a run. The first one warms up: caches fill, and the heap finds its size."""
+    """Return the medians of the quarters of a run. In the first, caches fill and the heap finds its size."""
     size = max(1, len(values) // 4)
     return [statistics.median(values[at * size : (at + 1) * size] or values) for at in range(3)] + [
         statistics.median(values[-size:])
@@ -96,7 +97,7 @@ def quarters(values: Sequence[float]) -> list[float]:
 
 
 def gone(pid: int) -> bool:
-    """Has this process ended? A zombie counts: a container without init does not reap it."""
+    """True if this process has ended. A zombie counts: a container without init does not reap it."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except (FileNotFoundError, ProcessLookupError):
@@ -104,7 +105,7 @@ def gone(pid: int) -> bool:
 
 
 def process_name(pid: int) -> str:
-    """The first 15 bytes of a process's name, as the kernel knows it; "" if it has ended, also while it is read."""
+    """Return the first 15 bytes of a process's name, as the kernel knows it; "" if it has ended."""
     try:
         return Path(f"/proc/{pid}/comm").read_text().strip()
     except (FileNotFoundError, ProcessLookupError):
@@ -119,7 +120,7 @@ class Child(subprocess.Popen[Any]):
 
 
 def listening(port: int, address: str = "127.0.0.1") -> bool:
-    """Does a server accept connections on this port of a loopback address?"""
+    """True if a server accepts connections on this port of a loopback address."""
     try:
         socket.create_connection((address, port), 0.2).close()
     except OSError:
@@ -130,7 +131,7 @@ def listening(port: int, address: str = "127.0.0.1") -> bool:
 class Broker:
     """A real mosquitto on a free loopback port. ``stop``/``kill`` then ``start`` keep port and persistence.
 
-    With ``persistence`` it saves after each change, or without ``autosave`` when asked to.
+    With ``persistence`` it saves after each change; without ``autosave`` only when asked to.
     """
 
     def __init__(
@@ -173,18 +174,18 @@ class Broker:
         assert until(self.answers, 30), f"mosquitto did not start: {self._command}"
 
     def stop(self) -> None:
-        """SIGTERM: persistence is written. With its security plugin it has been seen to hang then, once."""
+        """Stop with SIGTERM: persistence is written. With its security plugin it has been seen to hang then, once."""
         try:
             self.end(lambda process: process.terminate())
         except subprocess.TimeoutExpired:
             self.kill()
 
     def kill(self) -> None:
-        """SIGKILL: what was not saved is lost."""
+        """Stop with SIGKILL: what was not saved is lost."""
         self.end(lambda process: process.kill())
 
     def save(self) -> None:
-        """Make it write its persistence now, and wait until it has done so."""
+        """Let it write its persistence now, and wait for that."""
         file = self.store / "mosquitto.db"
         before = file.stat().st_mtime_ns if file.exists() else 0
         os.kill(self.pid, signal.SIGUSR1)
@@ -196,7 +197,7 @@ class Broker:
             file.unlink(missing_ok=True)
 
     def freeze(self) -> None:
-        """SIGSTOP: it keeps its connections and answers nothing."""
+        """Stop with SIGSTOP: it keeps its connections and answers nothing."""
         os.kill(self.pid, signal.SIGSTOP)
 
     def thaw(self) -> None:
@@ -215,7 +216,7 @@ class Broker:
 
 
 def refusal(rules: Path, filters: Sequence[str]) -> list[str]:
-    """The options of a mosquitto that refuses subscriptions to ``filters``, spelled exactly so; writes ``rules``.
+    """Return options of a mosquitto that refuses subscriptions to ``filters``, spelled exactly so; write ``rules``.
 
     It does so in its SUBACK. With an `acl_file` it would grant them, and deliver nothing.
     """
@@ -235,7 +236,7 @@ def refusal(rules: Path, filters: Sequence[str]) -> list[str]:
 
 
 class RefusingBroker(Broker):
-    """A broker that refuses subscriptions, others at each :meth:`refuse`."""
+    """A broker that refuses subscriptions to certain filters, which :meth:`refuse` sets."""
 
     def __init__(self, folder: Path) -> None:
         port = free_port()
@@ -243,14 +244,14 @@ class RefusingBroker(Broker):
         super().__init__(folder, *refusal(self._rules, ()), port=port)
 
     def refuse(self, *filters: str) -> None:
-        """From now on refuse these filters and no others; restarts it."""
+        """Restart so that these filters are refused, and no others."""
         self.stop()
         refusal(self._rules, filters)
         self.start()
 
 
 class AmqttBroker:
-    """amqtt in a process of its own: no bridge mode, no MQTT 5."""
+    """An amqtt broker in a process: no bridge mode, no MQTT 5."""
 
     def __init__(self) -> None:
         self.port = free_port()
@@ -270,7 +271,7 @@ class AmqttBroker:
 
 
 def refused(number: int) -> Callable[..., Any]:
-    """Return a call that a file system refuses with this error."""
+    """Return a function that raises this error, as a file system that refuses does."""
 
     def refuse(*_arguments: Any) -> None:
         raise OSError(number, os.strerror(number))

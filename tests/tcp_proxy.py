@@ -1,4 +1,4 @@
-"""TCP proxies on loopback that fail as networks do: one goes silent or resets connections, one has a limited rate."""
+"""TCP proxies on loopback that fail as networks do: going silent, resetting connections, or limiting the rate."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _BUFFER = 4096  # bytes that the far end's kernel confirms before they have gone
 
 
 class TcpProxy:
-    """Listens on ``port`` and passes everything on to ``target``, a port of this machine.
+    """A proxy that listens on ``port`` and passes everything on to ``target``, a port of this machine.
 
     `blackhole` stops passing data and closes nothing, as a radio link does that loses its signal: the kernel accepts
     new connections, and they receive nothing. `resume` ends that: held data is passed on late, or the connection is
@@ -73,7 +73,7 @@ class TcpProxy:
         self._thread.start()
 
     def lead_to(self, target: int) -> None:
-        """Connections from now on lead to another port behind it; those of before are reset, and no others."""
+        """Lead new connections to another port; those to the former port are reset."""
         self.drop(target)
 
     def drop(self, target: int | None = None) -> None:
@@ -123,18 +123,18 @@ class TcpProxy:
             end.close()
 
     def passes(self, _data: bytes) -> bool:
-        """Whether what a client sends goes on; otherwise its connection is reset."""
+        """True if a client's data is passed on; otherwise its connection is reset."""
         return True
 
     def wait_until_passing(self) -> bool:
-        """True at once while data passes; False after a moment in a black hole."""
+        """Return True at once while data passes, False after a moment in a black hole."""
         return self._passing.wait(_STEP_S)
 
 
 class PrefixProxy(TcpProxy):
-    """Shows a web server below a path, as a reverse proxy does: ``prefix``, which it takes away, ends with a slash.
+    """A reverse proxy that shows a web server below ``prefix``, which ends with a slash and is removed.
 
-    ``outside``: what was asked for elsewhere, and was answered 404.
+    ``outside``: paths elsewhere that were requested, and answered with 404.
     """
 
     def __init__(self, target: int, prefix: str) -> None:
@@ -166,7 +166,7 @@ class PrefixProxy(TcpProxy):
 
 
 def _carry(source: socket.socket, sink: socket.socket) -> None:
-    """Until the end of what comes, which is then the end of what goes."""
+    """Copy data until its end, and pass on the end."""
     with suppress(OSError):
         while data := source.recv(65536):
             sink.sendall(data)
@@ -174,7 +174,7 @@ def _carry(source: socket.socket, sink: socket.socket) -> None:
 
 
 class BridgelessProxy(TcpProxy):
-    """Makes any broker one that hangs up on bridge mode, as RabbitMQ does, while ``bridgeless`` is set."""
+    """A proxy that makes any broker hang up on bridge mode, as RabbitMQ does, while ``bridgeless`` is set."""
 
     bridgeless = True
     connections = 0
@@ -190,21 +190,21 @@ class BridgelessProxy(TcpProxy):
 
 
 class ForbiddingProxy(TcpProxy):
-    """Makes any broker one that hangs up on each PUBLISH to a `forbidden` topic, as aedes and hosted ones do."""
+    """A proxy that makes any broker hang up on each PUBLISH to a `forbidden` topic, as aedes and hosted ones do."""
 
     def __init__(self, target: int) -> None:
         self.forbidden: set[str] = set()
         super().__init__(target)
 
     def passes(self, data: bytes) -> bool:
-        """Whether ``data``, which a client sent together, has none of them."""
+        """True if ``data``, which a client has sent together, has no forbidden PUBLISH."""
         if not any(b"\0" + bytes((len(topic),)) + topic.encode() in data for topic in self.forbidden):
             return True
         return 0x30 not in {data[at] & 0xF0 for at in _packets(data)}  # a SUBSCRIBE
 
 
 class Hole(TcpProxy):
-    """A way that loses what is larger than a packet, unless the client's segments are small."""
+    """A way on which large packets are lost, unless the client's segments are small."""
 
     judges_answers, limit = True, 1400
 
@@ -215,7 +215,7 @@ class Hole(TcpProxy):
         return False
 
     def segments(self) -> int:
-        """The largest segment of this process's connections to it."""
+        """Return the largest segment of this process's connections to it."""
         sizes = [0]
         for link in list(Path("/proc/self/fd").iterdir()):
             with suppress(OSError, IndexError):
@@ -228,7 +228,7 @@ class Hole(TcpProxy):
 
 
 def _packets(data: bytes) -> list[int]:
-    """Where each packet in ``data`` begins, whole ones that are shorter than 16 KB."""
+    """Return where each packet in ``data`` begins: whole ones that are shorter than 16 KB."""
     found, at = [], 0
     while at + 2 < len(data):
         found.append(at)
@@ -289,7 +289,7 @@ class _Pair:
 
 
 class SlowTcpProxy:
-    """Listens on ``port`` and passes on to ``target``: at most ``kbits`` per second there, and unlimited back.
+    """A proxy that passes at most ``kbits`` per second to ``target``, and any number back.
 
     ``back``: the other way round.
     """

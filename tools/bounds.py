@@ -22,7 +22,7 @@ _CONSTANT = re.compile(
 
 
 class Bound(NamedTuple):
-    """One constant, or several in one assignment; `why` is empty where no comment says it."""
+    """A constant, or several in one assignment; `why` is empty if it has no comment."""
 
     file: str
     name: str

@@ -48,9 +48,9 @@ def _product() -> list[Path]:
 def main(arguments: list[str]) -> int:
     """Print the findings; return 1 if there are any."""
     files = [file for path in map(Path, arguments) for file in ([path] if path.is_file() else path.rglob("*.py"))]
-    found = [line for path in files or _product() for line in findings(path)]
-    print(*found, sep="\n", end="\n" if found else "")
-    return 1 if found else 0
+    lines = [line for path in files or _product() for line in findings(path)]
+    print(*lines, sep="\n", end="\n" if lines else "")
+    return 1 if lines else 0
 
 
 if __name__ == "__main__":

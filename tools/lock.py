@@ -45,7 +45,7 @@ def main() -> None:
     text = LOCK.read_text()
     within = ("--constraint", str(LOCK))
     kinds = {
-        kind: set(NAME.findall(compiled("pyproject.toml", "-", *within, *(f"--extra={one}" for one in extras))))
+        kind: set(NAME.findall(compiled("pyproject.toml", "-", *within, *(f"--extra={extra}" for extra in extras))))
         for kind, extras in KINDS.items()
     }
     kinds[TOOLS] = set(NAME.findall(compiled("--group", TOOLS, *within)))

@@ -1,4 +1,4 @@
-"""Writes messages.d.ts, the types of what pages and server send each other, and the table of the words for people.
+"""Writes messages.d.ts, the types of messages between pages and server, and the table of the sentences for people.
 
 Program: ``python tools/messages_docs.py`` writes messages.d.ts; a test checks that it is current. With a folder it
 writes the table there.
@@ -53,7 +53,7 @@ def declarations() -> str:
 
 
 def _views() -> Iterator[type]:
-    """Yield the values of the server's metrics, each after what it consists of."""
+    """Yield the types of the server's metrics, each after those that it contains."""
     yield messages.OwnerState
     yield from messages.SERVER_METRICS.values()
 

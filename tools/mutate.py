@@ -111,7 +111,7 @@ def script_mutants(file: str, text: bytes) -> Iterator[Mutant]:
 
 
 def replacements(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
-    """Yield the changes of this node, each once: the operator, the part that goes, and the one that comes."""
+    """Yield each change of this node: the operator, the part that is removed, and its replacement."""
     match node:
         case ast.If(test=ast.Name(id="TYPE_CHECKING")):
             return
@@ -136,7 +136,7 @@ def replacements(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
 
 
 def tests_that_import(files: list[str]) -> list[str]:
-    """Return the test files whose imports lead to one of these files in the end; those of page modules are a folder."""
+    """Return the test files that import one of these files, also indirectly; those of page modules are a folder."""
     if all(file.endswith(".js") for file in files):
         return ["tests/ext/page/modules"]
     packages = {"tests", *(path.parent.name for path in ROOT.glob("*/__init__.py"))}
@@ -148,7 +148,7 @@ def tests_that_import(files: list[str]) -> list[str]:
 
 
 def forked(work: Callable[[], object], seconds: float | None = None) -> bool:
-    """Run ``work`` in a process of its own, and kill all that it leaves; True if it succeeds within its time."""
+    """Run ``work`` in a child process, and kill what it leaves behind; True if it succeeds within its time."""
     ctypes.CDLL(None).prctl(36, 1)  # PR_SET_CHILD_SUBREAPER: a process whose parent ends becomes a child of this one
     others = set(children())
     try:
@@ -158,8 +158,8 @@ def forked(work: Callable[[], object], seconds: float | None = None) -> bool:
         os.close(descriptor)
         return bool(ended) and os.waitpid(pid, 0)[1] == 0
     finally:
-        while left := set(children()) - others:
-            for child in left:
+        while orphans := set(children()) - others:
+            for child in orphans:
                 os.kill(child, signal.SIGKILL)
                 os.waitpid(child, 0)
 
@@ -238,8 +238,8 @@ class Trial:
                 self.functions[self.file_of(code.co_filename), code.co_qualname, code.co_firstlineno].append(function)
         gc.freeze()
         for file, text in self.texts.items():
-            found = script_mutants(file, text) if file.endswith(".js") else mutants(file, text)
-            drawn = sorted(found, key=lambda mutant: crc32(mutant[0]["name"].encode(), self.options.seed))
+            possible = script_mutants(file, text) if file.endswith(".js") else mutants(file, text)
+            drawn = sorted(possible, key=lambda mutant: crc32(mutant[0]["name"].encode(), self.options.seed))
             report(file, len(drawn), [self.attempt(*mutant) for mutant in drawn[: self.options.n or None]])
         return True
 
@@ -279,7 +279,7 @@ class Trial:
         return passed
 
     def attempt(self, record: dict[str, Any], reached_by: set[tuple[str, int]], text: bytes) -> dict[str, Any]:
-        """Run rows with a mutant; write and return the result."""
+        """Run rows with a mutant; write the result, and return it."""
         start, file = time.monotonic(), record["file"]
         script = file.endswith(".js")
         swaps = [] if script or reached_by & self.imported else self.swaps(file, text)
@@ -301,7 +301,7 @@ class Trial:
         return record
 
     def swaps(self, file: str, text: bytes) -> list[tuple[FunctionType, CodeType]]:
-        """Return the functions of a file and their code in a changed text; none if one cannot have it."""
+        """Return the functions of a file with their code in a changed text; none if a function cannot have it."""
         codes = [compile(text, file, "exec", dont_inherit=True)]
         for code in codes:
             codes += [constant for constant in code.co_consts if isinstance(constant, CodeType)]
@@ -327,7 +327,7 @@ class Trial:
 
 
 def report(file: str, possible: int, records: list[dict[str, Any]]) -> None:
-    """Print how many mutants were killed, calls that log apart, and all that were not."""
+    """Print how many mutants were killed, those in calls that log separately, and all that were not killed."""
     counts = Counter("log " * (":log:" in record["name"]) + record["result"] for record in records)
     seconds = sum(record["seconds"] for record in records) / max(1, len(records))
     print(f"{file}: {len(records)} of {possible} mutants: {dict(counts)}; {seconds:.2f} s each")
@@ -337,7 +337,7 @@ def report(file: str, possible: int, records: list[dict[str, Any]]) -> None:
 
 
 def compare(before: Iterable[str], after: Iterable[str]) -> int:
-    """Print each mutant that was killed before and is not now; return 1 if there is one."""
+    """Print each mutant that was killed before but is not now; return 1 if there is one."""
     killed = {record["name"]: record for record in map(json.loads, before) if record["result"] == "killed"}
     now = [record for record in map(json.loads, after) if record["name"] in killed]
     lost = [record for record in now if record["result"] != "killed"]
@@ -349,7 +349,7 @@ def compare(before: Iterable[str], after: Iterable[str]) -> int:
 
 
 def spare(results: Iterable[Iterable[str]]) -> int:
-    """Print test functions that can go together: others have each of their arcs and kill all that they kill."""
+    """Print the test functions that can be removed together: others cover all their arcs and kill all their mutants."""
     needs = [{name.partition("[")[0] for name in json.loads(line)["killers"]} for lines in results for line in lines]
     counts = Counter(itertools.chain.from_iterable(needs))
     for function in sorted(counts, key=lambda function: (counts[function], function)):
@@ -362,7 +362,7 @@ def spare(results: Iterable[Iterable[str]]) -> int:
 
 
 def main() -> int:
-    """Run what the command line says; return the exit code."""
+    """Run the command line; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", nargs="*", type=Path, metavar="FILE", help="a file of the tree in this folder")
     parser.add_argument("--tests", nargs="+", metavar="PATH", help="what to run (default: tests that import a FILE)")

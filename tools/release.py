@@ -48,7 +48,7 @@ PACKAGE = (
 
 
 def copied(source: Path, into: Path) -> None:
-    """Copy what git knows or would add: a build leaves files behind, and a checkout may have others besides."""
+    """Copy the files that git tracks or would add; a checkout has others, such as those that builds leave behind."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     names = subprocess.run(command, cwd=source, stdout=subprocess.PIPE, check=True).stdout.decode().split("\0")
     for name in filter(None, names):
@@ -61,7 +61,7 @@ def copied(source: Path, into: Path) -> None:
 
 
 def normal(sdist: Path, epoch: int) -> None:
-    """Write an sdist again, because setuptools leaves times and owners of its build in it."""
+    """Write an sdist again without the times and owners of its build, which setuptools leaves in it."""
     with tarfile.open(sdist) as archive:
         members = [(member, archive.extractfile(member)) for member in archive.getmembers()]
         tar = io.BytesIO()
@@ -89,7 +89,7 @@ def manifest(source: Path, version: str, files: list[Path]) -> dict[str, Any]:
 
 
 def package(source: Path, version: str, release: list[Path], into: Path) -> Path:
-    """Build the Debian package, whose first release are these files."""
+    """Build the Debian package with these files as its first release; return its path."""
     tree = source / "build" / "package"
     control = (source / "configs/debian/control").read_text().replace("@VERSION@", f"{version}-1")
     (tree / "DEBIAN").mkdir(parents=True)
@@ -147,14 +147,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--sbom", type=Path, help="goes with it; tools/sbom.py writes it")
     parser.add_argument("--into", type=Path, default=INTO)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     git = subprocess.run(["git", "log", "-1", "--format=%ct"], cwd=ROOT, capture_output=True, text=True, check=True)
     os.environ.setdefault("SOURCE_DATE_EPOCH", git.stdout.strip())
     os.umask(0o022)
     with tempfile.TemporaryDirectory() as folder:
         copied(ROOT, Path(folder))
-        version = build(Path(folder), asked.into.resolve(), asked.sbom)
-    for path in sorted(asked.into.iterdir()):
+        version = build(Path(folder), options.into.resolve(), options.sbom)
+    for path in sorted(options.into.iterdir()):
         print(f"{path.stat().st_size:>9}  {path}")
     if subprocess.run(["git", "status", "--porcelain"], cwd=ROOT, capture_output=True, check=True).stdout:
         print("These files have changes that are in no commit.")

@@ -30,17 +30,17 @@ def schema_text() -> str:
     for kind in _subclasses(Section):
         if kind.__name__ in definitions:
             _complete(definitions[kind.__name__], kind)
-    whole = {
+    schema = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "Config of a Pebble robot",
         "$ref": f"#/$defs/{Root.__name__}",
         "$defs": dict(sorted(definitions.items())),
     }
-    return json.dumps(whole, indent=1) + "\n"
+    return json.dumps(schema, indent=1) + "\n"
 
 
 def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
-    """Allow comments and retired keys; a section's default consists of the defaults of its keys."""
+    """Allow comments and retired keys; set each section's default to the defaults of its keys."""
     properties = definition["properties"]
     for field in fields(kind):
         choices = [choice for meta in unwrap(field.type)[1] for choice in (meta.extra or {}).get("choices", ())]

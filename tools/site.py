@@ -1,4 +1,4 @@
-"""Writes build/site: the documents, what `make docs` generates and the API, as one static site; a broken link ends it.
+"""Writes build/site: the documents, the output of `make docs` and the API as a static site; a broken link ends it.
 
 Pages are those of docs/, in the order of docs/README.md. Links to other files of the repository become plain text.
 """
@@ -78,7 +78,7 @@ def main() -> int:
 
 
 def _link(origin: Path, page: Path, pages: dict[Path, Path], link: re.Match[str]) -> str:
-    """Return a link to a page as the site has it; to another file, only its text; to nothing, the link unchanged."""
+    """Return a link in the site's form; a link to another file becomes its text, a broken one is unchanged."""
     folder = origin if origin.is_dir() else origin.parent
     file = (folder / link[3]).resolve()
     if file not in pages:
@@ -89,7 +89,7 @@ def _link(origin: Path, page: Path, pages: dict[Path, Path], link: re.Match[str]
 
 
 def _title(page: Path) -> str:
-    """Return the heading of a page, up to a colon, for links that show the name of its file."""
+    """Return the heading of a page up to a colon, as text for links."""
     heading, _, _ = page.read_text().removeprefix("# ").partition("\n")
     return heading.partition(":")[0]
 

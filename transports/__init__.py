@@ -26,9 +26,9 @@ GROUP = "pebble.transports"
 
 
 def create(kind: str, client_id: str, settings: Any, *, will: Message | None = None) -> Transport:
-    """Make a transport of ``kind``, not yet opened.
+    """Return a transport of ``kind``, not yet opened.
 
-    A third party's package offers one with ``[project.entry-points."pebble.transports"] mykind = "package:Class"``;
+    A third party's package offers a kind with ``[project.entry-points."pebble.transports"] mykind = "package:Class"``;
     the class is called as ``Class(client_id, settings, will=…)``.
     """
     module = module_of(kind)

@@ -1,7 +1,7 @@
 """Ages of messages when they arrive, by the clocks of their senders (T19).
 
-A sender's clock may show any time. The fastest recent message of a sender is taken to have needed no time on its way: a
-message that seems to have needed longer has waited somewhere.
+A sender's clock may show any time. The fastest recent message of a sender is assumed to have needed no time on its way:
+a message that seems to have needed longer has waited somewhere.
 """
 
 import threading
@@ -21,10 +21,10 @@ K = TypeVar("K", bound=Hashable)
 
 
 class Patience(Struct, frozen=True):
-    """Seconds after which a sender whose messages all seem late is believed: its clock was changed.
+    """Seconds after which a sender is believed although all its messages seem late: its clock was changed.
 
-    ``believed_s`` counts in general, ``set_back_s`` if its stamps went back, as no delay explains that. ``gap_s``: only
-    while no two of its messages are further apart. ``silent_s``: a sender that was not heard for longer is forgotten.
+    ``believed_s`` counts in general, ``set_back_s`` if its stamps went back, which no delay explains. This holds only
+    while no two of its messages are more than ``gap_s`` apart. A sender that was silent for ``silent_s`` is forgotten.
     """
 
     believed_s: float
@@ -34,7 +34,7 @@ class Patience(Struct, frozen=True):
 
 
 class _Clock:
-    """The clock of one sender. A *difference* is the time of our clock when a message arrives, less its stamp."""
+    """The clock of one sender. A *difference* is our time when a message arrives, minus its stamp."""
 
     __slots__ = ("began", "least", "newest", "other", "patience_s", "proved", "received_at")
 
@@ -54,15 +54,15 @@ class _Clock:
 
     @property
     def standing(self) -> tuple[float, float]:
-        """The order in which clocks give way: those received for a shorter time first, then those silent for longer."""
+        """Sort key for forgetting clocks: received for the shortest time first, then silent for the longest."""
         return self.received_at - self.began, self.received_at
 
 
 class SenderClocks(Generic[K]):
-    """The clocks of at most ``most`` senders, each known by a key.
+    """The clocks of at most ``most`` senders, each identified by a key.
 
-    Where there is no room, a silent sender gives way, or else the sender that was received for the shortest time, so
-    that a flood of invented keys does not displace a sender that goes on.
+    If there is no room, a silent sender is forgotten, or else the sender that was received for the shortest time: a
+    flood of invented keys does not displace a sender that continues.
     """
 
     def __init__(self, most: int, patience: Patience) -> None:
@@ -74,11 +74,11 @@ class SenderClocks(Generic[K]):
         return len(self._clocks)
 
     def age_s(self, key: K, sent: float, waited_s: float, now: float, late_s: float) -> float:
-        """Return for how many seconds a message stamped ``sent`` has waited at ``now``; learns the sender's clock.
+        """Return the seconds that a message stamped ``sent`` has waited at ``now``; learn the sender's clock from it.
 
         A message that has waited for more than ``late_s`` is late. ``waited_s`` is the longest time that it can have
-        waited, as far as is known without the stamp. This time counts, too, until the clock is two seconds old, and
-        until one of the sender's messages was not late by it.
+        waited, as far as is known without the stamp. It counts, too, until the clock is two seconds old, and one of the
+        sender's messages was in time by it.
         """
         with self._lock:
             clock = self._clocks.get(key)
@@ -93,13 +93,13 @@ class SenderClocks(Generic[K]):
             return age if now - clock.began >= _YOUNG_S else max(age, waited_s)
 
     def is_passed(self, key: K, sent: float) -> bool:
-        """True if a message of this sender with a newer stamp was received; if much newer, its clock was set back."""
+        """True if a newer message of this sender was received. A much newer stamp means that its clock was set back."""
         with self._lock:
             clock = self._clocks.get(key)
             return clock is not None and clock.newest - _JUMP_S < sent < clock.newest
 
     def pass_over(self, key: K, sent: float, now: float) -> None:
-        """Note the stamp of a message that is not judged: messages that its sender stamped earlier are late."""
+        """Note the stamp of a message without judging it: the sender's earlier messages are late from now on."""
         with self._lock:
             clock = self._clocks.get(key)
             if clock is not None and sent - clock.newest < now - clock.received_at + _JUMP_S:
@@ -115,7 +115,7 @@ class SenderClocks(Generic[K]):
         return clock
 
     def _clock_to_use(self, key: K, clock: _Clock, sent: float, now: float, late_s: float) -> _Clock:
-        """Return the sender's clock as it is, or as changed once all its messages have seemed late for long enough."""
+        """Return the sender's clock, corrected if all its messages have seemed late for long enough."""
         if now - sent - clock.least <= late_s:
             clock.other = None  # on time: the clock holds
             return clock
@@ -135,9 +135,9 @@ class SenderClocks(Generic[K]):
 class MessageAges:
     """Ages of messages of other processes; a message older than ``late_s`` is late. Thread-safe.
 
-    All processes of a boot share a clock that counts since that boot. A sender can claim any boot, and so make all
-    messages from that machine seem late: so a clock counts for one topic only, on which few may send. A machine whose
-    messages all seem late was stopped for a while, like a virtual one that was paused.
+    All processes of a machine share a clock that counts since its boot. A sender can claim any boot, and so make all
+    messages of that machine seem late: therefore a clock counts for one topic only, on which few may send. A machine
+    whose messages all seem late was suspended for a while, as a virtual machine may be.
     """
 
     def __init__(self, boot: int, late_s: float) -> None:

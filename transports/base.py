@@ -1,6 +1,6 @@
-"""The pub/sub interface, and all of its behaviour that does not depend on the backend.
+"""The publish/subscribe interface, with all behaviour that does not depend on the backend.
 
-docs/transports.md numbers the promises (T1 to T21) of every backend; the tests have the same numbers.
+docs/transports.md numbers the promises (T1 to T21) that every backend keeps; the tests have the same numbers.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ _WARNING_PERIOD_S = 5.0  # between two log lines about the same overflowing subs
 
 
 class Outgoing(Struct, frozen=True):
-    """Messages that a transport has accepted and not delivered yet; not the contract's direction ``outgoing``.
+    """The messages that a transport has accepted and not delivered yet; not the contract's direction ``outgoing``.
 
-    All zero from a backend that cannot measure them (T20).
+    All figures are zero from a backend that cannot measure them (T20).
     """
 
     waiting: int = 0  # bytes that the other machine has not confirmed, including some overhead of the protocols
@@ -50,7 +50,7 @@ class Outgoing(Struct, frozen=True):
 
 
 class Answer(Struct, frozen=True):
-    """The newest answer of the other end to a ping, or the oldest ping that it has not answered."""
+    """The newest answer of the other end to a ping, or the oldest ping that is still unanswered."""
 
     number: int  # of answers on this connection
     seconds: float  # that it took, or has taken so far
@@ -64,7 +64,7 @@ Handler = Callable[[Message], None]
 
 
 class Subscription:
-    """A filter, its handler and the bounded queue between them; :meth:`Transport.subscribe` makes it."""
+    """A filter with its handler and the bounded queue between them. :meth:`Transport.subscribe` makes it."""
 
     def __init__(
         self, transport: Transport, filter_: str, handler: Handler, *, qos: QoS, echo: bool, direct: bool, limit: int
@@ -101,8 +101,8 @@ class Subscription:
     def offer(self, message: Message, *, repeat: bool = False) -> None:
         """Queue ``message``, unless it is a retained message of a topic this connection has already delivered (T5, T8).
 
-        As-published connections cannot distinguish retained from live; their backend sets ``repeat`` when it is sure
-        that the message is a repetition.
+        As-published connections cannot distinguish retained from live messages; their backend sets ``repeat`` when it
+        is sure that the message is a repetition.
         """
         transport = self._transport
         with self._lock:
@@ -121,7 +121,7 @@ class Subscription:
             self._arrived.notify()
 
     def renew(self) -> None:
-        """Start a new connection: retained messages are delivered again."""
+        """Note that a new connection has begun, on which retained messages are delivered again."""
         with self._lock:
             self._delivered_topics.clear()
 
@@ -163,7 +163,7 @@ class Subscription:
 
 
 class Subscriptions:
-    """The subscriptions of one transport, thread-safe, with a search for those that match a topic."""
+    """The subscriptions of one transport, searched by topic; thread-safe."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -171,7 +171,7 @@ class Subscriptions:
         self._all: list[Subscription] = []
 
     def __iter__(self) -> Iterator[Subscription]:
-        """Iterate over the subscriptions of this moment."""
+        """Iterate over the present subscriptions."""
         with self.lock:
             return iter(list(self._all))
 
@@ -283,7 +283,7 @@ class Transport(ABC):
 
     @property
     def untried(self) -> bool:
-        """True if the name of the broker has addresses that have not had their first turn yet."""
+        """True if the broker's name has addresses that were not tried yet."""
         return False
 
     @property
@@ -294,7 +294,7 @@ class Transport(ABC):
         return f"it refuses to deliver {', '.join(refused[:_NAMED])}{more}" if refused else ""
 
     def suit_link(self, *, thin: bool) -> None:
-        """Set whether the link to the other end is thin (`is_thin`), from now on."""
+        """Set whether the link to the other end is thin (`is_thin`)."""
         self.is_thin = thin
 
     def renew_connection(self, why: str) -> None:  # noqa: B027 - where no other end keeps messages, nothing is to be done
@@ -308,11 +308,11 @@ class Transport(ABC):
         self._changes.watch(watcher)
 
     def open(self, timeout: float = 5.0) -> Self:
-        """Start connecting and wait up to ``timeout`` seconds for success.
+        """Start connecting, and wait up to ``timeout`` seconds for success.
 
-        Where a name has several addresses it waits, unless ``timeout`` is 0, until each has had a turn.
-        Returns in any case: a robot works without its broker. ``state`` and ``problem`` hold the result.
-        Raises TransportError only for settings that can never work.
+        If a name has several addresses it waits, unless ``timeout`` is 0, until each was tried. It returns in any case:
+        a robot works without its broker. ``state`` and ``problem`` hold the result. Raises TransportError only for
+        settings that can never work.
         """
         if self._state is not State.CLOSED:
             raise TransportError(f"transport {self.client_id} is already open")
@@ -328,7 +328,7 @@ class Transport(ABC):
         return self
 
     def close(self) -> None:
-        """Disconnect and free all resources. The will is published here too, so that others receive it either way."""
+        """Disconnect and free all resources. The will is published, so that others receive it as after a crash."""
         with self._changes.lock:
             if self._state is State.CLOSED:
                 return
@@ -356,12 +356,12 @@ class Transport(ABC):
         """Publish one message; return whether it was accepted.
 
         A live message is refused while there is no connection (on Zenoh: to other processes; CONNECTING only means that
-        the hub is away), and never delivered late. A retained one is accepted unless the transport is closed: its
-        newest value is stored, for at most 10,000 topics and 16 MB, and sent when the connection is back (T4).
-        ``remember`` False: it is not stored here, because others change it as well; without a connection it is refused.
-        ``shared``: others change it as well, so after an outage another value there counts as newer than ours, and is
-        left alone (T9). ``urgent`` gives commands and flags priority where the backend can. Raises TransportError for a
-        topic that is not allowed.
+        the hub is away), and never delivered late. A retained message is accepted unless the transport is closed: the
+        newest value of each topic is stored, for at most 10,000 topics and 16 MB, and sent when the connection is back
+        (T4). ``remember`` False: it is not stored here, because others change it as well; without a connection it is
+        refused. ``shared``: others change it as well, so after an outage a different value there counts as newer than
+        ours, and stays (T9). ``urgent`` gives commands and flags priority where the backend can. Raises TransportError
+        for a topic that is not allowed.
         """
         check_topic(topic)
         if not isinstance(payload, bytes):
@@ -435,7 +435,7 @@ class Transport(ABC):
         return subscriptions
 
     def ask(self, topics: Collection[str]) -> None:
-        """Have the retained messages of ``topics`` delivered to the subscriptions that match; waits, bounded.
+        """Let the retained messages of ``topics`` be delivered to the matching subscriptions; wait for a limited time.
 
         Some brokers send retained messages only to subscriptions of exact names; other backends do nothing here.
         """
@@ -450,7 +450,7 @@ class Transport(ABC):
     # -- for backends
 
     def _set_state(self, state: State) -> None:
-        """Notify the watchers, once per change. A closed transport stays closed unless it is opened again."""
+        """Set the state, and notify the watchers of a change. A closed transport stays closed until it is opened."""
         with self._changes.lock:
             if state is self._state or (self._state is State.CLOSED and state is State.CONNECTED):
                 return
@@ -474,7 +474,7 @@ class Transport(ABC):
         """Finish a new connection that has its subscriptions: send the retained messages it lacks, and set CONNECTED.
 
         Until then the ``_send`` of a backend that calls this accepts messages only while ``_own.syncing``: retained
-        ones that are published meanwhile are pending, and sent last.
+        messages that are published in the meantime are pending, and sent last.
         """
         self._sync_retained(known)
         self._set_state(State.CONNECTED)
@@ -486,7 +486,7 @@ class Transport(ABC):
 
     @abstractmethod
     def _open(self, timeout: float) -> None:
-        """Start connecting. Once subscriptions are in place, call ``_initial_sync``, or do the same (as Zenoh does)."""
+        """Start connecting. Once subscriptions are in place, call ``_initial_sync``, or do its work (as Zenoh does)."""
 
     @abstractmethod
     def _close(self, will: Message | None) -> None:
@@ -503,8 +503,8 @@ class Transport(ABC):
 
     @abstractmethod
     def _declare(self, subscription: Subscription) -> None:
-        """Activate ``subscription`` (already listed); wait, bounded, until it surely is active."""
+        """Activate ``subscription`` (already listed); wait, for a limited time, until it is certainly active."""
 
     @abstractmethod
     def _undeclare(self, subscription: Subscription) -> None:
-        """Stop receiving for ``subscription`` (no longer listed)."""
+        """Deactivate ``subscription`` (no longer listed)."""

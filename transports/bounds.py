@@ -1,4 +1,4 @@
-"""Containers whose memory is bounded, in number and in bytes: other programs choose topics and payloads."""
+"""Containers whose memory is limited, in number and in bytes, because other programs choose topics and payloads."""
 
 import threading
 from collections import deque
@@ -9,7 +9,7 @@ V = TypeVar("V")
 
 
 class BoundedQueue(Generic[V]):
-    """Items in order. The oldest make room for a new item, which is never refused, however large it is."""
+    """A queue of items. The oldest make room for a new item, which is never refused, however large it is."""
 
     def __init__(self, items: int, size: int) -> None:
         self._max_items, self._max_size = items, size
@@ -39,10 +39,10 @@ class BoundedQueue(Generic[V]):
 
 
 class BoundedTable(MutableMapping[str, V]):
-    """Values by topic, in the order in which they were set. The oldest are forgotten to make room for a new value.
+    """A table of values by topic, in the order in which they were set. The oldest are forgotten to make room.
 
-    A value that is too large for the table is not stored, and removes the older value of its topic. May be changed by
-    several threads.
+    A value that is too large for the table is not stored, and removes the older value of its topic. Several threads may
+    change the table.
     """
 
     def __init__(self, topics: int, size: int, size_of: Callable[[V], int]) -> None:
@@ -69,7 +69,7 @@ class BoundedTable(MutableMapping[str, V]):
         self._put(topic, value, forget=True)
 
     def put_if_room(self, topic: str, value: V) -> bool:
-        """Store the value, unless another topic would have to be forgotten; return True if it is stored."""
+        """Store the value if no other topic has to be forgotten for it; return True if it is stored."""
         return self._put(topic, value, forget=False)
 
     def __delitem__(self, topic: str) -> None:

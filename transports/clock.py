@@ -1,4 +1,4 @@
-"""The clock by which messages age: it goes on while the machine is suspended, and cannot be set."""
+"""The clock by which messages age. It also counts while the machine is suspended, and nobody can set it."""
 
 import time
 from collections.abc import Callable

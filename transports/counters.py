@@ -42,6 +42,6 @@ class Counters:
 
 
 def bounds_reached(*several: Counters) -> dict[str, int]:
-    """Return how many messages of these transports were dropped, by the name in BOUNDS; without zeros."""
+    """Return how many messages were dropped by limits, by the limit's name in BOUNDS; without zeros."""
     totals = {name: sum(counters[name] for counters in several) for name in BOUNDS}
     return {name: total for name, total in totals.items() if total}

@@ -1,4 +1,4 @@
-"""Password and certificates of connections to a broker, read again from their files when these have changed."""
+"""The password and certificates of a connection to a broker, read again when their files change."""
 
 import ssl
 from pathlib import Path
@@ -27,7 +27,7 @@ class Credentials:
 
 
 def renewed_context(tls: TlsSettings) -> Renewed[ssl.SSLContext]:
-    """Return the context of these certificates, or of the system's authorities. Raises TransportError without any."""
+    """Return the TLS context of these certificates, or of the system's authorities. TransportError without any."""
     system = ssl.get_default_verify_paths()
     trusted = (system.cafile, system.capath) if tls.ca_cert is None else (tls.ca_cert,)
     files = [Path(file) for file in (*trusted, tls.client_cert, tls.client_key) if file is not None]

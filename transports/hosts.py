@@ -1,4 +1,4 @@
-"""Addresses of a host. Each gets its turn, in whatever way the address before has failed."""
+"""The addresses of a host. Each is tried in turn, however the one before it has failed."""
 
 import socket
 from collections.abc import Callable
@@ -40,9 +40,9 @@ def addresses_of(host: str, port: int) -> list[Address]:
 
 
 def dial(address: Address, timeout: float | None = None, *, max_segment: int = 0) -> socket.socket:
-    """Return a TCP connection; the same ``timeout`` goes on for what follows, TLS. Raises OSError.
+    """Return a TCP connection, whose socket keeps ``timeout`` for the TLS handshake. Raises OSError.
 
-    ``max_segment``: bytes of one segment; 0: the system's.
+    ``max_segment``: bytes of one segment; 0: the system's value.
     """
     sock = socket.socket(address.family, socket.SOCK_STREAM)
     try:
@@ -57,10 +57,10 @@ def dial(address: Address, timeout: float | None = None, *, max_segment: int = 0
 
 
 def described(failures: dict[str, str]) -> str:
-    """Return one line of bounded length that names addresses and why each failed."""
-    some = [f"{address} {why}" for address, why in list(failures.items())[:_LONGEST]]
-    more = len(failures) - len(some)
-    return "; ".join(some) + (f"; and {more} more" if more else "")
+    """Return one line of limited length with the addresses and the reason why each failed."""
+    shown_failures = [f"{address} {why}" for address, why in list(failures.items())[:_LONGEST]]
+    hidden = len(failures) - len(shown_failures)
+    return "; ".join(shown_failures) + (f"; and {hidden} more" if hidden else "")
 
 
 class AddressRound:
@@ -79,7 +79,7 @@ class AddressRound:
         self._slow: set[Address] = set()  # addresses where TLS took long, or was not there in time
 
     def address(self) -> Address:
-        """Return the address whose turn it is; may wait for a name server. Raises OSError, ValueError."""
+        """Return the address to try now. May wait for a name server. Raises OSError, ValueError."""
         if not self._left:
             addresses = self._resolve(*self.host_port)
             if not addresses:
@@ -93,34 +93,34 @@ class AddressRound:
 
     @property
     def where(self) -> str:
-        """The broker in words; with its address if the host has several."""
+        """The broker in words, with its present address if the host has several."""
         return f"broker {self.host_port}" + (f" at {self._left[0].text}" if self.several and self._left else "")
 
     @property
     def untried(self) -> bool:
-        """True if one of several addresses has not had its first turn yet."""
+        """True if one of several addresses was not tried yet."""
         return self._is_first and self.several
 
     @property
     def patience_s(self) -> float:
-        """Seconds for which TLS may be silent at the address whose turn it is."""
+        """Seconds for which the present address may be silent during TLS."""
         return HANDSHAKE_S if self._left and self._left[0] in self._slow else CONNECT_TIMEOUT_S
 
     def opened(self, seconds: float) -> None:
-        """Note how long TCP and TLS took; addresses that had not answered in time before were dead, not slow."""
+        """Note how long TCP and TLS took. Addresses that failed by time before were then dead, not slow."""
         self._slow = {self._left[0]} if seconds > CONNECT_TIMEOUT_S else set()
 
     def was_slow(self) -> None:
-        """Note that TLS was silent for too long; the next attempt may be silent for longer."""
+        """Note that TLS was silent for too long; the next attempt gets more time."""
         self._slow.add(self._left[0])
 
     def succeeded(self) -> str:
-        """Note that the address has a connection, and return which ones failed before it, and how."""
+        """Note that the present address is connected; return a text about those that failed before it."""
         failed, self._failures, self._is_first = described(self._failures), {}, False
         return failed
 
     def failed(self, why: str, held_s: float = 0.0) -> str:
-        """Note a connection that was not made, or is lost after ``held_s``; return how each address failed."""
+        """Note a connection that was not made, or was lost after ``held_s``; return how each address failed."""
         if not self._left:  # the name was not resolved
             return why
         address = self._left.pop(0)

@@ -33,5 +33,5 @@ class Message(msgspec.Struct, frozen=True):
 
     @property
     def waited_s(self) -> float:
-        """Seconds for which it has waited at most, until now; 0 where that is unknown."""
+        """Longest time in seconds that the message can have waited until now; 0 if that is unknown."""
         return 0.0 if self.waiting_since is None else max(0.0, clock.since_boot() - self.waiting_since)

@@ -1,4 +1,4 @@
-"""Files that a process has made, and that others may remove or replace."""
+"""Files that this process has made, and that others may remove or replace."""
 
 import os
 from pathlib import Path
@@ -23,7 +23,7 @@ class OwnFile:
 
 
 def identity(file: Path | int) -> tuple[int, int] | None:
-    """Return numbers that no other file has at the same time; None if there is no such file."""
+    """Return the numbers that identify an existing file; None if it does not exist."""
     try:
         status = os.stat(file)  # noqa: PTH116 - of a descriptor as well
     except (FileNotFoundError, NotADirectoryError):

@@ -1,4 +1,4 @@
-"""The retained messages that one transport has published, to be sent again to a broker or hub that lacks them."""
+"""The retained messages that one transport has published. They are sent again to a broker or hub that lacks them."""
 
 from collections.abc import Callable, Collection
 
@@ -21,10 +21,10 @@ class OwnRetained(BoundedTable[Message]):
         self._counters = counters
 
     def remember(self, message: Message, *, sent: bool, shared: bool | None = None) -> bool:
-        """Store a message, to send it again.
+        """Store a message, to send it again; return False if there is no room.
 
-        False if there is no room; an older message of the topic is not sent again then either. ``shared`` None: as for
-        the older message of the topic.
+        Without room an older message of the topic is not sent again either. ``shared`` None: as for the older message
+        of the topic.
         """
         shared = message.topic in self.shared if shared is None else shared
         self.pending.pop(message.topic, None)

@@ -1,4 +1,4 @@
-"""The processes running in a run directory: one locked file each, so that an exit needs no message and no timeout.
+"""The processes of a run directory: each locks a file, so that its exit needs neither a message nor a timeout.
 
 A process holds a lock on its ``<name>.seat`` as long as it runs; the kernel releases it however the process ends. A
 process that finds an unlocked file removes the files of its former owner. The owner writes its name into the file when
@@ -40,8 +40,8 @@ def prepare_run_dir(run_dir: Path) -> None:
 def make_private(run_dir: Path, *, close: bool = False) -> None:
     """Create ``run_dir`` for this user alone, if it is missing; ``close`` takes access from others if it exists.
 
-    Raises TransportError for a folder in which others may write, because who writes there controls the robot, or what
-    its programs see. In /tmp another user may have created these names first.
+    Raises TransportError for a folder in which others may write: they could control the robot, and feed its programs.
+    In /tmp another user may have created these names first.
     """
     try:
         run_dir.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -80,7 +80,7 @@ class FileLock:
 
     @classmethod
     def take(cls, path: Path) -> FileLock | None:
-        """Lock ``path``, which is created if missing; None if another process has locked it."""
+        """Return the lock of ``path``, which is created if missing; None if another process has locked it."""
         try:
             return cls._get(path, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -88,7 +88,7 @@ class FileLock:
 
     @classmethod
     def wait(cls, path: Path) -> FileLock:
-        """Lock a path with a new name, which another process locks only for the moment of checking its owner."""
+        """Lock a file with a new name; another process may hold it for a moment, to check its owner."""
         return cls._get(path, fcntl.LOCK_EX)
 
     @classmethod
@@ -108,11 +108,11 @@ class FileLock:
 
     @property
     def in_place(self) -> bool:
-        """True if others that open its path find this lock: the file, or its folder, may have been removed."""
+        """True if others that open its path find this lock: the file and its folder are still there."""
         return _is_at(self.path, self._descriptor)
 
     def write(self, text: bytes) -> None:
-        """Replace the text in the file. A full disk leaves as many zeros: the lock counts, the text is for people."""
+        """Replace the text in the file. If the disk is full, zeros remain: the lock counts, the text is for people."""
         try:
             os.truncate(self._descriptor, len(text))  # needs no space
             os.pwrite(self._descriptor, text, 0)
@@ -120,14 +120,14 @@ class FileLock:
             log.warning("%s cannot be written: %s", self.path, error.strerror)
 
     def release(self, *, remove: bool = True) -> None:
-        """Release the lock; ``remove`` deletes the file, unless another has taken its place."""
+        """Release the lock; ``remove`` also deletes the file, unless another file has taken its place."""
         if remove and self.in_place:
             self.path.unlink(missing_ok=True)
         os.close(self._descriptor)
 
 
 class PresenceLock:
-    """The lock that marks one running process in the run directory, and the path of its socket."""
+    """The lock by which a process shows that it runs, and the path of its socket."""
 
     def __init__(self, run_dir: Path, name: str, owner: str, lock: FileLock) -> None:
         self.name, self._owner = name, owner
@@ -137,7 +137,7 @@ class PresenceLock:
         self._released = False
 
     def ready(self) -> None:
-        """Mark the process as reachable, so that newcomers wait for its answer from now on."""
+        """Mark this process as reachable; from now on newcomers wait for its answer."""
         with self._changing:
             if not self._released:
                 self._lock.write(self._owner.encode() or b"?")
@@ -157,16 +157,16 @@ class PeerRegistry:
         self._run_dir = run_dir
 
     def register(self, owner: str) -> PresenceLock:
-        """Add this process under a new name; ``owner`` describes it in logs."""
+        """Add this process under a new name; return its lock. ``owner`` describes it in logs."""
         name = new_name()
         return PresenceLock(self._run_dir, name, owner, FileLock.wait(self._run_dir / f"{name}.seat"))
 
     def sockets(self, *, but: str = "") -> list[Path]:
-        """Return the sockets where running processes listen or are about to, without the one called ``but``."""
+        """Return the sockets of running processes, even if they do not listen yet, except the one called ``but``."""
         return [self._run_dir / f"{name}.sock" for name in self._running() if name != but]
 
     def ready(self, *, but: str = "") -> dict[str, str]:
-        """Return the owners of all processes that are surely reachable, by name, without the one called ``but``."""
+        """Return the owners of all reachable processes by their names, except the one called ``but``."""
         return {name: owner for name, owner in self._running().items() if owner and name != but}
 
     def _running(self) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Values made from files that others replace while this process runs: certificates, keys, passwords."""
+"""Values made from files that may be replaced while this process runs: certificates, keys, passwords."""
 
 import logging
 from collections.abc import Callable, Iterable
@@ -13,10 +13,10 @@ _T = TypeVar("_T")
 
 
 class Renewed(Generic[_T]):
-    """A value that is made again when it is used after its files have changed.
+    """A value that is made again, at its next use, if its files have changed.
 
-    Files that cannot be used, because they are half written or gone, are logged once; until they can, the last good
-    value stays. ``first`` is the value if the files were read already; else it is made now, with its errors.
+    If the files cannot be used, because they are half written or gone, that is logged once, and the last good value
+    stays. ``first`` is the value if the files were read already; otherwise it is made now, and errors are raised.
     """
 
     def __init__(self, files: Iterable[Path], make: Callable[[], _T], first: _T | None = None) -> None:
@@ -46,7 +46,7 @@ class Renewed(Generic[_T]):
 
 
 def _version(file: Path) -> tuple[int, ...]:
-    """Return numbers that change whenever the file is written, replaced, removed or given to others."""
+    """Return numbers that change whenever the file is written, replaced, removed, or given to another user."""
     try:
         status = file.stat()
     except OSError:

@@ -1,4 +1,4 @@
-"""Processes that hold a socket, as far as this user may see: the user's own processes, or all for root."""
+"""Finds the processes that hold a socket, among those that this user may see: root sees all."""
 
 import errno
 from collections.abc import Collection, Iterator
@@ -10,7 +10,7 @@ _LISTENS = "0A"  # in /proc/net/tcp
 
 
 def _processes_with(inodes: Collection[str]) -> Iterator[tuple[Path, set[str]]]:
-    """Yield each process that holds some of these sockets: its folder in /proc, and the sockets that it holds."""
+    """Yield each process that holds some of these sockets: its folder in /proc, and the sockets."""
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             links = []
@@ -22,7 +22,7 @@ def _processes_with(inodes: Collection[str]) -> Iterator[tuple[Path, set[str]]]:
 
 
 def _command_of(process: int) -> str:
-    """Return the command of a process, safe to print: it may have any bytes."""
+    """Return the command line of a process in a form that is safe to print."""
     try:
         words = Path(f"/proc/{process}/cmdline").read_text(encoding="utf-8", errors="replace")
     except OSError as error:
@@ -31,12 +31,12 @@ def _command_of(process: int) -> str:
 
 
 def why_not(error: OSError, port: int) -> str:
-    """Return why this TCP port could not be listened at; for a port in use with its process, if that is found."""
+    """Return why this TCP port could not be opened; if it is in use, with the process, if that is found."""
     return f"{error.strerror}{port_holder(port)}" if error.errno == errno.EADDRINUSE else str(error.strerror)
 
 
 def port_holder(port: int) -> str:
-    """Return which process listens at a port, or "": `` (by process 12 of user 1000: 'nc -l 8080')``."""
+    """Return who listens at a port, or "": `` (by process 12 of user 1000: 'nc -l 8080')``, with the blank."""
     users = {}
     for name in ("tcp", "tcp6"):
         with suppress(OSError):

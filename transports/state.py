@@ -18,7 +18,7 @@ Watcher = Callable[[State], None]
 
 
 class StateChanges:
-    """A notifier of watchers about each change of one transport's state, in order; any thread may use it."""
+    """A notifier: it tells watchers each change of a transport's state, in order. Any thread may use it."""
 
     def __init__(self, client_id: str) -> None:
         self.lock = threading.RLock()  # held while the state changes and its watchers are called

@@ -1,4 +1,4 @@
-"""Makes the TLS context of a connection to a broker from its settings, with errors that name the file."""
+"""Makes the TLS context of a connection to a broker. Errors name the setting and its file."""
 
 import ssl
 from collections.abc import Callable
@@ -12,7 +12,7 @@ _T = TypeVar("_T")
 
 
 def make_context(tls: TlsSettings) -> ssl.SSLContext:
-    """Read the certificates; raises TransportError that names the field and the file."""
+    """Return the TLS context for these certificates. Raises TransportError that names the field and the file."""
     for field in ("ca_cert", "client_cert", "client_key"):
         path: Path | None = getattr(tls, field)
         if path is not None and not path.is_file():
@@ -35,5 +35,5 @@ def _try(what: str, load: Callable[[], _T]) -> _T:
 
 
 def no_password() -> str:
-    """Refuse: without this, OpenSSL asks the terminal for the password of an encrypted key, and waits."""
+    """Raise an error: otherwise OpenSSL asks the terminal for the password of an encrypted key, and waits."""
     raise OSError("the key is encrypted, and no password can be entered")

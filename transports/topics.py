@@ -21,7 +21,7 @@ _FORBIDDEN = re.compile(f"[\x00-\x1f\x7f-\x9f{_NON_CHARACTERS}]")
 
 
 def remembered(translate: Callable[[str], str]) -> Callable[[str], str]:
-    """Return ``translate``, which remembers what it returned for topics of the usual length; 2 MB at most."""
+    """Return ``translate`` with a memory of its results for topics of usual length; 2 MB at most."""
     cached = lru_cache(_REMEMBERED)(translate)
 
     def look_up(topic: str) -> str:
@@ -78,12 +78,12 @@ def is_pattern(filter_: str) -> bool:
 
 @remembered
 def beginning(filter_: str) -> str:
-    """Return the beginning of every topic that ``filter_`` matches, for ruling out most of many filters fast."""
+    """Return the text with which all topics that match ``filter_`` begin, to rule out most filters fast."""
     return _WILDCARD.split(filter_, maxsplit=1)[0]
 
 
 def matches(filter_: str, topic: str) -> bool:
-    """Return True if ``filter_`` matches ``topic``, by MQTT's rules.
+    """True if ``filter_`` matches ``topic``, by MQTT's rules.
 
     ``+`` is one level, a final ``#`` is the rest and its parent, and wildcards skip topics that begin with ``$``.
     """

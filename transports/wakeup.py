@@ -1,4 +1,4 @@
-"""Wake-ups of a thread that waits for new work, or for descriptors."""
+"""Wakes a thread that waits for new work, or for descriptors."""
 
 import socket
 import threading
@@ -7,7 +7,7 @@ from contextlib import suppress
 
 
 class Wakeup:
-    """An event that resets itself: any thread or signal handler sets it, one thread waits; a set before a wait counts.
+    """An event that resets itself: any thread or signal handler sets it, one thread waits. A set before a wait counts.
 
     It is a bare lock that is free while the event is set. A Condition takes ten times as long, and a signal handler
     that notifies it may interrupt its own thread inside. ``queue.SimpleQueue.get(timeout=…)`` can wait for ever: if the
@@ -32,7 +32,7 @@ class Wakeup:
 
 
 class WakeupPipe:
-    """A descriptor that one thread polls beside its devices. Any other or a signal sets it, also before the poll."""
+    """A descriptor that one thread polls beside its devices. Other threads and signals set it, also before the poll."""
 
     def __init__(self) -> None:
         self._reader, self._writer = socket.socketpair()
@@ -44,7 +44,7 @@ class WakeupPipe:
 
     @property
     def set_fileno(self) -> int:
-        """The descriptor that sets the pipe when a byte is written there: for ``signal.set_wakeup_fd``."""
+        """Descriptor that sets the pipe when a byte is written to it, for ``signal.set_wakeup_fd``."""
         return self._writer.fileno()
 
     def set(self) -> None:

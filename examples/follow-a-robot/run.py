@@ -37,7 +37,7 @@ class Options(Struct, kw_only=True):
 class Companion:
     """The place of another robot, seen from this one. Each odometry has a frame of its own, so only motions count.
 
-    ``ahead_m`` and ``left_m``: where the other one stands at the first call, heading as this one does.
+    ``ahead_m`` and ``left_m``: the other robot's place at the first call, when both head in the same direction.
     """
 
     def __init__(self, ahead_m: float, left_m: float) -> None:
@@ -54,7 +54,7 @@ class Companion:
 
 
 def _motion(before: Pose, now: Pose) -> tuple[complex, float]:
-    """Return the step in the frame of ``before``, and the turn; none at a jump."""
+    """Return the step in the frame of ``before``, and the turn; both 0 at a jump."""
     step = complex(now.x_m - before.x_m, now.y_m - before.y_m)
     if abs(step) > JUMP_M:
         return 0j, 0.0
@@ -67,12 +67,14 @@ def main(robot: Robot, options: Options) -> None:
     follower = Follower(convert(options, FollowSettings, from_attributes=True))
     companion = Companion(options.ahead_m, options.left_m)
     while True:
-        mine, its = (pose_of(seen.latest(WHEEL_ODOMETRY, POSE_AGE_S)) for seen in (robot, other))
-        if mine is None or its is None:
-            log.warning("odometry", "waits for the odometry of %s", options.robot if its is None else "this robot")
+        own_pose, other_pose = (pose_of(machine.latest(WHEEL_ODOMETRY, POSE_AGE_S)) for machine in (robot, other))
+        if own_pose is None or other_pose is None:
+            log.warning(
+                "odometry", "waits for the odometry of %s", options.robot if other_pose is None else "this robot"
+            )
             robot.stop()
         else:
-            command = follower.step(time.monotonic(), companion.place(mine, its))
+            command = follower.step(time.monotonic(), companion.place(own_pose, other_pose))
             robot.drive(command.x, command.z)
         robot.sleep(1 / options.control_rate_hz)
 

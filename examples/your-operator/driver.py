@@ -9,7 +9,7 @@ KEEPS_S = 3.0  # so long after the last command it is given back
 
 
 class Driver:
-    """One person at one robot. ``send(metric, value, qos)`` publishes below incoming/."""
+    """A person at a robot. ``send(metric, value, qos)`` publishes below incoming/."""
 
     def __init__(self, robot, name, send):
         self.robot = robot  # what is known of it, see robot_state.py
@@ -22,7 +22,7 @@ class Driver:
         self.moved_at = self.asked_at = self.sent_at = -math.inf
 
     def push(self, x, z):
-        """Put the stick there; what is no number lets it go."""
+        """Move the stick to this position; a value that is no number releases it."""
         if not (math.isfinite(x) and math.isfinite(z)):
             x = z = 0.0
         self.stick = (max(-1.0, min(1.0, x)), max(-1.0, min(1.0, z)))
@@ -32,7 +32,7 @@ class Driver:
             self.send("drive-values", {"x": 0, "z": 0, "key": key} if key else {"x": 0, "z": 0}, 1)
 
     def step(self, is_stopping):
-        """Call it often. ``is_stopping``: an emergency stop was pressed, and is not confirmed yet."""
+        """Continue; call this often. ``is_stopping``: an emergency stop was pressed, and is not confirmed yet."""
         now = time.monotonic()
         pushed = any(self.stick)
         if pushed and not self.must_let_go and (why := self.why_not(is_stopping)):
@@ -91,12 +91,12 @@ class Driver:
 
 
 def clock_ms():
-    """Return milliseconds of a clock that is never set: by them a robot drops commands that come late."""
+    """Return milliseconds of a clock that is never set: by them a robot recognises late commands."""
     return time.monotonic_ns() // 1_000_000
 
 
 def numbers(text):
-    """Return the two numbers that were typed; NaN, which lets go of the stick, if these are none."""
+    """Return the two numbers in a line; NaN, which releases the stick, if there are none."""
     try:
         x, z = text.split()
         return float(x), float(z)

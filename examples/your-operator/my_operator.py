@@ -51,12 +51,12 @@ class StopSender:
 
 
 def send(metric, value, qos):
-    """Publish a command, never retained: it would be carried out at every start of the robot."""
+    """Publish a command, never retained: otherwise the robot would carry it out at every start."""
     client.publish(INCOMING + metric, json.dumps(value), qos)
 
 
 def reset():
-    """End the stops that are shown now, and no later one."""
+    """End the stops that are shown now, and no later ones."""
     for state in robot.known(robot.stops).values():
         send("estop-reset", {"boot": state.get("boot"), "count": state.get("count")}, 1)
 

@@ -1,4 +1,4 @@
-"""The state of a robot as an operator knows it, by the messages that it publishes."""
+"""The state of a robot as an operator knows it, by the robot's messages."""
 
 import json
 import math
@@ -10,7 +10,7 @@ WIDE = {"level": "wide", "drive_hz": 20}  # a link that carries everything: robo
 
 
 class RobotState:
-    """One robot."""
+    """The state of one robot."""
 
     def __init__(self):
         self.capabilities = {}
@@ -26,7 +26,7 @@ class RobotState:
         self.controls = {}
 
     def receive(self, metric, payload, retained):
-        """Take one message below outgoing/; one that cannot be read changes nothing."""
+        """Handle a message below outgoing/. A message that cannot be read changes nothing."""
         try:
             self.take(metric, json.loads(payload) if payload else {}, retained)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
@@ -56,7 +56,7 @@ class RobotState:
         return self.is_offline or time.monotonic() > self.heartbeat_at + limit_s
 
     def known(self, states):
-        """Return them without those of owners that capabilities do not list: a broker keeps them after a renaming."""
+        """Return the states without those of unlisted owners, which a broker keeps after a renaming."""
         owners = (self.capabilities.get("estop") or {}).get("owners")
         return {owner: state for owner, state in states.items() if not owners or owner in owners}
 
@@ -64,17 +64,17 @@ class RobotState:
         return any(stop.get("latched") is not False for stop in self.known(self.stops).values())
 
     def has_stop(self, name):
-        """True if each owner of motors tells that it has the emergency stop of this name."""
+        """True if each owner of motors reports the emergency stop of this name."""
         owners = (self.capabilities.get("estop") or {}).get("owners") or list(self.stops)
         confirmed = [name in self.stops.get(owner, {}).get("recent", ()) for owner in owners]
         return bool(confirmed) and all(confirmed)
 
     def gives_control(self):
-        """True if no command with another key than that of who has control moves it."""
+        """True if the robot moves only by commands with the key of the client that has control."""
         return (self.capabilities.get("drive") or {}).get("control") is True
 
     def key(self, own_id):
-        """Return the keys of all owners that gave control to this id; "" if the first by name did not, who decides."""
+        """Return the keys of all owners that gave control to this id; "" if the first by name, who decides, did not."""
         keys = [
             str(control.get("key") or "") if control.get("id") == own_id else ""
             for _, control in sorted(self.known(self.controls).items())
@@ -82,7 +82,7 @@ class RobotState:
         return " ".join(filter(None, keys)) if keys and keys[0] else ""
 
     def show_holder(self, own_id):
-        """Print once that another client has control."""
+        """Print, once, that another client has control."""
         holder = ""
         for control in self.known(self.controls).values():
             if control.get("key") and control.get("id") != own_id:

@@ -1,4 +1,4 @@
-"""The control of a robot: it ends, is released or is taken; a request meanwhile is shown.
+"""The control of a robot: a client gets it on request, until it ends, is released or is taken.
 
 Times are milliseconds of a clock that is never set.
 """
@@ -12,9 +12,9 @@ LONGEST_MS = 10000
 
 
 class Control:
-    """The control of one robot. No command with another key than its holder's moves the robot.
+    """The control of one robot. A command with another key than the holder's does not move the robot.
 
-    At level open one without a key still does.
+    At level open, a command without a key still does.
     """
 
     def __init__(self):
@@ -34,11 +34,11 @@ class Control:
         return not self.is_free and key == self.holder["key"] and account == self._account
 
     def renew(self, now):
-        """Prolong it: its holder has sent a command."""
+        """Prolong control, because its holder has sent a command."""
         self._ends_at = max(self._ends_at, now + self._for_ms)
 
     def request(self, command, account, take, now):
-        """Give it to the first who asks, to its holder again, or to the one who takes it."""
+        """Give control to the first client that asks, to its holder again, or to a client that takes it."""
         own_id = command.get("id")
         for_ms = command.get("for_ms", USUAL_MS)
         if not is_hex(own_id, 8) or not is_number(for_ms):
@@ -66,14 +66,14 @@ class Control:
         self._asks = self._asks_id = ""
 
     def tick(self, now):
-        """End what is over."""
+        """End control and requests whose time is over."""
         if not self.is_free and now > self._ends_at:
             self.pass_to(NO_HOLDER)
         if now > self._asks_until:
             self._asks = self._asks_id = ""
 
     def state(self):
-        """Return what is published: outgoing/control/OWNER."""
+        """Return the state to publish: outgoing/control/OWNER."""
         state = {"asks": self._asks, "asks_id": self._asks_id}
         state.update(self.holder)
         return state

@@ -1,4 +1,4 @@
-"""The emergency stop of a robot. It ends only by a reset of what a person has seen, also after a power cut."""
+"""The emergency stop of a robot. Only a reset of exactly the stop that a person has seen ends it, not a power cut."""
 
 import json
 
@@ -11,7 +11,7 @@ class EmergencyStop:
     """The stop of one motor owner. ``save(text)`` writes a text so that a power cut does not take it."""
 
     def __init__(self, saved, save, named):
-        """``saved``: what was saved last; None: there was no stop yet."""
+        """Store the arguments. ``saved``: the text saved last; None: there was no stop yet."""
         self.boot = new_hex(8)  # new at each start: a reset that was meant for an earlier one does nothing
         self.count = 0  # of stops since the start
         self.refused = None  # why the last reset did nothing: "boot" or "count"
@@ -32,7 +32,7 @@ class EmergencyStop:
         return self.stop["latched"]
 
     def press(self, command, account, epoch_ms):
-        """Stop, whatever the command says. One that is repeated under its name counts once."""
+        """Stop, whatever the command says. A stop that is repeated under its name counts once."""
         name = command.get("stop")
         if not is_hex(name, 16):
             name = new_hex(16)
@@ -53,7 +53,7 @@ class EmergencyStop:
         self.is_saved = False
 
     def reset(self, command):
-        """End the stop that the sender has seen, and no later one. Return True if it ends."""
+        """End the stop that the sender has seen, and no later one; return True if it ends."""
         self.is_new = True
         self.refused = None
         if command.get("boot") != self.boot:
@@ -76,7 +76,7 @@ class EmergencyStop:
             self.is_saved = False  # which is published: people must not rely on it
 
     def state(self):
-        """Return what is published: outgoing/estop/OWNER."""
+        """Return the state to publish: outgoing/estop/OWNER."""
         state = {"boot": self.boot, "count": self.count, "reset_refused": self.refused, "persisted": self.is_saved}
         state.update(self.stop)
         return state

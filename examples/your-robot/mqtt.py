@@ -1,8 +1,8 @@
-"""This is as much MQTT 3.1.1 as a robot in MicroPython needs.
+"""A client of MQTT 3.1.1, as far as a robot in MicroPython needs it.
 
-``open`` waits for the network, for seconds: halt before it. Later only ``messages`` waits, as long as it is told; what
-the network does not take at once is sent in the next round. (Some boards, such as the Pico W, wait up to half a second
-in a write while the network takes nothing.)
+``open`` waits for the network, for seconds: halt the motors before it. After that only ``messages`` waits, for the
+given time; what the network does not accept at once is sent in the next round. (Some boards, such as the Pico W, wait
+up to half a second in a write while the network accepts nothing.)
 """
 
 import json
@@ -20,7 +20,7 @@ LOGIN = 0xC0
 
 
 class Mqtt:
-    """A connection to a broker. What sends or receives raises OSError once it has ended: open it again then."""
+    """A connection to a broker. Sending and receiving raise OSError once it has ended: open it again then."""
 
     def __init__(self, host, port, client_id, login, will):
         """``login``: user, password and the certificate of the broker's authority; (): without, and without TLS.
@@ -82,7 +82,7 @@ class Mqtt:
         self.send(PUBLISH | qos << 1 | 1, text(topic) + number + json.dumps(value).encode())
 
     def exchange(self, wait_ms):
-        """Send the bytes that wait, and read what arrives within ``wait_ms``."""
+        """Send waiting bytes, and read what arrives within ``wait_ms``."""
         if not self.socket:
             raise OSError("there is no connection")
         if self.unsent:

@@ -12,13 +12,13 @@ LONGEST = 1024  # bytes of a packet that are stored: memory is small
 
 
 def text(value):
-    """Return a text as MQTT has it, behind its length."""
+    """Return a text in MQTT's form: its length, then its bytes."""
     data = value.encode() if isinstance(value, str) else value
     return struct.pack("!H", len(data)) + data
 
 
 def header(first, size):
-    """Return the first bytes of a packet. Each byte of its size has seven bits, and one that is set if more follow."""
+    """Return the first bytes of a packet: ``first``, then its size, seven bits a byte and a bit that means "more"."""
     data = bytes((first,))
     while size > 127:
         data += bytes((size & 127 | 128,))
@@ -31,7 +31,7 @@ def packet(first, content):
 
 
 def message(first, content):
-    """Return the topic, the number and the payload in a PUBLISH packet; the number is empty with QoS 0."""
+    """Return topic, number and payload of a PUBLISH packet; the number is empty with QoS 0."""
     start = 2 + struct.unpack_from("!H", content)[0]
     topic = content[2:start].decode()
     end = start + 2 if first & 6 else start
@@ -39,7 +39,7 @@ def message(first, content):
 
 
 class Reader:
-    """The bytes that have arrived, and the packets in them."""
+    """The bytes that have arrived, with the packets in them."""
 
     def __init__(self):
         self.data = b""
@@ -50,7 +50,7 @@ class Reader:
         self.data += data
 
     def packets(self):
-        """Yield the first byte and the content of each packet that is there; content that is too long is cut."""
+        """Yield the first byte and the content of each complete packet; content that is too long is cut."""
         while self.skip():
             size, start = self.length()
             end = start + min(size, LONGEST)
@@ -64,7 +64,7 @@ class Reader:
             yield first, content
 
     def skip(self):
-        """Drop what is to be skipped, as far as it is there. Return True if it was."""
+        """Drop bytes that are to be skipped, as far as they have arrived; return True if all were dropped."""
         gone = min(self.skipped, len(self.data))
         self.skipped -= gone
         self.data = self.data[gone:]
@@ -74,9 +74,9 @@ class Reader:
         return self.skipped == 0
 
     def skip_long_topic(self, start, size):
-        """Skip the topic of a message if the number behind it, which is to be acknowledged, would be cut off.
+        """Skip the topic of a message if its number, which must be acknowledged, would otherwise be cut off.
 
-        Return True if it is skipped. None of ours is so long: what is left is a message with an empty topic.
+        Return True if it is skipped. No topic of ours is so long: what is left is a message with an empty topic.
         """
         topic = struct.unpack_from("!H", self.data, start)[0]
         if 2 + topic + 2 <= LONGEST:
@@ -87,7 +87,7 @@ class Reader:
         return True
 
     def length(self):
-        """Return the size of the next packet's content, and where it begins: 0 if that is not there yet."""
+        """Return the size of the next packet's content, and its beginning: 0 if that has not arrived yet."""
         size = 0
         for index in range(1, len(self.data)):
             size |= (self.data[index] & 127) << 7 * (index - 1)

@@ -1,4 +1,4 @@
-"""Readers of payloads, which may be anything: they become JSON objects, numbers and short texts, or nothing."""
+"""Readers of payloads, which may hold anything: they return JSON objects, numbers and short texts, or nothing."""
 
 import binascii
 import json
@@ -26,7 +26,7 @@ def command_of(payload):
 
 
 def is_number(value):
-    """True if it is a finite number. NaN is none: it is neither smaller nor larger than any other."""
+    """True if the value is a finite number. NaN is none: it is neither smaller nor larger than any other."""
     return type(value) in (int, float) and -INFINITY < value < INFINITY
 
 
@@ -35,17 +35,17 @@ def clamp(value, least, most):
 
 
 def is_hex(text, size):
-    """True if it is a text of so many hexadecimal digits."""
+    """True if the text has ``size`` hexadecimal digits, and nothing else."""
     return isinstance(text, str) and len(text) == size and all(letter in HEX for letter in text.lower())
 
 
 def new_hex(size):
-    """Return so many random hexadecimal digits."""
+    """Return ``size`` random hexadecimal digits."""
     return binascii.hexlify(os.urandom(size // 2)).decode()
 
 
 def only(text, allowed, size):
-    """Return a text of strangers as it may be published: cut, and with _ for each letter that is not allowed."""
+    """Return a stranger's text in the form to publish: cut, and with _ for each letter that is not allowed."""
     if not isinstance(text, str):
         return ""
     return "".join([letter if letter in allowed else "_" for letter in text[:size]])

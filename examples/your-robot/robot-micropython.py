@@ -57,7 +57,7 @@ class MyRobot(Robot):
 
 
 def saved():
-    """Return what was saved last; None if there is no file, "" if it cannot be read."""
+    """Return the saved text; None if there is no file, "" if it cannot be read."""
     folder, _, name = STOP_FILE.rpartition("/")
     if name not in os.listdir(folder or "/"):
         return None
@@ -69,7 +69,7 @@ def saved():
 
 
 def set_clock():
-    """Ask the internet for the time: people are shown how old messages are.
+    """Set the clock by the internet: people are shown how old messages are.
 
     Without it the times of messages count from the start of the board, and it drives as well.
     """

@@ -53,14 +53,14 @@ class MyRobot(Robot):
         return time.time_ns() // 1_000_000
 
     def say(self, text):
-        """Print it, unless it was printed last: it tries again five times a second."""
+        """Print a text, unless it was printed last: connecting is tried five times a second."""
         if text != self.said:
             print(text, flush=True)
         self.said = text
 
 
 def saved():
-    """Return what was saved last; None if there is no file, "" if it cannot be read."""
+    """Return the saved text; None if there is no file, "" if it cannot be read."""
     try:
         return Path(STOP_FILE).read_text(errors="replace")
     except FileNotFoundError:

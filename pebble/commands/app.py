@@ -1,4 +1,4 @@
-"""The command line: its commands, and how one is run."""
+"""The command line: its table of commands, and how a command is run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _GROUPS: Final = ("use", "own", "write", "share", "measure", "more")
 def commands(words: Sequence[str] = ()) -> dict[str, Offered]:
     """Return the commands by their words, in the order of the help.
 
-    Other packages are looked at only if none of our commands begins with the first of ``words``.
+    Packages of others are looked at only if none of our commands begins with the first of ``words``.
     """
     offered = {**_CORE, **{name: row for extension in ours() for name, row in extension.commands.items()}}
     if not words or words[0] not in offered:
@@ -68,7 +68,7 @@ def application(words: Sequence[str] = ()) -> Any:
 
 
 class _Pebble(TyperGroup):
-    """The command ``pebble``. Its help has one line for each command, and fits on a terminal of 80 x 24."""
+    """The top command ``pebble``. Its help has one line per command, and fits on a terminal of 80 x 24."""
 
     _offered: Mapping[str, Offered] = {}
 
@@ -89,7 +89,7 @@ class _Pebble(TyperGroup):
 
 
 class _Listed(TyperCommand):
-    """A command of the table. Its module is imported for running, help or completion."""
+    """A command of the table. Its module is imported only to run, explain or complete it."""
 
     def __init__(self, words: str, offered: Mapping[str, Offered]) -> None:
         super().__init__(words.split()[-1], help=offered[words].help)
@@ -122,7 +122,7 @@ class _Listed(TyperCommand):
 
 
 class _Completion(NamedTuple):
-    """A value, as a shell gets it."""
+    """A value as it is given to a shell that completes a word."""
 
     value: str
     type: str = "plain"
@@ -130,7 +130,7 @@ class _Completion(NamedTuple):
 
 
 def _complete_values(command: Any) -> None:
-    """Let a command, and those below it, complete the values of arguments that extensions know by their names."""
+    """Let a command and its subcommands complete the arguments whose values extensions know, by their names."""
     places = {name: place for extension in ours() for name, place in extension.completions.items()}
     for parameter in command.params:
         if place := places.get(parameter.metavar or ""):
@@ -178,7 +178,7 @@ class _ErrorHandler(logging.StreamHandler):  # type: ignore[type-arg]  # of the 
 
 @contextmanager
 def _thread_errors_on_stderr() -> Iterator[None]:
-    """Log errors of threads to stderr; a command raises its own errors."""
+    """Log exceptions of threads to stderr. The command itself raises its own."""
     handler = _ErrorHandler()
     handler.setLevel(logging.ERROR)
     logging.getLogger("pebble").addHandler(handler)

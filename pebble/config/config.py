@@ -57,7 +57,7 @@ class Config(Root, frozen=True, kw_only=True):
         return self.identity.base
 
     def section(self, kind: type[S]) -> S:
-        """Return the section of an extension by its class; its defaults where the extension is not installed."""
+        """Return the section of class ``kind``, which an extension adds; its defaults without that extension."""
         return next(values_of(self, kind), kind())
 
     def run_dir(self) -> Path:
@@ -69,7 +69,7 @@ class Config(Root, frozen=True, kw_only=True):
         return self.state_folder
 
     def state_file(self, name: str) -> Path:
-        """Return a file in the state directory, which several robots may share."""
+        """Return the path of a file in the state directory, which several robots may share."""
         return self.state_folder / f"{name}-{file_name(self.base)}.json"
 
     @staticmethod
@@ -81,11 +81,11 @@ class Config(Root, frozen=True, kw_only=True):
         """Return the enabled serial lines, one process each, by instance name; ``""`` is the section itself."""
         section = self.services.serial_mcu_bridge
         lines: dict[str, SerialBridge] = {"": section, **section.instances}
-        known = {*OF_CORE, *(protocol for extension in self.installed for protocol in extension.protocols)}
+        protocols = {*OF_CORE, *(protocol for extension in self.installed for protocol in extension.protocols)}
         return {
             name: line
             for name, line in lines.items()
-            if line.enabled and line.serial.port is not None and line.protocol in known
+            if line.enabled and line.serial.port is not None and line.protocol in protocols
         }
 
     def hall_memory(self, line: SerialBridge) -> str | None:
@@ -123,7 +123,7 @@ _handed_over: Config | None = None
 
 
 def hand_over(config: Config) -> None:
-    """Set the config of this process: the launcher does so in its children, which are forks of it."""
+    """Set the config of this process, as the launcher does before it forks its children, which then have it."""
     global _handed_over
     _handed_over = config
 
@@ -194,7 +194,7 @@ def _config(
 
 
 def _extensions(written: Any, folder: Path) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:
-    """Return our extensions and those that the file lists, and the ones that this machine lacks."""
+    """Return the extensions of this config, ours and those that the file lists, and the ones that are missing here."""
     listed = extension.value_at(written, "extensions")
     entries = listed if isinstance(listed, dict) else {}
     drives = {name: extension.value_at(entry, "drives") is True for name, entry in entries.items()}
@@ -210,7 +210,7 @@ def _extensions(written: Any, folder: Path) -> tuple[tuple[Extension, ...], tupl
 
 
 def _without_broken(config: Config) -> Config:
-    """Return the config without extensions that cannot list their programs: the rest of the robot starts."""
+    """Return the config without extensions whose list of programs cannot be made, so that the robot starts."""
     for tried in config.installed:
         try:
             extension.programs_of([tried], config)
@@ -224,7 +224,7 @@ def _without_broken(config: Config) -> Config:
 
 @cache
 def _tree(installed: tuple[Extension, ...]) -> tuple[type[Root], Any, tuple[Rule, ...]]:
-    """Return the classes of a file and of a config with the sections of these extensions, and the rules."""
+    """Return the classes of a config file and of a read config, with these extensions' sections, and the rules."""
     tree = tree_of({key: extension.part(place) for added in installed for key, place in added.sections.items()})
     added_fields = [
         (field.name, field.type, field.default) for field in fields(tree) if field.name not in Root.__struct_fields__
@@ -237,7 +237,7 @@ def _tree(installed: tuple[Extension, ...]) -> tuple[type[Root], Any, tuple[Rule
 
 
 def _guarded(owner: Extension, rule: Check) -> Check:
-    """Return the rule of a stranger's extension so that its failure is a problem of the config; ours unchanged."""
+    """Return a rule of an extension, with its exceptions turned into problems of the config; ours are not wrapped."""
     if owner in extension.ours():
         return rule
 
@@ -276,7 +276,7 @@ def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
 
 
 def _is_run_from(folder: Path, base: str) -> bool:
-    """True if the newest launcher in this run directory, if we may read it, was that of this robot."""
+    """True if this run directory can be read, and its newest launcher was that of the robot with this base topic."""
     try:
         return read_plain(folder / LAUNCHER_LOCK).decode(errors="replace").splitlines()[1:2] == [base]
     except OSError:
@@ -296,13 +296,13 @@ def default_state_folder(base: str, env: Mapping[str, str]) -> Path:
 
 
 def file_name(base: str) -> str:
-    """Return a name for one robot's files: its base, or a digest of a base that is too long for a file system."""
+    """Return a file name for one robot: its base topic, or a digest if that is too long for a file system."""
     name = base.replace("/", "+")  # which no level of a topic contains
     return name if len(os.fsencode(name)) <= _LONGEST_NAME else hashlib.sha256(os.fsencode(base)).hexdigest()
 
 
 def resolved(config: Config) -> dict[str, Any]:
-    """Return the file's keys as JSON can write them, with every default and inherited value, and ``derived`` values.
+    """Return the whole config as plain data: the file's keys, every default and inherited value, and ``derived``.
 
     Keys that are not set and have no default are left out; secrets and the values of variables read ``***``.
     """

@@ -1,4 +1,4 @@
-"""Paths in a home folder, which a user of a container or of a service may not have."""
+"""Paths that begin with ``~``. A user of a container or of a service may have no home folder."""
 
 from pathlib import Path
 
@@ -6,9 +6,9 @@ from pebble.errors import ConfigError
 
 
 def in_home(path: str | Path) -> Path:
-    """Return ``path`` with a ``~`` at its beginning replaced.
+    """Return ``path`` with its leading ``~`` or ``~user`` replaced by that user's home folder.
 
-    Raises ConfigError where that folder is not known: there is no HOME, and no entry for this user or for that name.
+    Raises ConfigError if that folder is not known: there is no HOME, and no entry for the user.
     """
     try:
         return Path(path).expanduser()

@@ -1,4 +1,4 @@
-"""Readers of hosts as people write them: names and addresses. An error says what to write instead."""
+"""Readers of host names and addresses as people write them. An error says what to write instead."""
 
 import re
 from ipaddress import IPv4Address, IPv6Address, ip_address
@@ -76,21 +76,21 @@ def endpoint(text: str) -> str:
 
 
 def no_login(text: str) -> str:
-    """Return a name that is published and logged. Raises HostError for a login such as ``user:password@``."""
+    """Return ``text``, a name that is published and logged. Raises HostError for a login such as ``user:password@``."""
     if without_secrets(text) != text:
         raise HostError("holds a login or a password, and is shown to everybody: remove it")
     return text
 
 
 def typeable(text: str) -> str:
-    """Return a name that people type, such as a robot's. Raises HostError if no keyboard writes it."""
+    """Return ``text``, a name that people type, such as a robot's. Raises HostError if no keyboard writes it."""
     if why := untypeable(text):
         raise HostError(why)
     return no_login(text)
 
 
 def no_url(text: str) -> str:
-    """Return a path. Raises HostError for a URL, which may hold a login."""
+    """Return ``text``, a path. Raises HostError for a URL, which may hold a login."""
     if "://" in text:
         raise HostError("is a URL: write a path")
     return no_login(text)
@@ -121,7 +121,7 @@ def split(text: str) -> UrlParts:
 
 
 def _only_place(text: str) -> UrlParts:
-    """Return the parts of ``HOST[:PORT]``. Raises HostError."""
+    """Return the parts of ``HOST[:PORT]``. Raises HostError for a text with more parts."""
     address = split(text)
     if address.scheme or address.rest or address.user is not None:
         raise HostError("must be HOST or HOST:PORT alone")
@@ -135,12 +135,12 @@ def _address(text: str) -> str:
 
 
 def _with_zone(text: str) -> str:
-    """Return a text with ``[fe80::1%eth0]`` in place of ``[fe80::1%25eth0]``."""
+    """Return ``text`` with the zone of an IPv6 address written plainly: ``[fe80::1%eth0]`` for ``[fe80::1%25eth0]``."""
     return _ZONE.sub(lambda match: f"[{match[1]}%{unquote(match[2])}]", text)
 
 
 def _name(text: str) -> str:
-    """Return a name, or an address of four numbers, in ASCII (RFC 3490). Raises ValueError."""
+    """Return a host name, or an IPv4 address, in ASCII (RFC 3490). Raises ValueError."""
     name = text.removesuffix(".")
     if not name.isascii():
         spelled = name.encode("idna")

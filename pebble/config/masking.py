@@ -1,4 +1,4 @@
-"""Secrets in a config: found by their keys, and in texts as secret_text does; and hidden."""
+"""Finds the secrets in a config, by their keys and as secret_text does, and hides them."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,7 +27,7 @@ def values_of(section: object, kind: type[Value]) -> Iterator[Value]:
 
 
 def holds_secret(value: Any, key: str = "") -> bool:
-    """True if plain data seems to hold a secret, by its keys and texts."""
+    """True if plain data looks as if it holds a secret, judged by its keys and texts."""
     if isinstance(value, dict):
         return any(holds_secret(item, name) for name, item in value.items())
     if isinstance(value, list):

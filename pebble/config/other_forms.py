@@ -1,4 +1,4 @@
-"""Values in forms, and beyond limits, that the original accepts and our keys do not have. Pure."""
+"""Values that the original accepts and our keys do not: other forms, and numbers beyond the limits. Pure."""
 
 import math
 from typing import Any, Literal, NamedTuple, get_origin
@@ -10,24 +10,24 @@ _SWITCHES = {"1": True, "true": True, "yes": True, "on": True, "0": False, "fals
 
 
 class Reading(NamedTuple):
-    """The value used in place of an unexpected one; ``differs``: not merely another form of the same value."""
+    """The value to use for an unexpected one. ``differs``: it changes the meaning, and not only the form."""
 
     value: Any
     differs: bool = True
 
 
 def switch(raw: Any) -> bool | None:
-    """Return the state that a number or a word such as "on" means; None if it is no word for a switch."""
+    """Return the state that a number or a word such as "on" means; None if it means none."""
     return _SWITCHES.get(str(raw).lower()) if isinstance(raw, str | int) else None
 
 
 def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default: Any) -> Reading | None:
-    """Return the value to use for ``raw``, which this key does not accept; None: it is a mistake.
+    """Return the value to use for ``raw``, which this key does not accept; None if it is a mistake.
 
     ``kind`` and ``metas`` are the parts of ``annotation``; ``default`` is that of the key, perhaps NODEFAULT. An empty
     value, 0 or a mere true means the default, and numbers are brought within their limits; ``exact`` keys accept only
-    0. ``synonyms`` are other names of values, ``circle`` is where numbers start again at 0, and ``unlike`` is the value
-    for any mistake.
+    0. ``synonyms`` are other names of values, ``circle`` is the number at which a count starts again at 0, and
+    ``unlike`` is the value for any mistake.
     """
     extra = {key: value for meta in metas for key, value in (meta.extra or {}).items()}
     number = _number(raw)
@@ -54,7 +54,7 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
 
 
 def _forms(kind: Any, extra: dict[str, Any], raw: Any, number: float | None) -> list[Any]:
-    """Return the forms to try; msgspec reads numbers in texts."""
+    """Return the forms of ``raw`` to try for this kind of value; msgspec itself reads numbers in texts."""
     if kind is bool:
         return [switch(raw)]
     forms = [raw] if isinstance(raw, str | int | float) else []

@@ -32,20 +32,20 @@ class Notes:
         self.problems.append(Note(path, text))
 
     def doubt(self, path: Path, text: str) -> None:
-        """Note a problem, unless one is known here or around this place: it may be the cause."""
-        if not any(known.path == path[: len(known.path)] for known in self.problems):
+        """Note a problem, unless one is already noted at this place or around it, which may be the cause."""
+        if not any(note.path == path[: len(note.path)] for note in self.problems):
             self.problem(path, text)
 
     def warning(self, path: Path, text: str) -> None:
         self.warnings.append(Note(path, text))
 
     def forget_inherited(self, written: Any, merged: Any) -> None:
-        """Remove notes about values in ``merged`` that are not in ``written``: their source has the same notes."""
+        """Remove the notes about values that are in ``merged`` but not in ``written``: their source has them too."""
         for notes in (self.problems, self.warnings, self.retired):
             notes[:] = [note for note in notes if holds(written, note.path) or not holds(merged, note.path)]
 
     def warning_lines(self) -> tuple[str, ...]:
-        """Return one line per warning; the keys that are no longer used share one."""
+        """Return one line per warning; keys that are no longer used share a line."""
         return (*_unused(self.retired), *map(str, self.warnings))
 
 
@@ -78,15 +78,15 @@ def show_path(path: Path) -> str:
 def holds(raw: Any, path: Path) -> bool:
     """True if there is a value at ``path``."""
     for step in path:
-        known = range(len(raw)) if isinstance(raw, list) else raw if isinstance(raw, Mapping) else ()
-        if step not in known:
+        steps = range(len(raw)) if isinstance(raw, list) else raw if isinstance(raw, Mapping) else ()
+        if step not in steps:
             return False
         raw = raw[step]
     return True
 
 
 def near(key: str, known: Iterable[str], likeness: float = _ALIKE) -> str:
-    """Return the most similar known key, or "" if none is similar enough."""
+    """Return the known key that is most similar to ``key``, or "" if none is similar enough."""
     from difflib import get_close_matches  # only a file with a mistake pays for this import
 
     return next(iter(get_close_matches(key, sorted(known), n=1, cutoff=likeness)), "")

@@ -1,4 +1,4 @@
-"""The plain data of a config file: JSON without comments, the keys that serial lines share copied to each."""
+"""Reads a config file as plain data: JSON without comments. Serial lines inherit the keys of their section."""
 
 import json
 import math
@@ -83,7 +83,7 @@ def _object(pairs: Pairs, notes: problems.Notes, path: problems.Path) -> dict[st
 
 
 def _is_words(path: problems.Path) -> bool:
-    """True if a text is a command, the value of a variable or made for people: blanks at its ends may be wanted."""
+    """True if the text at ``path`` may begin or end with blanks: a command, a variable's value, or words for people."""
     return "topics" not in path and any(key in _WORDS for key in path)
 
 
@@ -98,7 +98,7 @@ def deep_merge(under: Any, over: Any) -> Any:
 
 
 def with_instances(raw: Any) -> Any:
-    """Return ``raw`` with the keys of the section of serial lines copied to each of its instances."""
+    """Return ``raw`` with the keys of the section ``serial_mcu_bridge`` copied to each of its instances."""
     serial = value_at(raw, "services", "serial_mcu_bridge")
     instances = value_at(serial, "instances")
     if not isinstance(instances, dict):

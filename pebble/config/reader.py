@@ -1,4 +1,4 @@
-"""The reader of config sections from plain data. It continues after a mistake, so that all are reported at once."""
+"""Reads config sections from plain data. It continues after a mistake, so that all are reported at once."""
 
 import re
 import types
@@ -35,8 +35,8 @@ def _known(kind: type[Section]) -> dict[str, FieldInfo]:
 class Reader:
     """A reader of one file. Relative paths start at ``folder``; ``env`` is the environment for secrets.
 
-    ``file``: the file that is read; of files that it names, root reads only what its owner may. With ``other_forms`` it
-    reads what the original accepts as well; where that changes a value, it is a warning.
+    ``file``: the config file; root reads the files that it names only if the owner of the config may read them. With
+    ``other_forms`` it also accepts what the original accepts; where that changes a value, it notes a warning.
     """
 
     def __init__(
@@ -55,21 +55,21 @@ class Reader:
         self._rules = rules
 
     def section(self, kind: type[S], raw: Any, path: problems.Path = ()) -> S:
-        """Return a section of ``kind``. Refused values are noted and replaced by defaults, missing ones by None."""
-        known = _known(kind)
+        """Return a section of ``kind``. A refused value becomes the default, a missing required one None."""
+        keys = _known(kind)
         if not isinstance(raw, dict):
-            is_switch = self._other_forms and "enabled" in known and switch(raw) is not None
+            is_switch = self._other_forms and "enabled" in keys and switch(raw) is not None
             raw = {"enabled": raw} if is_switch else self._otherwise(kind, raw, path, {} if path else NODEFAULT)
         values: dict[str, Any] = {}
         for written, value in () if raw is _WRONG else raw.items():
-            key = self._key(kind, known, written, (*path, written))
-            field = known.get(key)
+            key = self._key(kind, keys, written, (*path, written))
+            field = keys.get(key)
             if field is None or value in ("", None) or (self._other_forms and value == [] and field.default):
                 continue
             result = self._value(field.type, value, (*path, written), _default(field))
             if result is not _WRONG:
                 values[field.name] = result
-        for field in known.values():
+        for field in keys.values():
             if field.required and field.name not in values:
                 values[field.name] = self._missing(field, (*path, field.encode_name))
         return self._checked(kind(**values), path)
@@ -133,7 +133,7 @@ class Reader:
         return Secret(value) if _extra(metas, "secret") else self._parsed(metas, value, path)
 
     def _otherwise(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:
-        """Return the value to use for an unexpected one, and note it if it differs."""
+        """Return the value to use for ``raw``, which the key does not accept; note it unless only the form differs."""
         kind, metas = unwrap(annotation)
         shown = "a value of another kind" if _extra(metas, "secret") else _shown(raw)
         instead = "" if shown == "text" and (get_origin(kind) is Literal or kind in (str, Path)) else f", not {shown}"
@@ -204,7 +204,7 @@ def unwrap(annotation: Any) -> tuple[Any, list[Meta]]:
 
 
 def expected(kind: Any, metas: list[Meta]) -> str:
-    """Return a correct value in words, to follow "must be"."""
+    """Return a correct value in words, to follow "must be", such as ``an integer from 1 to 10``."""
     if text := _extra(metas, "expected"):
         return str(text)
     if choices := _choices(kind, metas):
@@ -248,7 +248,7 @@ def _is_section(kind: Any) -> bool:
 
 
 def _shown(raw: Any) -> str:
-    """Return a value in words. A text is only shown if it is a number: a secret may stand in a wrong place."""
+    """Return a value for an error message. A text is shown only if it is a number: it may be a misplaced secret."""
     if isinstance(raw, str):
         return f'the text "{raw}"' if _NUMBER(raw) else "text"  # 1883 and "1883" look alike
     if isinstance(raw, dict):

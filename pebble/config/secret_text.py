@@ -1,4 +1,4 @@
-"""Secrets in texts, and texts without them: logins in addresses, passwords and tokens."""
+"""Finds and hides secrets in texts: logins in addresses, passwords and tokens."""
 
 import re
 
@@ -27,7 +27,7 @@ def is_secret(key: str) -> bool:
 def without_secrets(text: str) -> str:
     """Return ``text`` with stars in place of logins in URLs, and of passwords and tokens in queries and options.
 
-    It rather hides too much: everything before the last @ of a word that holds ``://``, or a colon before the @.
+    It rather hides too much: in a word with ``://``, or a colon before an @, everything before the last @.
     """
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
@@ -50,6 +50,6 @@ def _without_login(match: re.Match[str]) -> str:
 
 
 def shown_user(name: str) -> str:
-    """Return a user name for messages; a password behind it is hidden."""
+    """Return a user name for messages, with a password after it hidden."""
     user, colon, _ = without_secrets(name).partition(":")
     return f"{user}:{HIDDEN}" if colon else user

@@ -30,11 +30,11 @@ class Security(Section, frozen=True, kw_only=True):
 
     @property
     def unnamed(self) -> Strangers:
-        """The rule for drive commands without a key of control."""
+        """Rule for drive commands without a key of control."""
         return self.strangers or ("refuse" if self.level == "named" else "free")
 
     def on_board(self) -> dict[str, str]:
-        """Return the section `security` of a board's private_config.json; empty: the board's default."""
+        """Return the section `security` of a board's private_config.json; empty if the board's default applies."""
         if self.level == "open" and self.unnamed == "free":
             return {}
         return {"level": self.level, "strangers": self.unnamed}

@@ -27,7 +27,7 @@ def read_text(path: Path) -> str:
 def read_password(file: Path, option: str, place: Path | None = None) -> str:
     """Return the text of the file that ``option`` names, without its final newline. Raises PebbleError.
 
-    It does not repeat the name of the file, which may be the password itself. ``place``: a file that names it.
+    The error does not repeat the file's name, which may be the password itself. ``place``: a file that names it.
     """
     try:
         return (read_text(file) if place is None else text_of(read_for(place, file))).rstrip("\n")
@@ -38,12 +38,12 @@ def read_password(file: Path, option: str, place: Path | None = None) -> str:
 
 
 def password(file: Path | None) -> str | None:
-    """Return the broker's password in the file, else in the environment. Raises PebbleError."""
+    """Return the broker's password: the text of ``file``, or the environment's value. Raises PebbleError."""
     return os.environ.get(PASSWORD) if file is None else read_password(file, "--password-file")
 
 
 def text_of(data: bytes) -> str:
-    """Return the text in the bytes of a file. Raises NotTextError, which repeats none of them."""
+    """Return the text in the bytes of a file. Raises NotTextError, whose message repeats none of the bytes."""
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -148,7 +148,7 @@ class Link(Section, frozen=True, kw_only=True):
 
     @property
     def slowest(self) -> LinkLevel:
-        """The lowest level that the link may have: for programs that wait for an answer and do not know the level."""
+        """Lowest level that the link may have, for programs that wait for an answer without knowing the level."""
         return "wide" if self.profile == "wide" else "thin"
 
 
@@ -304,14 +304,14 @@ def tree_of(sections: Mapping[str, type[Section]]) -> type[Root]:
 
 
 def _with(kind: type[Section], sections: Mapping[str, type[Section]]) -> Any:
-    """Return ``kind`` with more sections; a dotted key is one of its own sections."""
+    """Return a subclass of ``kind`` with more sections; a dotted key belongs to one of its sections."""
     added = [(key, Annotated[section, doc(section.meaning())]) for key, section in sections.items() if "." not in key]
-    for known in fields(kind):
-        start = f"{known.name}."
+    for key_field in fields(kind):
+        start = f"{key_field.name}."
         inner = {key.removeprefix(start): section for key, section in sections.items() if key.startswith(start)}
         if inner:
-            section, *metas = get_args(known.type)
-            added.append((known.name, Annotated[_with(section, inner), *metas]))
+            section, *metas = get_args(key_field.type)
+            added.append((key_field.name, Annotated[_with(section, inner), *metas]))
     names = {"__doc__": kind.__doc__, "__module__": kind.__module__}
     rows = [(name, annotation, get_args(annotation)[0]()) for name, annotation in added]
     return defstruct(kind.__name__, rows, bases=(kind,), namespace=names, frozen=True, kw_only=True)

@@ -124,7 +124,7 @@ class Section(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     refused: ClassVar[Mapping[str, str]] = {}
 
     def connections(self) -> Iterator[tuple[tuple[str, ...], "Section"]]:
-        """Yield the connections of this section in use, with their keys: the security level judges them."""
+        """Yield the connections of this section that are in use, with their keys, to check the security level."""
         yield from ()
 
     @classmethod

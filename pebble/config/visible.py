@@ -1,4 +1,4 @@
-"""Characters that are not shown: they make two texts differ that look the same."""
+"""Finds invisible characters, which make texts differ that look the same."""
 
 import re
 
@@ -11,7 +11,7 @@ _JOINERS = re.compile("[\u200c\u200d\ufe00-\ufe0f]")  # parts of emoji and of Pe
 
 
 def hidden(text: str, *, words: bool = False) -> str:
-    """Return the mistake in ``text``: a character that is not shown, or a blank at an end; "" without a mistake.
+    """Return what is wrong with ``text``: an invisible character, or a blank at an end; "" if nothing is.
 
     ``words``: a blank, a tab and a new line may stand anywhere.
     """
@@ -27,7 +27,7 @@ def is_text(text: str) -> bool:
 
 
 def shown(text: str) -> str:
-    """Return ``text`` for a terminal or a log; a character that is not seen, or steers it, is a code: ``\\u202e``.
+    """Return ``text`` for a terminal or a log, with invisible and control characters as codes: ``\\u202e``.
 
     Tabs, line ends and blanks of all kinds stay, and the joiners in emoji and in Persian words.
     """
@@ -58,7 +58,7 @@ def _is_hidden(char: str) -> bool:
 
 
 def _joins(text: str, place: int) -> bool:
-    """True if the character joins its neighbours, or varies the one before it, which then looks different."""
+    """True if the character at ``place`` joins its neighbours, or changes the look of the one before it."""
     if place == 0 or not _JOINERS.match(text[place]) or text[place - 1].isascii() or _is_hidden(text[place - 1]):
         return False
     return "\ufe00" <= text[place] <= "\ufe0f" or (place + 1 < len(text) and not text[place + 1].isascii())

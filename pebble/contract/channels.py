@@ -101,11 +101,11 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
         return f"{base}/{re.sub(r'{[^}]*}', '+', self.suffix)}"
 
     def ends(self, value: Any) -> bool:
-        """True if ``value``, a payload of this channel, can only end something."""
+        """True if ``value``, a payload of this channel, can only end something, such as a zero drive command."""
         return issubclass(self.payload, p.Payload) and value.ends()
 
     def names(self, topic: str) -> dict[str, str]:
-        """Return the names in one of this pattern's topics: ``{"program": "camera_publisher"}``."""
+        """Return the values of this pattern's placeholders in ``topic``: ``{"program": "camera_publisher"}``."""
         match = re.search(re.sub(r"{([^}]*)}", r"(?P<\1>[^/]+)", self.suffix) + r"\Z", topic)
         return match.groupdict() if match is not None else {}
 
@@ -279,7 +279,7 @@ _RESERVED = frozenset(("by", "control", "control-turn", "control-vouched", "from
 
 
 def is_reserved(metric: str) -> bool:
-    """True if ``metric`` belongs to stops, control or neighbours: only the robot itself may define it."""
+    """True if ``metric`` belongs to stops, control or neighbours, so that only the robot itself may define it."""
     family = metric.partition("/")[0]
     return family.startswith("estop") or family in _RESERVED
 

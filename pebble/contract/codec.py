@@ -41,7 +41,7 @@ _decoder = msgspec.json.Decoder()
 def encode(channel: Channel, value: Any) -> bytes:
     """Return the wire form of ``value``: JSON, or the bytes themselves on binary channels.
 
-    The name of a file or user may be no UTF-8: its other bytes are written as codes, ``\\udce9``.
+    Bytes of a name that are not UTF-8 (of a file or a user) are written as codes: ``\\udce9``.
     """
     if channel.payload is bytes:
         return bytes(value)
@@ -107,16 +107,16 @@ def plain(channel: Channel, raw: bytes) -> Any:
 
 
 def trim(raw: bytes) -> bytes:
-    """Return ``raw`` without the bytes around its JSON that other languages add; the same object if there are none.
+    """Return the JSON in ``raw``: without a byte order mark, white space around it, or anything after a NUL.
 
-    No JSON holds a NUL: after it comes the old content of a C program's buffer. Firmware does the same
-    (firmware/common/payload.py).
+    If there is nothing to remove, the same object is returned. A C program may send its whole buffer, with old content
+    after the NUL. Firmware does the same (firmware/common/payload.py).
     """
     return raw.lstrip(_AROUND).partition(b"\0")[0].rstrip(_AROUND)
 
 
 def _stop(channel: Channel, raw: bytes) -> EstopCommand:
-    """Return a stop; a stop that cannot be read has no name. An empty payload, of a removed message, is no stop."""
+    """Return the stop in ``raw``, nameless if it cannot be read. Raises PayloadError only for an empty payload."""
     if not raw:
         raise PayloadError(f"{channel.metric}: empty")
     try:
@@ -129,7 +129,7 @@ def _stop(channel: Channel, raw: bytes) -> EstopCommand:
 
 
 def is_blank(raw: bytes) -> bool:
-    """True if ``raw`` is white space: bridges look for cycles by such payloads, and all programs ignore them."""
+    """True if ``raw`` is only white space: bridges publish such payloads to find cycles, and programs ignore them."""
     return bool(raw) and raw.isspace()
 
 
@@ -160,7 +160,7 @@ def _unwrap(channel: Channel, plain: Any, remark: Remark) -> Any:
 
 
 def _switch(plain: Any) -> Any:
-    """Return a command, bare or wrapped, boolean or object; some keys may be outside the wrapper (paper A.8.10)."""
+    """Return the fields of a command: a boolean or an object, bare or under ``value`` (paper A.8.10)."""
     if isinstance(plain, bool):
         return {"enabled": plain}
     if isinstance(plain, dict):
@@ -174,13 +174,13 @@ def _switch(plain: Any) -> Any:
 
 
 def _request(channel: Channel, plain: Any) -> Any:
-    """Return a boolean control from any of its forms, with its further fields."""
+    """Return the fields of a boolean control in any of its forms, with its state as ``enabled``."""
     inner = plain["value"] if isinstance(plain, dict) and isinstance(plain.get("value"), dict) else plain
     return {**(inner if isinstance(inner, dict) else {}), "enabled": _boolean(channel, inner)}
 
 
 def _drive(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str, Any]:
-    """Check a drive command: a wrong ``source``, ``run``, ``valid_ms`` or ``key`` refuses a motion, never a stop."""
+    """Return the valid fields of a drive command. Raises PayloadError for wrong ones, unless it moves nothing."""
     axes = _numbers(channel, plain, remark)
     if not axes:
         keys = ", ".join([_shown(key) for key in plain][:_KEYS_SHOWN]) or "nothing"
@@ -225,9 +225,9 @@ _NUMBERS: dict[Any, dict[str, float]] = {
 
 
 def _numbers(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str, float]:
-    """Return the numbers in a command as the original reads them: also from text, and a default for a wrong value.
+    """Return the numbers in a command, also those written as text. A value that is no number becomes its default.
 
-    Raises PayloadError for NaN and infinity.
+    The original reads commands in the same way. Raises PayloadError for NaN and infinity.
     """
     numbers = {}
     for name, default in _NUMBERS[channel.payload].items():
@@ -241,7 +241,7 @@ def _numbers(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[st
 
 
 def _number(channel: Channel, name: str, value: Any) -> float | None:
-    """Return the number in ``value``, or None. Firmware reads the same (firmware/common/payload.py)."""
+    """Return the number in ``value``, perhaps text, or None; PayloadError for NaN and infinity. As in firmware."""
     if isinstance(value, str):
         if "nan" in (word := value.lower()) or "inf" in word:
             raise PayloadError(f"{channel.metric}: {name} is not a finite number")

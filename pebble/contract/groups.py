@@ -1,9 +1,9 @@
-"""Several commands in one message on ``incoming/group``, by their metrics: all are carried out, or none. Pure.
+"""Groups: several commands in one message on ``incoming/group``; all are carried out, or none. Pure.
 
     {"drive-values": {"x": -0.3, "z": 0.7, "valid_ms": 400}, "lights-solid": {"r": 0.2, "g": 0.7, "b": 1}}
 
-Members are bare objects. Stops, resets, flags, control, scripts and media are never among them. Where names are
-checked, ``by`` is the sender of the group, and counts instead of any ``by`` in the members.
+The keys are metrics, the members bare objects. Stops, resets, flags, control, scripts and media are not allowed. Where
+names are checked, ``by`` is the sender of the group, and counts instead of any ``by`` in the members.
 """
 
 import math
@@ -74,7 +74,7 @@ def _member(metric: str, command: Any, by: Any) -> Member:
 
 
 def _unique_keys(text: bytes) -> Any:
-    """Return the JSON value in ``text``. Raises PayloadError if an object has a key twice, however it is written."""
+    """Return the JSON value in ``text``. Raises PayloadError if a key occurs twice in an object, in any spelling."""
     import json  # the only reader that shows it, and only robots with groups pay for it
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -89,7 +89,7 @@ class ParsedTopic(Struct, frozen=True):
 
 
 def composed(name: str) -> str:
-    """Return a name as keyboards write it: a letter and its accent are one character (Unicode's NFC)."""
+    """Return ``name`` in the form that keyboards write: a letter and its accent are one character (Unicode's NFC)."""
     return normalize("NFC", name)
 
 
@@ -101,7 +101,7 @@ def untypeable(name: str) -> str:
 
 
 def meant(names: Iterable[str], typed: str) -> str:
-    """Return ``typed`` if it is one of ``names``, else a name that looks the same, else ``typed`` all the same."""
+    """Return ``typed``, or else the name in ``names`` that looks the same on the screen, if there is one."""
     if typed.isascii():
         return typed
     alike = [name for name in names if composed(name) == composed(typed)]

@@ -1,4 +1,4 @@
-"""Levels of a link, and the traffic on each: the robot publishes the level of its link as ``outgoing/link``.
+"""Levels of a link, with the traffic that each allows. The robot publishes its level as ``outgoing/link``.
 
 Source: measured over 64, 19.2 and 9.6 kbit/s (docs/thin-links.md).
 """
@@ -17,7 +17,7 @@ INTERVAL_S: Final = 1.0  # assumed between heartbeats: most robots send four a s
 
 
 class Level(Struct, frozen=True, kw_only=True):
-    """The traffic on a link of one level. A QoS of None is the channel's own.
+    """The traffic that one level allows. A QoS of None is the channel's own.
 
     At every level, a message that ends something is sent at once, with QoS 1.
     """
@@ -53,8 +53,8 @@ LEVELS: Mapping[LinkLevel, Level] = {
 def silent_after(interval_s: float = INTERVAL_S, link: LinkLevel = "wide", late_s: float = 0.0) -> float:
     """Return the seconds without a heartbeat after which a robot counts as silent.
 
-    A heartbeat is sent every ``interval_s``, and arrives ``late_s`` late. ``link``: the level that the robot has
-    published, if known.
+    The robot sends a heartbeat every ``interval_s``; on the way it takes up to ``late_s``. ``link``: the level that the
+    robot has published, if known.
     """
     return max(2 * interval_s, 4 * late_s, LEVELS[link].silent_s)
 

@@ -1,7 +1,7 @@
 """The sender's account in a topic: ``incoming/by/{account}/{metric}``, where only that account can publish.
 
-A robot whose capabilities have ``named`` reads such topics. Without a name it takes only stops, zeros, and the
-commands that its config allows strangers. Nothing is retained there. A stop with an invalid name is a stop without one.
+A robot whose capabilities have ``named`` reads such topics. Without a name it takes only stops, zeros, and the commands
+that its config allows to strangers. Retained messages are ignored there. A stop with an invalid name has none.
 """
 
 import re
@@ -40,11 +40,11 @@ def without_name(topic: str) -> Named | None:
 
 
 def stop_topic(topic: str) -> str | None:
-    """Return the topic of stops if ``topic`` is that topic with any accounts in it, even invalid ones; else None."""
+    """Return the topic of stops without the accounts in it, even invalid ones; None for other topics."""
     match = _STOP.fullmatch(topic)
     return None if match is None else match[1] + match[2]
 
 
 def unchecked(claim: str) -> str:
-    """Return the claimed sender of a stop with a "?" after it. Names of accounts have no "?"."""
+    """Return the claimed sender of a stop with a "?" after it, which no account's name contains."""
     return claim[: _LONGEST - 1].rstrip(_UNCHECKED) + _UNCHECKED

@@ -1,7 +1,7 @@
-"""The protocols of serial lines to MCUs, a row each: other programs need no more.
+"""The protocols of serial lines to MCUs, a row each.
 
-A new protocol is a row that an extension declares, and the service that the row names. The rows are apart from the
-services, because every process reads the config, and should not import the library of serial ports for these names.
+An extension adds a protocol by declaring such a row, which names the service. The table is apart from the services
+because every process reads the config, and should not import the library of serial ports for these names.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class SerialProtocol(Struct, frozen=True):
     describes_itself: bool = False  # only its manifest says what the device is
 
     def has_imu(self, instance: str) -> bool:
-        """True if a line of this name has an inertial sensor, by the config alone, before the device is connected."""
+        """True if the MCU on a line of this name has an inertial sensor, by the config alone."""
         return self.is_imu or (self.describes_itself and instance == _IMU_INSTANCE)
 
 

@@ -1,4 +1,4 @@
-"""Bounds of messages to a robot, to which everybody may send anything."""
+"""Limits for messages to a robot, because any client may send anything."""
 
 import time
 from collections.abc import Callable
@@ -15,10 +15,10 @@ MAX_UNKNOWN_FLAGS = 64  # each is retained on the robot: in its broker or hub, a
 
 
 class Admission:
-    """Bounds by size, and by number for actions and for messages that the contract does not know.
+    """Limits on size, and on the number of actions and of messages that the contract does not know.
 
-    Unknown flags that the robot itself has set are always admitted and count as well, so a restarted bridge does not
-    begin a new number.
+    Unknown flags that the robot itself has set are always admitted, and count as well: a restarted bridge continues the
+    count.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -33,8 +33,8 @@ class Admission:
     def refuse(self, side: Side, subject: Subject, message: Message, topic: str, *, named: bool = True) -> Drop | None:
         """Return why this message may not pass to ``topic``; None if it may. Hot.
 
-        Counts the message if its kind is bounded, and remembers an unknown flag. ``named`` False: the message has no
-        sender where others have one; such messages are counted apart.
+        Counts the message if its kind is limited, and remembers an unknown flag. ``named`` False: the message has no
+        sender where others have one. Such messages have a limit of their own.
         """
         if side is Side.REMOTE and len(message.payload) > MAX_COMMAND_BYTES and _is_bounded(subject):
             return Drop.TOO_LARGE
@@ -56,7 +56,7 @@ class Admission:
         return None
 
     def refuses_flag(self, topic: bytes) -> bool:
-        """True if this flag, which the contract does not know, would be one too many."""
+        """True if the contract does not know this flag, and there is no room for another unknown flag."""
         return len(self._flags) >= MAX_UNKNOWN_FLAGS and topic.decode(errors="replace") not in self._flags
 
     def _is_too_often(self, subject: Subject, message: Message, named: bool) -> bool:

@@ -1,7 +1,8 @@
 """Ages of commands, by the clocks of their senders.
 
-The age that pings show includes the way *up*, which on a thin link may wait behind pictures. A drive command with its
-sender's clock ``t`` and a ``key`` needs no pings once one with this key was fast; a request for control has its ``id``.
+The age that pings show includes the way *up*, where messages may wait behind pictures on a thin link. A drive command
+with its sender's clock ``t`` and a ``key`` needs no pings once one with this key was fast; a request for control has an
+``id``.
 """
 
 from math import inf
@@ -23,8 +24,8 @@ _PATIENCE = Patience(believed_s=60.0, set_back_s=2.0, silent_s=60.0)
 class CommandAges:
     """Ages of drive commands and requests for control that carry a time stamp; thread-safe.
 
-    :attr:`keys` are the present keys of control: a command with another key has no age here, as at the motor owner.
-    None: no motor owner gives keys, and every sender has a key of its own.
+    :attr:`keys` are the present keys of control. A command with any other key has no age here, as the motor owner
+    refuses it. None: no motor owner gives keys, and senders choose their keys.
     """
 
     def __init__(self) -> None:
@@ -33,9 +34,9 @@ class CommandAges:
         self._asking = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
 
     def waited_s(self, subject: Subject, message: Message, account: str) -> float:
-        """Return seconds for which a message with a time stamp has waited; remembers the sender's clock.
+        """Return the seconds for which a message with a time stamp has waited; remember the sender's clock.
 
-        The stamp counts if the message has a valid key or id. A key, or an id, belongs to the ``account`` that uses it.
+        The stamp counts if the message has a valid key or id, which belongs to the ``account`` that uses it.
         """
         waited_s = message.waited_s
         assert subject.channel is not None  # noqa: S101 - else it is not stamped
@@ -57,7 +58,7 @@ class CommandAges:
         return clocks.age_s((account, key), command.t / 1000, waited_s, clock.since_boot(), subject.waits_s)
 
     def _key(self, command: Drive) -> str:
-        """Return the key by which the sender of a command is known; empty if no valid key is given."""
+        """Return the key or id that identifies the sender of a command; empty if there is no valid key."""
         text, keys = command.key, self.keys
         if not isinstance(text, str) or len(text) > _LONGEST:
             return ""
@@ -67,7 +68,7 @@ class CommandAges:
 
 
 def ends_something(subject: Subject, message: Message) -> bool:
-    """True if a message can only bring something to rest: then it passes, however late it is."""
+    """True if a message can only bring something to rest. Such a message passes however late it is."""
     if subject.channel is None:
         return False
     try:

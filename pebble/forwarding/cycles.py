@@ -1,9 +1,9 @@
-"""Detects messages that we forward and that come back by another way, for ever. Pure.
+"""Detects messages that circulate: we forward them, and something else brings them back. Pure.
 
-Something else may forward the same topics: a broker's own bridge, or a second robot with this id. A probe that we
-publish on one side and receive on the other proves it for its topic. It travels on that topic, because the other way
-may carry no other. Its payload is white space that encodes a random number: on topics of commands nothing else, which
-no parser accepts; on others it follows the topic's value, and does not change it.
+A broker's own bridge, or a second robot with this id, may forward the same topics. A probe that we publish on one side
+and receive on the other proves it for its topic. It must travel on that topic, because the other way may carry no
+other. Its payload is white space that encodes a random number, which no parser of commands accepts. On topics other
+than commands it follows the topic's value, which white space does not change.
 """
 
 import logging
@@ -42,7 +42,7 @@ _STOP_PERIOD_S = 0.25
 
 
 class Finding(Enum):
-    """A finding about a received message, with its consequence."""
+    """A finding about a received message: what the forwarder must do with it."""
 
     PASS = "forward it"  # noqa: S105  (no password)
     SUSPECT = "send a probe, then forward it"
@@ -52,7 +52,7 @@ class Finding(Enum):
 
 
 class _Way(Struct):
-    """Our way from one side to the other, on one topic."""
+    """Our way from one side to the other, for one topic."""
 
     began: float
     counts: dict[int, int] = {}  # of payloads, by their hash, since then
@@ -71,7 +71,7 @@ class _Way(Struct):
 
 
 class Cycles:
-    """Topics that circulate, by the side from which they come. Two threads may call it at once."""
+    """The topics whose messages circulate, by the side from which they come. Two threads may call it at once."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -84,7 +84,7 @@ class Cycles:
         self.closed_ways: Final[set[tuple[Side, str]]] = set()
 
     def examine(self, side: Side, subject: Subject, message: Message) -> Finding:
-        """Return a finding about a message from ``side`` that may be forwarded. Hot.
+        """Return the finding about a message from ``side`` that may be forwarded. Hot.
 
         Counts the message, and notes an answered probe. A message that runs something may pass while its topic
         circulates: the caller recognises the message when it comes back.
@@ -110,7 +110,7 @@ class Cycles:
             return Finding.SUSPECT if suspicious and due else Finding.PASS
 
     def _repeats_stop(self, side: Side, topic: str, payload: bytes) -> bool:
-        """True if an emergency stop returns too fast for its sender; counts the stop. Stops are not probed."""
+        """True if a stop comes back faster than a sender repeats it. Counts the stop; stops are not probed."""
         with self._lock:
             now, key = self._clock(), (side, payload)
             often = self._way(side, topic).count(payload, now) > SUSPICIOUS
@@ -120,7 +120,7 @@ class Cycles:
             return False
 
     def probe(self, side: Side, topic: str) -> bytes:
-        """Note a new probe about ``topic`` from ``side``; return its white space, to be published on the other side."""
+        """Make a probe about ``topic`` from ``side``; return its payload, to be published on the other side."""
         number = bytes(_DIGITS[byte % len(_DIGITS)] for byte in secrets.token_bytes(_LENGTH))
         with self._lock:
             way = self._way(side, topic)
@@ -130,7 +130,7 @@ class Cycles:
         return number
 
     def poll(self) -> list[tuple[Side, str]]:
-        """Open the topics that circulate no more; return those that need a new probe. Call this once a second."""
+        """Allow topics that no longer circulate; return the topics that need another probe. Call this once a second."""
         with self._lock:
             now, due = self._clock(), []
             for key in [key for key in self.closed_ways if now - self._ways[key].probed_at >= PROBE_PERIOD_S / 2]:
@@ -143,9 +143,9 @@ class Cycles:
     # -- with the lock held
 
     def _receive_probe(self, side: Side, topic: str, number: bytes) -> Finding:
-        """Return what to do with a probe from ``side``: relay another bridge's once; one of ours ends here.
+        """Return what to do with a probe from ``side``: a probe of another bridge is relayed once, ours ends here.
 
-        One of ours that was sent to the other side has come back by another way: its topic circulates.
+        If ours was sent to the other side, it has come back by another way: its topic circulates.
         """
         sent_to = self._ours.get(number)
         if sent_to is side.other:
@@ -189,7 +189,7 @@ class Cycles:
 
 
 def _usual_count(subject: Subject) -> int:
-    """Return how many equal messages within 2 s are not suspicious.
+    """Return how many equal messages within 2 s are normal; more of them start a probe.
 
     Actions are probed at once. Programs of others need to know of probes on those topics already; on topics of other
     commands they see one only after a repetition.
@@ -202,7 +202,7 @@ def _usual_count(subject: Subject) -> int:
 
 
 def _number_of(payload: bytes) -> bytes | None:
-    """Return the number of a probe, as white space; None if ``payload`` is no probe."""
+    """Return the number of a probe, still as white space; None if ``payload`` is no probe."""
     text = payload.rstrip(_DIGITS)
     return payload[-_LENGTH:] if len(payload) - len(text) == _LENGTH else None
 

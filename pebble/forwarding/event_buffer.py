@@ -50,7 +50,7 @@ class EventBuffer:
         self.resume()
 
     def hold(self, message: Message) -> None:
-        """Store ``message`` until the next :meth:`resume` or :meth:`flush`."""
+        """Keep ``message`` until the next :meth:`resume` or :meth:`flush`."""
         with self._lock:
             self._append(_Event(message))
 
@@ -61,7 +61,7 @@ class EventBuffer:
                 self._drain()  # Zenoh accepts messages while the hub is away
 
     def flush(self) -> None:
-        """Begin with a new connection: send events perhaps lost with the last connection, then those waiting."""
+        """Send, on a new connection, the events that the last connection may have lost, then those that wait."""
         with self._lock:
             if self._lost_at is not None:
                 recent = [event for event in self._recent if 0 <= self._lost_at - event.sent_at <= RESEND_S]

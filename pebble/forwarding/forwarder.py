@@ -1,12 +1,12 @@
 """Forwards messages between a robot's own transport and another one, by a routing table.
 
-A message is published on the other side by the thread that received it, in a bounded time: a drive command never waits
-for another thread. All retained messages pass under one lock, because both sides may change the same flag at once;
-commands and streams never wait for it.
+The thread that received a message publishes it on the other side, in a bounded time: a drive command never waits for
+another thread. All retained messages pass under one lock, because both sides may change the same flag at once; commands
+and streams never wait for it.
 
-Retained commands are stale. A live emergency stop passes even if it was published to be retained: a stop that does not
+Retained commands are stale. A live emergency stop passes even if it was published as retained: a stop that does not
 arrive is worse than one that a later subscriber must recognise as old. Commands and actions are also stale when they
-have waited, in a process that was stopped or stuck, or at the broker; a command that only ends something never is.
+have waited, in a process that was stopped or stuck, or at the broker; one that only ends something never is.
 """
 
 import itertools
@@ -47,7 +47,7 @@ Pass = Callable[[SideState, Subject, Message, Forward, str], Forward | Drop]
 
 
 class Routed(msgspec.Struct, frozen=True):
-    """The outcome for a received message; ``subject`` is None for a topic that is not this robot's.
+    """Result of forwarding a received message; ``subject`` is None for a topic that is not this robot's.
 
     ``by`` is the sender where names are checked: the topic's account, ``account/person``, or ``-`` (NO_ACCOUNT); for a
     refused message the account alone. It is None elsewhere, and for messages of the robot itself.
@@ -59,7 +59,7 @@ class Routed(msgspec.Struct, frozen=True):
 
 
 class Mirroring:
-    """The flag remote-mirror: while it is on, commands of the robot's own programs are forwarded as well."""
+    """State of the flag remote-mirror: while it is on, commands of the robot's own programs are forwarded as well."""
 
     def __init__(self, sides: Sides) -> None:
         self.on = False
@@ -69,7 +69,7 @@ class Mirroring:
         self.on, self._was_refused = on, on and self._was_refused
 
     def is_possible(self) -> bool:
-        """True if the broker does not send our own commands back, which would repeat each later, even after a stop."""
+        """True if the broker does not send our commands back: else they would be repeated, even after a stop."""
         if all(state.transport.exact_echo for state in self._sides.values()):
             return True
         if not self._was_refused:
@@ -148,25 +148,25 @@ class Forwarder:
     # -- connections
 
     def subscribed(self, side: Side) -> None:
-        """Note that ``side`` is connected and subscribed to, and that its retained messages have arrived."""
+        """Note that ``side`` is connected and subscribed, and that its retained messages have arrived."""
         self.sides[side].window.subscribed()
         if self.gate is Gate.OPEN:
             self.sides[side].events.flush()
 
     def open(self) -> None:
-        """Forward from now on, beginning with the messages that have waited."""
+        """Start forwarding, with the messages that have waited."""
         self.retained.open()
         for state in self.sides.values():
             state.events.flush()
 
     def shut(self) -> None:
-        """Forward nothing from now on. Takes no lock: a loop of messages must end at once."""
+        """Stop forwarding. Takes no lock: a loop of messages must end at once."""
         self.retained.shut()
         for state in self.sides.values():
             state.events.clear()
 
     def rearm(self) -> None:
-        """Undo :meth:`shut`: messages wait for :meth:`open`, and the remote side is to be synchronized again."""
+        """Undo :meth:`shut`: messages wait for :meth:`open`, and the remote side must be synchronized again."""
         if self.gate is Gate.SHUT:
             self.sides[Side.REMOTE].subscribing()
             self.sides[Side.REMOTE].restarted = True
@@ -175,7 +175,7 @@ class Forwarder:
     # -- the receiving threads
 
     def skips_retained(self, side: Side, topic: bytes) -> bool:
-        """True if no retained message of ``topic`` passes; counts and logs the message then. For TopicPolicy."""
+        """True if retained messages of ``topic`` do not pass; counts and logs this message then. For TopicPolicy."""
         kind = self.subjects.invented(topic)
         if self._names is not None and topic.endswith(_STOP) and self._is_stop(topic.decode(errors="replace")):
             return False  # it may be a live one
@@ -204,7 +204,7 @@ class Forwarder:
         return routed
 
     def _receive_named(self, source: SideState, names: Names, message: Message) -> Routed:
-        """Pass a message whose sender is checked, on the topic without the name and with the sender in the payload."""
+        """Forward a message whose sender is checked: the name moves from the topic into the payload."""
         sender = names[message.topic]
         subject, by = sender.subject, sender.account  # sign() adds the person for whom an account acts
         outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
@@ -227,9 +227,9 @@ class Forwarder:
     def admit(
         self, source: SideState, subject: Subject | None, message: Message, topic: str, named: bool
     ) -> Forward | Drop:
-        """Return how to forward ``message``, or why not: no subject, no route, or a reason of `_ADMISSION`. Hot.
+        """Return how to forward ``message``, or why it does not pass. Hot.
 
-        ``topic`` is the topic on which the message passes, and would be retained.
+        Reasons: no subject, no route, or those of `_ADMISSION`. ``topic`` is the topic on the other side.
         """
         if subject is None or not subject.is_stop:
             if message.retain:  # while such messages arrive, a stop among them is an old one
@@ -247,7 +247,7 @@ class Forwarder:
         return forward
 
     def _route(self, side: Side, subject: Subject, message: Message) -> Forward | Drop:
-        """Return the result of :func:`route`, computed once for each kind of message."""
+        """Return the result of :func:`route`, which is computed once per kind of message."""
         mirroring = self.mirroring.on and self.mirroring.is_possible()
         key = side, subject, message.qos, message.retain, message.retain_requested, mirroring
         forward = self._routes.get(key)
@@ -309,7 +309,7 @@ class Forwarder:
     def examine(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str
     ) -> Message | Drop:
-        """Return an admitted message as it may pass, or why not: it is too late, or is a script's from outside."""
+        """Return an admitted message as it may pass, or why not: it is too late, or a script elsewhere sent it."""
         if subject.kind.one_shot and self._is_late(subject, message, forward, account):
             return Drop.LATE
         return (self._without_script(source, message) or Drop.SIGNED) if forward.unsigned else message
@@ -325,7 +325,7 @@ class Forwarder:
         return late
 
     def _without_script(self, source: SideState, message: Message) -> Message | None:
-        """Return a drive command as it may pass; None for a script's command that does not end motion."""
+        """Return a drive command without a script's signature; None if a script's command would move the robot."""
         passing = unsigned(message.payload)
         if passing is message.payload:
             return message
@@ -336,7 +336,7 @@ class Forwarder:
         return Message(message.topic, passing, message.qos)
 
     def deliver(self, source: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
-        """Publish a message that is not retained; hold an event while the gate waits."""
+        """Publish a message that is not retained; if the gate is closed, keep an event for later."""
         target = self.sides[source.side.other]
         is_event = subject.kind is Kind.EVENT and message.qos is QoS.DELIVERED
         if self.sides.gate is not Gate.OPEN:
@@ -356,7 +356,7 @@ class Forwarder:
     def _act_on(
         self, finding: Finding, side: Side, subject: Subject, message: Message, forward: Forward
     ) -> Drop | None:
-        """Act on a finding; return why the message does not pass, None if it does."""
+        """Carry out a finding about cycles; return why the message does not pass, None if it does."""
         match finding:
             case Finding.CIRCULATES:
                 return Drop.CIRCULATES
@@ -385,10 +385,10 @@ class Forwarder:
 
 
 def barrier(transport: Transport, filter_: str) -> None:
-    """Wait, bounded, until the other end has handled all our messages, and its retained messages have arrived.
+    """Wait, for a limited time, until the other end has handled our messages and its retained messages have arrived.
 
-    A subscription is acknowledged after everything before it. ``filter_`` should be within a filter that is subscribed
-    to anyway, because a broker may forbid others. A narrow filter brings few retained messages.
+    A subscription is acknowledged after everything sent before it. ``filter_`` should lie within a filter that is
+    subscribed to anyway, because a broker may forbid others. A narrow filter brings few retained messages.
     """
     transport.subscribe(filter_, _ignore, echo=False, direct=True, limit=1).close()
 

@@ -1,4 +1,4 @@
-"""Recognises our own messages that come back: from a broker without bridge mode, or by way of something else."""
+"""Recognises our own messages that come back, from a broker without bridge mode or through another bridge."""
 
 import threading
 import time
@@ -26,7 +26,7 @@ class LoopbackFilter:
         return len(self._out)
 
     def expect(self, topic: str, payload: bytes) -> None:
-        """Expect a message to come back; call this before publishing, because the echo may be faster than that call."""
+        """Expect a message to come back. Call this before publishing: the echo may be faster than a call after it."""
         with self._lock:
             out = self._out.setdefault(topic, deque())
             out.append((self._clock(), _digest(payload)))
@@ -37,7 +37,7 @@ class LoopbackFilter:
                 self._messages -= len(self._out.pop(next(iter(self._out))))
 
     def forget(self, topic: str) -> None:
-        """Forget the newest message on ``topic``, which was not sent after all."""
+        """Forget the newest message on ``topic``, which could not be sent."""
         with self._lock:
             if self._out.get(topic):
                 self._out[topic].pop()

@@ -1,7 +1,7 @@
-"""Senders of messages at the level ``named``, where the broker vouches for the account in a message's topic. Pure.
+"""Senders of messages at the level ``named``, where the broker checks the account in a message's topic. Pure.
 
-On the robot itself the topic is without the account, and the sender stands in the payload. A message without a sender
-is from a program of the robot. An extension reads and writes the names.
+On the robot itself topics are without accounts, and the sender stands in the payload. A message without a sender is
+from a program of the robot. An extension reads and writes the names.
 """
 
 from abc import ABC, abstractmethod
@@ -16,8 +16,8 @@ from pebble.transports import Message
 class Sender(Struct, frozen=True):
     """The sender of a message by its topic: the account, or NO_ACCOUNT.
 
-    ``topic`` is the topic without the name, and ``subject`` the meaning of that topic; None if it means nothing to
-    this robot, for the reason ``foreign``.
+    ``topic`` is the topic without the name, and ``subject`` its meaning. ``subject`` is None if the topic means nothing
+    to this robot; ``foreign`` is the reason.
     """
 
     account: str
@@ -27,15 +27,15 @@ class Sender(Struct, frozen=True):
 
 
 class Signed(Struct, frozen=True):
-    """A message as it passes, with its sender in the payload; ``by`` is that sender."""
+    """A message with its sender in the payload, as it is forwarded; ``by`` is that sender."""
 
     message: Message
     by: str
 
 
 class Names(dict[str, Sender], ABC):
-    """Senders by the topics of their messages."""
+    """Finds the senders of messages by their topics."""
 
     @abstractmethod
     def sign(self, sender: Sender, message: Message) -> Signed | Drop:
-        """Return ``message`` with its sender in the payload instead of the topic, or why the message does not pass."""
+        """Return ``message`` with its sender in the payload instead of the topic, or why it does not pass."""

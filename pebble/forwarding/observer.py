@@ -1,6 +1,6 @@
-"""Additions of extensions to the way between operators and a robot: steps that may refuse messages, and observers.
+"""Extensions' parts of the way between operators and a robot: steps that may refuse messages, and observers.
 
-Both are called on the threads that receive: they must not wait. No step is asked about an emergency stop.
+Both are called on the threads that receive messages, and must not wait. No step is asked about an emergency stop.
 """
 
 import logging
@@ -26,32 +26,32 @@ Step: TypeAlias = Callable[[Side, Subject, Message], str]
 
 
 class Observer:
-    """An observer of messages to the robot, passed and refused. It is made with the config and a clock, first of all.
+    """An observer of messages to the robot, passed and refused. It is made before anything else, with config and clock.
 
     ``by`` is the sender that the broker has checked, ROBOT, or None where no names are checked.
     """
 
     def start(self) -> None:
-        """Begin to observe; on the service's thread, as :meth:`close`, :meth:`control` and :meth:`unconfirmed`."""
+        """Begin to observe. Runs on the service's thread, like all methods but :meth:`passed` and :meth:`refused`."""
 
     def close(self) -> None:
-        """End observing; keep the observations until now."""
+        """Stop observing, and save what was observed."""
 
     def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
-        """Note a command or a changed flag."""
+        """Note a command, or a changed flag, that was forwarded."""
 
     def refused(self, drop: Drop, channel: Channel | None, by: str | None) -> None:
-        """Note that a message from outside did not pass."""
+        """Note a message from outside that was refused."""
 
     def control(self, state: ControlState) -> None:
-        """Note the state of control, from the motor owner that decides."""
+        """Note the state of control, as the deciding motor owner has published it."""
 
     def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
-        """Note a stop that a motor owner has not confirmed, and that is not repeated any more."""
+        """Note a stop that is no longer repeated although a motor owner has not confirmed it."""
 
 
 class Observers(Observer):
-    """The observers of all extensions. An error of one observer is logged, and the others are called all the same."""
+    """The observers of all extensions. An exception in one is logged, and the others are still called."""
 
     def __init__(self, config: Config, clock: Callable[[], float]) -> None:
         self._observers: list[Observer] = []
@@ -85,7 +85,7 @@ class Observers(Observer):
 
 
 def steps_of(config: Config) -> dict[str, Step]:
-    """Return the steps that extensions add, by extension; a step that cannot be made is logged, and left out."""
+    """Return the steps that extensions add, by extension. A step that cannot be made is logged and left out."""
     steps: dict[str, Step] = {}
     for extension in config.installed:
         if extension.step:
@@ -96,7 +96,7 @@ def steps_of(config: Config) -> dict[str, Step]:
 
 @contextmanager
 def logged(name: str) -> Iterator[None]:
-    """Log an error of the extension called ``name``, and go on."""
+    """Log an exception in the block, as one of the extension called ``name``, and continue."""
     try:
         yield
     except Exception as error:  # noqa: BLE001 - whatever a stranger's code raises: it must not end the bridge

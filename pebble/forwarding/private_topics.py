@@ -1,4 +1,4 @@
-"""Topics that stay on the robot: none, unless an extension that publishes them knows more."""
+"""Topics that never leave the robot: none, unless an extension publishes private ones."""
 
 from pebble.transports import Message
 
@@ -10,9 +10,9 @@ class PrivateTopics:
         self.base = base
 
     def stays(self, topic: str) -> bool:  # noqa: ARG002
-        """True if messages on ``topic`` may not pass, in either direction."""
+        """True if messages on ``topic`` must not be forwarded, in either direction."""
         return False
 
     def admit(self, message: Message) -> list[Message]:
-        """Return the messages of the robot that may pass now: ``message``, none, or earlier ones as well."""
+        """Return the robot's messages that may pass now: none, ``message``, or waiting ones before it as well."""
         return [message]

@@ -1,8 +1,8 @@
 """Detects that two of a robot's connections lead to one broker: a probe sent on one arrives on the other. Pure.
 
-The bridge publishes probes on its remote side. For the mirror it also announces each on the robot's own transport,
-where clients of the mirrored broker can neither read nor publish it. So a probe that the mirror receives from both is
-the bridge's, and anything else on that topic is not.
+The bridge publishes probes on its remote side, and announces each to the mirror on the robot's own transport, where
+clients of the mirrored broker can neither read nor publish. A probe that the mirror receives from both is therefore the
+bridge's; anything else on that topic is not.
 """
 
 import secrets
@@ -52,7 +52,7 @@ class Probes:
 
 
 def _match(payload: bytes, counterparts: deque[bytes], waiting: deque[bytes]) -> bool:
-    """Return True, and remove the counterpart, if ``payload`` has one; else let ``payload`` wait for a counterpart."""
+    """Return True if ``payload`` is in ``counterparts``, and remove it there; else add ``payload`` to ``waiting``."""
     if payload in counterparts:
         counterparts.remove(payload)
         return True

@@ -1,4 +1,4 @@
-"""Publishes on either side of a forwarder, and recognises messages that come back."""
+"""Publishes on either side of a forwarder, and recognises its own messages when they come back."""
 
 import itertools
 from collections.abc import Callable
@@ -27,7 +27,7 @@ class Publisher:
         *,
         stored: bool,
     ) -> None:
-        """Store the arguments; ``stored``: retained messages are sent again after an outage."""
+        """Store the arguments; ``stored``: retained messages are published again after an outage."""
         self._sides, self._cycles, self._subjects = sides, cycles, subjects
         self._counters, self._both_ways, self._stored = counters, both_ways, stored
 
@@ -53,10 +53,9 @@ class Publisher:
             to.loopback.forget(topic)
 
     def note_return(self, to: SideState, subject: Subject, message: Message) -> None:
-        """Expect ``message``, which goes to one side, to come back from the other one if its topic circulates.
+        """Expect ``message`` to come back from the side to which it does not go, if its topic circulates.
 
-        A command that runs something is noted before it is known whether its topic circulates, while its probe is still
-        under way.
+        A command that runs something is expected even before its probe has shown whether its topic circulates.
         """
         origin = to.side.other
         if subject.runs or (not subject.kind.one_shot and (origin, message.topic) in self._cycles.closed_ways):
@@ -74,15 +73,15 @@ class Publisher:
     # -- cycles: what we forward to one side comes back from the other
 
     def probe_commands(self, *sides: Side) -> None:
-        """Find out whether commands and actions from ``sides`` would circulate; after each connection."""
+        """Send probes, after each connection, that show whether commands and actions from ``sides`` circulate."""
         for side, topic in itertools.product(sides, self._subjects.probed):
             self.probe(side, topic, b"")
 
     def probe_again(self, sides: tuple[Side, ...], value: Callable[[str], bytes | None]) -> None:
-        """Probe topics that circulated, and then also commands from ``sides``; call this once a second.
+        """Probe topics that circulated, and then also commands from ``sides``. Call this once a second.
 
-        ``value`` returns the newest value of a topic. Commands were probed when a connection began, but the other way
-        may be younger.
+        ``value`` returns the newest value of a topic. Commands were probed when the connection began, but the other way
+        may have been set up since.
         """
         for side, topic in self._cycles.poll():
             self.probe(side, topic, value(topic) or b"")
@@ -92,7 +91,7 @@ class Publisher:
                     self.probe(side, topic, b"")
 
     def probe(self, side: Side, topic: str, value: bytes) -> None:
-        """Publish a probe on the other side, where something else may lead back to ``side``."""
+        """Publish a probe on the other side: it returns on ``side`` if something else forwards the topic."""
         subject, target = self._subjects[topic], self._sides[side.other]
         if subject is None or not target.connected:
             return

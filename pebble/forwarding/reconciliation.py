@@ -1,9 +1,9 @@
 """Decides which value of a retained topic counts if both sides may publish it (a flag). Pure.
 
-A live message always counts, whichever side publishes it. `resolve` has the rules of retained messages that a
-subscription brings: at a reconnect the *winner* side is right, and the other one, the *loser*, fills what it does not
-have. A side that lost a value receives it again, and so does one that was restored from an earlier save. Silence does
-not mean that a side has no value: one of the winner may arrive after it was sent the loser's.
+A live message always counts, whichever side publishes it. `resolve` has the rules for the retained messages that a
+subscription brings. At a reconnect the *winner* side is right; the *loser* side only adds topics that the winner lacks.
+A side that has lost a value, or was restored from an earlier save, receives the newest value again. Silence does not
+mean that a side has no value: the winner's value may arrive after the loser's was sent to it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class LastValue(Struct, frozen=True):
 
 
 class Known(NamedTuple):
-    """The facts about a topic when one side sends a retained message on it."""
+    """The facts that are known about a topic when one side sends a retained message on it."""
 
     last: LastValue | None  # the newest value, whichever side published it
     winner: Side
@@ -90,7 +90,7 @@ def resolve(sender: Side, payload: bytes, known: Known) -> Resolution:
 
 
 class Reconciliation:
-    """The state of all retained topics that both sides may publish."""
+    """The values of all retained topics that both sides may publish."""
 
     def __init__(self, winner: Side) -> None:
         self._winner = winner
@@ -114,7 +114,7 @@ class Reconciliation:
         return None if last is None else last.payload
 
     def begin(self, side: Side) -> None:
-        """Begin again with ``side`` after its connection was lost: its retained messages will arrive again."""
+        """Forget what ``side`` has sent: its connection was lost, and its retained messages will arrive again."""
         self._received[side].clear()
         if side is self._winner:
             self._offered.clear()
@@ -198,9 +198,9 @@ class Reconciliation:
         )
 
     def _may_come_late(self, topic: str) -> bool:
-        """True if the winner may still have an old value that has not arrived."""
+        """True if an old value of the winner may still arrive."""
         return self._synchronized[self._winner] and topic not in self._received[self._winner]
 
     def _is_missing(self, side: Side, topic: str, last: LastValue) -> bool:
-        """True if ``side`` lacks the newest value; a removal counts only if it received the value before."""
+        """True if ``side`` lacks the newest value. It lacks a removal only if it had received the value before."""
         return topic not in self._received[side] and self._published[side].get(topic, b"") != last.payload

@@ -16,7 +16,7 @@ _DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
 
 
 class RetainedTopics:
-    """Retained messages of both sides: those that wait for the gate, and the choice between two values.
+    """Retained messages of both sides: they wait for the gate here, and the value that counts is chosen.
 
     ``on_value(subject, payload)`` is called with the lock held.
     """
@@ -39,7 +39,7 @@ class RetainedTopics:
     def receive(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, *, old: bool = False
     ) -> Forward | Drop:
-        """Forward ``message``, which will be retained, or return why not. ``old``: only an old message."""
+        """Forward ``message``, which will be retained, or return why not. ``old``: ignore it if it is a live one."""
         with self._lock:
             self._begin_restarted()
             if subject.kind in self._both_ways:
@@ -57,7 +57,7 @@ class RetainedTopics:
             return Drop.CLOSED
 
     def change(self, subject: Subject, message: Message) -> Forward | Drop:
-        """Publish a new value on both sides, as if it had been changed on the robot."""
+        """Publish a new value on both sides, as if a program on the robot had changed it."""
         with self._lock:
             self._begin_restarted()
             if self._sides.gate is not Gate.OPEN:
@@ -78,12 +78,12 @@ class RetainedTopics:
                 self._publish(Side.REMOTE, subject, message, forward)
 
     def shut(self) -> None:
-        """Shut the gate. Takes no lock: a loop of messages must end at once."""
+        """Close the gate. Takes no lock: a loop of messages must end at once."""
         self._sides.gate = Gate.SHUT
         self._waiting = {}
 
     def synchronize(self, side: Side) -> None:
-        """Publish the values that are still to be sent now that the retained messages of ``side`` have arrived."""
+        """Publish the values that were held back until the retained messages of ``side`` had arrived."""
         with self._lock:
             self._begin_restarted()
             self._sides[side].arrived()
@@ -104,7 +104,7 @@ class RetainedTopics:
         return self._reconciliation.value(topic)
 
     def remove(self, side: Side, topic: str, *, unless: Callable[[str], bool]) -> bool:
-        """Remove the retained message of ``side`` on ``topic``, unless ``unless(topic)``; return True if that was done.
+        """Remove the retained message of ``side`` on ``topic``, unless ``unless(topic)``; True if it was removed.
 
         No retained message passes before the removal is sent, so one that is published in the meantime comes after it.
         """
@@ -149,7 +149,7 @@ class RetainedTopics:
 
     @property
     def _own_return(self) -> bool:
-        """True if no side distinguishes our own messages exactly."""
+        """True if on no side our own messages are recognised with certainty."""
         return not any(state.transport.exact_echo for state in self._sides.values())
 
     def _is_retained(self, source: SideState, message: Message) -> bool:

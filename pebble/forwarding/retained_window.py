@@ -1,6 +1,6 @@
-"""Tells retained messages from live ones that have the retain flag as well. Pure but for its clock.
+"""Distinguishes retained messages from live ones that also have the retain flag. Pure but for its clock.
 
-Where a connection marks live messages with the flag, too, only the time since the subscription distinguishes the two.
+Some connections mark live messages with the flag, too: there only the time since the subscription tells.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ class RetainedWindow:
 
     @property
     def is_arriving(self) -> bool:
-        """True if retained messages have come until just now."""
+        """True if the last retained message came only a moment ago."""
         return self._clock() - self._newest_at < QUIET_S
 
     def subscribing(self) -> None:
@@ -43,7 +43,7 @@ class RetainedWindow:
         self._stops_until = max(self._until, self._newest_at + INITIAL_SYNC_S)
 
     def note(self) -> None:
-        """Note a message with the retain flag: while such messages come, a stop may be an old one."""
+        """Note a message with the retain flag. While such messages arrive, a stop may be an old one."""
         now, until = self._clock(), self._stops_until
         if now >= until:
             return

@@ -27,7 +27,7 @@ Side.LOCAL.other, Side.REMOTE.other = Side.REMOTE, Side.LOCAL
 
 
 class Drop(Enum):
-    """A reason why a message does not pass."""
+    """Reason why a message does not pass."""
 
     FOREIGN = "no topic of this robot"
     MEDIA = "media has connections of its own"
@@ -58,7 +58,7 @@ class Drop(Enum):
 
 
 class Forward(Struct, frozen=True):
-    """The options with which a message is published on the other side: same topic, same bytes."""
+    """Options with which a message is published on the other side; topic and bytes stay the same."""
 
     qos: QoS
     retain: bool
@@ -68,7 +68,7 @@ class Forward(Struct, frozen=True):
 
 
 class Rules(Struct, frozen=True, kw_only=True):
-    """A routing table: the kinds of messages forwarded from each side, and the kinds that need mirroring to be on."""
+    """A routing table: the kinds of messages forwarded from each side, and the kinds that pass only while mirroring."""
 
     passes: Mapping[Side, frozenset[Kind]]
     mirrored: Mapping[Side, frozenset[Kind]] = {}
@@ -77,7 +77,7 @@ class Rules(Struct, frozen=True, kw_only=True):
     stored: bool = True  # what is retained is sent again after an outage, because no other program forwards it
 
     def both_ways(self, kind: Kind) -> bool:
-        """True if both sides may be the origin of such messages."""
+        """True if either side may be the origin of messages of this kind."""
         return all(kind in self.passes[side] for side in Side)
 
 
@@ -120,14 +120,14 @@ def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *
 
 
 def _qos(subject: Subject, message: Message) -> QoS:
-    """Return the QoS as received, but *to* a robot at least the channel's: one QoS per topic keeps the order."""
+    """Return the received QoS; to the robot at least the channel's, because one QoS per topic keeps the order."""
     if subject.kind.direction == INCOMING:
         return message.qos if message.qos >= subject.qos else QoS(subject.qos)
     return message.qos
 
 
 def _retain(subject: Subject, message: Message) -> bool:
-    """Return True if the message is to be retained: as published, if that is known; flags always are, on both sides."""
+    """True if the message is to be retained: as published, if that is known. Flags are retained on both sides."""
     if subject.kind.one_shot:
         return False
     if subject.kind is Kind.FLAG and subject.retain:

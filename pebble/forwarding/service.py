@@ -1,4 +1,4 @@
-"""The base of bridge and mirror: a connection on each side, a forwarder between them, and the life of both."""
+"""The base of bridge and mirror: a connection on each side, and a forwarder between them."""
 
 from __future__ import annotations
 
@@ -88,10 +88,10 @@ class ForwardingService(Service, ABC):
     @property
     @abstractmethod
     def winner(self) -> Side:
-        """The side whose retained messages count where those of the two differ."""
+        """Side whose retained messages count where the two sides differ."""
 
     def make_names(self) -> Names | None:
-        """Return the names of senders on the remote side, where they are checked."""
+        """Return the finder of senders for the remote side; None if names are not checked."""
         return None
 
     def make_steps(self) -> Mapping[str, Step]:
@@ -99,15 +99,15 @@ class ForwardingService(Service, ABC):
         return {}
 
     def on_value(self, subject: Subject, payload: bytes) -> None:
-        """React to the value on which both sides agree; on any thread, with a lock held."""
+        """React to a value on which both sides agree. Called on any thread, with a lock held."""
 
     def pass_stop(self, side: Side, payload: bytes) -> Iterable[bytes]:  # noqa: ARG002
-        """Return the payloads that pass for a stop received on ``side``; on any thread."""
+        """Return the payloads to forward for a stop received on ``side``. Called on any thread."""
         return (payload,)
 
     @abstractmethod
     def connected(self, side: Side, epoch: int) -> None:
-        """React to a connection of ``side``; ``epoch`` was the current one when it was made."""
+        """React to a new connection of ``side``, whose number is ``epoch``."""
 
     def disconnected(self, side: Side) -> None:
         """React to a lost connection."""
@@ -120,7 +120,7 @@ class ForwardingService(Service, ABC):
 
     @abstractmethod
     def check_again(self, epoch: int) -> None:
-        """Check whether the reason to forward nothing is gone, without a reconnect."""
+        """Check whether forwarding may start again without a reconnect; ``epoch``: the number of the connection."""
 
     @abstractmethod
     def receive_local(self, message: Message) -> None:
@@ -154,7 +154,7 @@ class ForwardingService(Service, ABC):
         ]
 
     def subscribe_remote(self) -> None:
-        """Subscribe for a new connection, after the transport has sent the robot's changes during the outage.
+        """Subscribe on a new connection, after the transport has sent the robot's changes during the outage.
 
         Because of this order, no retained message of the remote side is older than a change by the robot.
         """
@@ -193,7 +193,7 @@ class ForwardingService(Service, ABC):
         self.forwarder.publisher.probe_again(self.probed_sides, self.forwarder.retained.value)
 
     def found_one_broker(self) -> None:
-        """React to the finding that the two sides are, or may be, one broker."""
+        """Stop forwarding: a probe shows that the two sides are, or may be, one broker."""
         self.forward_nothing()
 
     def forward_nothing(self, seconds: float = CHECK_AGAIN_S) -> None:
@@ -221,7 +221,7 @@ class ForwardingService(Service, ABC):
         self.post(partial(self.disconnected, side))
 
     def shut(self) -> None:
-        """Forward nothing from now on, as the two sides may be one broker, and do the rest on the service's thread."""
+        """Stop forwarding, as the two sides may be one broker; do the rest on the service's thread. Any thread."""
         if self.forwarder.gate is not Gate.SHUT:
             self.forwarder.shut()
             self.post_message(BRIDGE_PROBE, self.found_one_broker)

@@ -1,4 +1,4 @@
-"""The two sides of a forwarder, and the gate between them."""
+"""The two sides of a forwarder, and the gate that holds messages back until both are ready."""
 
 from collections.abc import Callable
 from enum import Enum
@@ -23,9 +23,9 @@ class Gate(Enum):
 
 
 class SideState:
-    """One side: its transport, messages that wait for it or may come back, and the age of its retained messages.
+    """A side: its transport, messages that wait for it or may come back, and its window of retained messages.
 
-    ``wins``: the retained messages of this side count where those of the two sides differ.
+    ``wins``: the retained messages of this side count where the two sides differ.
     """
 
     def __init__(
@@ -66,9 +66,9 @@ class SideState:
 
     @property
     def has_gone_back(self) -> bool:
-        """True if older retained values of this side come from a restored save.
+        """True if older retained values of this side come from a save that was restored.
 
-        Otherwise a program has chosen the older value again.
+        Otherwise a program has set the older value again.
         """
         if self._wins or not self._went_back:
             return self._went_back
@@ -77,7 +77,7 @@ class SideState:
     def arrived(self) -> None:
         """Note that the retained messages of this side have arrived.
 
-        An older value that comes from now on was chosen again by a program.
+        An older value that comes from now on was set again by a program.
         """
         self._went_back = False
 

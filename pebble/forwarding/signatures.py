@@ -1,7 +1,7 @@
-"""Takes a script's signature off drive commands from outside. Pure.
+"""Removes a script's signature from drive commands from outside the robot. Pure.
 
-A signature names the run that may drive, so it counts only from programs on the robot. From outside a signed command
-that moves anything does not pass, and a signed zero stops the motors as a person's.
+A signature names the script run that may drive, so it counts only if a program on the robot sends it. A signed command
+from outside does not pass if it moves anything. A signed zero passes as a person's, and stops the motors.
 """
 
 from msgspec import UNSET
@@ -15,10 +15,10 @@ _SCRIPT, _BACKSLASH = SCRIPT.encode(), 0x5C
 
 
 def unsigned(payload: bytes) -> bytes | None:
-    """Return a drive command without a script's signature; None if it may not pass. Hot: a person's is rarely decoded.
+    """Return a drive command without a script's signature; None if it must not pass.
 
-    JSON may write the name of a signature's field plainly or with backslashes. A payload that contains either and
-    cannot be decoded does not pass: the parser of a board may be more lenient.
+    Hot: a person's command is rarely decoded. JSON may spell the name of a field with backslashes. A payload that holds
+    a backslash or the name, and cannot be decoded, does not pass: the parser of a board may be more lenient.
     """
     if _BACKSLASH not in payload and _SCRIPT not in payload:
         return payload

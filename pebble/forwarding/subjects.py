@@ -1,4 +1,4 @@
-"""The meaning of topics to one robot: a channel, renamed or not, or the family of an unknown metric."""
+"""Subjects: the meaning of a topic to one robot, which is a channel (renamed or not) or a family of unknown metrics."""
 
 from functools import cache, cached_property
 from math import inf
@@ -27,7 +27,7 @@ _FAMILIES = (
 class Subject(Struct, frozen=True, eq=False, dict=True):
     """The meaning of all topics of a channel, or of a family; ``channel`` is None for metrics beyond the contract.
 
-    There is one object for each, so that tables by subject are bounded, and fast.
+    All topics of a channel or family share one object, so tables by subject are small and fast.
     """
 
     kind: Kind
@@ -76,24 +76,24 @@ class Subject(Struct, frozen=True, eq=False, dict=True):
 
     @cached_property
     def runs(self) -> bool:
-        """True if one message makes the robot do something, which must happen once even if the message circulates."""
+        """True if a message starts something, which must happen only once even if the message circulates."""
         return self.kind in (Kind.COMMAND, Kind.ACTION) and not self.drives and not self.is_stop
 
     @cached_property
     def counted(self) -> bool:
-        """True if a robot takes a limited number of messages: for actions, and for metrics beyond the contract."""
+        """True if the robot limits the number of such messages: actions, and metrics beyond the contract."""
         return self.channel is None or self.kind is Kind.ACTION
 
     @cached_property
     def is_two_way(self) -> bool:
-        """True if messages pass both ways even while remote-mirror is off, so that a broker may send them back."""
+        """True if messages pass both ways even while remote-mirror is off. A broker may then send them back."""
         return self.kind in (Kind.FLAG, Kind.ACTION)
 
 
 class Subjects(dict[str, Subject | None]):
-    """Subjects by effective topic, those of every serial instance included.
+    """Subjects by effective topic, those of all serial instances included.
 
-    The subject of a topic that is not this robot's, or not valid, is None. A topic that was looked up before is found
+    The subject is None for a topic that is invalid or not this robot's. A topic that was looked up before is found
     without calling a Python function. ``config``: the robot's, or its base if it renames nothing.
     """
 
@@ -119,7 +119,7 @@ class Subjects(dict[str, Subject | None]):
         return subject
 
     def invented(self, topic: bytes) -> Kind | None:
-        """Return the kind of an incoming topic (as UTF-8) that the contract does not name; None for any other. Fast."""
+        """Return the kind of an incoming topic (as UTF-8) that the contract does not know; else None. Fast."""
         if not topic.startswith(self._incoming):
             return None
         metric = topic[len(self._incoming) :]
@@ -150,7 +150,7 @@ class Subjects(dict[str, Subject | None]):
 
     @cached_property
     def probed(self) -> list[str]:
-        """The topics on which cycles are looked for at each connection, before they are used."""
+        """Topics that are probed for cycles at each connection, before they are used."""
         actions = (channel for channel in CHANNELS if channel.kind is Kind.ACTION)
         return self.topics(*(channel for channel in CHANNELS if channel.payload is Drive), *actions)
 

@@ -1,7 +1,7 @@
 """The process that publishes the launcher's messages: ``python -m pebble.launcher.announcer CONFIG``.
 
-The launcher itself never opens a transport: it could not fork any more, and it might wait for a broker. On a Zenoh
-robot this is the process of the hub as well, which no failure to publish may end.
+The launcher itself never opens a transport: with its threads it could not fork, and it might wait for a broker. On a
+Zenoh robot this process is also the hub, which keeps running when publishing fails.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 class Announcer:
-    """The publisher of the envelopes on ``pipe``: states again on every new connection, records only once."""
+    """A publisher of the envelopes on ``pipe``. It repeats states on every new connection, and sends records once."""
 
     def __init__(self, pipe: int, transport: Transport) -> None:
         self._pipe, self._transport = pipe, transport
@@ -139,7 +139,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _hub(config: Config) -> AbstractContextManager[ZenohHub | None]:
-    """Return the hub of a Zenoh robot, not yet open."""
+    """Return the hub of a Zenoh robot, not yet open; no hub for other robots."""
     if config.transport.kind != "zenoh":
         return _NO_HUB
     from pebble.runtime.hub import open_hub  # only who needs it pays for it

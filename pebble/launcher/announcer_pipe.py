@@ -17,7 +17,7 @@ Kind = Literal["will", "state", "record"]
 
 
 class Envelope(msgspec.Struct, frozen=True, array_like=True):
-    """A message with its kind. The will comes first; states are published on every new connection, records once."""
+    """A message with its kind: the will, a state or a record. The will comes first."""
 
     kind: Kind
     message: Message
@@ -64,7 +64,7 @@ class AnnouncerPipe:
             self._socket = None
 
     def _send_states(self) -> bool:
-        """Send the unsent states; True if all are sent, else arranges another attempt."""
+        """Send the unsent states; True if all are sent. Otherwise arrange another attempt."""
         for topic in list(self._unsent):
             if not self._send("state", self._unsent[topic]):
                 if self._socket is not None and self._retry is None:
@@ -92,6 +92,6 @@ class AnnouncerPipe:
 
 
 def next_envelope(descriptor: int) -> Envelope | None:
-    """Return the next envelope from the announcer's end; None at the end. Raises BlockingIOError, DecodeError."""
+    """Return the next envelope that the launcher has sent; None at the end. Raises BlockingIOError, DecodeError."""
     raw = os.read(descriptor, ENVELOPE_LIMIT)
     return msgspec.msgpack.decode(raw, type=Envelope) if raw else None

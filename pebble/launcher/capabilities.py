@@ -53,8 +53,8 @@ def capabilities(
 def _identity(config: Config) -> offers.RobotIdentity:
     robot = config.robot
     looks = {key: getattr(robot, key) for key in ("name", "description", "colour", "picture", "battery_cells")}
-    given: dict[str, Any] = {key: value for key, value in looks.items() if value is not None}
-    return offers.RobotIdentity(system=robot.system, type=robot.type, id=robot.id, **given)
+    known_looks: dict[str, Any] = {key: value for key, value in looks.items() if value is not None}
+    return offers.RobotIdentity(system=robot.system, type=robot.type, id=robot.id, **known_looks)
 
 
 def _system(config: Config, addresses: Addresses) -> offers.SystemOffer:
@@ -74,7 +74,7 @@ def _system(config: Config, addresses: Addresses) -> offers.SystemOffer:
 def _motor(
     config: Config, addresses: Addresses, lacking: Collection[str]
 ) -> tuple[offers.DriveOffer, offers.EstopOffer, offers.LightsOffer, offers.TelemetryOffer]:
-    """Return drive, stop, lights and telemetry of the serial line to the motor MCU, with its effective topics."""
+    """Return the offers of the motor MCU's serial line: drive, stop, lights and telemetry, with their topics in use."""
     lines, owned = config.motor_lines(), bool(config.motor_owners)
     present = bool(lines)
     name, line = next(iter(lines.items())) if lines else ("", config.services.serial_mcu_bridge)
@@ -122,14 +122,14 @@ def _estop(config: Config, owners: list[str]) -> offers.EstopOffer:
 
 
 def _imu(config: Config) -> tuple[bool, str]:
-    """Return whether a serial line has an inertial sensor, and the topic of the sensor."""
+    """Return (whether a serial line has an inertial sensor, the sensor's topic)."""
     lines = [name for name, line in config.serial_instances().items() if SERIAL_PROTOCOLS[line.protocol].has_imu(name)]
     addresses = Addresses(view_of(config, lines[0]) if lines else config)
     return bool(lines), addresses[c.IMU].topic
 
 
 def _outlets(config: Config, found: Collection[str]) -> offers.OutletsOffer:
-    """Return the outlets of the self-describing MCUs that are connected now, with the topics in use."""
+    """Return the outlets of the self-describing MCUs that are connected now, with their topics in use."""
     topics: dict[str, dict[str, str]] = {}
     for key, channel in (("status_topic", c.OUTLET_STATUS), ("command_topic", c.OUTLET_COMMAND)):
         for feature in sorted(found):

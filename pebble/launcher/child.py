@@ -1,4 +1,4 @@
-"""A child process of the launcher, and the pipes to it."""
+"""A child process of the launcher, with its pipes."""
 
 import os
 import signal
@@ -16,7 +16,7 @@ _SIGNALS = signal.valid_signals()
 
 
 class Child:
-    """A process in a group of its own: a terminal's Ctrl-C reaches only the launcher, and no grandchild outlives it.
+    """A process in its own process group: Ctrl-C in a terminal reaches only the launcher.
 
     ``output`` (stdout and stderr, in order), ``notes`` (pebble.runtime.notes) and ``exited`` are descriptors to wait
     on; ``exited`` is None where the process has to be polled (pebble.runtime.exits). The caller closes ``stdin``. The
@@ -72,7 +72,7 @@ class Child:
 
 
 def read_available(descriptor: int) -> bytes | None:
-    """Read up to 64 KiB from a non-blocking pipe; empty at its end, None when there is nothing."""
+    """Return up to 64 KiB from a non-blocking pipe; empty at its end, None if there is nothing to read yet."""
     try:
         return os.read(descriptor, _READ_BYTES)
     except BlockingIOError:
@@ -86,7 +86,7 @@ def _pipe(opened: list[int]) -> tuple[int, int]:
 
 
 def _fork(run: Callable[[], NoReturn]) -> int:
-    """Fork with signals blocked, because a child has the launcher's handlers until ``run`` sets its own."""
+    """Fork, with signals blocked until ``run`` has set the child's handlers; return the child's process id."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         pid = os.fork()

@@ -1,4 +1,4 @@
-"""An assessment of whether drive commands and stops reach the robot's motors, from its processes' notes. Pure."""
+"""Judges, by the notes of the robot's processes, whether drive commands and stops reach the motors. Pure."""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -26,7 +26,7 @@ def _starts(mcu: Mcu) -> str:
 
 
 def _drives(mcu: Mcu) -> tuple[str, str]:
-    """Return whether the board can drive, and why not. A board may be silent at rest: it then looks like a dead one."""
+    """Return ("yes", "no" or "unknown", the reason) for a board. One that is silent at rest looks like a dead one."""
     match mcu.state:
         case "absent":
             return _NO, mcu.why or "there is no such device"
@@ -42,10 +42,10 @@ def _drives(mcu: Mcu) -> tuple[str, str]:
 
 
 class Driveable:
-    """The newest notes Mcu, Local and Reach of all programs; ``on_change()`` is called when the status must follow.
+    """The newest notes Mcu, Local and Reach of all programs; ``on_change()`` is called when the judgement may change.
 
     ``lines``: the name of each serial line by its program. ``owners``: the programs that drive motors. ``ways``: the
-    programs that bring drive commands to them; they must receive what the owners publish.
+    programs through which drive commands reach them; they must receive the messages of the owners.
     """
 
     def __init__(
@@ -59,11 +59,11 @@ class Driveable:
 
     @property
     def mcus(self) -> dict[str, dict[str, Any]]:
-        """The states of the serial lines, by name, in the form of the robot's status."""
+        """States of the serial lines, by name, in the form of the robot's status."""
         return {name: _shown(self._mcus[program]) for program, name in self._lines.items() if program in self._mcus}
 
     def mcu(self, program: str, note: Mcu) -> None:
-        """Handle a note of ``program``."""
+        """Handle a note about a serial line of ``program``."""
         if program not in self._lines:
             return
         before, self._mcus[program] = self._mcus.get(program), note
@@ -72,12 +72,12 @@ class Driveable:
             self._on_change()
 
     def local(self, program: str, note: Local) -> None:
-        """Handle a note of ``program``."""
+        """Handle a note about the connection of ``program`` to the robot's other processes."""
         self._connected[program] = note
         self._on_change()
 
     def reach(self, program: str, note: Reach) -> None:
-        """Handle a note of ``program``."""
+        """Handle a note whether messages of a motor owner reach ``program``."""
         if note.owner in self._lines.values():
             self._reached.setdefault(program, {})[note.owner] = note.reached
             self._on_change()
@@ -88,9 +88,9 @@ class Driveable:
             table.pop(program, None)
 
     def assessment(self, states: Mapping[str, str]) -> dict[str, str] | None:
-        """Return the worst judgement, such as ``{"state": "no", "why": "serial: …"}``; None: the robot has no motors.
+        """Return the worst judgement, such as ``{"state": "no", "why": "serial: …"}``; None if there are no motors.
 
-        ``states``: of all programs.
+        ``states``: the states of all programs.
         """
         if not self._owners:
             return None

@@ -1,4 +1,4 @@
-"""The features that the robot's processes report: capabilities follow. Pure."""
+"""The features that the robot's processes report, for the capabilities message. Pure."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""The first and the last lines of every child: a forked copy of the launcher becomes one of its programs."""
+"""The first and last steps of a child: how a forked copy of the launcher becomes one of the robot's programs."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ _SIGNALS = signal.valid_signals()  # each call would make another set
 def become(
     program: Program, environment: Mapping[str, str], config: Config, *, stdin: int, output: int, notes: int
 ) -> NoReturn:
-    """Run ``program`` with these descriptors and no others, and exit with its code. Call right after the fork.
+    """Run ``program`` with these descriptors and no others, and exit with its code. Call this right after the fork.
 
-    The program gets ``config`` as it is: its file may have changed since. All signals must be blocked. Never return or
-    raise: the frames of the callers belong to the launcher, and unwinding them would close descriptors that by then
-    belong to other objects.
+    The program gets ``config`` as the launcher read it: the file may have changed since. All signals must be blocked.
+    Never return or raise: the callers' frames belong to the launcher, and unwinding them would close descriptors whose
+    numbers the child uses for other things.
     """
     code = 1
 
@@ -52,7 +52,7 @@ def become(
 
 
 def _arrange_descriptors(stdin: int, output: int, notes: int) -> None:
-    """Set the child's descriptors, and close all others, such as the launcher's lock, which the child would keep."""
+    """Set the child's standard descriptors and notes, and close all others, such as the launcher's lock."""
     wanted = (stdin, output, output, notes)
     clear = [fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, len(wanted)) for descriptor in wanted]
     for number, descriptor in enumerate(clear):
@@ -76,7 +76,7 @@ def _reset_signals() -> None:
 
 
 def _forget_launcher(environment: Mapping[str, str]) -> None:
-    """Remove the launcher's handlers and variables. Change only what differs, as a written page is no longer shared."""
+    """Remove the launcher's handlers and variables. Change only what differs: a written page is no longer shared."""
     atexit._clear()
     logging.getLogger().handlers.clear()
     for name in os.environ.keys() - environment.keys():
@@ -98,7 +98,7 @@ def _run(program: Program) -> None:
 
 
 def _finish() -> None:
-    """End as the interpreter does, but keep the objects that belong to the launcher."""
+    """Run the interpreter's exit steps, but leave the launcher's objects as they are."""
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()
     sys.stdout.flush()

@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 
 class Launcher:
-    """A running robot. Raises ConfigError for a config that does not run on this machine.
+    """A running robot. Raises ConfigError for a config that cannot run on this machine.
 
     ``table`` replaces the programs of the config, for tests. Programs are forked from this process, which therefore has
     no second thread and opens no transport (docs/decisions/0006).
@@ -90,7 +90,7 @@ class Launcher:
     # -- starting
 
     def _start(self) -> None:
-        """Start all programs without waiting for any; each process connects as soon as it can."""
+        """Start all programs, without waiting for any to be ready."""
         self._reactor.watch(self._signals.descriptor, self._signals.drain)
         preload(shared_modules(self._config, [supervisor.program for supervisor in self._supervisors]))
         for supervisor in self._supervisors:
@@ -169,7 +169,7 @@ class Launcher:
             log.error("%s", error)
 
     def _stop(self) -> None:
-        """Stop stage by stage, each within its share of the timeout, which a hung process cannot exceed."""
+        """Stop stage by stage. Each stage has its share of the timeout; a process that hangs is killed at its end."""
         log.info("stopping")
         self._status.stopping()
         end = self._reactor.now() + self._config.services.launcher.shutdown_timeout_seconds
@@ -191,7 +191,7 @@ class Launcher:
             self._end(supervisors)
 
     def _end(self, supervisors: Sequence[ProcessSupervisor]) -> None:
-        """Kill the programs that still run and wait for their end; none starts again."""
+        """Kill the programs that still run, and wait for their end. None is started again."""
         for supervisor in supervisors:
             supervisor.stop()
             supervisor.kill()

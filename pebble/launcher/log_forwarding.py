@@ -1,4 +1,4 @@
-"""Log lines of all processes: to the launcher's stderr, and as records to the robot's log topic (paper A.8.7)."""
+"""Forwards the log lines of all processes to the launcher's stderr and to the robot's log topic (paper A.8.7)."""
 
 import logging
 import os
@@ -25,7 +25,7 @@ _TRACEBACK = re.compile(r"[\s|+]*(Exception Group )?Traceback \(most recent call
 
 
 class LogForwarder:
-    """A writer of every line to stderr; ``publish`` gets the lines of INFO and above as records."""
+    """A writer of every line to stderr. Lines of INFO and above also go to ``publish``, as records."""
 
     def __init__(self, publish: Callable[[LogRecord], None], *, stderr: int | None = None) -> None:
         self._publish = publish
@@ -33,7 +33,7 @@ class LogForwarder:
         self._readers: dict[str, tuple[int, LevelReader]] = {}  # with the process id, by service
 
     def child_line(self, service: str, pid: int, line: str, *, published: bool = True) -> None:
-        """Forward a line of a child. Lines of an announcer alone are not published, because each may cause another."""
+        """Forward a line of a child. The announcer's lines are not published: each could cause another line."""
         last_pid, reader = self._readers.get(service, (pid, None))
         if reader is None or last_pid != pid:  # the level of the last line belongs to the previous process
             reader = LevelReader()
@@ -42,7 +42,7 @@ class LogForwarder:
         self._forward(level, service, pid, text, logger="root", published=published)
 
     def tagged_line(self, service: str, pid: int, line: str) -> None:
-        """Forward a line of a child, or of a process of the child, which the tag of the line names."""
+        """Forward a line of a child; a tag in the line may name a process of the child as its source."""
         tag = TAG.fullmatch(line)
         if tag is None:
             self.child_line(service, pid, line)

@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 
 class OnDemand:
-    """The requests in the notes Wanted and Held: a program runs while it is wanted and not held. For one thread."""
+    """The requests in notes Wanted and Held: a program runs if one wants it and none holds it. For one thread."""
 
     def __init__(self, reactor: Reactor, supervisors: Iterable[ProcessSupervisor]) -> None:
         self._reactor = reactor
@@ -33,7 +33,7 @@ class OnDemand:
         return tuple(name for name in self._supervisors if name in self._wanted)
 
     def environment(self, program: Program) -> dict[str, str]:
-        """Return the variables that tell a new process of ``program`` about requests."""
+        """Return the variables through which a new process of ``program`` learns of its requests."""
         if program.may_request:
             return {WANTED: " ".join(f"{name}={self._encodings[name]}" for name in self.requested)}
         return {ENCODING: self._encodings[program.name]} if program.on_demand else {}
@@ -52,7 +52,7 @@ class OnDemand:
         self._follow(name)
 
     def hold(self, sender: Program, note: Held) -> None:
-        """Let a program wait, or let it run again, as ``note`` says."""
+        """Let a program wait, or end the wait, as ``note`` says."""
         if self._may(sender, note):
             (self._held.add if note.on else self._held.discard)(note.program)
             self._follow(note.program)
@@ -67,7 +67,7 @@ class OnDemand:
             supervisor.request()
 
     def ended(self, program: Program) -> None:
-        """Note that a program has ended: its requests last only OUTLIVE_S longer, and it holds no program any more."""
+        """Note that a program has ended: its requests last OUTLIVE_S longer, and its holds end."""
         if not program.may_request:
             return
         held, self._held = self._held, set()
@@ -89,7 +89,7 @@ class OnDemand:
             self._follow(name)
 
     def _may(self, sender: Program, note: Wanted | Held) -> bool:
-        """True if ``sender`` may request this program; logs and remembers the first refusal of each sender."""
+        """True if ``sender`` may request this program. The first refusal of each sender is logged."""
         may = sender.may_request and note.program in self._supervisors
         if not may and sender.name not in self._refused:
             self._refused.add(sender.name)

@@ -1,4 +1,4 @@
-"""The output and the notes of a child process, line by line."""
+"""Reads the output and the notes of a child process, line by line."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,9 +17,9 @@ Taker = Callable[[bytes], None]
 
 
 class Pipes:
-    """A reader of a child: ``on_line`` and ``on_note`` get each line that is not empty, until :meth:`close`.
+    """A reader of a child's pipes, until :meth:`close`: ``on_line`` and ``on_note`` get each line that is not empty.
 
-    ``rate``: lines of output in a second; of the lines beyond it ``on_line`` gets the number.
+    ``rate``: the most lines of output a second; ``on_line`` gets the number of the lines beyond it.
     """
 
     def __init__(self, child: Child, reactor: Reactor, on_line: Taker, on_note: Taker, *, rate: float) -> None:
@@ -32,7 +32,7 @@ class Pipes:
         reactor.watch(child.notes, self._read_notes)
 
     def close(self) -> None:
-        """Read the rest that an ended child has left, and its unfinished line."""
+        """Read the rest of the output of an ended child, with its unfinished line."""
         for timer in (self._pause, self._tick):
             if timer is not None:
                 timer.cancel()

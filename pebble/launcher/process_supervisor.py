@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 
 class ProgramState(Enum):
-    """The state of the program, which also says what the supervisor's one timer is for."""
+    """State of the program; it also tells the purpose of the supervisor's one timer."""
 
     IDLE = auto()  # no child; started by request() or start()
     WAITING = auto()  # no child; the timer starts one
@@ -40,12 +40,12 @@ _ACTIVE = (ProgramState.WAITING, ProgramState.RUNNING, ProgramState.STUCK, Progr
 
 
 class ProcessSupervisor:
-    """A program, its restart policy and its present child. All methods belong to the reactor's thread.
+    """A program, its restart policy and its present child. All methods run on the reactor's thread.
 
-    An on-demand program is started by :meth:`request`, any other by :meth:`start`. ``on_line(pid, line)`` gets the
-    child's output, ``on_note(note)`` its notes other than Ready and Alive; ``on_change()`` is called when the reported
-    state may have changed, ``on_end()`` whenever a child has ended. While ``is_stopping()``, an ended child is not
-    started again.
+    :meth:`request` starts an on-demand program, :meth:`start` any other. ``on_line(pid, line)`` gets the child's
+    output, ``on_note(note)`` its notes other than Ready and Alive. ``on_change()`` is called when the reported state
+    may have changed, ``on_end()`` whenever a child has ended. While ``is_stopping()``, an ended child is not started
+    again.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class ProcessSupervisor:
             self._timer = self._reactor.after(self.program.stop_timeout_s, self._kill_overdue)
 
     def hold(self) -> None:
-        """Let a requested on-demand program wait until :meth:`request`."""
+        """End a requested on-demand program; it waits until :meth:`request`."""
         if not self.held:
             self.release()
             self.shown = self.held = True
@@ -221,7 +221,7 @@ class ProcessSupervisor:
     # -- the end of a child
 
     def _end_child(self, ending: ProgramState, ended: ProgramState) -> None:
-        """Ask the child to end. The state is ``ending``, or at once ``ended`` if there is no child."""
+        """Ask the child to end, and set the state ``ending``; without a child, set ``ended``."""
         self._cancel_timer()
         if self._child is not None:
             self.state = ending

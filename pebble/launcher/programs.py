@@ -1,4 +1,4 @@
-"""The processes of a robot in the order of their start: of the core, and of extensions."""
+"""The processes of a robot, those of extensions included, in the order in which they are started."""
 
 import gc
 import logging
@@ -15,9 +15,9 @@ log = logging.getLogger(__name__)
 
 
 def programs(config: Config) -> tuple[Program, ...]:
-    """Return the processes of this robot. Raises ConfigError if two of them have one name.
+    """Return the processes of this robot. Raises ConfigError if two have the same name.
 
-    Devices start before connections, so that a motor has received its stop before any command can arrive.
+    Devices start before connections: motors have received a stop before any command can arrive.
     """
     core = [program for enabled, program in _core(config) if enabled]
     added = programs_of(config.installed, config, core=(program.name for program in core))
@@ -28,7 +28,9 @@ def _core(config: Config) -> Iterator[tuple[bool, Program]]:
     bridge, mirror = config.services.mqtt_bridge, config.transport.mqtt_mirror
     yield True, _announcer(config)
     yield from ((True, _serial_line(config, *line)) for line in config.serial_instances().items())
-    seams = ((one.observer, one.step, one.private, *one.requests) for one in config.installed)
+    seams = (
+        (extension.observer, extension.step, extension.private, *extension.requests) for extension in config.installed
+    )
     shares = tuple(place.partition(":")[0] for places in seams for place in places if place)
     arguments = (str(config.path),)
     service = "pebble.services.mqtt_bridge.service:MqttBridge"
@@ -45,9 +47,9 @@ def shared_modules(config: Config, table: Iterable[Program]) -> list[str]:
 
 
 def preload(modules: Iterable[str]) -> None:
-    """Import ``modules``, because parent and children share the memory that was written before a fork.
+    """Import ``modules`` in the launcher: children share its memory, as far as it was written before the fork.
 
-    A module that cannot be imported is left to the process that runs it, which reports the error.
+    A module that cannot be imported is skipped: the process that runs it reports the error.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # else numpy starts threads, and no fork may follow
     for name in modules:

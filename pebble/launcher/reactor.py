@@ -1,4 +1,4 @@
-"""A thread that waits for descriptors, timers and stop signals at once."""
+"""An event loop of one thread: it waits for descriptors, timers and stop signals at once."""
 
 import selectors
 import signal
@@ -19,8 +19,8 @@ Job = Callable[[], None]
 class Reactor:
     """A loop that calls jobs when a descriptor can be read or a time has come. For one thread only.
 
-    Its clock stands still while this process is suspended, because the other processes are mostly suspended, too.
-    ``on_stall(seconds)`` is called afterwards.
+    Its clock does not count time in which this process is suspended, because the other processes are then mostly
+    suspended, too. ``on_stall(seconds)`` is called afterwards.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Reactor:
         return self._timers.add(self.now() + seconds, job, period=seconds)
 
     def run_until(self, condition: Callable[[], bool], timeout: float | None = None) -> bool:
-        """Work until ``condition()`` holds; False when ``timeout`` seconds have passed without it."""
+        """Run jobs until ``condition()`` is true; return False if ``timeout`` seconds pass first."""
         end = None if timeout is None else self.now() + timeout
         self._read = self._clock()
         try:
@@ -77,7 +77,7 @@ class Reactor:
         self._selector.close()
 
     def _turn(self, *waits: float | None) -> None:
-        """Read descriptors, then run timers, because a timer that checks for signs of life must know the newest."""
+        """Run the jobs of readable descriptors, then timers: a timer that checks for life needs the newest signs."""
         for key, _ in self._selector.select(min([_TURN_S, *(wait for wait in waits if wait is not None)])):
             if key.fd in self._selector.get_map():  # an earlier job of this turn may have forgotten it
                 key.data()
@@ -87,8 +87,7 @@ class Reactor:
 class StopSignals:
     """A counter of SIGTERM, SIGINT and SIGHUP from :meth:`install` on; ``descriptor`` is readable after each.
 
-    The signal handler calls ``on_repeat`` from the second signal on: the user does not want to wait any longer. Main
-    thread only.
+    From the second signal on, the handler calls ``on_repeat``, as the user no longer wants to wait. Main thread only.
     """
 
     def __init__(self, on_repeat: Callable[[], None]) -> None:

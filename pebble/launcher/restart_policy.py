@@ -1,4 +1,4 @@
-"""The record of one program across its restarts: when it is started again, and when it counts as stuck. Pure."""
+"""The history of one program's starts and exits: when to start it again, and when it counts as stuck. Pure."""
 
 from collections import deque
 from typing import Literal
@@ -43,11 +43,11 @@ class RestartPolicy:
         return sum(now - at <= LOOP_WINDOW_S for at in self._exits)
 
     def request_delay_s(self, now: float) -> float:
-        """Return the seconds to wait before a released on-demand program is started on a new request."""
+        """Return the seconds to wait before an on-demand program is started again by a new request."""
         return max(0.0, self._started + START_INTERVAL_S - now)
 
     def started(self, now: float, *, plain: bool = False) -> None:
-        """Record a start. A ``plain`` program is ready at once, and not watched until it gives a sign of life."""
+        """Record a start. A ``plain`` program counts as ready; it is watched from its first sign of life on."""
         if self.state == "stopped":  # it was asked to end: this is no restart
             self.state = "init"
         elif self.last_exit is not None:

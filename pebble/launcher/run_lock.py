@@ -14,9 +14,9 @@ log = logging.getLogger(__name__)
 
 
 class RunLock:
-    """The lock of a run directory, created for this user alone. The kernel releases the lock when the process ends.
+    """The lock of a run directory, which is made for this user alone. The kernel releases it when the process ends.
 
-    A second lock is in the state directory, for launchers whose environment names another run directory.
+    A second lock, in the state directory, also excludes launchers that were started with another run directory.
 
     Raises PebbleError when another process holds a lock, or when the directory cannot be trusted.
     """
@@ -58,8 +58,8 @@ class RunLock:
     def keep(self) -> bool:
         """Create the directory and the lock again if a cleaner or a logout has removed them. Call this every second.
 
-        Return True if they were created: programs that start now cannot reach those that run. Raises PebbleError if
-        another launcher has taken the lock.
+        True if they were created: programs that start now cannot reach those that were already running. Raises
+        PebbleError if another launcher has taken the lock.
         """
         lock, problem = self._lock, ""
         try:

@@ -82,7 +82,7 @@ class StatusPublisher:
             self._pipe.record(self._message(LOGS, record))
 
     def stood_still(self) -> None:
-        """Give systemd a sign of life after this process stood still, because systemd's clock has run on."""
+        """Give systemd a sign of life after this process was suspended: systemd's clock did not stop."""
         if self._systemd.watchdog_period_s is not None:
             self._systemd.watchdog()
 
@@ -116,8 +116,8 @@ class StatusPublisher:
     ) -> Status:
         """Return the status message. ``webrtc_url``: the address of the pictures that operator pages show."""
         driveable = self._driveable.assessment({name: service.state for name, service in states.items()})
-        more = {"mcu": mcus or None, "driveable": driveable, "webrtc_url": webrtc_url}
-        return Status(t=_now_ms(), value={"services": states, **{name: part for name, part in more.items() if part}})
+        parts = {"mcu": mcus or None, "driveable": driveable, "webrtc_url": webrtc_url}
+        return Status(t=_now_ms(), value={"services": states, **{key: part for key, part in parts.items() if part}})
 
     def _state(self, supervisor: ProcessSupervisor) -> ServiceState:
         policy = supervisor.policy
@@ -137,7 +137,7 @@ class StatusPublisher:
         self._pipe.state(self._message(channel, value))
 
     def _will(self) -> Message:
-        """Return the status with every service stopped: children die with the launcher, whose end publishes it."""
+        """Return the will: the status with every service stopped. The broker publishes it when the launcher dies."""
         shown = (supervisor.program.name for supervisor in self._supervisors if supervisor.shown)
         return self._message(STATUS, self._status({name: ServiceState(state="stopped") for name in shown}))
 
@@ -147,7 +147,7 @@ class StatusPublisher:
 
 
 def _rests(supervisor: ProcessSupervisor) -> bool:
-    """True if the program is on-demand and not requested: systemd's summary leaves it out."""
+    """True if the program is on-demand and not requested now. systemd's summary leaves such programs out."""
     return supervisor.program.on_demand and not supervisor.requested and not supervisor.running
 
 

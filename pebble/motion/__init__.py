@@ -1,4 +1,4 @@
-"""The decisions about moving and stopping a robot. The files are those of the boards' firmware: MicroPython as well.
+"""The decisions about moving and stopping a robot, shared with the boards: plain MicroPython.
 
-Their links lead to ``firmware/common``, so a rule that is changed there changes on boards and on Linux robots.
+The files are links to ``firmware/common``, so a changed rule changes on boards and on Linux robots.
 """

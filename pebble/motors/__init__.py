@@ -1,1 +1,1 @@
-"""The way of a command to the motors: inbox, latch, arbiter and lease, and the file that outlives the process."""
+"""The way of a command to the motors: inbox, latch, arbiter and lease, and the file that keeps the stop."""

@@ -1,4 +1,4 @@
-"""Control of a Linux robot's motor owner: answers to requests, and the published state."""
+"""Control of a Linux robot's motor owner: it answers requests for control, and publishes who has it."""
 
 import logging
 import operator
@@ -38,8 +38,8 @@ class Control:
     ) -> None:
         """Store the arguments; ``owners``: all motor owners of the robot.
 
-        ``show_turn()`` must send the result of :meth:`turn` to the other owners. ``bridged``: the silence of a client
-        counts only as far as the bridge vouches (:meth:`vouch`) that it would have passed on messages.
+        ``show_turn()`` must send the result of :meth:`turn` to the other owners. ``bridged``: a client counts as silent
+        only for the time for which the bridge vouches (:meth:`vouch`) that it has passed on all messages.
         """
         self.boot = secrets.token_hex(4)  # of this life of the motor owner
         self._named = security.named
@@ -61,20 +61,20 @@ class Control:
         )  # fmt: skip
 
     def holds(self, drive: Drive) -> bool:
-        """True if this command is from the client that has control. Any thread may ask."""
+        """True if the client that has control sent this command. Any thread may ask."""
         return isinstance(drive.key, str) and self.lease.holds(drive.key, self.account(drive) or "")
 
     def knows(self, request: ControlRequest) -> bool:
-        """True if the sender of ``request`` has control, or is the first that asks for control. Any thread may ask."""
+        """True if the sender of ``request`` has control, or is the first that asks for it. Any thread may ask."""
         client = self.sender(request)
         return client == self.lease.holder[:2] or client == self.lease.asker[:2]
 
     def sender(self, request: ControlRequest) -> tuple[str, str]:
-        """Return the account and the id of a client, by which the lease tells clients apart. Any thread may ask."""
+        """Return the account and the id that identify a client to the lease. Any thread may ask."""
         return self._client(request)[:2]
 
     def request(self, request: ControlRequest, over: bool, now: float) -> None:
-        """Request or release control; ``over``: without asking its holder."""
+        """Handle a request for control, or its release; ``over``: take control without asking its holder."""
         client = self._client(request)
         if request.ends():
             self.lease.release(client, _ms(now))
@@ -86,7 +86,7 @@ class Control:
         self.lease.vouch(vouched.begin, vouched.end, _ms(now))
 
     def doubt(self, now: float) -> None:
-        """Note that earlier messages may have been lost between the bridge and here."""
+        """Note that messages the bridge passed on earlier may not have arrived here."""
         self.lease.doubt(_ms(now))
 
     def account(self, drive: Drive) -> str | None:
@@ -101,11 +101,11 @@ class Control:
 
     @property
     def peers(self) -> frozenset[str]:
-        """The other motor owners whose turns this one needs."""
+        """Names of the other motor owners, whose turns this one needs."""
         return frozenset() if self._shared is None else self._shared.peers
 
     def receive_turn(self, owner: str, turn: ControlTurn, now: float) -> None:
-        """Take a turn of a peer; call :meth:`note` then."""
+        """Handle the turn of a peer. Call :meth:`note` afterwards."""
         if self._shared is not None:
             self._shared.receive(owner, turn, _ms(now))
 
@@ -118,11 +118,11 @@ class Control:
         return self._shared is not None and self._shared.waits(_ms(now))
 
     def left_ms(self, now: float) -> int:
-        """Return the longest time for which a command that is permitted now may move the motors."""
+        """Return the longest time for which a command that is permitted now may still move the motors."""
         return sys.maxsize if self._shared is None else max(0, self._shared.until - _ms(now))
 
     def note(self, now: float) -> bool:
-        """Publish a changed state; return True, once, if control has passed to another client or ended.
+        """Publish the state if it has changed; return True, once, if control has passed to another client or ended.
 
         The caller must halt the motors then.
         """
@@ -142,12 +142,12 @@ class Control:
 
     @property
     def due(self) -> float | None:
-        """The time at which :meth:`tick` must run next; None if nothing is due."""
+        """Time at which :meth:`tick` must run next; None if nothing is due."""
         times = (self._next, self._state.due, self._turn_due, self._turns.due)
         return min((at for at in times if at is not None), default=None)
 
     def tick(self, now: float) -> None:
-        """End control that is over; call :meth:`note` and :meth:`show_turn` then."""
+        """End control whose time is over. Call :meth:`note` and :meth:`show_turn` afterwards."""
         if self._next is not None and now >= self._next:
             self._next = None
             self.lease.tick(_ms(now))
@@ -155,7 +155,7 @@ class Control:
         self._turns.tick(now)
 
     def show_turn(self, now: float) -> None:
-        """Send the turn to the other owners, if it has changed or is due again; the motors are halted before."""
+        """Send the turn to the other owners if it has changed or must be repeated. Halt the motors before."""
         if self._turn_due is not None and now >= self._turn_due:
             self._turn_due = now + _REPEAT_S
             self._turns.changed(now)

@@ -1,4 +1,4 @@
-"""Messages that wait to be judged before they reach the motors: stops, resets, requests for control, drive commands."""
+"""An inbox for messages that are judged before they reach the motors: stops, resets, requests, drive commands."""
 
 import threading
 from itertools import chain
@@ -27,9 +27,9 @@ _HOLDER = -2  # in place of the number of a run: the holder of control
 
 
 class ReceivedDrive(Struct, frozen=True):
-    """A drive command, and when it was received on the service's clock.
+    """A drive command, with the time at which it was received.
 
-    ``company``: the members of its group that are carried out together with it, or not at all.
+    ``company``: the other members of its group; all are carried out together, or none.
     """
 
     drive: Drive
@@ -38,14 +38,14 @@ class ReceivedDrive(Struct, frozen=True):
 
 
 class ReceivedReset(Struct, frozen=True):
-    """A reset, and when it was received on the service's clock."""
+    """A reset, with the time at which it was received."""
 
     reset: EstopReset
     at: float
 
 
 class ReceivedRequest(Struct, frozen=True):
-    """A request for control, whether it takes control over, and when it was received on the service's clock."""
+    """A request for control, with the time at which it was received, and whether it takes control over."""
 
     request: ControlRequest
     over: bool
@@ -65,11 +65,11 @@ class Batch(Struct):
 
 
 class MotionInbox:
-    """A bounded inbox. Any thread puts, one takes; a ``put`` returns True if the inbox was empty: wake the taker then.
+    """A bounded inbox. Any thread may put, one takes. ``put`` returns True if the inbox was empty: then wake the taker.
 
-    The newest drive command of each sender waits, and before it the zero that it replaced: a zero is always judged. The
-    holder of control is a sender of its own, whom others do not replace. So is each client that requests control, by
-    account and id, as in the lease: one account may name any number of persons.
+    Of each sender the newest drive command waits, and before it any zero that it replaced, because a zero is always
+    judged. The holder of control is a sender apart, so that no other replaces its commands. So is each client that
+    requests control, by account and id as in the lease: one account may be used by any number of persons.
     """
 
     def __init__(self, control: Control) -> None:
@@ -107,8 +107,8 @@ class MotionInbox:
             sender = self._control.sender(request)
             waiting = self._requests.pop(sender, None)
             if len(self._requests) >= _REQUESTS:
-                known = self._control.knows
-                del self._requests[next(key for key, received in self._requests.items() if not known(received.request))]
+                knows = self._control.knows
+                del self._requests[next(key for key, received in self._requests.items() if not knows(received.request))]
                 self.dropped += 1
             over = not request.ends() and (over or (waiting is not None and waiting.over))
             self._requests[sender] = ReceivedRequest(request, over, now)
@@ -127,7 +127,7 @@ class MotionInbox:
             return was_empty
 
     def note_state(self, state: State) -> None:
-        """Note that a connection is lost, and messages with it; the loss counts when the next messages come."""
+        """Note a lost connection, and with it lost messages; the loss counts when the next messages come."""
         if state is not State.CONNECTED:
             with self._lock:
                 self._lost = True
@@ -168,16 +168,16 @@ class MotionInbox:
 
 
 def run_of(drive: Drive) -> int:
-    """Return the run of a script's drive command, PERSON for a person's, or UNKNOWN_RUN."""
+    """Return the run of a script's drive command, or UNKNOWN_RUN; PERSON for a person's command."""
     if drive.source != SCRIPT:
         return PERSON
     return drive.run if isinstance(drive.run, int) else UNKNOWN_RUN
 
 
 def _replaced(waiting: list[ReceivedDrive], newest: ReceivedDrive) -> list[ReceivedDrive]:
-    """Return the commands that wait once ``newest`` has come: at most one zero and one command after it.
+    """Return the commands that wait when ``newest`` has come: at most a zero and a command after it.
 
-    Two zeros become one: as new as the newer one, and final if either of them is.
+    Two zeros become one zero with the later time, final if either of them is final.
     """
     zeros = [received for received in waiting if not received.drive.moves]
     if newest.drive.moves or not zeros:

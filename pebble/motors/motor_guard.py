@@ -1,4 +1,4 @@
-"""Decides for one motor owner which drive commands move its motors, and stops them: latch, arbiter and deadline."""
+"""Decides which drive commands move the motors of an owner, and stops them: latch, arbiter and deadline."""
 
 import logging
 import operator
@@ -38,7 +38,7 @@ class MotorGuard:
     """The emergency stop and the arbiter of a Linux robot's motor owner; on the service's thread.
 
     Call :meth:`begin` first, and :meth:`tick` at :attr:`due`. ``publish(state)`` is called with each new state, at most
-    four times a second. ``file`` outlives a power cut, ``barred_file`` this process, as running scripts do.
+    four times a second. ``file`` keeps the stop over a power cut, ``barred_file`` barred runs over a restart.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class MotorGuard:
         return self._saving == self._saved if self._can_save else None
 
     def stop(self, command: EstopCommand, now: float) -> None:
-        """Latch an emergency stop. The caller has stopped the motors before."""
+        """Latch an emergency stop. The caller must have stopped the motors before."""
         name = command.stop if isinstance(command.stop, str) else secrets.token_hex(8)
         by, why, earlier_by = _given(command.by), _given(command.why), self._latch.by
         if self._arbiter.stop(name, by, why, time.time_ns() // 1_000_000):
@@ -146,11 +146,11 @@ class MotorGuard:
 
     @property
     def due(self) -> float | None:
-        """The time at which :meth:`tick` must run next; None if nothing is due."""
+        """Time at which :meth:`tick` must run next; None if nothing is due."""
         return min((at for at in (self._state.due, self._hold_until) if at is not None), default=None)
 
     def tick(self, now: float) -> None:
-        """End a person's hold that is over, and publish a state that had to wait."""
+        """End a person's hold whose time is over, and publish a state that had to wait."""
         if self._hold_until is not None and now >= self._hold_until:
             self._hold_until = None
             self._arbiter.tick(_ms(now))
@@ -159,14 +159,14 @@ class MotorGuard:
         self._state.tick(now)
 
     def on_saved(self, number: int, succeeded: bool, now: float) -> None:
-        """Note that write ``number`` of the file has ended."""
+        """Note the result of write ``number`` of the file."""
         if succeeded:
             self._saved = number
         if number == self._saving:
             self._state.changed(now)
 
     def save_again(self) -> None:
-        """Repeat a write that failed, or whose file was removed since, unless the last write is still running."""
+        """Write the file again if the last write failed, or the file was removed, unless a write is still running."""
         if not self._can_save and self._file.can_save():
             self._can_save = True
             self._save()
@@ -176,7 +176,7 @@ class MotorGuard:
             self._barred_file.save(self._barred)
 
     def appeared_stop(self) -> EstopCommand | None:
-        """Return an unknown stop from a file that has just appeared, as after a late mount; else None.
+        """Return the stop in a file that has just appeared (a late mount), if this owner does not know it; else None.
 
         A file that has appeared without an unknown stop is overwritten with the state here, which is newer.
         """
@@ -193,7 +193,7 @@ class MotorGuard:
         return None
 
     def repeat_state(self, now: float) -> None:
-        """Publish the state again: a broker that was restored from an older save retains an older one."""
+        """Publish the state again, because a broker that was restored from a save retains an older state."""
         self._state.changed(now)
 
     def state(self) -> EstopState:
@@ -224,7 +224,7 @@ class MotorGuard:
 
 
 def _described(by: str, why: str) -> str:
-    """Return the sender and the reason of a stop or a reset, fit for a log."""
+    """Return the sender and the reason of a stop or a reset, for the log."""
     _, by, why = stop_of({"by": by, "why": why})
     return f"{by or 'an unnamed sender'}{f' ({why})' if why else ''}"
 

@@ -1,4 +1,4 @@
-"""The base of every program that owns motors: only what its guard permits moves them, and only for a limited time."""
+"""The base of every program that owns motors: it moves them only as its guard permits, and for a limited time."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class MotorOwner(Service, ABC):
     """A service that receives stops, control and drive commands, and moves motors as its guard permits.
 
     A subclass moves them: :meth:`move`, :meth:`halt`. Both are called on the service's thread or on one of the
-    transport's, never on two at once, and must not wait. ``move`` is valid for some time only: :meth:`halt` is called
-    at its end, and a subclass whose hardware goes on by itself also gives it that limit. It halts in its ``start()``
-    before anything can arrive, and at its end, by :meth:`on_stop`.
+    transport's, never on two at once, and must not wait. ``move`` is valid for some time only, and :meth:`halt` is
+    called at its end; a subclass whose hardware continues by itself also gives the hardware that limit. The subclass
+    halts in its ``start()``, before anything can arrive, and at its end, by :meth:`on_stop`.
     """
 
     publishes: ClassVar[tuple[c.Channel, ...]] = (c.ESTOP_STATE, c.CONTROL_STATE, c.CONTROL_TURN)
@@ -83,7 +83,7 @@ class MotorOwner(Service, ABC):
     @property
     @abstractmethod
     def owner(self) -> str:
-        """The name of this motor owner in ``outgoing/estop/OWNER``, as in ``Extension.motors``."""
+        """Name of this motor owner in ``outgoing/estop/OWNER``, as in ``Extension.motors``."""
 
     @property
     def drive_timeout_s(self) -> float:
@@ -92,7 +92,7 @@ class MotorOwner(Service, ABC):
 
     @property
     def latched(self) -> bool:
-        """True while an emergency stop lasts, for hardware with a lock of its own; changes only in :meth:`judge`."""
+        """True while an emergency stop lasts, for hardware that locks itself. Changes only in :meth:`judge`."""
         return self._guard.latched
 
     @abstractmethod
@@ -104,14 +104,14 @@ class MotorOwner(Service, ABC):
         """Stop the motors now. This is called again and again while the motors stand still."""
 
     def move_with(self, drive: Drive, valid_s: float, company: tuple[groups.Member, ...]) -> None:  # noqa: ARG002
-        """Carry out a drive command, a zero too, together with the members of its group on channels in :attr:`company`.
+        """Carry out a drive command, or a zero, and at once the members of its group on channels in :attr:`company`.
 
-        Both are to take effect at once. A subclass with such channels overrides this method.
+        A subclass with such channels overrides this method.
         """
         self.move(drive, valid_s)
 
     def accompany(self, company: tuple[groups.Member, ...]) -> None:
-        """Carry out members of a group that has no drive command; on the service's thread."""
+        """Carry out the members of a group without a drive command; on the service's thread."""
 
     def report(self, able: bool, why: str = "") -> None:
         """Tell the launcher whether the motors can be moved, and if not, why: ``driveable`` in the robot's status."""
@@ -142,7 +142,7 @@ class MotorOwner(Service, ABC):
         self._judge_soon(self._waiting.put_request(request, True, arrived))
 
     def set_up(self) -> None:
-        """Receive the turns of other motor owners as well, where there are any."""
+        """Start and subscribe, also to the turns of other motor owners if there are any."""
         self.transport.on_state(self._waiting.note_state)
         super().set_up()
         receive = self.refusals.reader(c.CONTROL_TURN, self._receive_turn)
@@ -163,11 +163,11 @@ class MotorOwner(Service, ABC):
             self._judge_soon(self._waiting.put_drive(drive, arrived))
 
     def is_copy(self, command: Drive | LightsSolid) -> bool:
-        """True if ``command`` is the copy of a group's member, and this motor owner takes the group itself."""
+        """True if ``command`` is the copy of a group's member: this motor owner takes the group itself."""
         return self._takes_groups and command.group is True
 
     def _receive_group(self, message: Message, _value: Any, _names: dict[str, str]) -> None:
-        """Take the members of a group that are for this motor owner; other programs act on the members' copies."""
+        """Handle the members of a group that are meant for motors; other programs receive copies of their members."""
         try:
             members = groups.decode(message.payload)
         except PayloadError as error:
@@ -191,7 +191,7 @@ class MotorOwner(Service, ABC):
     # -- commands
 
     def judge(self) -> None:
-        """Judge all waiting messages; stops first, as they void every drive command that waits with them."""
+        """Judge all waiting messages, stops first, because a stop voids the drive commands that wait with it."""
         batch = self._waiting.take()
         latches = not batch.stops or self._latches  # without a stop nothing here depends on it
         for stop in batch.stops:
@@ -278,7 +278,7 @@ class MotorOwner(Service, ABC):
 
     @property
     def _latches(self) -> bool:
-        """True if an emergency stop latches: the broker refuses neither its topic nor the topic of resets."""
+        """True if an emergency stop latches: the broker accepts both its topic and the topic of resets."""
         return not (self.refused(c.ESTOP) or self.refused(c.ESTOP_RESET))
 
     def on_connected(self) -> None:
@@ -286,7 +286,7 @@ class MotorOwner(Service, ABC):
 
     @every(_CHECK_S)
     def check_subscriptions(self) -> None:
-        """Withdraw the emergency stop while its topics are refused. Raises TransportError for a refused drive topic."""
+        """Withdraw the emergency stop while its topics are refused. TransportError for a refused drive topic."""
         if self.refused(c.DRIVE):
             raise TransportError(
                 f"the broker refuses the subscription to {self.addresses[c.DRIVE].topic}: nothing can drive this robot."
@@ -346,7 +346,7 @@ class MotorOwner(Service, ABC):
         self._arm_guard()
 
     def _publish_state(self, state: EstopState) -> None:
-        """Publish the state; while a stop does not latch, remove it, repeatedly, as a bridge may have missed that."""
+        """Publish the state. While a stop does not latch, remove it, repeatedly: a bridge may have missed that."""
         if self._latches:
             self.publish(c.ESTOP_STATE, state, owner=self.owner)
         else:

@@ -1,4 +1,4 @@
-"""Publishes a state when it has changed, and not more often than its topic may."""
+"""Publishes a state when it changes, but not more often than its topic may be published."""
 
 from collections import deque
 from collections.abc import Callable
@@ -7,7 +7,7 @@ STATES_PER_S = 4
 
 
 class Paced:
-    """A rate limit: ``publish()`` is called at each change, or as soon as ``per_s`` calls a second allow it."""
+    """A rate limit: each change calls ``publish()``, at once or as soon as ``per_s`` calls a second allow it."""
 
     def __init__(self, publish: Callable[[], object], per_s: int = STATES_PER_S) -> None:
         self._publish = publish
@@ -16,7 +16,7 @@ class Paced:
 
     @property
     def last(self) -> float:
-        """The time at which the newest state was published."""
+        """Time at which the newest state was published."""
         return self._published[-1]
 
     def changed(self, now: float) -> None:
@@ -29,6 +29,6 @@ class Paced:
             self._publish()
 
     def tick(self, now: float) -> None:
-        """Publish a state that had to wait; call it at :attr:`due`."""
+        """Publish a state that had to wait. Call this at :attr:`due`."""
         if self.due is not None and now >= self.due:
             self.changed(now)

@@ -1,4 +1,4 @@
-"""The leases of several motor owners that are one robot: the first by name grants, the others follow it. Pure.
+"""The leases of a robot with several motor owners: the first owner by name grants, the others follow. Pure.
 
 Times are milliseconds of the clock that all processes of a machine share.
 """
@@ -20,7 +20,7 @@ class SharedLease(VouchedLease):
     until = sys.maxsize  # when everything stops, unless another turn is received before
 
     def __init__(self, peers: frozenset[str], now: int, *lease: Any) -> None:
-        """Store the owners whose turns are given to :meth:`receive`; ``lease``: the other arguments of VouchedLease."""
+        """Store the peers, whose turns are given to :meth:`receive`; ``lease``: the other arguments of VouchedLease."""
         super().__init__(now, *lease)
         self.peers = peers
 
@@ -30,7 +30,7 @@ class SharedLease(VouchedLease):
 
     @abstractmethod
     def waits(self, now: int) -> bool:
-        """True if nothing may move, for any client."""
+        """True if no client may move anything now."""
 
     @abstractmethod
     def receive(self, owner: str, turn: ControlTurn, now: int) -> None:
@@ -38,7 +38,7 @@ class SharedLease(VouchedLease):
 
     @abstractmethod
     def shown(self, barred: int, now: int) -> ControlTurn | None:
-        """Return the turn that the peers are to receive."""
+        """Return the turn to send to the peers; None if there is none to send."""
 
 
 class FirstLease(SharedLease):
@@ -71,7 +71,7 @@ class FirstLease(SharedLease):
 
 
 class FollowingLease(SharedLease):
-    """The lease of another motor owner, which follows the lease of the first: it grants and ends nothing itself."""
+    """The lease of any other motor owner: it follows the lease of the first, and grants and ends nothing itself."""
 
     until = 0
 
@@ -83,7 +83,7 @@ class FollowingLease(SharedLease):
         return now >= self.until
 
     def receive(self, _owner: str, turn: ControlTurn, now: int) -> None:
-        """Follow the newest turn; a turn with a time in the future is from another clock and is ignored."""
+        """Follow the newest turn. A turn whose time lies in the future is from another clock, and ignored."""
         earlier = self._followed
         if turn.t > now or (earlier is not None and turn.t < earlier.t):
             return

@@ -1,4 +1,4 @@
-"""A small file that survives a power cut, written by a thread of its own: a disk may take seconds."""
+"""A small file that survives a power cut. A thread of its own writes it, because a disk may take seconds."""
 
 import json
 import logging
@@ -45,20 +45,20 @@ class StateFile:
 
     @property
     def in_place(self) -> bool:
-        """True unless the file that this process wrote was removed or replaced."""
+        """True unless the file that this process wrote was removed or replaced since."""
         try:
             return self._own is None or self._own.in_place
         except OSError:  # what is there cannot be seen
             return True
 
     def can_save(self) -> bool:
-        """True if the folder can be written or created, or ends with a container: a write there counts as failed."""
+        """True if the folder can be written or made, or is lost with this container: its writes count as failed."""
         existing = next(folder for folder in self.path.parents if os.access(folder, os.F_OK))
         return self.lost or (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK))
 
     @property
     def lost(self) -> bool:
-        """True if this is a container, and no volume holds the folder: a new container does not know the value."""
+        """True if this is a container and no volume holds the folder: the next container will not have the file."""
         if CONTAINER not in os.environ:
             return False
         return str(next(folder for folder in self.path.resolve().parents if folder.is_mount())) in LOST
@@ -81,14 +81,14 @@ class StateFile:
             return Unreadable()
 
     def appeared(self) -> Any:
-        """Return the value of a file that another process wrote; None if there is none, or it cannot be seen."""
+        """Return the value of a file that another process wrote; None without such a file, or if it is unreadable."""
         try:
             return None if self._own is not None and not self._own.replaced else self.load()
         except OSError:
             return None
 
     def save(self, value: Any) -> int:
-        """Write ``value`` soon; return at once, with the number of this write."""
+        """Let the thread write ``value`` soon; return the number of this write."""
         with self._changed:
             self._number += 1
             self._newest = self._number, value
@@ -100,7 +100,7 @@ class StateFile:
 
     @property
     def busy(self) -> bool:
-        """True if a value waits or is being written: its result follows."""
+        """True if a value waits to be written, or is being written; ``on_saved`` will follow."""
         with self._changed:
             return self._newest is not None or self._writing
 
@@ -126,7 +126,7 @@ class StateFile:
             self._on_saved(number, succeeded)
 
     def _write(self, value: Any) -> bool:
-        """Replace the file in one step: after a power cut it holds the old value or the new one."""
+        """Replace the file in one step. After a power cut it holds the old value or the new one."""
         try:
             make_folder(self.path.parent)
             write(self.path, json.dumps(value).encode(), 0o600, PebbleError)

@@ -1,4 +1,4 @@
-"""A lease that does not take a flood, an outage or a stalled broker for silence of its holder. Pure."""
+"""A lease whose holder is not taken for silent because of a flood, an outage or a stalled broker. Pure."""
 
 from pebble.motion.lease import Lease
 
@@ -7,7 +7,7 @@ _IDLE_MS, _OTHERS_MS = 5000, 2000  # as in Lease
 
 
 class VouchedLease(Lease):
-    """A lease for which a holder is quiet only during the time for which the bridge vouches.
+    """A lease that counts its holder as silent only for time for which the bridge vouches.
 
     The bridge vouches for a time after it has passed on all messages of that time to the motor owner.
     """
@@ -16,18 +16,18 @@ class VouchedLease(Lease):
     _received_all_since = 0
 
     def vouch(self, begin: int, end: int, now: int) -> None:
-        """Note the time for which the bridge vouches; a time in the future is from another clock and is ignored."""
+        """Note the time for which the bridge vouches. A time in the future is from another clock, and ignored."""
         if self.vouched is not None and begin <= end <= now:
             self.vouched = max(begin, self._received_all_since), end
 
     def doubt(self, now: int) -> None:
-        """Note that earlier messages may not have been received here, though they were passed on."""
+        """Note that messages which the bridge passed on earlier may not have arrived here."""
         self._received_all_since = now
 
     def tick(self, now: int) -> None:
-        """End control that is over, as in Lease, which has no method for a part of this, to save memory on boards.
+        """End control whose time is over. This repeats Lease.tick, which is kept in one piece to save memory on boards.
 
-        The quiet time is computed anew in each call, because the vouched time may shrink.
+        The silent time is computed in each call, because the vouched time may shrink.
         """
         if self.others and now - self._received >= _OTHERS_MS:
             self.others, self.changed = False, True
@@ -38,7 +38,7 @@ class VouchedLease(Lease):
             self._end(now)
 
     def _quiet_ms(self, since: int, now: int) -> int:
-        """Return for how long the holder has sent nothing, as far as the bridge vouches."""
+        """Return for how long the holder has been silent, counting only vouched time."""
         quiet = now - since
         if self.vouched is None or quiet >= ENDS_AFTER_MS:
             return quiet

@@ -36,8 +36,8 @@ class Addresses:
         renamed = self._channels.get(topic)
         if renamed is not None or not topic.startswith(self.base + "/"):
             return renamed
-        known = channel_of(topic[len(self.base) + 1 :])
-        return known if known is not None and known.is_pattern else None
+        channel = channel_of(topic[len(self.base) + 1 :])
+        return channel if channel is not None and channel.is_pattern else None
 
 
 def _address(channel: Channel, config: Config) -> Address:

@@ -1,4 +1,4 @@
-"""Work of root in other users' folders: done as the owner, so a link there reaches only what the owner could."""
+"""Lets root work in other users' folders with the rights of the owner, so a link there reaches nothing more."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pebble.runtime.whole_file import is_root
 
 @contextmanager
 def as_owner(folder: Path, *modules: str, make: bool = False) -> Iterator[None]:
-    """Run the ``with`` block as the owner of a folder, or of its nearest parent that exists, if this process is root.
+    """Run the ``with`` block as the owner of ``folder``, or of its nearest existing parent, if this process is root.
 
     For commands, whose process has one thread. ``modules`` are imported first: that user may not be able to read them.
     ``make``: create the folder if it is missing. Raises PebbleError as :func:`owner_of`.
@@ -37,7 +37,7 @@ def as_owner(folder: Path, *modules: str, make: bool = False) -> Iterator[None]:
 
 @contextmanager
 def as_before() -> Iterator[None]:
-    """Be root again for a moment, inside of :func:`as_owner`."""
+    """Be root again in the ``with`` block, inside of :func:`as_owner`."""
     if hasattr(os, "getresuid") and os.getresuid()[2] == 0 != os.geteuid():
         with as_user(Owner(0, os.getgid())):
             yield
@@ -48,13 +48,13 @@ def as_before() -> Iterator[None]:
 def require_own(folder: Path, does: str = "does not write there", *, there: bool = False) -> None:
     """Raise PebbleError if this process is root and the folder belongs to another user.
 
-    For programs that run in the folder for long, or with threads. A folder where every user may make files, such as
-    /tmp, is refused, too. ``folder`` may be a file; with ``there`` it has to exist. ``does``: what root does not do
-    then, for the error.
+    For programs with threads, or that use the folder for long. A folder in which every user may make files, such as
+    /tmp, is refused, too. ``folder`` may be a file; with ``there`` it has to exist. ``does`` completes the error: "root
+    does not …".
     """
     if not is_root():
         return
     owner = owner_of(folder, nameless=False, there=there)
-    who = f"user {owner.uid}" if owner.uid else "all users" if is_open(folder) else ""
-    if who:
+    if owner.uid or is_open(folder):
+        who = f"user {owner.uid}" if owner.uid else "all users"
         raise PebbleError(f"{folder} belongs to {who}, so root {does}: run it as that user, or name another folder")

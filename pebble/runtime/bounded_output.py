@@ -1,4 +1,4 @@
-"""The output of a program as lines for a log: bounded in length and number, and the missing lines are counted."""
+"""Makes lines for a log from a program's output: limited in length and number, with a count of dropped lines."""
 
 import re
 import time
@@ -19,13 +19,13 @@ _clock = re.compile(rb"\d\d:\d\d:\d\d(?:[.,]\d+)? ").match
 
 
 class BoundedOutput:
-    """A filter of a program's output that passes ``rate`` lines a second to ``write``. Times are passed in.
+    """A filter that passes at most ``rate`` lines a second of a program's output to ``write``. Times are passed in.
 
-    A line that is repeated at once is written once. Lines that count missing ones have the form of our programs' lines.
+    A line that is repeated at once is written once. A line that counts dropped ones looks like a line of our programs.
     """
 
     def __init__(self, write: Callable[[bytes], None], longest: int, now: float, *, rate: float = LINES_PER_S) -> None:
-        """Make a filter. ``longest``: bytes of a line; the rest of a longer line is left out."""
+        """Make a filter. ``longest``: the most bytes of a line; the rest of the line is cut off."""
         self.flooded = False  # by the newest chunk: the reader may take its time
         self._write, self._rate, self._most = write, rate, rate * _BURST_S
         self._lines = LineSplitter(longest, truncate=True)
@@ -37,11 +37,11 @@ class BoundedOutput:
 
     @property
     def waits(self) -> bool:
-        """True if dropped lines were not counted in the log yet; call :meth:`tick` from time to time then."""
+        """True if dropped lines were not yet counted in the log: then call :meth:`tick` from time to time."""
         return self._left_out + self._repeats > 0
 
     def feed(self, data: bytes, now: float) -> None:
-        """Take a chunk of output."""
+        """Handle a chunk of output."""
         self.tick(now)
         if self.flooded and len(data) > 2 * _SKIM and (end := data.rfind(b"\n", 0, -_SKIM)) >= 0:
             self._left_out, self._suppressed_at = self._left_out + data.count(b"\n", 0, end + 1), now
@@ -61,7 +61,7 @@ class BoundedOutput:
             self._say()
 
     def end(self) -> None:
-        """Write the last of the missing lines, and the unfinished line."""
+        """Write the last count of dropped lines, and the unfinished line."""
         self._say()
         if rest := self._lines.rest().rstrip():
             self._write(rest)

@@ -60,7 +60,7 @@ def check_connections(config: Config) -> None:
 
 
 def local_settings(config: Config, as_published: bool = False) -> Any:
-    """Return the settings of the local transport; for a third party's kind the section ``transport.settings``."""
+    """Return the settings of the local transport; those of a transport by others are ``transport.settings``."""
     kind = config.transport.kind
     if kind == "mqtt":
         settings = mqtt_settings(config.local_mqtt, as_published=as_published, reconnect_max_s=LOCAL_RECONNECT_S)
@@ -87,8 +87,8 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
 def stops_transport(config: Config) -> Transport | None:
     """Return the bridge's second connection to operators, only for stops; None if there is none.
 
-    Without accounts at the broker a second connection is no better than the first, unless the link may be thin: there
-    a client that sends too much fills the first connection. The second one is not as-published.
+    Without accounts at the broker a second connection helps only if the link may be thin: there a client that sends too
+    much fills the first connection. The second one is not as-published.
     """
     bridge = config.services.mqtt_bridge
     if config.security.level == "open" and (bridge.remote is not None or bridge.link.profile == "wide"):
@@ -102,7 +102,7 @@ def stops_transport(config: Config) -> Transport | None:
 
 
 def live_only(settings: MqttSettings) -> MqttSettings:
-    """Return the settings of a connection without retained messages (MQTT 5), so that none delays others."""
+    """Return the settings of a connection that gets no retained messages (MQTT 5), which would delay the others."""
     return replace_settings(settings, max_segment=SMALL_SEGMENT, sends_retained=False)
 
 
@@ -118,7 +118,7 @@ def _name(config: Config, kind: str, name: str) -> str:
 
 
 def _remote_settings(config: Config, remote: RemoteConnection) -> Any:
-    """Return the settings of an uplink: with Zenoh a client of a hub elsewhere, apart from the local transport."""
+    """Return the settings of an uplink; with Zenoh those of a client of a hub elsewhere."""
     if remote.kind != "zenoh":
         return remote.settings
     return client_of_hub(config.run_dir() / "remote", remote, remote.lease_ms, remote.account)
@@ -185,7 +185,7 @@ def mqtt_settings(
 ) -> MqttSettings:
     """Return the settings of a connection to a broker of the config.
 
-    A client id in the config is that of the bridge (``program=""``); ids of other programs begin with it.
+    A client id in the config is used by the bridge (``program=""``); ids of other programs begin with it.
     """
     client_id = mqtt.client_id if isinstance(mqtt, RemoteMqtt) else None
     return MqttSettings(

@@ -9,7 +9,7 @@ _LAUNCHERS = (ENCODING, LAUNCHER_PID, NOTIFY_FD, WANTED)  # between the launcher
 
 
 def withhold(passwords: Iterable[str]) -> None:
-    """Empty the variables ``passwords`` of this process: programs that it starts do not receive them.
+    """Empty the variables ``passwords`` of this process, so that programs which it starts do not receive them.
 
     The variables remain set, so that such a program can read a config that names them.
     """
@@ -19,7 +19,7 @@ def withhold(passwords: Iterable[str]) -> None:
 
 
 def child_environment(*more: Mapping[str, str]) -> dict[str, str]:
-    """Return this process's variables without the launcher's, updated by ``more``."""
+    """Return this process's variables without the launcher's, with ``more`` added."""
     merged = {name: value for name, value in os.environ.items() if name not in _LAUNCHERS}
     for variables in more:
         merged |= variables

@@ -1,4 +1,4 @@
-"""The end of a child process, noticed by a descriptor or, where the system denies that, by asking."""
+"""Notices the end of a child process: by a descriptor or, where the system denies that, by polling."""
 
 import errno
 import logging
@@ -12,7 +12,7 @@ log = logging.getLogger(__name__)
 
 
 def exit_descriptor(pid: int) -> int | None:
-    """Return a descriptor, readable after the end of a child; None: poll :func:`has_ended` instead. Raises OSError."""
+    """Return a descriptor that is readable once the child has ended; None: poll :func:`has_ended`. Raises OSError."""
     try:
         return os.pidfd_open(pid)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The Zenoh hub: a part of a robot's announcer, or a program of its own on another machine."""
+"""Runs the Zenoh hub: inside a robot's announcer, or as a program on another machine."""
 
 import logging
 import threading
@@ -41,7 +41,7 @@ def run_hub(settings: ZenohSettings, stop: EndSignal | threading.Event) -> None:
 
 @contextmanager
 def open_hub(settings: ZenohSettings) -> Iterator[ZenohHub]:
-    """Give a hub that is open during the ``with`` block. Raises TransportError if it cannot open."""
+    """Yield a hub that is open during the ``with`` block. Raises TransportError if it cannot open."""
     settings = replace(settings, wills=(*WILLS, *settings.wills), unretained=UNRETAINED)
     hub = ZenohHub(settings, _accounts(settings)).open()
     try:
@@ -53,7 +53,7 @@ def open_hub(settings: ZenohSettings) -> Iterator[ZenohHub]:
 
 
 def _accounts(settings: ZenohSettings) -> Admission | None:
-    """Return the admission of accounts of other machines, by the file ``transport.access``; None without that file."""
+    """Return the accounts of the file ``transport.access``, by which other machines are admitted; None without it."""
     if settings.access is None:
         return None
     from pebble.extension import ours, part  # only who needs it pays for it

@@ -16,7 +16,7 @@ LIMIT = 1000  # jobs that wait
 class Inbox:
     """A queue of jobs, posted by any thread and taken by one. Beyond ``limit`` jobs the oldest is dropped and counted.
 
-    Jobs without a name are dropped first, so that no number of them keeps out a command that ends something.
+    Jobs without a name are dropped first, so that they cannot keep out a command that ends something.
 
     A signal handler may post while its own thread is inside any of these methods: the lock and the wakeup are
     reentrant.
@@ -33,9 +33,9 @@ class Inbox:
         self.dropped = 0
 
     def post(self, job: Job, *, newest_of: Hashable = None, last_of: Hashable = None) -> None:
-        """Queue ``job``. With ``newest_of`` the job takes the place of a waiting job of that name.
+        """Queue ``job``. With ``newest_of`` the job replaces a waiting job of that name, at its place in the queue.
 
-        With ``last_of`` the job replaces such a job as well, but is queued behind all others.
+        With ``last_of`` the job replaces such a job as well, but goes to the end of the queue.
         """
         with self._lock:
             if last_of is not None:
@@ -49,12 +49,12 @@ class Inbox:
         self._wakeup.set()
 
     def post_internal(self, job: Job) -> None:
-        """Queue a job of the service's own life cycle: first in line and never dropped."""
+        """Queue a job of the service's life cycle, before all others. It is never dropped."""
         self._internal.append(job)
         self._wakeup.set()
 
     def wake(self) -> None:
-        """Let `wait` return without a job."""
+        """Make `wait` return without a job."""
         self._woken = True
         self._wakeup.set()
 

@@ -4,10 +4,10 @@ LINE_LIMIT = 256  # bytes; the longest line of any text protocol of an MCU is un
 
 
 class LineSplitter:
-    """A splitter that takes chunks of any size and returns complete lines of up to ``limit`` bytes.
+    """A splitter: takes chunks of any size, and returns complete lines of up to ``limit`` bytes.
 
-    A longer line is discarded up to the next ``end``. With ``truncate``, its first ``limit`` bytes are returned as
-    soon as they are complete, and only the rest is discarded.
+    A longer line is discarded up to the next ``end``. With ``truncate``, its first ``limit`` bytes are returned as soon
+    as they are complete, and only the rest is discarded.
     """
 
     def __init__(self, limit: int = LINE_LIMIT, end: bytes = b"\n", *, truncate: bool = False) -> None:
@@ -17,7 +17,7 @@ class LineSplitter:
         self._skipping = False  # inside the rest of a line that was too long
 
     def feed(self, chunk: bytes) -> list[bytes]:
-        """Return the lines that ``chunk`` completes, without their end. A CR stays: the protocol ignores it."""
+        """Return the lines that ``chunk`` completes, without their ends. A CR stays: the protocol ignores it."""
         lines: list[bytes] = []
         *complete, tail = chunk.split(self._separator)
         for part in complete:
@@ -34,9 +34,9 @@ class LineSplitter:
 
     def rest(self) -> bytes:
         """Return the unfinished line at the end of the stream."""
-        left = self._tail
+        unfinished = self._tail
         self.reset()
-        return left
+        return unfinished
 
     def reset(self) -> None:
         """Forget an unfinished line, because the stream starts again."""

@@ -12,15 +12,15 @@ _Why: TypeAlias = Annotated[str, Meta(max_length=200)]
 
 
 class Ready(Struct, frozen=True, tag_field="note", tag="ready"):
-    """A note that the process works from now on."""
+    """A note that the process has started to work."""
 
 
 class Alive(Struct, frozen=True, tag_field="note", tag="alive"):
-    """A sign of life, every second."""
+    """A sign of life, sent every second."""
 
 
 class Wanted(Struct, frozen=True, tag_field="note", tag="wanted"):
-    """A request that an on-demand program runs, beginning with ``encoding`` (empty: as configured), or its end."""
+    """A request to run an on-demand program, first with ``encoding`` (empty: as configured), or its end."""
 
     program: _Name
     on: bool
@@ -28,14 +28,14 @@ class Wanted(Struct, frozen=True, tag_field="note", tag="wanted"):
 
 
 class Held(Struct, frozen=True, tag_field="note", tag="held"):
-    """A request that an on-demand program waits, or its end."""
+    """A request to let an on-demand program wait, or its end."""
 
     program: _Name
     on: bool
 
 
 class Feature(Struct, frozen=True, tag_field="note", tag="feature"):
-    """A feature that the process has or lacks: pebble.launcher.features; the capabilities list it."""
+    """A note that the process has or lacks a feature of pebble.launcher.features; the capabilities list it."""
 
     name: Annotated[str, Meta(pattern=r"^(estop|control|outlets/[^/]{1,64}/(status|power))$(?!\n)")]
     has: bool
@@ -49,7 +49,7 @@ class Local(Struct, frozen=True, tag_field="note", tag="local"):
 
 
 class Mcu(Struct, frozen=True, tag_field="note", tag="mcu"):
-    """The state of a serial line. ``silent``: a board that sends all the time has stopped."""
+    """The state of a serial line. ``silent``: a board that normally sends all the time has stopped sending."""
 
     state: Literal["absent", "booting", "ready", "silent"]
     silent_ms: Literal[0, 1000, 10000] | None  # at least so long ago the board sent; None: never since opening
@@ -58,7 +58,7 @@ class Mcu(Struct, frozen=True, tag_field="note", tag="mcu"):
 
 
 class Reach(Struct, frozen=True, tag_field="note", tag="reach"):
-    """A note whether messages of a motor owner arrive in the process."""
+    """A note whether messages of a motor owner arrive in this process."""
 
     owner: _Name
     reached: bool

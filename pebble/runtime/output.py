@@ -1,4 +1,4 @@
-"""The output of commands: as wide as the terminal, unfolded in a pipe, and discarded if no program reads it."""
+"""The output of commands: as wide as the terminal; in a pipe not folded, and discarded if its reader has ended."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _UNFOLDED = 10_000  # columns
 
 
 def console() -> Console:
-    """Return a console for tables. In a pipe no line is folded or cut, unless COLUMNS has a width."""
+    """Return a console for tables. In a pipe, lines are neither folded nor cut, unless COLUMNS sets a width."""
     from rich.console import Console
 
     is_wide = not sys.stdout.isatty() and "COLUMNS" not in os.environ

@@ -1,4 +1,4 @@
-"""A process's side towards its launcher: ends with the launcher, sends notes to it, and logs in its format."""
+"""The link of a process to its launcher: it ends with the launcher, sends notes to it, and logs in its format."""
 
 import ctypes
 import logging
@@ -37,14 +37,14 @@ def set_up_logging(level: str) -> None:
 
 
 class MaskingFormatter(logging.Formatter):
-    """A formatter that hides logins in lines and tracebacks, and characters that steer a terminal."""
+    """A formatter that hides logins in lines and tracebacks, and characters that control a terminal."""
 
     def format(self, record: logging.LogRecord) -> str:
         return shown(without_secrets(super().format(record)))
 
 
 def set_log_level(level: str) -> None:
-    """Log from ``level`` on. A change writes into each logger, into memory that is shared with the launcher."""
+    """Log from ``level`` on. Set it only if it differs: this writes into memory that is shared with the launcher."""
     if logging.getLevelName(logging.getLogger().level) != level:
         logging.getLogger().setLevel(level)
 
@@ -52,13 +52,13 @@ def set_log_level(level: str) -> None:
 def tagged(part: str, pid: int, line: bytes) -> bytes:
     """Return a line of a child of this process, for stderr: the launcher logs it under ``part`` and ``pid``.
 
-    ``part`` contains no ``]``.
+    ``part`` must not contain ``]``.
     """
     return f"[{part} {pid}] ".encode() + line + b"\n"
 
 
 def die_with_launcher() -> None:
-    """Ask the kernel for SIGTERM at the launcher's death, so that a killed launcher leaves no orphans."""
+    """Ask the kernel to send SIGTERM when the launcher dies, so that a killed launcher leaves no orphans."""
     launcher = os.environ.get(LAUNCHER_PID)
     if launcher is None:
         return
@@ -68,19 +68,19 @@ def die_with_launcher() -> None:
 
 
 def end_with_parent(number: int | None = None) -> None:
-    """Ask the kernel to send this process ``number``, else SIGKILL, when the thread that started it has ended."""
+    """Ask the kernel to send this process the signal ``number``, by default SIGKILL, when its parent thread ends."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL if number is None else number)
 
 
 class ProgramRequest(NamedTuple):
-    """A request that an on-demand program runs, beginning with ``encoding`` (empty: as configured), or ends."""
+    """A request to run an on-demand program, first with ``encoding`` (empty: as configured), or to end it."""
 
     on: bool
     encoding: str = ""
 
 
 def earlier_requests() -> dict[str, ProgramRequest]:
-    """Return the requests that an earlier process of this program made, by the requested program."""
+    """Return the requests of an earlier process of this program, by the requested program."""
     words = (word.partition("=") for word in os.environ.get(WANTED, "").split())
     return {name: ProgramRequest(on=True, encoding=encoding) for name, _, encoding in words}
 
@@ -93,7 +93,7 @@ def requested_encoding() -> str | None:
 class Notifier:
     """A sender of notes to the launcher. Without a launcher nothing is sent.
 
-    A method returns False if the launcher was too busy: then call it again.
+    A method returns False if the launcher was too busy to take the note: then call it again.
     """
 
     def __init__(self) -> None:
@@ -120,11 +120,11 @@ class Notifier:
         return self._write(notes.Wanted(program, request.on, request.encoding))
 
     def hold(self, program: str, on: bool) -> bool:
-        """Let an on-demand program wait, until this process ends at most, or let it run again; see :meth:`request`."""
+        """Let an on-demand program wait, or end its wait; the end of this process does so, too. See :meth:`request`."""
         return self._write(notes.Held(program, on))
 
     def feature(self, name: str, has: bool) -> bool:
-        """Report if this process provides a feature of pebble.launcher.features; the capabilities follow."""
+        """Report whether this process has a feature of pebble.launcher.features; the capabilities follow."""
         return self._write(notes.Feature(name, has))
 
     def local(self, connected: bool, why: str = "") -> bool:
@@ -152,12 +152,12 @@ class Notifier:
 
 
 def _one_line(text: str) -> str:
-    """Return a text for an operator: in one line, without passwords, not too long."""
+    """Return a text for an operator: on one line, without passwords, not too long."""
     return "".join(char if char.isprintable() else " " for char in without_secrets(text))[:_WHY].strip()
 
 
 class Reported:
-    """A value that is sent to the launcher when it changes, and again until the launcher takes it."""
+    """A value that is sent to the launcher when it changes, until the launcher has taken it."""
 
     def __init__(self, send: Callable[..., bool], *known: object) -> None:
         """Make a reporter. ``known``: the value that the launcher assumes at first."""

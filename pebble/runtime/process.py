@@ -72,7 +72,7 @@ def _serve(service_class: type[Service], config: Config, instance: str) -> int:
 
 
 def view_of(config: Config, instance: str) -> Config:
-    """Return the config of a serial line: its entry replaces the section of all lines."""
+    """Return the config as the process of a serial line sees it: its entry replaces the section of all lines."""
     if not instance:
         return config
     instances = config.serial_instances()
@@ -82,9 +82,9 @@ def view_of(config: Config, instance: str) -> Config:
 
 
 def exit_at_the_latest() -> None:
-    """End the process after 3 s even if stopping hangs; hardware that moves has its own deadline besides.
+    """End the process after 3 s even if stopping hangs. Hardware that moves also has its own deadline.
 
-    The kernel does it, because this is called in signal handlers, where starting a thread may wait for ever.
+    The kernel ends it: this is called in signal handlers, where starting a thread may wait for ever.
     """
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.setitimer(signal.ITIMER_REAL, _STOP_DEADLINE_S)

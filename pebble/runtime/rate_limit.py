@@ -8,8 +8,8 @@ import time
 class RateLimitedLog:
     """A log of at most ``burst`` lines per ``period_s`` and subject, each with the number of events so far.
 
-    Subjects are names from a fixed set, never text from the wire, unless ``most`` bounds their number in a period:
-    further subjects share one.
+    Subjects are names from a fixed set. If they come from the wire, ``most`` must limit their number in a period: all
+    further subjects then count as one.
     """
 
     def __init__(self, log: logging.Logger, *, burst: int = 1, period_s: float = 5.0, most: int | None = None) -> None:
@@ -36,7 +36,7 @@ class RateLimitedLog:
             self._log.log(level, text, *values)
 
     def totals(self) -> dict[str, int]:
-        """Return how often each subject came up, logged or not."""
+        """Return the number of events of each subject, logged or not."""
         with self._lock:
             return dict(self._totals)
 

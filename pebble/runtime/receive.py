@@ -1,4 +1,4 @@
-"""The decoding of a channel's messages for services and scripts; stale and malformed ones are refused."""
+"""Decodes a channel's messages for services and scripts, and refuses stale and malformed ones."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Refusals:
         self._log, self._counters = log, counters
 
     def stale(self, metric: str) -> None:
-        """Count a retained message of a channel whose messages happen once."""
+        """Count a retained message on a channel whose messages must not be repeated."""
         self._counters.add("stale")
         self._log.warning(f"{metric} retained", "refused a retained message on %s", metric)
 

@@ -47,7 +47,7 @@ def on(channel: Channel, *, direct: bool = False) -> Callable[[Method], Method]:
 
 
 def every(seconds: float) -> Callable[[Method], Method]:
-    """Mark a method to be called every ``seconds``."""
+    """Mark a method so that it is called every ``seconds``."""
 
     def mark(method: Method) -> Method:
         method.__dict__["period"] = seconds
@@ -61,7 +61,7 @@ def _fail(failure: Exception) -> None:
 
 
 def _marked(cls: type, mark: str) -> list[str]:
-    """Return the names of the methods with this mark, in the order of definition, base classes first."""
+    """Return the names of the methods with this mark, in the order of their definition, base classes first."""
     names = dict.fromkeys(name for base in reversed(cls.__mro__) for name in vars(base))
     return [name for name in names if mark in getattr(getattr(cls, name), "__dict__", ())]
 
@@ -115,13 +115,13 @@ class Service:
     # -- to override
 
     def start(self) -> None:
-        """Open hardware; the transport is not open yet. Raise to exit; the launcher restarts the process."""
+        """Open the hardware, before the transport is open. An exception ends the process; the launcher restarts it."""
 
     def stop(self) -> None:
-        """Leave hardware safe. Runs however :meth:`run` ends, before the :meth:`on_stop` callbacks; not if killed."""
+        """Leave the hardware safe. Called however :meth:`run` ends, before :meth:`on_stop` callbacks; not if killed."""
 
     def on_connected(self) -> None:
-        """React to a new connection, before the states are published on it."""
+        """React to a new connection. The states are published afterwards."""
 
     # -- to use
 
@@ -133,7 +133,7 @@ class Service:
         self._on_stop.callback(callback)
 
     def dropped(self) -> dict[str, int]:
-        """Return the numbers of messages that bounds dropped since the start, by reason: for the log."""
+        """Return how many messages were dropped since the start because of a limit, by reason, for the log."""
         return bounds_reached(self.transport.counters) | {"late": self.counters["late"]}
 
     def publish(self, channel: Channel, value: Any, **names: str) -> bool:
@@ -145,7 +145,7 @@ class Service:
         return self._send(channel, topic, raw)
 
     def retract(self, channel: Channel, **names: str) -> None:
-        """Clear the retained message of a STATE ``channel``, and publish it no more."""
+        """Clear the retained message of a STATE ``channel``, and publish that state no more."""
         topic = self._topic(channel, names)
         if self._states.pop(topic, None) is not None:
             self._send(channel, topic, b"")
@@ -160,7 +160,7 @@ class Service:
             self._send(channel, topic, raw)
 
     def listen(self, channel: Channel, method: Callable[..., None], *, direct: bool = False) -> Subscription:
-        """Handle ``channel``, as ``@on`` does from the start, until the subscription is closed."""
+        """Handle ``channel`` until the returned subscription is closed; ``@on`` does the same for the whole run."""
 
         def deliver_direct(message: Message, value: Any, names: dict[str, str]) -> None:
             method(value, self.clock() - message.waited_s, **names)
@@ -182,7 +182,7 @@ class Service:
         self._inbox.post(job, newest_of=newest_of)
 
     def post_message(self, channel: Channel, job: Callable[[], None], *, newest_of: str | None = None) -> None:
-        """Run ``job`` as :meth:`post` does, for a message on ``channel``: a failure is counted as one of a handler."""
+        """Run ``job``, for a message on ``channel``, as :meth:`post` does. A failure counts as one of a handler."""
         self._inbox.post(lambda: self._attempt(channel, job), newest_of=newest_of)
 
     def post_first(self, job: Callable[[], None]) -> None:
@@ -190,10 +190,10 @@ class Service:
         self._inbox.post_internal(job)
 
     def run_if_idle(self, job: Callable[[], None]) -> bool:
-        """Run ``job`` now, on the calling thread, if the service is idle; False: it was not run, so post it.
+        """Run ``job`` now, on the calling thread, if the service is idle. False: it was not run, so post it.
 
-        This saves a switch of threads, which costs more than most jobs. A service is idle if it does nothing and no
-        job waits; a service that hangs is not. ``job`` must neither block nor take long. A failure ends the service.
+        This saves a switch of threads, which costs more than most jobs. A service is idle if it does nothing and no job
+        waits; a service that hangs is not idle. ``job`` must neither block nor take long. A failure ends the service.
         """
         work = self._work
         if not work.try_enter():
@@ -243,7 +243,7 @@ class Service:
         self._set_timers()
 
     def turn(self, timeout: float | None) -> bool:
-        """Do one job, if there is one within ``timeout`` seconds, and run due timers. True if there was a job."""
+        """Run the next job, if one comes within ``timeout`` seconds, and due timers. True if there was a job."""
         self._inbox.wait(timeout)
         with self._work:
             job = self._inbox.take()
@@ -277,7 +277,7 @@ class Service:
 
     @property
     def republish_interval_s(self) -> float:
-        """The seconds between two publications of retained state; 0: it is not repeated."""
+        """Seconds after which retained states are published again; 0: they are not repeated."""
         return self.config.services.defaults.retained_publish_interval_seconds
 
     def _begin_connection(self) -> None:
@@ -292,9 +292,9 @@ class Service:
         return self.transport.publish(topic, raw, qos=_QOS[address.qos], retain=address.retain)
 
     def _handle(self, channel: Channel, method: Callable[[], None], arrived: float) -> None:
-        """Call the handler, unless a hung or suspended process has made the command late.
+        """Call the handler, unless the message has waited too long in a hung or suspended process.
 
-        Only commands that newer ones replace are dropped.
+        Only commands that a newer command replaces are dropped.
         """
         if channel.kind is Kind.COMMAND and channel.newest and self.clock() - arrived > WAIT_LIMIT_S:
             self.count_late(channel)
@@ -302,7 +302,7 @@ class Service:
         self._attempt(channel, method)
 
     def _attempt(self, channel: Channel, method: Callable[[], None]) -> None:
-        """Call a handler, and count a failure: with a retained message it would end the service again and again."""
+        """Call a handler, and count an exception: a retained message would otherwise end the service repeatedly."""
         try:
             method()
         except Exception:  # a message of another process must not end this one
@@ -310,14 +310,14 @@ class Service:
             self.log_limited.exception(f"{channel.metric} failed", "failed on a message on %s", channel.metric)
 
     def count_late(self, channel: Channel) -> None:
-        """Count and log a command that the caller drops because it waited longer than WAIT_LIMIT_S."""
+        """Count and log a command that the caller drops because it has waited longer than WAIT_LIMIT_S."""
         self.counters.add("late")
         self.log_limited.warning(f"{channel.metric} late", "dropped a late %s", channel.metric)
 
     # -- the transport's threads: decode and post, nothing else
 
     def _deliver(self, channel: Channel, method: Callable[..., None], message: Message, value: Any, names: Any) -> None:
-        """Post a valid message, which may replace another in the inbox."""
+        """Post a valid message to the inbox, where it may replace a waiting one."""
         arrived = self.clock() - message.waited_s
 
         def handle() -> None:
@@ -330,9 +330,9 @@ class Service:
             self._inbox.post(handle, last_of=message.topic if channel.ends(value) else None)
 
     def _remark(self, channel: Channel, sender: str, text: str) -> None:
-        """Log a remark about a command that its sender may not mean, once a minute and sender."""
-        known = f", from {sender[:_SENDER_SHOWN]!a}" if sender else ""
-        self._remarks.warning(channel.metric + known, "%s%s: %s", channel.metric, known, text)
+        """Log a remark about a command that its sender may not have meant, once a minute for each sender."""
+        origin = f", from {sender[:_SENDER_SHOWN]!a}" if sender else ""
+        self._remarks.warning(channel.metric + origin, "%s%s: %s", channel.metric, origin, text)
 
     def _on_state(self, state: State) -> None:
         if state is State.CONNECTED:

@@ -1,4 +1,4 @@
-"""An event for the signals that end a program."""
+"""An event that is set by the signals that end a program."""
 
 import select
 import signal
@@ -16,9 +16,9 @@ def ending_signals() -> list[signal.Signals]:
 class EndSignal:
     """An event that a signal, or :meth:`set`, sets for good. Make it on the main thread.
 
-    It is no threading.Event: a signal handler may have interrupted a wait for that event, which holds the event's lock,
-    and would wait for ever. And a signal that arrives on a thread of a library does not interrupt a wait on the main
-    thread: the pipe ends it.
+    A threading.Event does not do: a signal handler may interrupt a wait for that event, which holds the event's lock,
+    and would wait for ever. And a signal that arrives on a library's thread does not interrupt a wait on the main
+    thread; a byte in the pipe does.
     """
 
     def __init__(self) -> None:
@@ -32,5 +32,5 @@ class EndSignal:
         self._wakeup.set()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """True if the event is set within ``timeout`` seconds."""
+        """Wait up to ``timeout`` seconds; True if the event is set."""
         return bool(select.select([self._wakeup], [], [], timeout)[0])

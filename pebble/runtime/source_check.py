@@ -1,4 +1,4 @@
-"""A check of a source that sends punctually: it must not repeat itself, nor come at a wrong rate. Pure."""
+"""Checks that a source sends at the right rate, and that its contents do not repeat themselves. Pure."""
 
 from collections import deque
 from collections.abc import Hashable
@@ -11,10 +11,10 @@ _TOLERANCE = 0.2  # of the rate that was asked
 
 
 class SourceCheck:
-    """The record of the newest contents of a source, and of its rate. One thread writes, any reads."""
+    """A record of a source's newest contents and of its rate. One thread writes, any thread reads."""
 
     def __init__(self, asked_hz: float = 0.0, *, remembered: int = 1) -> None:
-        """Make a record. ``asked_hz``: 0 if every rate is right; ``remembered``: recent contents that are not new."""
+        """Make a record. ``asked_hz``: 0 for any rate; ``remembered``: how many recent contents to compare."""
         self.content: Hashable = None  # the newest
         self.same_s = 0.0  # for so long no new content has come
         self.changes = 0  # so often a new content has come
@@ -31,12 +31,12 @@ class SourceCheck:
         return self.same_s >= REPEATS_S
 
     def clear(self) -> None:
-        """Forget all: the source was opened again."""
+        """Forget the source's history, because it was opened again."""
         self.same_s, self.changes, self.wrong_hz, self._window = 0.0, 0, None, None
         self._recent.clear()
 
     def take(self, content: Hashable, now: float, *, counts: bool = True) -> None:
-        """Note a content. ``counts`` is False while contents may repeat themselves, as those of a sensor at rest."""
+        """Note a content. ``counts``: False while contents may repeat themselves, as those of a sensor at rest do."""
         if content not in self._recent:
             self.changes += bool(self._recent)
             self._recent.append(content)
@@ -47,7 +47,7 @@ class SourceCheck:
         self.content, self._at = content, now
 
     def count(self, times: int, now: float) -> None:
-        """Note the number of contents since the last call."""
+        """Add ``times`` contents that have come since the last call."""
         if self._window is None:
             self._window, self._count = now + _SETTLE_S, -1
         if now < self._window:
@@ -58,7 +58,7 @@ class SourceCheck:
         self._count += times
         seconds = now - self._window
         if seconds >= _RATE_S:
-            rate, asked = self._count / seconds, self._asked_hz
-            off = abs(rate - asked) > max(_TOLERANCE * asked, 1 / seconds)
-            self.wrong_hz = rate if asked and off else None
+            rate, asked_hz = self._count / seconds, self._asked_hz
+            off = abs(rate - asked_hz) > max(_TOLERANCE * asked_hz, 1 / seconds)
+            self.wrong_hz = rate if asked_hz and off else None
             self._window, self._count = now, 0

@@ -21,7 +21,7 @@ class Timer(Struct, eq=False):
 
 
 class Timers:
-    """A heap of timers. Its owner asks how long to wait, and runs the due ones. Times are passed in."""
+    """A heap of timers. Its owner asks how long to wait, and then runs the due ones. Times are passed in."""
 
     def __init__(self) -> None:
         self._heap: list[tuple[float, int, Timer]] = []
@@ -34,7 +34,7 @@ class Timers:
 
     @property
     def next_due(self) -> float:
-        """The time of the next timer; infinite without timers."""
+        """Time of the next timer; infinite without timers."""
         heap = self._heap
         if heap and heap[0][2].cancelled:
             self._discard_cancelled()
@@ -46,7 +46,7 @@ class Timers:
         return None if due == inf else max(0.0, due - now)
 
     def run_due(self, now: float) -> None:
-        """Run the due timers. A periodic timer that is late skips the missed turns."""
+        """Run the due timers. A periodic timer that is late skips the runs that it has missed."""
         self._discard_cancelled()
         while self._heap and self._heap[0][0] <= now:
             timer = heapq.heappop(self._heap)[2]

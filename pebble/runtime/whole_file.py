@@ -1,4 +1,4 @@
-"""Files that exist whole or not at all, also after a power cut, and may hold secrets."""
+"""Writes files that exist whole or not at all, also after a power cut, and may hold secrets."""
 
 import errno
 import logging
@@ -15,7 +15,7 @@ _IN_USE = (errno.EACCES, errno.EPERM, errno.EBUSY, errno.ETXTBSY)  # a mount poi
 
 
 def is_root() -> bool:
-    """True if this process may give files to other users; on Windows no process may."""
+    """True if this process may change the owner of files; on Windows no process may."""
     return hasattr(os, "geteuid") and os.geteuid() == 0
 
 
@@ -27,9 +27,9 @@ def _give(file: Path | int, owner: tuple[int, int]) -> None:
 
 
 def set_mode(file: Path, mode: int, opened: Path | int | None = None) -> None:
-    """Set the mode of ``file``, or log that its file system lets others read it. Raises OSError.
+    """Set the mode of ``file``; if its file system cannot hide it from others, log that. Raises OSError.
 
-    ``opened``: the file or descriptor with its content, if that is another one.
+    ``opened``: the file or descriptor to change, if that is not ``file``.
     """
     opened = file if opened is None else opened
     try:
@@ -42,7 +42,7 @@ def set_mode(file: Path, mode: int, opened: Path | int | None = None) -> None:
 
 
 def sync_file(descriptor: int, *, data: bool = False) -> None:
-    """Make a file durable, or only its ``data``, if its file system can. Raises OSError if data may be lost."""
+    """Write a file to the disk, or only its ``data``, if its file system can. Raises OSError if data may be lost."""
     try:
         (os.fdatasync if data else os.fsync)(descriptor)
     except OSError as error:
@@ -53,7 +53,7 @@ def sync_file(descriptor: int, *, data: bool = False) -> None:
 def write(
     file: Path, content: bytes, mode: int, error: type[PebbleError], owner: tuple[int, int] | None = None
 ) -> None:
-    """Replace the file at once: it is never half written, and others can never read it. Raises ``error``.
+    """Replace the file in one step: it is never half written, and others can never read it. Raises ``error``.
 
     After a power cut the file has the old content or the new one. ``owner`` None: a file that root writes keeps its
     owner, who may be a broker that reads it.
@@ -85,7 +85,7 @@ def write(
 
 
 def _write_in_place(file: Path, content: bytes, mode: int) -> None:
-    """Write into a file that cannot be replaced, such as a container's mount. Raises OSError."""
+    """Write into a file that cannot be replaced, such as a file mounted into a container. Raises OSError."""
     with os.fdopen(os.open(file, os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0)), "wb") as output:
         set_mode(file, mode, output.fileno())
         output.write(content)
@@ -96,7 +96,7 @@ def _write_in_place(file: Path, content: bytes, mode: int) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it, durably. Raises OSError."""
+    """Make a folder and its missing parents, so that a power cut does not undo it. Raises OSError."""
     if not folder.is_dir():
         make_folder(folder.parent)
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -104,7 +104,7 @@ def make_folder(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable, if the system can. Raises OSError."""
+    """Write the names in a folder to the disk, if the system can. Raises OSError."""
     if os.name != "posix":
         return
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

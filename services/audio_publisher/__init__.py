@@ -1,4 +1,4 @@
-"""Sound for operators: sent in the encoding that they request, never late, over a connection of its own."""
+"""The sender of sound to operators: in the encoding that they request, never late, on its own connection."""
 
 from pebble.extension import Extension
 

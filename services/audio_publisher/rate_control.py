@@ -1,4 +1,4 @@
-"""The reduction of sound on a slow connection: first headers, then bits. Pure: times are passed in."""
+"""Reduces sound on a slow connection: first headers, then bits. Pure: times are passed in."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ _LIMIT = 256  # packets in flight that are remembered; far more than may wait
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A way to encode Opus. ``reduced`` describes it on the display."""
+    """A way to encode Opus. ``reduced`` describes it for display."""
 
     bundle: int
     bitrate: int
@@ -41,7 +41,7 @@ class Step:
 def steps(bundle: int, bitrate: int) -> tuple[Step, ...]:
     """Return the steps of quality, from the configured one down to the lowest useful one.
 
-    Steps that would save nothing are left out.
+    A step that would save nothing is left out.
     """
     steps = [Step(bundle, bitrate)]
     if bundle < BUNDLE_LIMIT:
@@ -53,10 +53,9 @@ def steps(bundle: int, bitrate: int) -> tuple[Step, ...]:
 
 
 class RateController:
-    """A controller of how Opus is encoded, ``step``, and which packets are sent.
+    """A controller of the packets that are sent, and of their Opus encoding (``step``).
 
-    ``outgoing()`` returns the unacknowledged messages. ``thin``: after a packet that was slow, none is sent for a
-    while.
+    ``outgoing()`` returns the unacknowledged messages. ``thin``: after a slow packet there is a pause.
     """
 
     def __init__(
@@ -74,11 +73,11 @@ class RateController:
 
     @property
     def configured(self) -> Step:
-        """Return the settings of full quality."""
+        """Settings of full quality."""
         return self._steps[0]
 
     def poll(self, now: float, encoding: str) -> Step | None:
-        """Measure how long packets wait; return the new step if it changes, as only Opus can."""
+        """Measure how long packets wait; return another step if that is better. Only Opus has steps."""
         outgoing = self._outgoing()
         for packet in self._in_flight.acknowledge(outgoing.waiting):
             self._rests.note(now - packet.at - outgoing.round_trip_s, now)
@@ -99,8 +98,9 @@ class RateController:
 
 
 class LevelControl:
-    """A choice of step. It begins with the last one, because the connection is not known yet, goes up while packets do
-    not wait, more slowly after each try that failed, and down while they do.
+    """The choice of a step. It begins with the last one, because the connection is not known yet.
+
+    It goes up while packets do not wait, later after each try that failed, and down while they wait.
     """
 
     def __init__(self, last: int, now: float) -> None:

@@ -74,7 +74,7 @@ class AudioPublisher(Service):
 
     @property
     def encoding(self) -> str:
-        """Return the present encoding."""
+        """Present encoding."""
         return self._options.encoding if self._encoder is None else self._encoder.name
 
     # -- the microphone's thread
@@ -93,7 +93,7 @@ class AudioPublisher(Service):
             raise DeviceError("the thread that reads the microphone has ended")  # the launcher restarts this process
 
     def take(self, info: FrameInfo, pcm: bytes, now: float) -> None:
-        """Send one chunk of the microphone's sound, received at the monotonic time ``now``."""
+        """Send a piece of the microphone's sound, received at the monotonic time ``now``."""
         if info.format != "s16le" or not (0 < info.rate <= 384_000 and 0 < info.channels <= 8):
             self.counters.add("refused")
             return
@@ -118,7 +118,7 @@ class AudioPublisher(Service):
         self.counters.add("bytes", len(packet))
 
     def _encoder_for(self, rate: int, channels: int) -> SoundEncoder:
-        """Return the encoder; a new one if its settings have to change.
+        """Return the encoder, or another one if its settings must change.
 
         A change of the step waits for the end of a packet.
         """
@@ -134,9 +134,9 @@ class AudioPublisher(Service):
         return self._encoder
 
     def _make(self, name: str, rate: int, channels: int, step: Step) -> SoundEncoder:
-        """Return the encoder called ``name``.
+        """Return an encoder called ``name``.
 
-        If it cannot be made, the one that every robot has and every client reads.
+        If it cannot be made, return the one that every robot has and every client reads.
         """
         options = self._options
         self._problem = ""

@@ -1,4 +1,4 @@
-"""An operator's voice on the robot: a jitter buffer, and a program that writes to the loudspeaker."""
+"""The player of an operator's voice on the robot: a jitter buffer, and a program for the loudspeaker."""
 
 from pebble.extension import Extension
 

@@ -1,4 +1,4 @@
-"""The program that plays sound: started when there is something to play, restarted when it ends."""
+"""The program that plays sound. It is started when there is sound to play, and restarted when it ends."""
 
 import fcntl
 import logging
@@ -30,7 +30,7 @@ _DRAIN_S = 1.0  # for a program to play what is left in its buffer
 
 
 class Player:
-    """A program that plays sound. Writes wait for the program, at most 2 s.
+    """A program that plays sound. A write waits for the program, at most 2 s.
 
     One thread uses it, except ``problem`` and ``stopping``.
     """
@@ -50,7 +50,7 @@ class Player:
             self._failed(f"{self._name} is not installed", time.monotonic())
 
     def play(self, chunk: Chunk) -> None:
-        """Write samples to the program; drop them if there is none."""
+        """Write samples to the program; drop them if it cannot be started."""
         now = self._played_at = time.monotonic()
         if self._child is not None and (chunk.rate, chunk.channels) != self._format:
             if now - self._started_at < _CHANGE_S:
@@ -65,7 +65,7 @@ class Player:
             self._write(self._child, chunk.pcm)
 
     def idle(self) -> None:
-        """End the program after SILENCE_S. Call it while there is nothing to play."""
+        """End the program after SILENCE_S. Call this while there is nothing to play."""
         if self._child is not None and time.monotonic() - self._played_at > SILENCE_S:
             self._end(_DRAIN_S)
 
@@ -89,13 +89,13 @@ class Player:
         return child
 
     def _write(self, child: Child, data: bytes) -> None:
-        left = memoryview(data)
+        unwritten = memoryview(data)
         deadline = time.monotonic() + _STUCK_S
         poll = select.poll()
         poll.register(self._pipe, select.POLLOUT)
-        while left and not self._stopping.is_set():
+        while unwritten and not self._stopping.is_set():
             try:
-                left = left[os.write(self._pipe, left) :]
+                unwritten = unwritten[os.write(self._pipe, unwritten) :]
             except BlockingIOError:
                 poll.poll(_POLL_MS)
             except OSError:

@@ -25,7 +25,7 @@ _WAITING_PACKETS = 48  # that wait to be played
 class AudioReceiver(Service):
     """The service that plays voices.
 
-    A connection receives packets, a thread plays them, and the service's thread only reports.
+    A connection receives packets, a thread plays them; the service's own thread only reports.
     """
 
     name = "audio_receiver"

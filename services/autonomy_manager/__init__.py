@@ -1,4 +1,4 @@
-"""The manager of autonomy scripts: it runs one at a time."""
+"""The manager of autonomy scripts, which runs one at a time."""
 
 from pebble.extension import Extension, Program
 

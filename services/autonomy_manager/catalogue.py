@@ -1,4 +1,4 @@
-"""The catalogue of scripts: folders with an entry point, as the config and they themselves describe them."""
+"""The catalogue of scripts: folders with an entry point, described by the config and by the scripts themselves."""
 
 from __future__ import annotations
 
@@ -46,22 +46,22 @@ log = logging.getLogger(__name__)
 
 
 def roots(config: Config, own: Path = _OWN_SCRIPTS) -> tuple[Path, ...]:
-    """Return the folders that are searched for scripts; the first script of a name counts.
+    """Return the folders to search for scripts; of scripts with one name the first counts.
 
-    An absolute ``autonomy_root`` is the only folder. A relative one is taken from the config's folder and, as in the
-    original program, from two folders above a config in ``control/configs``; Pebble's own scripts come last.
+    An absolute ``autonomy_root`` is the only folder. A relative one starts at the config's folder or, as in the
+    original program, two folders above a config in ``control/configs``. Pebble's own scripts come last.
     """
-    given = in_home(config.section(AutonomyManager).autonomy_root)
-    if given.is_absolute():
-        return (given,)
-    beside = [config.folder / given]
+    configured = in_home(config.section(AutonomyManager).autonomy_root)
+    if configured.is_absolute():
+        return (configured,)
+    beside = [config.folder / configured]
     if config.folder.parts[-2:] == ("control", "configs"):
-        beside.append(config.folder.parent.parent / given)
+        beside.append(config.folder.parent.parent / configured)
     return (*beside, own)
 
 
 class _Answer(NamedTuple):
-    """A script's description, and why it has no settings or cannot be started."""
+    """A script's description, or why it has no settings or cannot be started."""
 
     description: Description
     ours: bool = False
@@ -75,7 +75,7 @@ class Catalogue:
     """The scripts in the folders. Used by one thread, because asking a script takes up to 20 s."""
 
     def __init__(self, config: Config, *, asks: bool = True, clock: Callable[[], float] = time.monotonic) -> None:
-        """Store the folders. ``asks`` False: list our scripts without asking them for their settings."""
+        """Store the folders. ``asks`` False: list our scripts without running them for their settings."""
         self._config, self._section, self._asks = config, config.section(AutonomyManager), asks
         self._roots, self._login = roots(config), local_login(config)
         self._clock = clock
@@ -84,7 +84,7 @@ class Catalogue:
         self._complained: set[str] = set()  # names with a warning in the log
 
     def scan(self, found: Callable[[dict[str, Script]], object]) -> None:
-        """Call ``found`` with all scripts: at once, and again when scripts that had to be asked have answered."""
+        """Call ``found`` with all scripts: at once, and again when scripts that had to be run have answered."""
         folders = dict(self._folders())
         scripts = self._scripts(folders, asks=False)
         if self._asks:
@@ -154,7 +154,7 @@ class Catalogue:
         )
 
     def _answer(self, name: str, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
-        """Return a script's description by its files; stored until they change, a failure for a minute."""
+        """Return a script's description. It is kept until the script's files change; a failure is kept for a minute."""
         version = entry, stamp(entry), stamp(folder / MANIFEST)
         command, before, until = self._answers.get(name, (None, _Answer(Description()), 0.0))
         if (command == version and self._clock() < until) or (command is not None and not asks):
@@ -169,7 +169,7 @@ class Catalogue:
         return answer
 
     def _asked(self, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
-        """Read the script's files, and ask the script itself if ``asks`` and it is one of ours (up to 20 s)."""
+        """Return a description from the script's files and, if ``asks`` and it is ours, by running it (up to 20 s)."""
         described, problem = Description(), ""
         try:
             if folder.parent != _OWN_SCRIPTS:
@@ -218,9 +218,9 @@ class Catalogue:
     def _settings(
         self, name: str, section: ScriptSection, described: Description, *, ours: bool
     ) -> tuple[Setting, ...]:
-        """Return the config's settings, then the script's others.
+        """Return the config's settings, and then those that only the script gives.
 
-        A script of ours describes its options itself, which counts more.
+        For our scripts the script's own description of an option counts more.
         """
         configured = [Setting(**asdict(argument)) for argument in section.args]
         options = {setting.key: setting for setting in described.configs}
@@ -248,22 +248,19 @@ class Catalogue:
 
 
 def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
-    """Return the ``files`` of `autonomy-files`; without forms if it would be too long with them."""
+    """Return the ``files`` of `autonomy-files`, without forms if they would make it too long."""
     entries: list[dict[str, object]] = []
-    left = _LONGEST_FILES
+    room = _LONGEST_FILES
     for script in scripts:
         configs = form(script.settings)
-        left -= len(msgspec.json.encode(configs))
-        configs = configs if left >= 0 else []
+        room -= len(msgspec.json.encode(configs))
+        configs = configs if room >= 0 else []
         entries.append({"file": script.file, "label": script.label, "configs": configs, **_first_seen(script, configs)})
     return entries
 
 
 def _first_seen(script: Script, configs: Iterable[Mapping[str, object]]) -> dict[str, object]:
-    """Return the script's summary, and the keys of the settings that operators see first.
-
-    Only those that the script itself gives.
-    """
+    """Return a script's summary, and the keys of the settings that operators see first, if the script gives them."""
     keys = {setting["key"] for setting in configs}
     first = {"summary": script.summary, "main": [key for key in script.main if key in keys]}
     unasked = {} if script.asked else {"asked": False}
@@ -278,7 +275,7 @@ def _inside(root: Path) -> list[Path]:
 
 
 def _merged(first: Description, second: Description) -> Description:
-    """Return ``first`` with missing fields taken from ``second``."""
+    """Return ``first``, with its missing fields taken from ``second``."""
     keys = {setting.key for setting in first.configs}
     return Description(
         label=first.label or second.label,
@@ -294,7 +291,7 @@ def _with_option(configured: Setting, option: Setting) -> Setting:
 
 
 def _dependencies(name: str, section: ScriptSection, described: Description) -> tuple[Dependency, ...]:
-    """Return the config's dependencies, or else the script's; each script once, and never itself."""
+    """Return the dependencies in the config, or else the script's; each script once, and never itself."""
     chosen: Iterable[tuple[str, Mapping[str, object]]]
     if section.dependencies:
         chosen = ((dependency.file, dependency.config) for dependency in section.dependencies if dependency.enabled)

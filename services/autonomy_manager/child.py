@@ -1,4 +1,4 @@
-"""A process of a script: started, read, signalled, and watched until it ends."""
+"""The process of a script: it is started, read, signalled, and watched until it ends."""
 
 import logging
 import os
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 class Launch(Struct, frozen=True):
-    """A process to start: ``file`` names the script in the log, ``tie`` ends it with this process."""
+    """The parameters of a process: ``file`` names the script in the log, ``tie`` ends it with this process."""
 
     file: str
     command: tuple[str, ...]
@@ -50,7 +50,7 @@ class Processes:
     def __call__(self, launch: Launch, ended: Callable[[int], None]) -> "Process":
         """Start a process; ``ended`` gets its exit code, or minus the signal that ended it, on any thread.
 
-        The first call waits until no script of an earlier manager is alive. Raises PebbleError if one stays.
+        The first call waits until no script of an earlier manager lives. Raises PebbleError if one does not end.
         """
         self._guard.begin()
         process = Process(launch)
@@ -73,7 +73,7 @@ class Processes:
 
 
 class Process:
-    """A process, and the thread that reads its output and waits for its end."""
+    """A running process, with the thread that reads its output and waits for its end."""
 
     def __init__(self, launch: Launch) -> None:
         _check_program(Path(launch.command[0]))
@@ -84,7 +84,7 @@ class Process:
         self._thread: threading.Thread | None = None
 
     def watch(self, ended: Callable[[int], None]) -> None:
-        """Start to read its output, and to wait for its end; ``ended`` gets its exit code."""
+        """Start reading the output and waiting for the end; ``ended`` gets the exit code."""
         self._thread = threading.Thread(target=self._watch, args=(ended,), name=f"script {self._file}", daemon=True)
         self._thread.start()
 
@@ -110,7 +110,7 @@ class Process:
         ended(self._child.finish(0.0))
 
     def _read_until_exit(self) -> None:
-        """Read the output until the process has ended; it is not reaped yet."""
+        """Read the output until the process has ended. It is not reaped here."""
         pipe = self._child.pipe("stdout").fileno()
         output = BoundedOutput(self._write, _LONGEST_LINE, time.monotonic())
         os.set_blocking(pipe, False)
@@ -145,7 +145,7 @@ class Process:
 
 
 def _check_program(path: Path) -> None:
-    """Raise PebbleError for an interpreter line that the kernel would report as a missing file."""
+    """Raise PebbleError for a missing interpreter, which the kernel would report as a missing script."""
     if not path.is_file():
         return
     if not os.access(path, os.X_OK):

@@ -1,4 +1,4 @@
-"""The description of a script, from its `script.json` or, for our scripts, from the script with `--describe`."""
+"""Reads the description of a script: from its `script.json` or, for our scripts, by running it with `--describe`."""
 
 import ast
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,10 +24,10 @@ _NICE = "10"  # lower than the robot's own processes
 
 
 class Description(Struct, frozen=True):
-    """The description that a script gives of itself; ``command`` only in a manifest.
+    """A script's description of itself; ``command`` only in a manifest.
 
     ``summary`` says in one sentence what it does; ``main`` are the keys of the settings that operators see first.
-    ``drives`` is False for one that only measures; it counts only where ``pebble.script`` refuses to drive then.
+    ``drives`` is False for a script that only measures; it counts only where ``pebble.script`` refuses to drive then.
     """
 
     label: str | None = None
@@ -62,17 +62,17 @@ def _texts(description: Description) -> Iterator[str]:
 
 
 class DescribeError(Exception):
-    """A script without a form; the text says why."""
+    """An error: the script has no form of settings. The text says why."""
 
 
 class BrokenScriptError(DescribeError):
-    """A script that cannot be started either; the text says why."""
+    """An error: the script cannot be started either. The text says why."""
 
 
 def is_ours(entry: Path) -> bool:
     """True if a Python file imports ``run`` from pebble, or pebble.script. It is parsed, not run.
 
-    Pipes and devices are not opened, as that could wait for ever. Raises BrokenScriptError for a file that is no
+    Pipes and devices are not opened, as that could wait for ever. Raises BrokenScriptError for a file that is not valid
     Python.
     """
     if entry.suffix != ".py" or not entry.is_file():
@@ -112,12 +112,12 @@ def read_manifest(path: Path) -> Description | None:
 
 
 def ask(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> Description:
-    """Run ``command --describe`` and return its answer. Raises DescribeError; takes at most 20 s."""
+    """Run ``command --describe``, at most 20 s; return the description. Raises DescribeError."""
     return _parse(answer_of((*command, "--describe"), folder, environment, "its --describe"), "its --describe")
 
 
 def answer_of(command: Sequence[str], folder: Path, environment: Mapping[str, str], name: str = "it") -> bytes:
-    """Run ``command``; return its output. Raises DescribeError; takes at most 20 s."""
+    """Run ``command``, at most 20 s; return its output. Raises DescribeError."""
     limited = ["nice", "-n", _NICE, "prlimit", f"--fsize={_LONGEST + 1}", *command]
     with TemporaryFile() as output, TemporaryFile() as errors:
         try:
@@ -146,7 +146,7 @@ def _content(file: IO[bytes]) -> bytes:
 
 
 def _parse(raw: bytes, source: str) -> Description:
-    """Return the JSON in the last line of a script's output; imported modules may print lines before it."""
+    """Return the description in the last line of a script's output: imported modules may print lines before it."""
     if len(raw) > _LONGEST:
         raise DescribeError(f"{source} is longer than {_LONGEST} bytes")
     try:
@@ -157,7 +157,7 @@ def _parse(raw: bytes, source: str) -> Description:
 
 
 def stamp(file: Path) -> tuple[int, int] | None:
-    """Return a value that differs after the file has changed; None if there is no file."""
+    """Return a value that changes with the file; None if there is no file."""
     try:
         status = file.stat()
     except OSError:

@@ -12,7 +12,7 @@ from pebble.services.autonomy_manager.interpreter import SYSTEM
 
 
 def environment(*more: Mapping[str, str], ours: bool = True) -> dict[str, str]:
-    """Return this process's variables updated with ``more``.
+    """Return this process's variables with ``more`` added.
 
     For foreign scripts (``ours`` False) ``python3`` is the system's, even if Pebble's comes first in PATH.
     """
@@ -30,7 +30,7 @@ def environment(*more: Mapping[str, str], ours: bool = True) -> dict[str, str]:
 
 
 def local_login(config: Config) -> dict[str, str]:
-    """Return the variable with the password of the robot's own broker, for a script that connects to it itself."""
+    """Return the variable with the password of the robot's own broker, for a script that connects by itself."""
     local = config.local_mqtt
     if config.transport.kind != "mqtt" or local.password_env is None:
         return {}

@@ -1,4 +1,4 @@
-"""Facts about a robot's scripts, for its capabilities, for ``pebble check`` and for Tab completion."""
+"""Facts about a robot's scripts for its capabilities, ``pebble check`` and Tab completion."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
-    """Return ``value`` with the robot's scripts added; a shipped one computes odometry from its touch sensors."""
+    """Return ``value`` with the robot's scripts, among them a shipped one that computes odometry from touch sensors."""
     enabled = config.section(AutonomyManager).enabled
     telemetry: Any = value.telemetry
     telemetry = replace(telemetry, wheel_odometry=enabled and telemetry.touch_sensors)
@@ -34,16 +34,16 @@ def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
 
 
 def facts(config: Config) -> Facts:
-    """Return the scripts on offer, each with whether it can run here."""
+    """Return the robot's scripts, each with whether it can run here."""
     if config.robot.platform != "linux" or not config.section(AutonomyManager).enabled:
         return Facts()
     try:
         from pebble.services.autonomy_manager.catalogue import Catalogue  # few checks need it
     except ModuleNotFoundError:  # a system without fcntl runs no robots
         return Facts()
-    found: list[dict[str, Script]] = []
-    Catalogue(config, asks=False).scan(found.append)
-    return Facts(table=tuple(("script", name, _fitness(config, script)) for name, script in found[-1].items()))
+    scans: list[dict[str, Script]] = []
+    Catalogue(config, asks=False).scan(scans.append)
+    return Facts(table=tuple(("script", name, _fitness(config, script)) for name, script in scans[-1].items()))
 
 
 def _fitness(config: Config, script: Script) -> str:
@@ -58,7 +58,7 @@ def _fitness(config: Config, script: Script) -> str:
 
 
 def _may_run(config: Config, script: Script) -> bool:
-    """True if the script may be asked: with this machine's Python and without variables of the config.
+    """True if the script may be run to describe itself: with this machine's Python, without the config's variables.
 
     Otherwise a stranger's config could run its own program.
     """
@@ -74,7 +74,7 @@ def _may_run(config: Config, script: Script) -> bool:
 
 
 def complete_scripts(context: Any) -> list[str]:
-    """Return the names of the given robot's scripts, or else of those of Pebble."""
+    """Return the names of the given robot's scripts, or else of Pebble's."""
     file = Path(str(context.params.get("robot")))
     folders: tuple[Path, ...] = (Path(pebble.__file__).with_name("extensions") / "scripts" / "shipped",)
     if file.is_file():

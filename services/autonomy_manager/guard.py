@@ -1,4 +1,4 @@
-"""A guard that ends all processes of scripts when this process has ended, before another manager starts."""
+"""A guard that ends all script processes when this process has ended, before another manager starts."""
 
 import fcntl
 import logging
@@ -30,9 +30,9 @@ log = logging.getLogger(__name__)
 
 
 class Guard:
-    """Small programs that outlive this one until no script is left, one for each script.
+    """Small programs, one for each script, that outlive this process until no script is left.
 
-    They hold ``lock``, which the next manager of scripts waits for: never are scripts of two managers alive.
+    They hold ``lock``, for which the next manager of scripts waits: scripts of two managers never run at once.
     """
 
     def __init__(self, lock: Path) -> None:
@@ -56,9 +56,9 @@ class Guard:
             time.sleep(_TRY_S)
 
     def watch(self, group: int, number: signal.Signals) -> Callable[[], None]:
-        """Start a helper that ends a process group if this process dies, with ``number``, then with SIGKILL.
+        """Start a helper that ends a process group if this process dies: with signal ``number``, then SIGKILL.
 
-        Return a function that calls the helper off: call it when the group has ended. Raises OSError.
+        Return a function that ends the helper; call it when the group has ended. Raises OSError.
         """
         helper = subprocess.Popen(
             ["sh", "-c", _PROGRAM, "sh", number.name.removeprefix("SIG"), str(group)],
@@ -77,7 +77,7 @@ class Guard:
         return call_off
 
     def close(self) -> None:
-        """Let the next manager start once no script is left."""
+        """Let the next manager start, once no script is left."""
         if self._locked >= 0:
             os.close(self._locked)
             self._locked = -1

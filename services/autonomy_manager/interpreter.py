@@ -1,4 +1,4 @@
-"""The Python that runs a script, and the modules that are missing there."""
+"""Finds the Python that runs a script, and the modules that it lacks."""
 
 import ast
 import re
@@ -40,16 +40,16 @@ for want in sys.argv[1:]:
 
 
 def interpreter(configured: str | None, *, ours: bool) -> str:
-    """Return the Python of a script: the configured one, else ours for our scripts, the system's for others."""
+    """Return the Python for a script: the configured one, else ours for our scripts, the system's for others."""
     return configured or (sys.executable if ours or not SYSTEM.is_file() else str(SYSTEM))
 
 
 def lacking(command: Sequence[str], folder: Path, variables: Mapping[str, str]) -> list[str]:
-    """Return the modules that a script imports at its beginning and its Python does not find.
+    """Return the modules that a script imports at its beginning and that its Python does not find.
 
-    The script is read, not run, and so are the files beside it that it names. For OpenCV and NumPy, the functions that
-    it calls and newer releases lack are returned as well. Nothing is known of a script that is no Python file. A script
-    that changes ``sys.path`` may find more modules.
+    The script is read, not run, and so are the files beside it that it names. The result also has functions of OpenCV
+    and NumPy that it calls and that newer releases lack. Nothing is known about a script that is no Python file. A
+    script that changes ``sys.path`` may find more modules.
     """
     entry = next((folder / word for word in command[1:] if word.endswith(".py")), None)
     if entry is None:
@@ -90,7 +90,7 @@ def _read(path: Path) -> bytes:
 
 
 def _needs(tree: ast.Module, text: bytes) -> Iterator[str]:
-    """Yield the script's requirements on OpenCV and NumPy beyond being installed."""
+    """Yield what the script needs of OpenCV and NumPy besides their being installed."""
     if b"shmsrc" in text:
         yield _GSTREAMER
     if re.search(rb"\bfloat\((?!\s*[\"'\d])|\bmap\(float\b", text):

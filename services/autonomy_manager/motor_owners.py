@@ -1,4 +1,4 @@
-"""The states of motor owners: whether a script may start, and why a running one has to end. Pure."""
+"""Decides by the states of motor owners whether a script may start, and why a running one must end. Pure."""
 
 from collections.abc import Collection, Iterator
 
@@ -15,7 +15,7 @@ OVERRIDDEN = "stopped by an operator"
 
 
 class MotorOwners:
-    """The newest state of each motor owner; if ``names`` are known, only of the owners with these names."""
+    """The newest state of each motor owner; if ``names`` are given, only of owners with these names."""
 
     def __init__(self, names: Collection[str]) -> None:
         self.newest_run = 0  # of all that were received or used; an owner bars the run before it
@@ -35,30 +35,27 @@ class MotorOwners:
         return owner in self._names or (not self._names and (owner in owners or len(owners) < _MOST))
 
     def holder_beside(self, by: str) -> str:
-        """Return the holder of control, if it is another account than ``by``'s; else empty.
-
-        The first owner by name decides.
-        """
+        """Return the account that has control, if it is not ``by``'s; else empty. The first owner by name decides."""
         state = self._controls[min(self._controls)] if self._controls else None
         if state is None or not state.key or state.by.partition("/")[0] == by.partition("/")[0]:
             return ""
         return state.by or "a program of the robot"
 
     def note_run(self, run: int) -> None:
-        """Note that a drive command carries the run number ``run``."""
+        """Note the run number ``run`` of a drive command."""
         if newer(run, self.newest_run):
             self.newest_run = run
 
     @property
     def barred(self) -> int:
-        """Return the newest run that moves nothing any more."""
+        """Newest run that can no longer move anything."""
         return newest(state.last_barred for state in self._states.values())
 
     def steps_to(self, run: int) -> Iterator[int]:
-        """Yield run numbers whose zeros make every owner take ``run`` as newer.
+        """Yield run numbers whose zeros make every owner treat ``run`` as newer.
 
-        Needed if an owner was away while a stranger sent numbers far ahead: it may be more than half of all numbers
-        behind.
+        Needed if an owner was away while a stranger sent numbers far ahead: then ``run`` may seem older to it, more
+        than half of all numbers behind.
         """
         for state in self._states.values():
             if not newer(run, state.last_barred):
@@ -66,20 +63,20 @@ class MotorOwners:
 
     @property
     def refusal(self) -> str:
-        """Return why no script may start; empty if one may."""
+        """Reason why no script may start; empty if one may."""
         return next((_stopped(owner, state) for owner, state in self._states.items() if state.latched), "")
 
     def baseline(self) -> Baseline:
-        """Return each owner's boot, count of stops and last barred run, to compare with later ones."""
+        """Return each owner's boot, count of stops and last barred run, to compare with later states."""
         return {owner: (state.boot, state.count, state.last_barred) for owner, state in self._states.items()}
 
     @property
     def held(self) -> bool:
-        """True if a person has control of an owner."""
+        """True if a person has control of any owner."""
         return any(state.key for state in self._controls.values())
 
     def ending(self, run: int, baseline: Baseline, signs: bool = True) -> str:
-        """Return why this run has to end; empty if it may go on. New owners are added to ``baseline``.
+        """Return why this run must end; empty if it may continue. New owners are added to ``baseline``.
 
         A run that does not sign its commands bars itself by them, which does not end it.
         """

@@ -1,4 +1,4 @@
-"""The list of scripts on offer, repeated because people add and change scripts."""
+"""The list of offered scripts, made again and again because people add and change scripts."""
 
 import logging
 import threading
@@ -12,7 +12,7 @@ log = logging.getLogger(__name__)
 
 
 class Offer:
-    """The scripts on offer. ``on_change`` gets `autonomy-files`.
+    """The offered scripts. ``on_change`` gets `autonomy-files`.
 
     Only the listing itself runs on another thread than the service's.
     """
@@ -24,7 +24,7 @@ class Offer:
         on_change: Callable[[list[dict[str, object]]], None],
         fixed: Mapping[str, Script] | None,
     ) -> None:
-        """Store the catalogue. ``fixed`` replaces the folders in tests."""
+        """Store the arguments. ``fixed`` replaces the folders in tests."""
         self.scripts = dict(fixed or {})
         self.complete = self._fixed = fixed is not None  # whether every folder was looked at once
         self._config, self._post, self._on_change = config, post, on_change
@@ -32,7 +32,7 @@ class Offer:
         self._wanted, self._ended = threading.Event(), False
 
     def begin(self) -> bool:
-        """True if :meth:`scan` has to be called from now on."""
+        """True if :meth:`scan` must be called from now on."""
         if self._fixed:
             self._found(self.scripts)
         else:
@@ -48,7 +48,7 @@ class Offer:
         self._wanted.set()
 
     def _scan(self) -> None:
-        """List the scripts on a thread, since asking them takes long."""
+        """List the scripts on another thread, since running them for their settings takes long."""
         catalogue = Catalogue(self._config)
         while self._wanted.wait() and not self._ended:
             self._wanted.clear()

@@ -1,4 +1,4 @@
-"""A run of a script with the scripts it needs: its start, its stop, and what follows when a process ends."""
+"""A run of a script with the scripts that it needs: how it starts and stops, and what follows if a process ends."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Part:
 
 @dataclass
 class Run:
-    """A start of a script, until its last process has ended."""
+    """A run of a script, from its start until its last process has ended."""
 
     number: int
     plan: Plan
@@ -62,23 +62,25 @@ class Runner:
 
     @property
     def run(self) -> Run | None:
-        """Return the present run, also while its processes are ending."""
+        """The present run, also while its processes are ending."""
         return self._run
 
     @property
     def active(self) -> Run | None:
-        """Return the present run unless it is being ended."""
+        """The present run, unless it is being ended."""
         return None if self._run is None or self._run.ending else self._run
 
     @property
     def switching(self) -> bool:
-        """True if a start waits for the end of the present run."""
+        """True if another start waits for the end of the present run."""
         return self._next is not None
 
     @property
     def stoppable(self) -> Run | None:
-        """Return the present run; None if it is being ended with no successor, or cannot move the robot."""
-        return (self._run if self._next is not None else self.active) if self.drives else None
+        """The present run; None if it is being ended without a successor, or cannot move the robot."""
+        if not self.drives:
+            return None
+        return self.active if self._next is None else self._run
 
     @property
     def config(self) -> Mapping[str, Value] | None:
@@ -91,7 +93,7 @@ class Runner:
         return any(plan is not None and plan.drives for plan in plans)
 
     def refuse(self, error: str | None, *, stopped: bool = False) -> None:
-        """Set why no start is possible; None: starts are possible again. The present run goes on."""
+        """Refuse all starts for the reason ``error``; None: permit them again. The present run continues."""
         self.error, self.stopped = error, stopped
         self._service.changed()
 
@@ -102,7 +104,7 @@ class Runner:
         self._go_on()
 
     def stop(self, error: str | None = None, *, stopped: bool = False) -> None:
-        """End the present run, because of ``error``, or None on request. ``stopped``: by an emergency stop."""
+        """End the present run because of ``error``; None: on request. ``stopped``: by an emergency stop."""
         if error is not None:
             log.warning("%s", error)
         self.error, self.stopped, self._next = error, stopped, None
@@ -110,7 +112,7 @@ class Runner:
         self._go_on()
 
     def close(self, wait_s: float) -> None:
-        """End everything and wait for it, because this process ends."""
+        """End all processes and wait for their end, because this process ends."""
         self._next = None
         run = self._run
         if run is None:
@@ -174,7 +176,7 @@ class Runner:
     # -- ending
 
     def _end(self) -> None:
-        """Start to end the present run: wheels first, then the script, then those that it needed."""
+        """Begin to end the present run: first the wheels, then the script, then the scripts that it needed."""
         run = self._run
         if run is None or run.ending:
             return

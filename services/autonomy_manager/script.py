@@ -1,4 +1,4 @@
-"""A script of the catalogue, and the plan for starting it."""
+"""A script of the catalogue, and the plan to start it."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,19 +12,19 @@ from pebble.extensions.operator.client.forms import Setting, SettingError, Value
 
 
 class StartError(PebbleError):
-    """A refused start; the text is for the person who asked for it."""
+    """An error: a start is refused. The text is for the person who asked for it."""
 
 
 class StoppedError(StartError):
-    """A start that is refused until the reset of an emergency stop."""
+    """An error: a start is refused until the emergency stop is reset."""
 
 
 class UnknownScriptError(StartError):
-    """A start of a script that is not listed, or whose dependencies are not known yet."""
+    """An error: the script is not listed, or its dependencies are not known yet."""
 
 
 class Dependency(Struct, frozen=True, forbid_unknown_fields=True):
-    """A script that has to run while another one runs, and its settings."""
+    """A script that must run while another one runs, and its settings."""
 
     file: str
     config: dict[str, Any] = {}
@@ -50,14 +50,14 @@ class Script(Struct, frozen=True, kw_only=True):
 
 
 class Step(Struct, frozen=True):
-    """A process of a plan."""
+    """A process of a plan, with its command line."""
 
     script: Script
     options: tuple[str, ...]
 
 
 class Plan(Struct, frozen=True):
-    """A checked start: the script, the scripts it needs in their order, and the effective settings."""
+    """A checked start: the script, the scripts that it needs in order, and the effective settings."""
 
     main: Step
     dependencies: tuple[Step, ...]
@@ -65,12 +65,12 @@ class Plan(Struct, frozen=True):
 
     @property
     def drives(self) -> bool:
-        """True unless all of its processes only measure."""
+        """True unless all its processes only measure."""
         return any(step.script.drives for step in (self.main, *self.dependencies))
 
 
 def plan(scripts: Mapping[str, Script], file: str, config: Mapping[str, Any]) -> Plan:
-    """Check a start; return its plan. Raises StartError."""
+    """Return the plan for a start, after checking it. Raises StartError."""
     script = scripts.get(meant(scripts, file))
     if script is None:
         raise UnknownScriptError(f"Unknown autonomy file: {shown(file)}")

@@ -45,7 +45,7 @@ _CLOSE_S = 1.0  # for scripts to end after SIGTERM when this process ends; it is
 
 
 class AutonomyManager(Service):
-    """The service that manages scripts. ``spawn`` and ``scripts`` replace processes and folders in tests."""
+    """The manager of scripts. ``spawn`` and ``scripts`` replace processes and folders in tests."""
 
     name = "autonomy_manager"
     publishes = (AUTONOMY_FILES, AUTONOMY_STATUS, DRIVE)
@@ -94,7 +94,7 @@ class AutonomyManager(Service):
     @on(AUTONOMY_COMMAND)
     def command(self, command: AutonomyCommand) -> None:
         word = (command.action or "").strip().lower()
-        begin = True if word in _START else False if word in STOP_WORDS else command.enabled
+        begin = word in _START if word in (*_START, *STOP_WORDS) else command.enabled
         self._waiting = None
         if begin is None:
             self.log_limited.warning("command", "ignored a command that neither starts nor stops a script")
@@ -106,7 +106,7 @@ class AutonomyManager(Service):
             self._runner.stop()
 
     def _start_script(self, file: str, config: Mapping[str, Any], by: str | None, until: float) -> None:
-        """Start the script if that becomes possible before ``until``.
+        """Start the script, if that becomes possible before ``until``.
 
         ``by`` None: a program of the robot asks, without control.
         """
@@ -129,7 +129,7 @@ class AutonomyManager(Service):
             self._runner.start(wanted)
 
     def _wait(self, start: Callable[[], None]) -> None:
-        """Try again soon, unless another command, a person's driving or an emergency stop comes first."""
+        """Try again soon, unless another command, a person who drives or an emergency stop comes first."""
 
         def again() -> None:
             if self._waiting is start:
@@ -139,7 +139,7 @@ class AutonomyManager(Service):
         self.later(_AGAIN_S, again)
 
     def _check(self, wanted: Plan) -> None:
-        """Raise StartError if this robot cannot run ``wanted`` at present."""
+        """Raise StartError if this robot cannot run ``wanted`` now."""
         failed = f"Failed to start {wanted.main.script.label}"
         if refusal := self._owners.refusal:
             raise StoppedError(f"{failed}: {refusal}")
@@ -191,7 +191,7 @@ class AutonomyManager(Service):
         self.changed()
 
     def _person_stops(self) -> None:
-        """End unsigned scripts, and refuse starts while the arbiter holds a person's zero, as they may be older."""
+        """End unsigned scripts, and refuse starts while the arbiter holds a person's zero: they may be older."""
         self._refused_until = self.clock() + _HOLD_S
         self._end_unsigned()
 
@@ -204,7 +204,7 @@ class AutonomyManager(Service):
         self.changed()
 
     def _end_unsigned(self) -> None:
-        """End a script that does not sign its commands; others are ended by the motor owner's arbiter."""
+        """End a script that does not sign its commands; the motor owner's arbiter ends the others."""
         if self._runner.active is not None and not self._signs:
             self._runner.stop(OVERRIDDEN)
 
@@ -243,7 +243,7 @@ class AutonomyManager(Service):
             self.publish(DRIVE, Drive(source=self.name))
 
     def halt_repeatedly(self, run: int) -> None:
-        """Stop the wheels now and again: a command of a dead process may still be in a queue."""
+        """Stop the wheels now and again: a command of an ended process may still be in a queue."""
         self.halt(run)
         for seconds in _HALTS_S:
             self.later(seconds, lambda: self.halt(run))
@@ -252,7 +252,7 @@ class AutonomyManager(Service):
         self.call_at(self.clock() + seconds, job)
 
     def changed(self) -> None:
-        """Publish the status if it differs from the last one; only once between two scripts."""
+        """Publish the status if it has changed; while one script replaces another, only once."""
         status, last = self._present_status(), self._status
         still_down = last is not None and not (last.running or status.running)
         if status != last and not (still_down and self._runner.switching):

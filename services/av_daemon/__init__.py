@@ -1,4 +1,4 @@
-"""Captures camera and microphone while there are readers, for any number of them."""
+"""The owner of camera and microphone: captures while there are readers, for any number of them."""
 
 from pebble.extension import Extension, Program, Stage
 

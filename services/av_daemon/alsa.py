@@ -15,7 +15,7 @@ _BEHIND = 10  # chunks; further behind, it skips to the newest
 
 
 class AlsaMicrophone:
-    """The program ``arecord``: s16le, 20 ms at a time, none lost unless this process was delayed by 200 ms."""
+    """A microphone by ``arecord``: s16le, 20 ms a piece; none is lost unless this process is late by 200 ms."""
 
     def __init__(self, options: AvDaemon) -> None:
         audio = options.audio

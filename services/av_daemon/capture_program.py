@@ -1,4 +1,4 @@
-"""A program that captures pictures or sound and writes them to its standard output; it ends with this process."""
+"""A program that captures pictures or sound and writes them to its standard output. It ends with this process."""
 
 import fcntl
 import os
@@ -23,7 +23,7 @@ _CHUNK = 256 * 1024
 
 
 class CaptureProgram:
-    """A running program. ``read`` fails when it ends or writes nothing for 3 s."""
+    """A running program. ``read`` fails when it has ended, or has written nothing for 3 s."""
 
     def __init__(self, command: Sequence[str], *, pipe_bytes: int = 0) -> None:
         self.name = Path(command[0]).name
@@ -45,15 +45,15 @@ class CaptureProgram:
         self._poll.register(self._err, select.POLLIN)
 
     def read(self, limit: int = _CHUNK) -> bytes:
-        """Return the program's new output, at least one byte. Raises DeviceError when the program ends or hangs."""
+        """Return the program's new output, at least one byte. Raises DeviceError if the program has ended or hangs."""
         deadline = time.monotonic() + self._silence_s
         while True:
-            left = deadline - time.monotonic()
-            if left <= 0:
+            remaining_s = deadline - time.monotonic()
+            if remaining_s <= 0:
                 if self._child.wait(0.0) is not None:  # and what it left behind holds its output open
                     raise DeviceError(self._end())
                 raise DeviceError(f"{self.name} hangs: nothing came for {self._silence_s:.0f} s{self._last_error()}")
-            ready = dict(self._poll.poll(left * 1000))
+            ready = dict(self._poll.poll(remaining_s * 1000))
             if self._err in ready:
                 self._read_errors()
             if self._out in ready:
@@ -64,7 +64,7 @@ class CaptureProgram:
                 return chunk
 
     def interrupt(self) -> None:
-        """Kill the program, from any thread, which makes a waiting ``read`` fail."""
+        """Kill the program, from any thread. A waiting ``read`` then fails."""
         self._child.signal(signal.SIGKILL)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""The thread of one device: opens it while its stream has readers, delivers its frames, and retries after failures."""
+"""The thread of one device: opens it while its stream has readers, writes its frames, and retries after failures."""
 
 import logging
 import threading
@@ -24,7 +24,7 @@ _POLL_S = 0.1  # how soon the first reader is noticed
 class Capturer:
     """A thread that captures until :meth:`end`, which does not wait, because a device can hang.
 
-    After that it neither writes nor reports, even if its device answers at last.
+    After :meth:`end` it neither writes nor reports, even if its device answers at last.
     """
 
     def __init__(
@@ -50,14 +50,14 @@ class Capturer:
         return self._thread.is_alive()
 
     def end(self) -> None:
-        """End soon, and return at once, whatever the device does."""
+        """End soon. Returns at once, whatever the device does."""
         self._ended.set()
         source = self._source
         if source is not None:
             source.interrupt()
 
     def join(self, timeout: float) -> bool:
-        """Wait for the thread to end; False if it has not, because its device hangs."""
+        """Wait for the thread's end; return False if it has not ended, because its device hangs."""
         self._thread.join(timeout)
         return not self._thread.is_alive()
 
@@ -105,7 +105,7 @@ class Capturer:
             self._health.frame(info, time.monotonic(), skipped=capture.skipped, content=content)
 
     def _write(self, capture: Capture) -> tuple[FrameInfo, int | str | None]:
-        """Return the frame's metadata, and its content as far as its health goes by it."""
+        """Write a frame; return its metadata, and its content for the check of the device's health."""
         slot = self._writer.slot(capture.size) if capture.draw is not None else None
         pixels = capture.pixels(self._room(capture) if slot is None else slot.array)
         info, content = _as_it_is(capture.info, pixels), _content(capture.info, pixels)
@@ -131,7 +131,7 @@ class Capturer:
 
 
 def _as_it_is(info: FrameInfo, data: Bytes) -> FrameInfo:
-    """Return ``info`` with the size that stands in a JPEG, whatever its camera was asked for."""
+    """Return ``info`` with the size in the JPEG itself, which may differ from the requested size."""
     if info.format != "mjpeg":
         return info
     try:
@@ -142,9 +142,9 @@ def _as_it_is(info: FrameInfo, data: Bytes) -> FrameInfo:
 
 
 def _content(info: FrameInfo, data: Bytes) -> int | str:
-    """Return a checksum that differs for frames with other bytes.
+    """Return a checksum of the frame's bytes.
 
-    Only some bytes of a large frame are read, because all bytes of a camera's frame change.
+    Of a large frame only some bytes are read, because in a camera's frames all bytes change.
     """
     if info.rate and not data.any():
         return NOTHING

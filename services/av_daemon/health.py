@@ -1,4 +1,4 @@
-"""The health of one device: written by its thread, reported by the service. Times are passed in."""
+"""The health of one device: its thread writes it, the service reports it. Times are passed in."""
 
 from collections.abc import Iterator
 from typing import Final
@@ -22,7 +22,7 @@ NOTHING: Final = ""  # the content of sound that is zeros
 
 
 class Asked(Struct, frozen=True):
-    """The frames in a second, and the width and height of pictures, that a device was asked for; 0: any."""
+    """The frames per second, and the width and height of pictures, that a device was asked for; 0: any."""
 
     rate: float = 0.0
     width: int = 0
@@ -33,7 +33,7 @@ class Health:
     """The health of a device. One thread at a time writes, any reads. The delay after a failure doubles."""
 
     def __init__(self, first_delay_s: float = FIRST_DELAY_S, asked: Asked | None = None) -> None:
-        """Begin. ``asked`` is None for a device that is computed: it may repeat itself."""
+        """Make a record. ``asked`` is None for a computed device, whose frames may be equal."""
         self._first_delay_s, self._asked = first_delay_s, asked
         self._check = SourceCheck(asked.rate if asked else 0.0, remembered=_REMEMBERED)
         self._doing = "starts"
@@ -58,7 +58,7 @@ class Health:
         self._deadline = now + _OPENING_S
 
     def frame(self, info: FrameInfo, now: float, *, skipped: int = 0, content: int | str | None = None) -> None:
-        """Note a frame. ``content`` differs from that of a frame with other bytes; None: it was not looked at."""
+        """Note a frame. ``content`` differs between frames with different bytes; None: it was not computed."""
         self._dropped += skipped
         if content is not None or self._info is None:
             self._info = info
@@ -72,7 +72,7 @@ class Health:
             self._failures = 0
 
     def failed(self, why: str, *, expected: bool = False) -> float:
-        """Note a failure, and return how long to wait before the next try: the first delay if it was expected."""
+        """Note a failure; return the seconds until the next try: the first delay if the failure was ``expected``."""
         doublings = 0 if expected else self._failures
         delay: float = min(self._first_delay_s * 2**doublings, max(_LONGEST_DELAY_S, self._first_delay_s))
         self._failures = min(doublings + 1, 32)
@@ -83,13 +83,13 @@ class Health:
     # -- the service's thread
 
     def overdue(self, now: float) -> bool:
-        """True if the device should have opened, or given a frame, by now."""
+        """True if the device should have opened by now, or should have given a frame."""
         deadline = self._deadline
         return deadline is not None and now > deadline
 
     @property
     def problems(self) -> dict[str, str]:
-        """The problems of the frames that come, by kind."""
+        """Problems of the frames that come, by kind."""
         info, asked = self._info, self._asked
         return {} if info is None or asked is None else dict(self._problems(info, asked))
 

@@ -1,4 +1,4 @@
-"""A splitter of a stream of JPEG pictures into pictures. Bytes in, bytes out."""
+"""Splits a stream of bytes into JPEG pictures. Bytes in, bytes out."""
 
 from typing import Final
 
@@ -8,17 +8,14 @@ _BARE = frozenset((0x01, *range(0xD0, 0xD8)))  # markers without a length: TEM a
 
 
 class JpegSplitter:
-    """A splitter of a stream of bytes into JPEGs.
-
-    Pictures longer than ``limit`` bytes, and bytes that belong to no picture, are skipped.
-    """
+    """A splitter. It skips pictures longer than ``limit`` bytes, and bytes that belong to no picture."""
 
     def __init__(self, limit: int = 16 << 20) -> None:
         self._limit = limit
         self._buffer = bytearray()
 
     def feed(self, chunk: bytes) -> list[bytes]:
-        """Return the pictures that are complete now."""
+        """Return the pictures that ``chunk`` completes."""
         buffer, pictures = self._buffer, []
         buffer += chunk
         while True:
@@ -35,9 +32,9 @@ class JpegSplitter:
 
 
 def _end(buffer: bytearray) -> int:
-    """Return where the first picture ends; 0: not yet known; -1: it is none.
+    """Return the end of the first picture; 0: not yet known; -1: the bytes are no picture.
 
-    Segments before the scan are stepped over by their lengths: a preview inside them has an end marker, too.
+    Segments before the scan are skipped by their lengths: a preview inside them has an end marker, too.
     """
     at = len(_START)
     while at + 4 <= len(buffer):

@@ -18,7 +18,7 @@ _PIPE_BYTES = 1 << 20  # what an unprivileged process may have
 
 
 class LibcameraCamera:
-    """Pictures as the camera compressed them."""
+    """A camera whose pictures stay as it has compressed them."""
 
     def __init__(self, options: AvDaemon) -> None:
         video = options.video

@@ -12,7 +12,7 @@ from pebble.services.av_daemon.config import AvDaemon
 
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
-    """Return ``value`` with its pictures and sound: the bridge requests what sends them, so without it none obeys."""
+    """Return ``value`` with pictures and sound. They obey only with the bridge, which starts their programs."""
     devices, obeys = config.section(AvDaemon), config.services.mqtt_bridge.enabled
     video, audio = devices.enabled and devices.video.enabled, devices.enabled and devices.audio.enabled
     return replace(
@@ -23,13 +23,13 @@ def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
 
 
 def _completed(offer: Any, captured: Any, keys: tuple[str, ...], available: bool, obeys: bool) -> Any:
-    """Return ``offer`` with each of ``keys`` that it leaves open (None) filled in from ``captured``."""
+    """Return ``offer``, with each of ``keys`` that is None there filled in from ``captured``."""
     missing = {key: getattr(captured, key) for key in keys if getattr(offer, key) is None}
     return replace(offer, available=available, controls=available and obeys, **missing)
 
 
 def facts(config: Config) -> Facts:
-    """Return where programs of the original find pictures and sound on the robot."""
+    """Return the lines about the sockets where programs of the original find pictures and sound."""
     forms = {"video": "pictures", "audio": "sound"}
     sockets = config.section(AvDaemon).sockets().items()
     texts = (f"{forms[name]} at {path}, by examples/gstreamer_sockets.py" for name, path in sockets)

@@ -24,7 +24,7 @@ SILENCE_S: Final = 5.0  # after which a program that has reported has ended
 
 
 class Reports:
-    """The latest report of every media program, by its name, without those that stopped reporting. Pure."""
+    """The latest report of each media program, by its name, until it stops reporting. Pure."""
 
     def __init__(self) -> None:
         self._reports: dict[str, tuple[float, MediaReport]] = {}
@@ -40,7 +40,7 @@ class Reports:
 
 
 class AvDaemon(Service):
-    """Each device has a thread of its own, and is open only while its stream has a reader."""
+    """The owner of the devices. Each has a thread, and is open only while its stream has a reader."""
 
     name = "av_daemon"
     publishes = (MEDIA_STATUS,)
@@ -75,14 +75,14 @@ class AvDaemon(Service):
 
     @every(0.5)
     def poll(self) -> None:
-        """Detect devices that hang."""
+        """Find devices that hang."""
         now = self.clock()
         for stream in self._streams:
             stream.poll(now)
 
     @every(1.0)
     def look(self) -> None:
-        """End, to be started again, when what readers need was removed, or room in /dev/shm is there at last."""
+        """End this process, to be restarted, if its shared memory was removed, or /dev/shm has room for it at last."""
         if not all(writer.in_place for writer in self._writers):
             raise DeviceError("the shared memory of the frames was removed: starting again with a new one")
         if any(writer.may_share for writer in self._writers):
@@ -90,7 +90,7 @@ class AvDaemon(Service):
 
     @every(1.0)
     def publish_status(self) -> None:
-        """Publish changes at most once a second, and changes of mere numbers every few seconds."""
+        """Publish the status: other words within a second, other numbers within a few seconds."""
         now = self.clock()
         streams = {stream.name: stream.report(now) for stream in self._streams}
         self._publish(self._reports.current(now) | streams)
@@ -113,5 +113,5 @@ class AvDaemon(Service):
 
 
 def _states(value: dict[str, MediaReport]) -> str:
-    """Return its text without numbers, which change all the time."""
+    """Return the status as text without its numbers, which change all the time."""
     return _NUMBER.sub("", msgspec.json.encode(value).decode())

@@ -14,10 +14,10 @@ Bytes: TypeAlias = NDArray[np.uint8]  # of any shape
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """A frame from a device: either its ``data``, or how to ``draw`` its ``size`` bytes into an array given to it.
+    """A frame from a device: its ``data``, or a function to ``draw`` its ``size`` bytes into an array.
 
-    ``at_ns`` is when it was complete (monotonic); 0: when it is drawn. ``skipped``: how many were thrown away before
-    it because this program was too slow, or because they were broken.
+    ``at_ns`` is the time when it was complete (monotonic); 0: when it is drawn. ``skipped``: how many frames before it
+    were dropped, because this program was too slow or they were broken.
     """
 
     info: FrameInfo
@@ -28,9 +28,9 @@ class Capture:
     skipped: int = 0
 
     def pixels(self, scratch: Bytes) -> Bytes:
-        """Return the frame as bytes in one dimension.
+        """Return the frame as a one-dimensional array of bytes.
 
-        Drawn into ``scratch``, of ``size`` bytes, where it has no data.
+        If it has no data, it is drawn into ``scratch``, of ``size`` bytes.
         """
         if self.draw is not None:
             self.draw(scratch)
@@ -45,19 +45,19 @@ class Source(Protocol):
     """An open device. One thread uses it, except for ``interrupt``."""
 
     def grab(self) -> Capture:
-        """Wait for the next frame, which is valid until the next call. Raises DeviceError if the device failed."""
+        """Wait for the next frame, which is valid until the next call. Raises DeviceError if the device fails."""
 
     def close(self) -> None:
         """Release the device."""
 
     def interrupt(self) -> None:
-        """Make a waiting ``grab`` fail soon, from any thread, where that is possible."""
+        """Make a waiting ``grab`` fail soon, if that is possible. Any thread."""
 
 
 def opencv() -> Any:
-    """Return OpenCV on one thread, because one picture is too small a job for several.
+    """Return OpenCV, set to use one thread: a picture is too small a job for several.
 
-    Imported only where a camera needs it: it is 16 MB, which a robot without one does not pay.
+    It is imported only for a camera that needs it, because it takes 16 MB.
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""The camera and the microphone that a config names, and a camera that is mounted at an angle."""
+"""Opens the camera and the microphone of a config, also a camera that is mounted at an angle."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _BROKEN_LIMIT = 30  # pictures one after the other that cannot be decoded; a few
 def camera(options: AvDaemon, start: float) -> Opener:
     """Return a function that opens the camera, upright.
 
-    ``start``: when a synthetic camera begins to count, in monotonic time.
+    ``start``: the time at which a synthetic camera begins to count, monotonic.
     """
 
     def open_() -> Source:
@@ -47,7 +47,7 @@ def microphone(options: AvDaemon, start: float) -> Opener:
 def asked_of_camera(video: CameraCapture) -> Asked | None:
     """Return the rate and size that a camera is asked for; None for a synthetic camera.
 
-    A file, or a network's stream, cannot be asked for any.
+    A file or a network stream cannot be asked for any.
     """
     if video.backend == "synthetic":
         return None
@@ -69,7 +69,7 @@ def picture_bytes(options: AvDaemon) -> int:
 
 
 def chunk_bytes(options: AvDaemon) -> int:
-    """Return the size of one piece of sound."""
+    """Return the number of bytes in a piece of sound."""
     return round(options.audio.rate * CHUNK_S) * 2 * options.audio.channels
 
 
@@ -110,7 +110,7 @@ class Rotated:
         self._camera.interrupt()
 
     def _next(self) -> tuple[Capture, Bytes, int]:
-        """Return the next picture that is whole, and how many were skipped."""
+        """Return the next whole picture, and how many broken ones were skipped."""
         skipped = 0
         for broken in range(_BROKEN_LIMIT):
             capture = self._camera.grab()

@@ -1,4 +1,4 @@
-"""One stream: a device and its writer; a device that hangs is abandoned and opened again."""
+"""One stream: a device and its writer. A device that hangs is abandoned, and opened again."""
 
 import logging
 import time
@@ -19,7 +19,7 @@ _HUNG_LIMIT = 3  # threads whose device never answers, before no more are starte
 
 
 class Stream:
-    """All methods are for the service's thread. ``poll`` has to be called now and then."""
+    """The stream. All methods are for the service's thread. Call ``poll`` now and then."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class Stream:
         self._hung: list[Capturer] = []
 
     def poll(self, now: float) -> None:
-        """Abandon a device that is overdue, and open it again in another thread; log what is wrong with its frames."""
+        """Abandon a device that is overdue, and open it again in another thread; log problems of its frames."""
         self._tell(self._health.problems)
         self._hung = [capturer for capturer in self._hung if capturer.alive]
         if len(self._hung) >= _HUNG_LIMIT or not self._health.overdue(now):
@@ -66,11 +66,11 @@ class Stream:
         )
 
     def end(self) -> None:
-        """Begin to release the device. Returns at once."""
+        """Begin to release the device, without waiting."""
         self._capturer.end()
 
     def join(self, timeout: float = 0.5) -> None:
-        """Wait until the device is released; one that hangs is left to the end of the process."""
+        """Wait until the device is released. A device that hangs is left until the process ends."""
         deadline = time.monotonic() + timeout
         for capturer in (self._capturer, *self._hung):
             if not capturer.join(max(0.0, deadline - time.monotonic())):

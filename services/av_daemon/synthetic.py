@@ -24,7 +24,7 @@ _BEHIND = 10  # chunks of sound that are made up for after a delay
 
 
 class Pacer:
-    """A steady pace: turn ``n`` is due at ``start + n / rate``, however long the turns before it took.
+    """A steady pace: turn ``n`` is due at ``start + n / rate``, however long earlier turns took.
 
     A caller that is more than ``behind`` turns late skips to the present one. :meth:`interrupt` ends the wait.
     """
@@ -52,24 +52,24 @@ class Pacer:
         self._interrupted.set()
 
     def _now(self) -> int:
-        """Return the latest turn that is due."""
+        """Return the newest turn that is due."""
         return int((self._clock() - self._start) * self._rate)
 
 
 class ComputedDevice:
-    """A camera or microphone that is computed: nothing is ever open."""
+    """A computed camera or microphone, which has nothing to open or close."""
 
     _pacer: Pacer
 
     def close(self) -> None:
-        """Do nothing: nothing is open."""
+        """Do nothing: there is nothing to close."""
 
     def interrupt(self) -> None:
         self._pacer.interrupt()
 
 
 class ComputedCamera(ComputedDevice, ABC):
-    """A camera that draws a picture at each turn; turns are counted without readers, too."""
+    """A camera that draws a picture at each turn; turns also count while there are no readers."""
 
     def __init__(self, video: CameraCapture, start: float) -> None:
         self._shape = (video.height, video.width, 3)
@@ -78,11 +78,11 @@ class ComputedCamera(ComputedDevice, ABC):
 
     @abstractmethod
     def look(self, turn: int) -> int:
-        """Choose the picture to draw; return its moment in ns, 0: now."""
+        """Choose the picture to draw; return its moment in ns, or 0 for now."""
 
     @abstractmethod
     def draw(self, picture: Bytes) -> None:
-        """Draw it into an array of shape (height, width, 3)."""
+        """Draw the chosen picture into an array of shape (height, width, 3)."""
 
     def grab(self) -> Capture:
         at_ns = self.look(self._pacer.next())
@@ -96,7 +96,7 @@ class ComputedCamera(ComputedDevice, ABC):
 
 
 class SyntheticCamera(ComputedCamera):
-    """The scene, frame ``n`` at ``start + n / fps``."""
+    """A camera that shows the scene: frame ``n`` at ``start + n / fps``."""
 
     def __init__(self, video: CameraCapture, start: float) -> None:
         super().__init__(video, start)
@@ -112,9 +112,9 @@ class SyntheticCamera(ComputedCamera):
 
 
 class WorldCamera(ComputedCamera):
-    """The view from the robot that ``device`` (``world.json#goob``) names, in a world whose program shares poses.
+    """A camera on the robot that ``device`` (``world.json#goob``) names, in a world whose program shares poses.
 
-    The moment of a picture is when the robots were where it shows them. Raises NotRunningError while there is no world.
+    The moment of a picture is the time of the poses that it shows. Raises NotRunningError while the world does not run.
     """
 
     def __init__(self, video: CameraCapture, start: float) -> None:
@@ -130,7 +130,7 @@ class WorldCamera(ComputedCamera):
 
 
 class SyntheticMicrophone(ComputedDevice):
-    """Speech in chunks of 20 ms; sample ``n`` was recorded at ``start + n / rate``."""
+    """A microphone with speech in pieces of 20 ms; sample ``n`` was recorded at ``start + n / rate``."""
 
     def __init__(self, audio: Microphone, start: float) -> None:
         self._speech = Speech(audio.rate, audio.channels)

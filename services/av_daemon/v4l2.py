@@ -21,7 +21,7 @@ _PASSED_ON = {"MJPG": "mjpeg", "YUYV": "yuyv"}  # frames that may travel as the 
 
 
 class V4l2Camera:
-    """A camera by its device. MJPEG of the camera is shared as it is, unless ``capture_format`` is ``raw``.
+    """A camera by its device. Its MJPEG is shared unchanged, unless ``capture_format`` is ``raw``.
 
     A read that hangs cannot be interrupted; OpenCV's timeout ends it after 3 s.
     """
@@ -72,7 +72,7 @@ class V4l2Camera:
         return capture
 
     def _choose_format(self, video: CameraCapture) -> str:
-        """Return the format of the frames: the camera's own if readers can decode it and OpenCV leaves it alone."""
+        """Return the frames' format: the camera's own if readers can decode it and OpenCV passes it unchanged."""
         code = int(self._capture.get(self._cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
         has = code.to_bytes(4, "little").decode("latin-1")
         wanted = video.capture_format
@@ -106,15 +106,15 @@ class V4l2Camera:
 
     def _draw(self, target: Bytes) -> None:
         wanted = target.reshape(self._info.height, self._info.width, 3)
-        got = self._retrieve(wanted)
-        if got.shape != wanted.shape:
+        picture = self._retrieve(wanted)
+        if picture.shape != wanted.shape:
             raise DeviceError(f"{self._name} changed the size of its pictures")
-        if not np.shares_memory(got, wanted):  # not every backend of OpenCV writes into the array given to it
-            np.copyto(wanted, got)
+        if not np.shares_memory(picture, wanted):  # not every backend of OpenCV writes into the array given to it
+            np.copyto(wanted, picture)
 
 
 def is_device(name: str) -> bool:
-    """True if it is a camera of this machine; other names are of files and network streams."""
+    """True if this names a camera of this machine; other names are files and network streams."""
     return name.isdecimal() or name.startswith("/dev/")
 
 

@@ -1,4 +1,4 @@
-"""Sends pictures to operators: at the configured rate, never old ones, over a connection of its own."""
+"""The sender of pictures to operators: at the configured rate, never old ones, over a connection of its own."""
 
 from pebble.extension import Extension
 

@@ -1,4 +1,4 @@
-"""A reader of the camera's frames, on a thread of its own, that holds the newest one for the service."""
+"""Reads the camera's frames on a thread, and holds the newest one for the service."""
 
 import logging
 import threading
@@ -17,7 +17,7 @@ _RETRY_S = 2.0
 
 
 class CameraReader:
-    """A reader that is ``enabled`` or not. ``on_frame()`` runs on its thread for every frame and must only hand over.
+    """A reader that can be ``enabled``. ``on_frame()`` runs on its thread for every frame, and must be quick.
 
     ``on_end()`` runs there if the thread ends before :meth:`close`.
     """
@@ -55,7 +55,7 @@ class CameraReader:
         self._put(None)
 
     def take(self) -> Frame | None:
-        """Return the newest frame, once; the caller releases it."""
+        """Return the newest frame, once; None if there is no new one. The caller releases it."""
         with self._lock:
             frame, self._newest = self._newest, None
         return frame

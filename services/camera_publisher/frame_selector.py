@@ -1,4 +1,4 @@
-"""The choice of a camera's frames that are sent, and of those sent as full pictures. Pure: times are passed in."""
+"""Chooses which of a camera's frames are sent, and which of those as full pictures. Pure: times are passed in."""
 
 _EARLY = 0.25  # of a period: how far ahead of its turn a frame may be, because cameras have jitter
 _LATE = 1.0  # periods that may be made up for; a longer pause is not
@@ -6,10 +6,11 @@ PERIOD_S = 1.0  # full pictures are large: one per second, however many receiver
 
 
 class FrameSelector:
-    """The turns of frames, at the configured rate on the clock of capture times; a frame that is due uses up one.
+    """The turns of frames: times at the configured rate. A frame that is due uses up one turn.
 
-    Comparing each frame with the one sent before it would round every wait up to the camera's next frame: 15 frames per
-    second thinned out to 10 would become 7.5. Turns do not drift: a frame sent late leaves the next one its time.
+    Times are those of capture. Comparing each frame with the one sent before it would round every wait up to the
+    camera's next frame: 15 frames per second reduced to 10 would become 7.5. Turns do not drift: after a frame that was
+    sent late, the next one keeps its time.
     """
 
     def __init__(self, fps: float) -> None:
@@ -28,14 +29,14 @@ class FrameSelector:
             self._turn = min(self._turn, self._captured + self._period)
 
     def due(self, captured_s: float) -> bool:
-        """True if it is the turn of a frame captured at ``captured_s``. A clock that went back starts again."""
+        """True if a frame captured at ``captured_s`` has its turn. If the clock went back, turns start again."""
         if captured_s < self._captured:
             self._turn = None
         self._captured = captured_s
         return self._turn is None or captured_s >= self._turn - _EARLY * self._period
 
     def use(self, captured_s: float) -> float:
-        """Take the frame: the next turn is one period after the one it used up. Returns how many turns were missed."""
+        """Use up the frame's turn: the next one is a period later. Return how many turns were missed."""
         turn = captured_s if self._turn is None else self._turn
         missed = max(0.0, (captured_s - turn) / self._period - _LATE)
         self._turn = turn + (1.0 + missed) * self._period
@@ -43,7 +44,7 @@ class FrameSelector:
 
 
 class KeyframeRequests:
-    """The requests since the last full picture; the next one answers all of them."""
+    """The requests for a full picture since the last one; the next full picture answers them all."""
 
     def __init__(self) -> None:
         self._requested = self._required = False
@@ -54,14 +55,14 @@ class KeyframeRequests:
         self._requested = True
 
     def require(self) -> None:
-        """Require a full picture at once: the next one cannot build upon the last one."""
+        """Require a full picture at once: the next picture cannot be a difference from the last one."""
         self._required = True
 
     def due(self, now: float) -> bool:
-        """True if the next picture has to be a full one."""
+        """True if the next picture must be a full one."""
         return self._required or (self._requested and now - self._sent_at >= PERIOD_S)
 
     def sent(self, now: float) -> None:
-        """Note that a full picture was sent, for whatever reason."""
+        """Note that a full picture was sent, for any reason."""
         self._requested = self._required = False
         self._sent_at = now

@@ -1,7 +1,7 @@
-"""The reduction of pictures on a slow connection: first less quality, then less size, then fewer frames.
+"""Reduces pictures on a slow connection: first their quality, then their size, then their number.
 
-What counts is how long the connection was busy with each frame, compared with the time between two frames. Nothing is
-ever measured by sending more than is configured. Pure: times are passed in.
+It compares the time for which each frame kept the connection busy with the time between two frames. It never sends more
+than is configured in order to measure. Pure: times are passed in.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ _HEADER, _PER_RECORD, _RECORD = 8, 30, 16 << 10
 
 
 def wire_size(topic: str, payload: bytes) -> int:
-    """Return the bytes that a message takes on the wire, roughly."""
+    """Return roughly how many bytes a message takes on the wire."""
     size = _HEADER + len(topic) + len(payload)
     return size + _PER_RECORD * (1 + size // _RECORD)
 
 
 class RateController:
-    """A controller of frames, and of how they are encoded: ``step``. No picture waits behind another on its way.
+    """A controller of the frames that are sent, and of their encoding (``step``). No picture waits behind another.
 
-    ``outgoing()`` says what is unacknowledged on the connection. A frame that was due and not encoded because of that
-    is counted as ``held_back``. ``thin``: the connection may carry very little, so pictures begin small, and a slow one
-    is followed by a rest.
+    ``outgoing()`` returns the unacknowledged messages of the connection. A frame that was due and not encoded because
+    of them is counted as ``held_back``. ``thin``: the connection may carry very little, so pictures begin small, and a
+    slow one is followed by a pause.
     """
 
     def __init__(
@@ -56,16 +56,16 @@ class RateController:
 
     @property
     def step(self) -> Step:
-        """The way to encode the next frame."""
+        """Way to encode the next frame."""
         return self._levels.step
 
     @property
     def in_flight(self) -> bool:
-        """True if a picture is in flight: :meth:`poll` has to be called every 20 ms then, to measure its time."""
+        """True if a picture is in flight: then call :meth:`poll` every 20 ms, to measure its time."""
         return len(self._window) > 0
 
     def may_encode(self, captured_s: float, now: float) -> bool:
-        """Return True if a frame captured at ``captured_s`` is due, and waits for no other; it uses up its turn."""
+        """True if a frame captured at ``captured_s`` is due and need not wait for another; it uses up its turn."""
         if not self._selector.due(captured_s):
             return False
         round_trip_s = self._update(now)
@@ -83,11 +83,11 @@ class RateController:
         return True
 
     def sent(self, size: int, now: float) -> None:
-        """Note that the connection has accepted a picture that takes ``size`` bytes on the wire."""
+        """Note that the connection has accepted a picture of ``size`` bytes on the wire."""
         self._window.sent(size, now)
 
     def poll(self, now: float) -> Step | None:
-        """Measure what was acknowledged; return the step if it has changed since the last poll."""
+        """Measure what was acknowledged; return the step if it has changed since the last poll, else None."""
         self._update(now)
         changed, self._changed = self._changed, False
         return self.step if changed else None
@@ -108,7 +108,7 @@ class RateController:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One way to send pictures, as shares of what is configured."""
+    """A way to send pictures, as shares of the configured quality, size and rate."""
 
     quality: Fraction
     size: Fraction  # of width and of height
@@ -117,17 +117,17 @@ class Step:
 
     @property
     def cost(self) -> float:
-        """The step's share of the full bytes per second. Fewer frames differ more from each other."""
+        """Share of the full bytes per second. With fewer frames, each differs more from the last."""
         return self.bytes * math.pow(self.rate, 0.9)
 
     def __str__(self) -> str:
-        """Return what is reduced, for display: "quality 1/2, size 3/4"; empty if nothing is."""
+        """Return the reduced properties for display: "quality 1/2, size 3/4"; empty if there are none."""
         parts = {"quality": self.quality, "size": self.size, "rate": self.rate}
         return ", ".join(f"{name} {share}" for name, share in parts.items() if share != 1)
 
 
 def _step(quality: str, size: str, rate: str) -> Step:
-    """Return a step with the costs of JPEG: half the quality is two thirds of the bytes, small pictures are denser."""
+    """Return a step with JPEG's costs: half the quality is two thirds of the bytes, small pictures are denser."""
     q, s, r = Fraction(quality), Fraction(size), Fraction(rate)
     return Step(q, s, r, math.pow(q, 0.6) * math.pow(s, 1.6))
 
@@ -150,8 +150,9 @@ SMALL = 6  # of them: small pictures, as many as are configured
 
 
 class LevelControl:
-    """A choice among STEPS: down at once and as far as it takes, up one step at a time, and more slowly each time that
-    went wrong.
+    """The choice among STEPS: down at once as far as necessary, up one step at a time.
+
+    After each step up that failed, the next one comes later.
     """
 
     def __init__(self, fps: float, now: float, level: int = 0) -> None:
@@ -168,12 +169,12 @@ class LevelControl:
         return STEPS[self.level]
 
     def lost(self, turns: float, now: float) -> None:
-        """Note how many frames could not be sent just now because those before them were late."""
+        """Note how many frames could not be sent just now, because earlier ones were late."""
         if now - (turns + 1) * self._frame_s > self._changed_at:  # else those before them were of another step
             self._lost.append((now, turns))
 
     def poll(self, acknowledged: list[Acknowledged], age_s: float, now: float) -> bool:
-        """Note the frames ``acknowledged``, and the age of the oldest in flight. True: another step from now on."""
+        """Note the ``acknowledged`` frames, and the age of the oldest in flight; True if the step has changed."""
         self._seen.extend((now, frame.took_s) for frame in acknowledged if frame.sent_at >= self._changed_at)
         for memory in (self._seen, self._lost):
             while memory and now - memory[0][0] > _WINDOW_S:
@@ -195,12 +196,12 @@ class LevelControl:
 
     @property
     def _frame_s(self) -> float:
-        """The seconds from one frame to the next at this step."""
+        """Seconds from one frame to the next at this step."""
         return self._period / float(self.step.rate)
 
     @property
     def _load(self) -> float:
-        """The share of the time the connection is busy if every due frame is sent: may well be above 1."""
+        """Share of the time for which the connection is busy if every due frame is sent; may be well above 1."""
         if not self._seen:
             return 0.0
         frames = len(self._seen)
@@ -209,7 +210,7 @@ class LevelControl:
         return max(busy, 1.0 + lost) if lost > _LOST else busy
 
     def _go_down(self, load: float, now: float) -> bool:
-        """Reduce as far as necessary; what was just restored is reduced again, and restored later next time."""
+        """Reduce as far as necessary. A step up that was just tried is undone, and tried later next time."""
         lower = range(self.level + 1, len(STEPS))
         affordable = self.step.cost * _AIM / load
         if self._rose_at is not None and now - self._rose_at < _PROBATION_S:

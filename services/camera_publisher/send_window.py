@@ -1,4 +1,4 @@
-"""The frames in flight: how many may be, and how long the connection was busy with each. Pure."""
+"""The frames in flight: how many are permitted, and how long each kept the connection busy. Pure."""
 
 from dataclasses import dataclass
 
@@ -18,21 +18,21 @@ _SLACK_BYTES = 64  # of pings and headers
 
 @dataclass(frozen=True, slots=True)
 class Acknowledged:
-    """A frame the other side has acknowledged."""
+    """A frame that the other side has acknowledged."""
 
     sent_at: float
     took_s: float  # how long it kept the connection busy; short times are given the benefit of the doubt
 
 
 class SendWindow:
-    """The frames in flight on one connection, and how many may be.
+    """The frames in flight on one connection, and how many are permitted.
 
     Over a long round trip several frames travel at once: at first one, then one more for each that arrived promptly,
     because the capacity of the path shows only after a round trip.
 
     Delayed acknowledgements come together: a late frame is acknowledged at once with younger ones, for which a slow
-    connection would have needed longer. To tell the two apart, a younger frame has to be in flight: when only one is,
-    and late, another is let through now and then.
+    connection would have needed longer. To tell the two apart, a younger frame must be in flight: when there is only
+    one, and it is late, another is let through now and then.
     """
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class SendWindow:
         return len(self._frames)
 
     def clear(self) -> None:
-        """Note that the connection is lost, and all frames in flight with it."""
+        """Forget all frames in flight, because the connection is lost."""
         self._frames.clear()
         self._limit = 1
 
@@ -57,7 +57,7 @@ class SendWindow:
         self._frames.sent(size, now)
 
     def poll(self, waiting: int, round_trip_s: float, now: float) -> list[Acknowledged]:
-        """Return the frames acknowledged since the last poll, while ``waiting`` bytes are not."""
+        """Return the frames acknowledged since the last poll; ``waiting`` bytes are still unacknowledged."""
         self._round_trip_s, since_s, self._polled_at = round_trip_s, now - self._polled_at, now
         frames, slack_s = self._frames.acknowledge(waiting), self._slack_s(now)
         acknowledged = []
@@ -75,7 +75,7 @@ class SendWindow:
         return acknowledged
 
     def full(self, round_trip_s: float, now: float) -> bool:
-        """True if another frame would have to wait for those before it."""
+        """True if another frame would have to wait for those in flight."""
         if len(self._frames) >= self._limit:
             return True
         late_s = self.age_s(round_trip_s, now)
@@ -83,19 +83,19 @@ class SendWindow:
         return late_s > 0 and not probe
 
     def age_s(self, round_trip_s: float, now: float) -> float:
-        """Return how much longer than a mere round trip the oldest frame has been in flight; 0 without one."""
+        """Return how much longer than a round trip the oldest frame has been in flight; 0 if there is none."""
         if not len(self._frames):
             return 0.0
         return max(0.0, self._frames.age_s(now) - round_trip_s - self._slack_s(now))
 
     def _slack_s(self, now: float) -> float:
-        """Return by how much an acknowledgement may be late and say nothing about the connection."""
+        """Return how late an acknowledgement may be without telling anything about the connection."""
         return BEACON_SLACK_S if now < self._beacon_until else SLACK_S
 
 
 def _credible(took_s: float, slack_s: float) -> float:
-    """Return the part of ``took_s`` that is surely due to the connection.
+    """Return the part of ``took_s`` that the connection certainly caused.
 
-    That is none below ``slack_s``, and all from twice ``slack_s`` on.
+    It is 0 below ``slack_s``, and all of it from twice ``slack_s`` on.
     """
     return took_s * min(1.0, max(0.0, took_s / slack_s - 1.0))

@@ -1,4 +1,4 @@
-"""The sender of the camera's pictures: at the configured rate, never old ones, over a connection of its own."""
+"""The service that sends the camera's pictures: at the configured rate, never old ones, on its own connection."""
 
 from functools import partial
 from typing import Any
@@ -30,7 +30,7 @@ _WORST_QUALITY = 3  # of a JPEG: below it nothing gets smaller
 
 
 class CameraPublisher(Service):
-    """The sender of pictures. It encodes nothing while the remote broker is away, and soon reads nothing either."""
+    """The sender of pictures. While the remote broker is away it encodes nothing, and soon reads nothing either."""
 
     name = "camera_publisher"
     publishes = (MEDIA_REPORT, CAMERA)
@@ -90,7 +90,7 @@ class CameraPublisher(Service):
     def _make_encoder(self, name: str) -> VideoEncoder:
         """Return the encoder called ``name``.
 
-        Where it cannot be made, the one that every robot has and every client reads.
+        If it cannot be made, return the one that every robot has and every client reads.
         """
         try:
             encoder = self._open_encoder(name)
@@ -116,7 +116,7 @@ class CameraPublisher(Service):
     # -- the connection
 
     def _on_remote(self) -> None:
-        """Take the present state: a change that was undone counts as none, but what was in flight is lost."""
+        """Adapt to the connection's present state. Frames in flight are lost, even if it is connected again."""
         self._rate.connection_lost()
         self._keyframes.require()
         self._meter.clear()
@@ -126,7 +126,7 @@ class CameraPublisher(Service):
         self._report()
 
     def _poll(self) -> None:
-        """Measure the picture in flight, repeatedly: only so it is known how long it took."""
+        """Measure the picture in flight. It is called repeatedly, as only this shows how long a picture took."""
         step = self._rate.poll(self.clock())
         if step is not None:
             self.log.info("reduced because the connection is slow: %s", str(step) or "nothing any more")
@@ -174,7 +174,7 @@ class CameraPublisher(Service):
         return self._encoder.encode(picture, captured_ms, keyframe=self._keyframes.due(self.clock()))
 
     def _throw_away(self, why: str) -> None:
-        """Throw a picture away: the encoder assumes that it was sent, so the next one must not build upon it."""
+        """Drop an encoded picture. The next one must not build upon it, as the encoder assumes that it was sent."""
         self.counters.add(why)
         self._keyframes.require()
 
@@ -238,5 +238,5 @@ class CameraPublisher(Service):
 
 
 def is_black(picture: Pixels) -> bool:
-    """True if nothing is seen in the picture, as with a lid on the lens."""
+    """True if the picture is all black, as with a lid on the lens."""
     return bool(picture[::_STEP, ::_STEP].max() <= _DARK)

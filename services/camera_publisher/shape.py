@@ -1,4 +1,4 @@
-"""From a frame as the camera gives it to the picture that is sent: decoded, as large as wanted, and turned."""
+"""Makes the picture to send from a camera's frame: decodes, scales and turns it."""
 
 from fractions import Fraction
 from typing import Any, Final
@@ -15,14 +15,14 @@ _TURNS: Final = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTA
 
 
 class Shape:
-    """The shape of what is sent. ``width``, ``height`` None: as captured, or in proportion; ``turn`` is clockwise."""
+    """The shape of sent pictures. ``width``, ``height`` None: as captured, or in proportion; ``turn``: clockwise."""
 
     def __init__(self, width: int | None, height: int | None, turn: int) -> None:
         self._wanted = (height, width) if turn in (90, 270) else (width, height)  # before it is turned
         self._turn = turn
 
     def picture(self, frame: Frame, part: Fraction = Fraction(1)) -> Pixels:
-        """Return the picture, BGR, at ``part`` of the wanted size, maybe a view into the frame. Raises PayloadError."""
+        """Return the picture, BGR, at ``part`` of its size, perhaps a view of the frame. Raises PayloadError."""
         width, height = self._size(frame.info.width, frame.info.height, part)
         picture = frame.picture(width)  # at a fraction of the work where a JPEG need not be decoded whole
         if picture.shape[:2] != (height, width):

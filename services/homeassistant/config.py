@@ -21,7 +21,7 @@ class HomeAssistant(ServiceSection, frozen=True, kw_only=True):
 
 
 def _check(reader: Reader, root: Root, _: Place) -> Root:
-    """Note that there is no broker which Home Assistant could use."""
+    """Note a problem if there is no broker that Home Assistant could use."""
     section: HomeAssistant = root.services.homeassistant  # type: ignore[attr-defined]  # of this extension
     bridge = root.services.mqtt_bridge
     if section.enabled and not (bridge.enabled and bridge.remote is None):
@@ -34,12 +34,12 @@ RULES: tuple[Rule, ...] = ((Root, _check),)
 
 
 def saved(config: Config) -> Path:
-    """Return the file with the topics that may be retained at the broker."""
+    """Return the path of the file with the topics that may be retained at the broker."""
     return config.state_file("homeassistant")
 
 
 def programs(config: Config) -> list[Program]:
-    """Return the process; also after Home Assistant was disabled, until the broker has forgotten the robot."""
+    """Return the process, even if Home Assistant was disabled, until the broker has forgotten the robot."""
     bridge = config.services.mqtt_bridge
     runs = config.section(HomeAssistant).enabled or saved(config).exists()
     if not (runs and bridge.enabled and bridge.remote is None):
@@ -48,7 +48,7 @@ def programs(config: Config) -> list[Program]:
 
 
 def facts(config: Config) -> Facts:
-    """Return a line about what it gets."""
+    """Return the line of the summary about Home Assistant."""
     section = config.section(HomeAssistant)
     buttons = ", ".join(("stop", *section.expose))
     return Facts((("home assistant", f"{section.prefix}, buttons: {buttons}"),) if section.enabled else ())

@@ -1,6 +1,7 @@
-"""The message by which Home Assistant makes a device of a robot, from the robot's capabilities. Pure.
+"""The discovery message, by which Home Assistant shows a robot as a device; from its capabilities. Pure.
 
-It never has what moves a robot or ends a stop: Home Assistant repeats nothing, so it is no dead man.
+It never offers to move a robot or to end a stop: Home Assistant does not repeat commands, so it is no dead man's
+switch.
 """
 
 import re
@@ -33,7 +34,7 @@ Component = dict[str, Any]
 
 
 def object_id(base: str) -> str:
-    """Return the robot's name where only letters, digits and lines are allowed; no two robots have the same."""
+    """Return a unique name of the robot that has only letters, digits and underscores or hyphens."""
     plain = base.replace("/", "_")
     allowed = re.sub(r"[^A-Za-z0-9_-]", "_", plain)
     exact = allowed == plain and base.count("_") == 0
@@ -41,15 +42,15 @@ def object_id(base: str) -> str:
 
 
 def discovery(base: str, capabilities: dict[str, Any], expose: Collection[str] = (), unit: str = "") -> bytes:
-    """Return the message. ``unit``: of the battery's level, ``v`` or ``%``; "": none is known."""
+    """Return the message. ``unit``: the unit of the battery's level, ``v`` or ``%``; "" if unknown."""
     name, identity = object_id(base), section_of(capabilities, "identity")
     online = c.ONLINE.topic(base)
-    there = {"avty_t": online, "avty_tpl": f"{{{{ 'offline' if {_ONLINE} else 'online' }}}}"}
+    availability = {"avty_t": online, "avty_tpl": f"{{{{ 'offline' if {_ONLINE} else 'online' }}}}"}
     components: dict[str, Component] = {}
     # Without availability: an absent tracker would be unavailable, not away.
-    here = {"p": "device_tracker", "name": "Presence", "stat_t": online, "src_type": "router"}
-    components["presence"] = here | {"val_tpl": f"{{{{ 'not_home' if {_ONLINE} else 'home' }}}}"}
-    components |= {key: value | there for key, value in _components(base, capabilities, expose, unit)}
+    presence = {"p": "device_tracker", "name": "Presence", "stat_t": online, "src_type": "router"}
+    components["presence"] = presence | {"val_tpl": f"{{{{ 'not_home' if {_ONLINE} else 'home' }}}}"}
+    components |= {key: value | availability for key, value in _components(base, capabilities, expose, unit)}
     for key, component in components.items():
         component["uniq_id"] = f"{name}_{key}"
     message = {

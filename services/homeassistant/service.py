@@ -1,4 +1,4 @@
-"""The service that tells Home Assistant of the robot, over a connection of its own."""
+"""The service that announces the robot to Home Assistant, over a connection of its own."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ _TICK_S = 0.25
 
 
 class HomeAssistantService(Service):
-    """The publisher of the discovery message, and of the empty one that ends it."""
+    """The publisher of the discovery message, and of the empty message that removes it."""
 
     name = "homeassistant"
 
@@ -60,7 +60,7 @@ class HomeAssistantService(Service):
             self._wanted = discovery(self.config.base, self._capabilities, self._section.expose, self._unit)
 
     def _on_status(self, message: Message) -> None:
-        """Take what Home Assistant says of itself, on the transport's thread."""
+        """Handle Home Assistant's own status message, on the transport's thread."""
         if message.payload == b"online":
             self.post(self._on_connection)
 
@@ -70,7 +70,7 @@ class HomeAssistantService(Service):
 
     @every(_TICK_S)
     def send(self) -> None:
-        """Send what is due: the message, or empty ones where an earlier config had it."""
+        """Send the message if it is due, and empty ones on topics of an earlier config."""
         if self._remote.state is not State.CONNECTED:
             return
         now = self.clock()
@@ -97,10 +97,7 @@ class HomeAssistantService(Service):
             return {self._place}
 
     def _save(self, topics: set[str]) -> None:
-        """Save the topics.
-
-        Without topics the file is removed, so that this process is not started next time.
-        """
+        """Save the topics. Without topics the file is removed: this process is then not started next time."""
         if topics == self._retained:
             return
         try:

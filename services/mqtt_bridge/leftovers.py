@@ -1,7 +1,7 @@
 """Finds retained messages at the remote broker that the robot has removed while no bridge was running.
 
 An earlier bridge process had forwarded them, so only the broker has them. Each bridge process looks once, and only for
-topics that the robot alone publishes.
+topics on which only the robot publishes.
 """
 
 from collections.abc import Callable
@@ -15,14 +15,14 @@ _EXCEPTED = (ONLINE, MCU_DESCRIBE)  # the bridge's own, and one that MCU_VALUE c
 
 
 class Leftovers:
-    """Topics that robot and broker retain. Transports call :meth:`note_local` on their threads."""
+    """The topics that robot and broker retain. Transports call :meth:`note_local` on their threads."""
 
     def __init__(
         self, base: str, subjects: Subjects, remote: Transport, *channels: Channel, sparing: bool = False
     ) -> None:
-        """Store the arguments; ``channels`` are further channels that the bridge itself publishes on the remote side.
+        """Store the arguments; ``channels`` are more channels that the bridge itself publishes on the remote side.
 
-        ``sparing``: topics that the robot has are not asked for: the answers would only hold up messages to it.
+        ``sparing``: do not ask for topics that the robot has, because the answers would delay messages to it.
         """
         self._remote, self._sparing = remote, sparing
         self._on_robot: set[str] | None = set()  # topics that the robot retains; None: the search is over
@@ -45,13 +45,13 @@ class Leftovers:
             (on_robot.add if message.payload else on_robot.discard)(message.topic)
 
     def begin(self) -> None:
-        """Begin again, because a connection was lost."""
+        """Start again, because a connection was lost."""
         self._close()
         self._next = 0
         self._at_remote.clear()
 
     def ask_next(self) -> bool:
-        """Ask the broker for some of the topics, and wait for the answer; False if all were asked for already."""
+        """Ask the broker for the next few topics, and wait for the answer; False if all were asked for."""
         on_robot = self._on_robot or set()
         while self._sparing and self._next < len(self._filters) and self._filters[self._next] in on_robot:
             self._next += 1
@@ -59,21 +59,21 @@ class Leftovers:
             return False
         filter_ = self._filters[self._next]
         self._next += 1
-        asked = self._remote.subscribe(filter_, self._note_remote, echo=False, direct=True)
-        self._subscriptions.append(asked)
-        if asked.refused:  # it will refuse the others as well
+        subscription = self._remote.subscribe(filter_, self._note_remote, echo=False, direct=True)
+        self._subscriptions.append(subscription)
+        if subscription.refused:  # it will refuse the others as well
             self._next = len(self._filters)
         return True
 
     def remove(self, remove: Callable[..., bool]) -> list[str]:
-        """Remove messages that only the broker retains, and return their topics; the last call.
+        """Remove messages that only the broker retains; return their topics. This is the last call.
 
         ``remove(topic, unless=…)`` removes one message, unless there is a reason not to, and returns True if it did.
         """
         self._close()
-        gone = [topic for topic in sorted(self._at_remote) if remove(topic, unless=self._stays)]
+        removed = [topic for topic in sorted(self._at_remote) if remove(topic, unless=self._stays)]
         self._on_robot = None
-        return gone
+        return removed
 
     def _stays(self, topic: str) -> bool:
         on_robot = self._on_robot or set()

@@ -1,4 +1,4 @@
-"""A check that the robot's motor owners and this process reach each other."""
+"""Checks that messages pass between the robot's motor owners and this process."""
 
 from collections.abc import Iterable
 
@@ -10,9 +10,9 @@ _MISSED_S = 15.0  # owners publish their state every 5 s
 
 
 class MotorOwners:
-    """Motor owners from which states are received, reported to the launcher; times are of the caller's clock.
+    """The motor owners whose states arrive here, for reports to the launcher; times are of the caller's clock.
 
-    The first message of a connection counts for nothing, because it may be a retained one.
+    The first message of a connection does not count, because it may be a retained one.
     """
 
     def __init__(self, base: str, owners: Iterable[str], notifier: Notifier) -> None:
@@ -24,14 +24,14 @@ class MotorOwners:
         self._reported: dict[str, bool | None] = dict.fromkeys(self.topics)
 
     def connected(self) -> None:
-        """Note that a new connection begins; on the transport's thread, like :meth:`receive`."""
+        """Note a new connection. Called on the transport's thread, like :meth:`receive`."""
         self._messages = dict.fromkeys(self.topics, 0)
 
     def receive(self, topic: str) -> None:
         self._messages[topic] += 1
 
     def check(self, now: float) -> None:
-        """Report changes; call it every ``CHECK_S``, on one thread."""
+        """Report changes. Call this every ``CHECK_S``, on one thread."""
         for topic, owner in self.topics.items():
             count, checked = self._messages[topic], self._checked[topic]
             self._checked[topic] = count

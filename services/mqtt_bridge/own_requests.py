@@ -1,4 +1,4 @@
-"""Requests to the bridge itself: the flag remote-mirror, and those that extensions fulfil."""
+"""Requests to the bridge itself: the flag remote-mirror, and requests that extensions carry out."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from pebble.runtime.service import Service
 
 
 class Requests(ABC):
-    """Requests that an extension fulfils; made for the bridge's service, and called on its thread."""
+    """Requests that an extension carries out. Made for the bridge's service, and called on its thread."""
 
     channels: ClassVar[tuple[Channel, ...]]
 
@@ -23,16 +23,16 @@ class Requests(ABC):
 
     @abstractmethod
     def take(self, channel: Channel, value: Any) -> None:
-        """Handle the value of a message; the value of a flag that was removed or cannot be read is False."""
+        """Handle the value of a message. A flag that was removed, or cannot be read, is False."""
 
     def repeat(self) -> None:  # noqa: B027 - most do nothing
         """Try again the requests that failed; called once a second."""
 
 
 class OwnRequests:
-    """Requests, read on the transports' threads, and fulfilled on the thread of ``service``.
+    """Requests to the bridge, read on the transports' threads, and carried out on the thread of ``service``.
 
-    ``note_drive`` is given each drive command from operators.
+    ``note_drive`` gets each drive command from operators.
     """
 
     def __init__(self, service: Service, mirroring: Mirroring, note_drive: Callable[[bytes], None]) -> None:
@@ -45,7 +45,7 @@ class OwnRequests:
         self._takers = {channel.suffix: requests for requests in self._requests for channel in requests.channels}
 
     def message(self, channel: Channel, payload: bytes) -> None:
-        """Handle a message that is no flag."""
+        """Handle a message that is not a flag."""
         if channel is DRIVE:
             self._note_drive(payload)
         elif channel.kind is not Kind.FLAG and (value := self._decoded(channel, payload)) is not None:
@@ -59,7 +59,7 @@ class OwnRequests:
             self._take(channel, bool(payload and self._decoded(channel, payload)))
 
     def repeat(self) -> None:
-        """Have all requests try again what has failed."""
+        """Try again all requests that have failed."""
         for requests in self._requests:
             requests.repeat()
 
@@ -69,7 +69,7 @@ class OwnRequests:
             self._service.post_message(channel, partial(taker.take, channel, value), newest_of=channel.metric)
 
     def _decoded(self, channel: Channel, payload: bytes) -> Any:
-        """Return the value of a message that some extension takes; None if it is malformed, or of no interest."""
+        """Return the value of a message that an extension handles; None if it is malformed, or none does."""
         return self._decode(channel, payload) if channel.suffix in self._takers else None
 
     def _decode(self, channel: Channel, payload: bytes) -> Any:

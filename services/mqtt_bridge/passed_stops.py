@@ -1,7 +1,7 @@
-"""Passes a stop on to every motor owner until that owner has confirmed it. Kept in memory only; no I/O.
+"""Repeats a stop to every motor owner until that owner has confirmed it. Kept in memory only; no I/O.
 
-A stop that is sent once must not be lost because an owner restarts or stands still. For each owner the newest stop
-waits, and is repeated, until a state of that owner names it. No bound of what is remembered here drops a stop.
+A stop that is sent once must not be lost because an owner restarts or is suspended. For each owner the newest stop
+waits, and is repeated, until a state of that owner names it. No limit on what is remembered here drops a stop.
 """
 
 import secrets
@@ -22,7 +22,7 @@ NAMES = 1024  # of stops: a minute of 17 in a second
 
 
 def is_stop(payload: bytes) -> bool:
-    """True unless the payload removes a retained message, or is a probe for cycles: any other is a stop."""
+    """True for every payload but two: an empty one, which removes a retained message, and a probe for cycles."""
     return bool(payload) and not codec.is_blank(payload)
 
 
@@ -31,7 +31,7 @@ def is_named(payload: bytes) -> bool:
 
 
 def named(payload: bytes) -> bytes:
-    """Return a stop of the remote side with a name, and without the owner that only the bridge may add."""
+    """Return a stop from the remote side with a name, and without an owner: only the bridge may add that."""
     if not is_stop(payload):
         return payload
     stop = codec.decode(ESTOP, payload)
@@ -42,7 +42,7 @@ def named(payload: bytes) -> bytes:
 
 
 class Pending(Struct, frozen=True):
-    """A stop that an owner has not confirmed; ``first``: when it was passed first, ``at``: when it began to wait."""
+    """A stop that an owner has not confirmed. ``first``: when it was first forwarded; ``at``: when it began to wait."""
 
     stop: EstopCommand
     first: float
@@ -50,7 +50,7 @@ class Pending(Struct, frozen=True):
 
 
 class Owner:
-    """The state of one motor owner, as far as it is known."""
+    """The known state of one motor owner."""
 
     def __init__(self) -> None:
         self.state: EstopState | None = None
@@ -64,7 +64,7 @@ class Owner:
         return state is not None and name in state.recent and (state.persisted is not False or not state.latched)
 
     def follow(self, state: EstopState | None, now: float) -> None:
-        """Note the owner's newest state; None: the owner has withdrawn its state."""
+        """Note the owner's newest state; None: the owner has withdrawn it."""
         earlier, self.state = self.state, state
         if state is None:
             self.withdrawn_at = now if self.withdrawn_at is None else self.withdrawn_at
@@ -78,7 +78,7 @@ class Owner:
 
 
 class PassedStops:
-    """Stops that were passed, and those that owners have not confirmed. Any thread may use it."""
+    """The stops that were forwarded, and those that owners have not confirmed. Any thread may use it."""
 
     def __init__(self, owners: Iterable[str], clock: Callable[[], float]) -> None:
         self._owners = {owner: Owner() for owner in owners}
@@ -88,13 +88,13 @@ class PassedStops:
 
     @property
     def pending(self) -> dict[str, Pending]:
-        """The stops that are not confirmed, by owner."""
+        """Stops that are not confirmed, by owner."""
         return {key: owner.pending for key, owner in self._owners.items() if owner.pending is not None}
 
     def accept(self, payload: bytes) -> list[bytes]:
-        """Remember a stop with a name as passed; return the payloads to publish.
+        """Remember a stop with a name as forwarded; return the payloads to publish.
 
-        A motor owner that was reset since gets no copy of the stop.
+        A motor owner that was reset since the stop gets no copy of it.
         """
         if not is_stop(payload):
             return [payload]
@@ -126,7 +126,7 @@ class PassedStops:
             return [_addressed(stop.stop, key) for key, stop in waiting if self._owners[key].withdrawn_at is None]
 
     def give_up(self) -> list[tuple[str, EstopCommand]]:
-        """End the stops of owners that were withdrawn for too long; return them, with the owner of each."""
+        """End the stops for owners whose state was withdrawn for too long; return them, each with its owner."""
         now, ended = self._clock(), []
         with self._lock:
             for key, pending in self.pending.items():
@@ -146,5 +146,5 @@ def _addressed(stop: EstopCommand, owner: str) -> bytes:
 
 
 def _encoded(command: EstopCommand, **fields: Any) -> bytes:
-    kept = {"by": command.by or UNSET, "why": command.why or UNSET}
-    return codec.encode(ESTOP, msgspec.structs.replace(command, **(kept | fields)))
+    sender = {"by": command.by or UNSET, "why": command.why or UNSET}
+    return codec.encode(ESTOP, msgspec.structs.replace(command, **(sender | fields)))

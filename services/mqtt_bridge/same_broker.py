@@ -1,7 +1,7 @@
-"""Detects that the bridge's two sides are one broker, whatever addresses lead to it (paper A.5.1).
+"""Detects that the bridge's two sides are one broker, by whatever addresses (paper A.5.1).
 
-Then nothing may be mirrored, because every message would come back and circulate for ever. A probe that is published on
-the remote side and received on the local side proves this.
+Then the bridge must not forward: every message would come back and circulate for ever. A probe that is published on the
+remote side and received on the local side proves it.
 """
 
 import time
@@ -19,10 +19,10 @@ _PERIOD_S = 1.0
 
 
 class SameBrokerProbe:
-    """Probes, sent in rounds, and the newest round in which one was received on the local side.
+    """A sender of probes, in rounds; it knows the newest round in which one was received on the local side.
 
-    On a robot with a mirror each probe is also announced on the robot's own transport. The mirror compares the probe
-    with the messages of its broker, until the bridge announces that no probe is under way.
+    On a robot with a mirror each probe is also announced on the robot's own transport. The mirror compares it with its
+    broker's messages, until the bridge announces that no probe is under way.
     """
 
     def __init__(self, config: Config, local: Transport, remote: Transport, clock: Callable[[], float]) -> None:
@@ -57,7 +57,7 @@ class SameBrokerProbe:
             self.send()
 
     def report_arrival(self) -> None:
-        """Announce that the remote broker has the newest probe, once it has answered a later message."""
+        """Announce that the remote broker has the newest probe, as its answer to a later message shows."""
         answer = self._remote.answer
         if self._under_way and answer is not None and answer.delivered_s < self._clock() - self._sent_at:
             self.report_none()
@@ -78,9 +78,9 @@ class SameBrokerProbe:
             self.report_none()
 
     def begin_round(self, remote_topic: str) -> int | None:
-        """Send a probe and wait, bounded, until it would have arrived; return None if a connection was lost.
+        """Send a probe, wait (bounded) until it would have arrived, and return the round; None without a connection.
 
-        The barrier is first on the side the probe went to, then on the side where it would arrive.
+        The barrier is first on the side to which the probe went, then on the side where it would arrive.
         """
         self._round += 1
         if not self.send():
@@ -96,7 +96,7 @@ class SameBrokerProbe:
     # -- the transports' threads
 
     def proves_same_broker(self, message: Message) -> bool:
-        """True, once for each of our probes, if ``message`` is one, received on the local side on :attr:`topic`.
+        """True, once for each of our probes, if ``message`` is that probe, received on the local side.
 
         A copy that a client keeps sending, or has retained, proves nothing.
         """

@@ -62,7 +62,7 @@ ASK_S = 0.2  # between two questions about what is left at the remote broker
 
 
 class MqttBridge(ForwardingService):
-    """The bridge: it forwards by Table A.1, once its two sides are known not to be one broker."""
+    """The bridge: it forwards by Table A.1, once it knows that its two sides are not one broker."""
 
     name = "mqtt_bridge"
     publishes = (ONLINE, BRIDGE_PROBE, CONTROL_VOUCHED)
@@ -102,7 +102,7 @@ class MqttBridge(ForwardingService):
 
     @property
     def winner(self) -> Side:
-        """The side whose retained messages count. Where names are checked, flags at the broker are the robot's own."""
+        """Side whose retained messages count: where names are checked the local one, as flags are the robot's own."""
         return Side.LOCAL if self.config.security.named else Side.REMOTE
 
     @property
@@ -173,7 +173,7 @@ class MqttBridge(ForwardingService):
 
     @property
     def _subscribes_soon(self) -> bool:
-        """True if the heartbeat must wait until we subscribe, because operators that see it send commands at once."""
+        """True if the heartbeat must wait until we subscribe: operators that see it send commands at once."""
         subscribed = self.subscriptions[Side.REMOTE] or self.forwarder.gate is Gate.SHUT
         return not subscribed and self._same_broker.both_connected
 
@@ -183,7 +183,7 @@ class MqttBridge(ForwardingService):
             self._publish_heartbeat()
 
     def _look_later(self) -> None:
-        """Wait until all messages that the robot retains are known; then look for those only at the remote side."""
+        """Wait until all messages that the robot retains are known; then look for others at the remote side."""
         if self._leftovers.done:
             return
         if self._leftover_timer is not None:
@@ -195,19 +195,19 @@ class MqttBridge(ForwardingService):
         if self.forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
             self._look_later()
             return
-        asked = self._leftovers.ask_next()
+        is_waiting = self._leftovers.ask_next()
         pause = self._uplink.pause(ASK_S)
-        wait, then = (pause, self._look_for_leftovers) if asked else (INITIAL_SYNC_S, self._remove_leftovers)
+        wait, then = (pause, self._look_for_leftovers) if is_waiting else (INITIAL_SYNC_S, self._remove_leftovers)
         self._leftover_timer = self.call_at(self.clock() + wait, then)
 
     def _remove_leftovers(self) -> None:
         if self.forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
             self._look_later()
             return
-        gone = self._leftovers.remove(partial(self.forwarder.retained.remove, Side.REMOTE))
-        if gone:
-            few = ", ".join(topic[:_LOGGED] for topic in gone[:3]) + (", …" if len(gone) > 3 else "")
-            self.log.info("removed %d retained topics that the robot no longer has: %s", len(gone), few)
+        removed = self._leftovers.remove(partial(self.forwarder.retained.remove, Side.REMOTE))
+        if removed:
+            few = ", ".join(topic[:_LOGGED] for topic in removed[:3]) + (", …" if len(removed) > 3 else "")
+            self.log.info("removed %d retained topics that the robot no longer has: %s", len(removed), few)
 
     def connected(self, side: Side, epoch: int) -> None:
         if side is Side.REMOTE:
@@ -244,7 +244,7 @@ class MqttBridge(ForwardingService):
         self.remote.ask(self.subjects.flags)
 
     def _check_brokers(self) -> None:
-        """Open the gate if the two sides cannot be one broker, or begin a round of probing."""
+        """Open the gate if the two sides cannot be one broker; otherwise begin a round of probing."""
         if not self._same_broker.possible:
             if self._same_broker.announces:
                 self._same_broker.send()  # before anything is forwarded: the mirror may have to shut
@@ -257,7 +257,7 @@ class MqttBridge(ForwardingService):
             self.call_at(self.clock() + wait_s, partial(self._end_round, round_))
 
     def _end_round(self, round_: int) -> None:
-        """Open the gate if no probe came back. A connection that was lost meanwhile brings a new round."""
+        """Open the gate if no probe came back. If a connection was lost, another round begins."""
         if self._same_broker.proves_two_brokers(round_):
             self._open()
 
@@ -295,7 +295,7 @@ class MqttBridge(ForwardingService):
 
     @every(PERIOD_S)
     def _vouch(self) -> None:
-        """Tell the motor owners the time up to which they have been sent all messages."""
+        """Tell the motor owners until when they have been sent all messages."""
         if not self.config.motor_owners:
             return
         gate, counters = self.forwarder.gate, self.forwarder.counters
@@ -345,7 +345,7 @@ class MqttBridge(ForwardingService):
             self._react(Side.LOCAL, admitted, self.forwarder.receive(Side.LOCAL, admitted))
 
     def _follow_control(self, payload: bytes) -> None:
-        """Note who has control, and the key of control, by which the age of a command counts."""
+        """Note who has control, and the present key, which decides whether a command has an age."""
         keys = None
         with suppress(PayloadError):
             state: ControlState = codec.decode(CONTROL_STATE, payload)
@@ -370,7 +370,7 @@ class MqttBridge(ForwardingService):
         self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
 
     def _receive_stop(self, message: Message) -> None:
-        """Give a stop a name first, so that all who wait for its confirmation know the same name."""
+        """Name a stop before anything else, so that all who wait for its confirmation know it by one name."""
         message = msgspec.structs.replace(message, payload=named(message.payload))
         self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
 
@@ -382,7 +382,7 @@ class MqttBridge(ForwardingService):
             self._passed_stops.follow(owner, codec.decode(ESTOP_STATE, payload) if payload else None)
 
     def _has_passed(self, message: Message) -> bool:
-        """True if this stop has come over the stops' own connection before; remembers or forgets the stop."""
+        """True if this stop came over the stops' own connection before. Remembers or forgets the stop."""
         return self._stops is not None and not self.forwarder.mirroring.on and self._stops.is_copy(message)
 
     def _pass_stop(self, message: Message) -> None:
@@ -394,7 +394,7 @@ class MqttBridge(ForwardingService):
             self._receive_stop(message)
 
     def _react(self, side: Side, message: Message, routed: Routed) -> None:
-        """Handle a message that requests something of the bridge itself, whether or not a remote side is connected.
+        """Handle a message with a request to the bridge itself, whether or not a remote side is connected.
 
         The bridge does not receive messages that it forwards to the local side, so this is the only occasion.
         """

@@ -1,9 +1,9 @@
-"""A second connection of the bridge to the operators' broker, for stops alone.
+"""A second connection of the bridge to the operators' broker, only for stops.
 
-A broker sends what it has for a client in order, and drops what comes while that waits. So one account that floods a
-robot with messages which it may write would hold up, or lose, the stop of another. On a connection that is subscribed
-to nothing else no stop waits. The main connection still receives every stop, too. A stop with a name passes both times,
-for motor owners know it by that; of the others each counts once, whichever way is faster.
+A broker sends a client's messages in order, and drops new ones while too many wait. So one account that floods a robot
+with permitted messages would delay, or lose, the stop of another. On a connection that is subscribed to nothing else no
+stop waits. The main connection still receives every stop, too. A stop with a name passes both times, as motor owners
+recognise its name. Of stops without a name each counts once, whichever way is faster.
 """
 
 import logging
@@ -28,7 +28,7 @@ _KICKS = 3  # in a row
 
 
 class Way(Enum):
-    """The connection over which a stop has come."""
+    """The connection over which a stop came."""
 
     MAIN = "main"
     STOPS = "stops"
@@ -38,11 +38,11 @@ class Copies:
     """A memory that recognises the second copy of a stop without a name, which comes both ways; thread-safe.
 
     No stop is lost because of this memory: :meth:`lost` returns the stops that only the main connection has received
-    while the other was dead and this was not known yet.
+    while the other one was dead and that was not known yet.
     """
 
     def __init__(self, clock: Callable[[], float], notices_s: float) -> None:
-        """Store the arguments; ``notices_s``: seconds after which the loss of a connection is known."""
+        """Store the arguments; ``notices_s``: seconds after which a lost connection is noticed."""
         self._clock, self._notices_s = clock, notices_s
         self._lock = threading.Lock()
         #: By the way on which the copy is to come: hashes, and until when.
@@ -50,7 +50,7 @@ class Copies:
         self._dropped = deque[tuple[float, Message]](maxlen=_DROPPED)
 
     def is_copy(self, way: Way, message: Message, *, other: bool) -> bool:
-        """True if this stop has come the other way before, and forgets it; else remembers the stop.
+        """True if this stop came the other way before; then forget it, else remember it.
 
         ``other``: the stop can come the other way now.
         """
@@ -86,10 +86,10 @@ class Copies:
 
 
 class StopConnection:
-    """The second connection, kept as long as the broker lets it.
+    """The second connection, as long as the broker accepts it.
 
-    ``pass_on`` gets each stop of this connection, on its thread, but for stops without a name that came over the main
-    connection before. ``main`` returns True while the main connection is there, and messages are forwarded. Call
+    ``pass_on`` gets each stop of this connection, on its thread, except stops without a name that came over the main
+    connection before. ``main`` returns True while the main connection exists, and messages are forwarded. Call
     :meth:`check` once a second and :meth:`main_lost`, on the service's thread.
     """
 
@@ -105,9 +105,9 @@ class StopConnection:
         grace_s: float = _GRACE_S,
         wanted: Callable[[], bool] = lambda: True,
     ) -> None:
-        """Store the arguments; ``notices_s``: seconds after which the loss of the connection is known.
+        """Store the arguments; ``notices_s``: seconds after which a lost connection is noticed.
 
-        ``grace_s``: seconds for which connecting is tried. ``wanted`` returns True while this is worth its cost.
+        ``grace_s``: seconds for which it tries to connect. ``wanted`` returns True while this is worth its cost.
         """
         self._grace_s, self._wanted = grace_s, wanted
         self._transport, self._filters, self._clock = transport, tuple(filters), clock
@@ -122,11 +122,11 @@ class StopConnection:
 
     @property
     def listens(self) -> bool:
-        """True if stops come this way."""
+        """True if stops arrive on this connection."""
         return self._transport.state is State.CONNECTED and not self._transport.not_received
 
     def is_copy(self, message: Message) -> bool:
-        """True if a stop without a name from the main connection has passed already; remembers or forgets the stop."""
+        """True if a stop without a name on the main connection has passed already. Remembers or forgets the stop."""
         return not is_named(message.payload) and self._copies.is_copy(Way.MAIN, message, other=self.listens)
 
     def check(self) -> None:

@@ -1,4 +1,4 @@
-"""The way to the remote broker, as the bridge uses it: it carries everything, unless an extension knows better."""
+"""The bridge's view of the way to the remote broker: wide, unless an extension replaces it."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ POLL_S = 0.1
 
 
 class Uplink:
-    """A wide link, over which nothing waits. Methods that an extension overrides run on the service's thread."""
+    """A wide link, on which nothing waits. Methods that an extension overrides run on the service's thread."""
 
     channels: tuple[Channel, ...] = ()  # that it publishes on the remote side itself
 
     @property
     def is_flooded(self) -> bool:
-        """True if a client lately sent more commands than the link carries."""
+        """True if a client has recently sent more commands than the link carries."""
         return False
 
     @property
@@ -32,15 +32,15 @@ class Uplink:
         return None
 
     def heartbeat_due(self) -> bool:
-        """Return True if a heartbeat is due, and there is room for it on the link."""
+        """True if a heartbeat is due, and the link has room for it."""
         return True
 
     def pause(self, seconds: float) -> float:
-        """Return the time to wait between two requests that are not urgent; ``seconds`` on a wide link."""
+        """Return the time to wait between two requests that are not urgent; on a wide link ``seconds``."""
         return seconds
 
     def poll(self) -> bool:
-        """Measure the link and send waiting messages, every POLL_S; True if heartbeats are sent with these polls."""
+        """Measure the link and send waiting messages, every POLL_S; True if heartbeats are due at these polls."""
         return False
 
     def note_drive(self, payload: bytes) -> None:
@@ -50,7 +50,7 @@ class Uplink:
 def uplink_of(
     config: Config, addresses: Addresses, remote: Transport, forwarder: Forwarder, clock: Callable[[], float]
 ) -> Uplink:
-    """Return the uplink of a robot. Raises ConfigError if it is not plain and no extension provides that."""
+    """Return the uplink of a robot. Raises ConfigError if its link may be thin and no extension supports that."""
     link = config.services.mqtt_bridge.link
     if link.profile == "wide" and not link.groups:
         return Uplink()

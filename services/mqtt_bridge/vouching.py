@@ -1,4 +1,4 @@
-"""The time for which the bridge vouches that all messages of the operators' broker were passed on in time."""
+"""The time for which the bridge vouches that all messages of the operators' broker were forwarded promptly."""
 
 from collections.abc import Hashable
 
@@ -10,10 +10,10 @@ PERIOD_S = 0.5
 
 
 class Vouching:
-    """The time that ends with the newest prompt answer of the broker, and begins after the newest loss or delay.
+    """The vouched time: from the newest loss or delay to the newest prompt answer of the broker.
 
-    Messages that the broker had before its answer have been passed on before the motor owner gets this time. A motor
-    owner that counts silence only within this time does not take late or lost messages for silence.
+    Messages that the broker had before its answer are forwarded before the motor owner gets this time. A motor owner
+    that counts silence only within this time does not take late or lost messages for silence.
     """
 
     def __init__(self, remote: Transport, now: float, noticed_s: float | None = None) -> None:
@@ -23,9 +23,9 @@ class Vouching:
         self._losses: Hashable = None
 
     def check(self, passes: bool, losses: Hashable, now: float) -> ControlVouched:
-        """Update and return the time, every PERIOD_S. ``losses`` changes whenever a message may have been lost here.
+        """Update and return the vouched time; ``losses`` changes when a message may have been lost here.
 
-        A broker is late if its answer takes longer than a drive command may wait.
+        Call it every PERIOD_S. A broker is late if its answer takes longer than a drive command may wait.
         """
         delivered_s = self._delivered_s()
         if not passes or losses != self._losses or delivered_s is None:
@@ -36,7 +36,7 @@ class Vouching:
         return ControlVouched(begin=round(1000 * self._begin), end=round(1000 * self._end))
 
     def _delivered_s(self) -> float | None:
-        """Return the seconds since which messages may not be delivered yet; None if the broker is late."""
+        """Return how long ago all messages were certainly delivered; None if the broker is late."""
         if self._noticed_s is not None:
             return self._noticed_s
         answer = self._remote.answer

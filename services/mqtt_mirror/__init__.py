@@ -1,1 +1,1 @@
-"""Offers a Zenoh robot's topics on a broker on the robot."""
+"""The mirror: it offers a Zenoh robot's topics on a broker on the robot."""

@@ -1,4 +1,4 @@
-"""Offers a Zenoh robot's topics on a broker on the robot.
+"""The mirror as a process: it offers a Zenoh robot's topics on a broker on the robot.
 
 docs/bridge.md explains when the mirror forwards, and when it refuses to.
 """
@@ -33,7 +33,7 @@ class MqttMirror(ForwardingService):
 
     Where retained messages differ at a reconnect, the local side is right. If a probe of the bridge arrives from the
     broker, that broker is the remote one: the bridge serves it already, and with a second path messages would
-    circulate. A probe counts only if the bridge has announced it on the local side; a heartbeat from the broker is a
+    circulate. A probe counts only if the bridge has announced it on the local side. A heartbeat from the broker is a
     reason to request one.
     """
 
@@ -87,7 +87,7 @@ class MqttMirror(ForwardingService):
             self._check_broker(epoch)
 
     def _check_broker(self, epoch: int) -> None:
-        """Wait for probes of the bridge from the broker, before anything is forwarded."""
+        """Wait whether probes of the bridge arrive from the broker, before anything is forwarded."""
         self.forwarder.rearm()
         self._announced, self._under_way = False, bool(self._watched)
         self.unsubscribe(Side.REMOTE)
@@ -100,7 +100,7 @@ class MqttMirror(ForwardingService):
         self.call_at(begins, partial(self._begin, epoch, begins + self._slowest_s))
 
     def _begin(self, epoch: int, latest: float) -> None:
-        """Forward from now on, unless a probe may be under way; by ``latest`` no bridge has a connection without it."""
+        """Start forwarding, unless a probe may be under way; after ``latest`` no bridge has an unprobed connection."""
         if self._under_way and self.clock() < latest:
             self._request_again()
             self.call_at(self.clock() + _ARRIVAL_S, partial(self._begin, epoch, latest))
@@ -136,7 +136,7 @@ class MqttMirror(ForwardingService):
         self._refuse("is the remote one, which the bridge serves already", seconds)
 
     def _refuse(self, why: str, seconds: float = CHECK_AGAIN_S) -> None:
-        """Forward nothing until the next check, when the address may lead to another broker."""
+        """Forward nothing until the next check, because the address may then lead to another broker."""
         self.forward_nothing(seconds)
         if why != self._refused:
             self._refused = why
@@ -178,7 +178,7 @@ class MqttMirror(ForwardingService):
             self.post_message(ONLINE, self._request_again, newest_of="suspect")
 
     def _is_fresh(self, message: Message) -> bool:
-        """True if a heartbeat is current; a retained heartbeat may be old. The sender uses the same clock."""
+        """True if a heartbeat is recent: a retained one may be old. Its sender uses the same clock."""
         try:
             heartbeat = codec.decode(ONLINE, message.payload)
         except PayloadError:

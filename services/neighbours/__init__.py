@@ -1,4 +1,4 @@
-"""Robots of a LAN hear each other, and scripts of one drive another that lets them."""
+"""A LAN of robots: they hear each other, and scripts of one drive another that permits it."""
 
 from pebble.extension import Extension, Program
 

@@ -1,4 +1,4 @@
-"""The newest run of each other robot that has begun here: each begins once, also over a restart of this program."""
+"""A file with the newest run of each other robot that has begun here: each begins only once, even over restarts."""
 
 from collections.abc import Collection
 from pathlib import Path
@@ -15,10 +15,10 @@ _decode = msgspec.json.Decoder(dict[str, Annotated[int, msgspec.Meta(gt=0, le=LA
 
 
 def begin(path: Path, names: Collection[str], name: str, run: int) -> str:
-    """Return why this run of robot ``name`` cannot begin; empty: it has, and does not again.
+    """Return why this run of robot ``name`` cannot begin; empty: it has begun, and never begins again.
 
-    ``path`` holds the newest run of each of ``names``, the robots that may begin any. A file that cannot be read, or
-    written, lets none begin until it is there again: else one that a person has stopped would go on after a restart.
+    ``path`` holds the newest run of each of ``names``, the robots that may begin any. If the file cannot be read or
+    written, no run begins until it can: otherwise a run that a person has stopped would continue after a restart.
     """
     try:
         newest = _decode(path.read_bytes())

@@ -1,4 +1,4 @@
-"""Neighbours of a robot that runs no program of ours, such as a board: beside the broker at which it is."""
+"""The neighbours of a robot that runs no program of ours, such as a board: this one runs beside its broker."""
 
 import os
 import zlib
@@ -21,9 +21,9 @@ AWAY_S = silent_after(0.5)  # boards publish four heartbeats a second
 
 
 class BoardNeighbours(NeighboursService):
-    """The neighbours of a board, which announce it to others only while its heartbeats arrive.
+    """The neighbours of a board. They announce it to others only while its heartbeats arrive.
 
-    This program runs elsewhere and may outlive the board.
+    This program runs elsewhere, and may outlive the board.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -37,7 +37,7 @@ class BoardNeighbours(NeighboursService):
         )
 
     def _on_heartbeat(self, message: Message, heartbeat: Heartbeat, _names: dict[str, str]) -> None:
-        """Take a message, on the transport's thread."""
+        """Handle a heartbeat of the board, on the transport's thread."""
         if not message.retain:
             self._received_live_at = float("-inf") if heartbeat.online is False else self.clock()
 

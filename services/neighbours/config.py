@@ -79,7 +79,7 @@ def _check(reader: Reader, section: Neighbours, path: Path) -> Neighbours:
 
 
 def _check_hub(reader: Reader, root: Root, _: Path) -> Root:
-    """Note where the hub of the LAN is also that of the operators, or of the robot itself."""
+    """Note a problem if the hub of the LAN is also the operators' hub, or the robot's."""
     endpoints = list(zenoh_endpoints(root))
     meets = {_place_of(endpoint): endpoint for path, endpoint in endpoints if path[:3] == _LAN}
     for path, endpoint in endpoints:
@@ -91,7 +91,7 @@ def _check_hub(reader: Reader, root: Root, _: Path) -> Root:
 
 
 def _place_of(endpoint: str) -> tuple[str, str]:
-    """Return host and port; all names of this machine are one."""
+    """Return host and port of an endpoint; all names of this machine are one host."""
     host, _, port = re.sub(r"[?#].*", "", endpoint.partition("/")[2]).rpartition(":")
     host = host.strip("[]")
     return ("" if host in _EVERYWHERE or is_loopback(host) else host), port
@@ -101,7 +101,7 @@ RULES: tuple[Rule, ...] = ((Neighbours, _check), (Root, _check_hub))
 
 
 def facts(config: Config) -> Facts:
-    """Return a line about the LAN."""
+    """Return the line of the summary about the LAN."""
     section = config.section(Neighbours)
     if not section.enabled:
         return Facts()

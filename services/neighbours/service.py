@@ -1,4 +1,4 @@
-"""The service between a robot and the hub of its LAN: what others hear of it, and what their scripts have it do."""
+"""The service between a robot and the hub of its LAN: shares its messages, and lets others' scripts drive it."""
 
 from __future__ import annotations
 
@@ -86,13 +86,13 @@ class NeighboursService(Service):
     # -- to the others
 
     def _share(self, metric: str, message: Message) -> None:
-        """Share what another robot may hear, as it is, on the transport's thread; never an old value."""
+        """Share a message that other robots may hear, unchanged, on the transport's thread; never an old value."""
         if not message.retain:
             self._lan.publish(self._me.outgoing(metric), message.payload, qos=QoS.LATEST)
 
     @every(HEARTBEAT_S)
     def _announce(self) -> None:
-        """Publish this robot's state: to the hub again and again, to operators when it changes."""
+        """Publish this robot's state: to the hub repeatedly, to operators when it changes."""
         now = self.clock()
         state = Neighbours(
             shares=list(self._section.shares),
@@ -108,7 +108,7 @@ class NeighboursService(Service):
 
     @on(TO_NEIGHBOUR, direct=True)
     def to_neighbour(self, drive: Drive, arrived: float, robot: str) -> None:
-        """Send a command of a script of this robot to another one, on the transport's thread."""
+        """Send a command of a script on this robot to another robot, on the transport's thread."""
         if robot not in self._others or not drive.signed:
             self.counters.add("refused")
             return
@@ -122,7 +122,7 @@ class NeighboursService(Service):
     # -- from the others
 
     def _receive(self, name: str, metric: str, message: Message) -> None:
-        """Take what another robot lets this one hear, on the transport's thread."""
+        """Handle a message that another robot shares, on the transport's thread."""
         if message.retain or len(message.payload) > MOST_BYTES:
             self.counters.add("refused")
             return
@@ -132,7 +132,7 @@ class NeighboursService(Service):
         self.transport.publish(topic, message.payload, qos=QoS.LATEST)
 
     def _on_command(self, message: Message, drive: Drive, names: dict[str, str]) -> None:
-        """Take a message, on the transport's thread."""
+        """Handle another robot's drive command, on the transport's thread."""
         if not message.retain_requested:
             job = partial(self._command, names["robot"], message, drive)
             self.post_message(FROM_NEIGHBOUR, job, newest_of=message.topic)
@@ -147,7 +147,7 @@ class NeighboursService(Service):
     # -- what happens on this robot
 
     def _on_owner(self, message: Message) -> None:
-        """Take a message, on the transport's thread."""
+        """Handle the state of a motor owner, on the transport's thread."""
         if self._estop.receive(message):
             self.post(self._owners_changed, newest_of="owners")
 
@@ -157,13 +157,13 @@ class NeighboursService(Service):
 
     @on(DRIVE, direct=True)
     def drive(self, drive: Drive, _arrived: float) -> None:
-        """Take a drive command, on the transport's thread; all of a person's mean the same here."""
+        """Handle a drive command to this robot, on the transport's thread; a person's all mean the same."""
         self.post(lambda: self._visit.received(drive, self.clock()), newest_of="script" if drive.signed else "person")
 
     # -- what a visit needs
 
     def _number(self, barred: int, received: int) -> int | None:
-        """Return the number of a run that begins now; None: a script of this robot runs, or none can be had."""
+        """Return the number of a run that begins now; None if a script of this robot runs, or no number is free."""
         with self._local.none_runs() as free:
             try:
                 return next_run(self.config, barred, received) if free else None

@@ -1,7 +1,7 @@
-"""The run of another robot that drives this one, and its number here. Pure.
+"""The run of another robot that drives this one, with a run number here. Pure.
 
-A run of another robot is here a script like any other: it gets one number, once, and :class:`DriveSender`, which every
-script has, ends it by what motor owners publish. A person ends it by any command. What has ended never goes on.
+Here a run of another robot is a script like any other: it gets a number, once, and :class:`DriveSender`, which every
+script uses, ends it by the states of motor owners. A person ends it by any command. An ended run never continues.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,9 +16,9 @@ LOCAL, PERSON = "a script of its own runs", "a person drives it"
 
 
 class Visit:
-    """A run of another robot here. ``begin`` returns why it cannot begin, ``number`` numbers it, ``publish`` drives.
+    """The run of another robot here. ``begin`` returns why it cannot begin, ``number`` numbers it, ``publish`` drives.
 
-    ``local_runs``: whether a script of this robot's own runs; it comes first. One thread; times are of one clock.
+    ``local_runs``: whether a script of this robot runs, which comes first. One thread; times are of one clock.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class Visit:
         self._refused: dict[str, NeighbourRefusal] = {}
 
     def command(self, name: str, drive: Drive, now: float) -> bool:
-        """Take a command of a robot that may drive this one; return False if it has no effect."""
+        """Handle a command of a robot that may drive this one; return False if it has no effect."""
         if not drive.signed or not isinstance(drive.run, int):
             return False  # no script's: it could neither be ended nor told from the next one
         if self._who != (name, drive.run) and not (drive.moves and self._starts(name, drive.run, now)):
@@ -53,7 +53,7 @@ class Visit:
         self.tick(now)
 
     def received(self, drive: Drive, now: float) -> None:
-        """Take a command on this robot's own topic, of whomever."""
+        """Handle any drive command on this robot's own topic."""
         if not drive.signed:
             self._person_at = now
             self.end(PERSON, now)
@@ -72,21 +72,21 @@ class Visit:
 
     @property
     def due(self) -> float | None:
-        """The time to call :meth:`tick`; None: not before something happens."""
+        """Time at which to call :meth:`tick`; None: only after another event."""
         return self._sender.due
 
     def driver(self, now: float) -> str:
-        """Return the robot whose run drives this one; empty: none does."""
+        """Return the robot whose run drives this one; empty if none does."""
         return "" if self._sender.ended(now) else self._who[0]
 
     def refused(self, now: float) -> dict[str, NeighbourRefusal]:
-        """Return the refusals by robot, of its newest run here while that has no effect."""
+        """Return why the newest run of each robot has no effect here, by robot."""
         name, run = self._who
         why = self._sender.refusal(now) if name else ""
         return self._refused | ({name: NeighbourRefusal(run=run, why=why)} if why else {})
 
     def _starts(self, name: str, run: int, now: float) -> bool:
-        """Begin the run if nothing prevents it; return True if it drives from now on."""
+        """Begin the run if nothing prevents it; True if it drives from now on."""
         why = self._begin(name, run) or (PERSON if now - self._person_at < HOLD_S else "")
         barred = newest(state.last_barred for state in self._states.values())
         number = None if why else self._number(barred, self._received)

@@ -1,4 +1,4 @@
-"""Records the robot on the robot."""
+"""The recorder on the robot."""
 
 from pebble.extension import Extension, Program
 

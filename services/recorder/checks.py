@@ -42,9 +42,9 @@ def checks(config: Config) -> Iterator[CheckResult]:
 
 def _running(folder: Path, entries: list[Entry]) -> CheckResult:
     if not Folder.is_in_use(folder):
-        left = sum(entry.is_active for entry in entries)
-        if left:
-            text = f"does not run, and {left} files in {folder} are not finished"
+        unfinished = sum(entry.is_active for entry in entries)
+        if unfinished:
+            text = f"does not run, and {unfinished} files in {folder} are not finished"
             return warn(text, f"pebble recordings mend {folder}")
         return ok("does not run now")
     status = _status(folder)

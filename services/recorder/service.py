@@ -18,7 +18,7 @@ _METRICS_S: Final = 10.0
 
 
 class RobotRecorder(Service):
-    """A recorder of everything on the local transport, and on the remote side where the config says so."""
+    """A recorder of all messages on the local transport, and on the remote side if the config says so."""
 
     name = "recorder"
 

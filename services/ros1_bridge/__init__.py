@@ -1,4 +1,4 @@
-"""A base with ROS 1, a Husky, Jackal or TurtleBot, as a robot like any other."""
+"""The bridge to a base with ROS 1 (a Husky, Jackal or TurtleBot), which then is a robot like any other."""
 
 from pebble.extension import Extension
 

@@ -9,7 +9,7 @@ from pebble.services.ros1_bridge.wire import RosError
 
 
 def checks(config: Config) -> Iterator[CheckResult]:
-    """Yield whether the master answers, and whether anything would obey."""
+    """Yield the checks: the master answers, and some base listens to commands."""
     section = config.section(Ros1)
     if not section.enabled:
         return

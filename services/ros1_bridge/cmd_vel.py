@@ -1,6 +1,7 @@
-"""The commands to the base: the newest one repeatedly while it is valid, then zeros.
+"""Sends commands to the base: the newest one repeatedly while it is valid, then zeros.
 
-While it is stopped: zeros and a lock. It has a deadline and a thread of its own: a service that hangs moves nothing.
+While the robot is stopped it sends zeros and a lock. It has a deadline and a thread of its own, so that the base stops
+when the service hangs.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ class CmdVel:
 
     @property
     def bases(self) -> set[str]:
-        """The names of the nodes that listen."""
+        """Names of the nodes that receive the commands."""
         return self._out.names
 
     @property
@@ -93,7 +94,7 @@ class CmdVel:
 
     @property
     def hangs(self) -> bool:
-        """True if the base has sent odometry, and does not any more."""
+        """True if the base has sent odometry, but no longer does."""
         return self._heard_at is not None and time.monotonic() - self._heard_at > SILENT_S
 
     def hear(self) -> None:
@@ -126,7 +127,7 @@ class CmdVel:
                 self._plan(time.monotonic())
 
     def latch(self, latched: bool) -> None:
-        """Hold the base: the running command is over, others of ROS are locked out and their goals are cancelled."""
+        """Lock or unlock the base. A lock ends the command, keeps other ROS programs out, cancels their goals."""
         with self._changed:
             if latched is self._latched:
                 return
@@ -158,7 +159,7 @@ class CmdVel:
             self._save(owed)
 
     def _first_lock(self) -> bytes | None:
-        """Return what a new subscriber of the lock gets; called on the thread of sockets."""
+        """Return the first message for a new subscriber of the lock, if any; called on the thread of sockets."""
         if not self._opens:
             return None
         if not self._latched:

@@ -205,12 +205,12 @@ class Ros1(Section, frozen=True, kw_only=True):
         return self.ros.master_uri or os.environ.get("ROS_MASTER_URI") or "http://127.0.0.1:11311"
 
     def host(self) -> str:
-        """Return where the node listens, and what it tells others to connect to."""
+        """Return the address at which the node listens, and to which it lets other nodes connect."""
         return self.ros.host or os.environ.get("ROS_IP") or os.environ.get("ROS_HOSTNAME") or "127.0.0.1"
 
 
 def _check(reader: Reader, root: Root, _: Path) -> Root:
-    """Note what the original's keys ask for, and this bridge does otherwise."""
+    """Note the keys of the original that this bridge treats otherwise."""
     section: Ros1 = root.services.ros1_bridge  # type: ignore[attr-defined]  # of this extension
     if not section.enabled:
         return root
@@ -261,7 +261,7 @@ RULES: tuple[Rule, ...] = ((Root, _check),)
 
 
 def programs(config: Config) -> list[Program]:
-    """Return the process; without driving it has another name, so that the robot has no motor owner."""
+    """Return the process. Without driving it has another name, so that the robot has no motor owner."""
     section = config.section(Ros1)
     if not section.enabled:
         return []
@@ -270,7 +270,7 @@ def programs(config: Config) -> list[Program]:
 
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
-    """Return ``value`` with what is published of the base."""
+    """Return ``value`` with offers of the values that are published of the base."""
     section = config.section(Ros1)
     if not section.enabled:
         return value
@@ -282,7 +282,7 @@ def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
 
 
 def facts(config: Config) -> Facts:
-    """Return a line about the base."""
+    """Return the line of the summary about the base."""
     section = config.section(Ros1)
     if not section.enabled:
         return Facts()

@@ -1,4 +1,4 @@
-"""The messages of ROS 1 that are sent and read here, without ROS: bytes in, bytes out."""
+"""The messages of ROS 1 that are sent or read here, without ROS: bytes in, bytes out."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 
 class Form(NamedTuple):
-    """A type of messages, and the digest of its definition by which nodes compare it."""
+    """A message type, with the digest of its definition, which nodes compare."""
 
     kind: str
     md5: str
@@ -64,7 +64,7 @@ class Route(NamedTuple):
 
 
 class Goal(NamedTuple):
-    """The outcome of a goal."""
+    """The result of a goal."""
 
     id: str
     code: int
@@ -81,7 +81,7 @@ class Health(NamedTuple):
 
 
 def twist(linear: float, angular: float) -> bytes:
-    """Return a Twist: metres a second ahead, radians a second to the left. Raises ValueError if one is not finite."""
+    """Return a Twist: forward speed in m/s, turn rate in rad/s to the left. Raises ValueError if one is not finite."""
     if not (math.isfinite(linear) and math.isfinite(angular)):
         raise ValueError("a speed is not a finite number")
     return _TWIST(linear, 0.0, 0.0, 0.0, 0.0, angular)
@@ -92,7 +92,7 @@ def boolean(value: bool) -> bytes:
 
 
 class _Reader:
-    """A reader of fields, one after the other. Raises struct.error where the message ends too early."""
+    """A reader of consecutive fields. Raises struct.error if the message ends too early."""
 
     def __init__(self, body: bytes) -> None:
         self._body, self._at = body, 0
@@ -167,6 +167,6 @@ def diagnostics(body: bytes) -> tuple[Header, list[Health]]:
 
 
 def yaw(quaternion: Sequence[float]) -> float:
-    """Return the turn about the vertical axis, in radians to the left."""
+    """Return the heading: the turn about the vertical axis, in radians to the left."""
     x, y, z, w = quaternion
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

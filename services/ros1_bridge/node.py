@@ -31,7 +31,7 @@ _QUIET_S, _PROBE_S, _PROBES = 10, 5, 3  # a publisher of whose machine nothing i
 
 
 class Source:
-    """A publisher of a topic to which the node subscribes; ``asked``: a connection is being made."""
+    """A publisher to which the node subscribes; ``asked``: a connection to it is being made."""
 
     def __init__(self, uri: str) -> None:
         self.uri, self.asked = uri, False
@@ -105,7 +105,7 @@ class Node:
             thread.start()
 
     def close(self) -> None:
-        """Let what was sent arrive, then leave the master; bounded by the time of a call."""
+        """Let messages on their way arrive, then sign off at the master; takes no longer than one call."""
         for publication in self._publications.values():
             publication.finish()
         self._ends.set()
@@ -121,34 +121,34 @@ class Node:
 
     @property
     def alive(self) -> bool:
-        """True until a thread of the node has ended by a mistake."""
+        """True until a thread of the node has failed."""
         return all(thread.is_alive() for thread in self._threads)
 
     def dropped(self) -> dict[str, int]:
-        """Return the numbers of messages that bounds dropped since the start, by what they were."""
+        """Return how many messages were dropped since the start because of a limit, by kind."""
         messages = sum(publication.dropped for publication in self._publications.values())
         return {**self.counters.snapshot(), **({"ros_messages": messages} if messages else {})}
 
     # -- what its API asks, on threads of its own
 
     def publishers_are(self, topic: str, uris: list[str]) -> None:
-        """Take the publishers of a topic; who is connected stays, since a master that restarts lists none of them."""
+        """Note the publishers of a topic. Connected ones stay: a master that has restarted lists none of them."""
         subscription = self._subscriptions.get(topic)
         if subscription is not None:
             self._in_sockets(lambda: self._update(subscription, uris))
 
     def address_of(self, topic: str) -> tuple[str, int] | None:
-        """Return where a topic is published; None: it is not, or not at present."""
+        """Return the address at which a topic is published; None if it is not published now."""
         return self._address if topic in self._publications and not self._evicted else None
 
     def evict(self, why: str) -> None:
-        """Note that another node has this name now: move nothing, and wait until it has gone."""
+        """Handle another node that has taken this name: move nothing, and wait until it has gone."""
         self.problem = f"the ROS master has ended this node: {why}"
         log.error("%s", self.problem)
         self._rest()
 
     def _rest(self) -> None:
-        """Let no subscriber hear this node until it is registered again."""
+        """Disconnect all subscribers until this node is registered again."""
         self._evicted, self.registered = True, False
         self._on_evicted(self.problem)
         for publication in self._publications.values():
@@ -175,7 +175,7 @@ class Node:
                 self._attempt_call(self._calls.get(timeout=max(0.0, due - time.monotonic())))
 
     def _check(self) -> None:
-        """Register the node, also again: a master that restarts has forgotten everything."""
+        """Register the node, again and again: a master that restarts has forgotten everything."""
         try:
             self._look()
             self.registered = not self._evicted
@@ -227,7 +227,7 @@ class Node:
             return ""
 
     def _revive(self, publishers: Mapping[str, list[str]], subscribers: Mapping[str, list[str]]) -> None:
-        """Tell subscribers that are not connected who publishes: without it one that was cut off waits for minutes."""
+        """Tell subscribers that are not connected about this node. Otherwise one that was cut off waits for minutes."""
         now = time.monotonic()
         missing: dict[tuple[str, str], float] = {}
         for topic, publication in self._publications.items():
@@ -277,7 +277,7 @@ class Node:
             log.debug("%s: %s", type(error).__name__, error)
 
     def _connect(self, subscription: Subscription, source: Source) -> None:
-        """Ask a publisher where it sends its topic, and connect to that."""
+        """Ask a publisher for the address of its topic, and connect to it."""
         sock = None
         try:
             _, host, port = call(source.uri, "requestTopic", self.name, subscription.topic, [["TCPROS"]])
@@ -332,7 +332,7 @@ class Node:
             key.fileobj.close()  # type: ignore[union-attr]  # all of them are sockets
 
     def _attempt(self, job: Callable[[], None]) -> None:
-        """Call a job; what it raises ends a connection at most, not all of them."""
+        """Call a job. An exception ends at most one connection."""
         try:
             job()
         except Exception:  # noqa: BLE001 - of any connection
@@ -358,7 +358,7 @@ class Node:
         self._close(subscriber.sock)
 
     def _hear(self, subscriber: Subscriber) -> None:
-        """Read what a subscriber wants; of one that is connected only its end arrives here."""
+        """Read a subscriber's request; a connected subscriber only ever sends its end."""
         publication = subscriber.publication
         try:
             chunk = subscriber.sock.recv(4096)

@@ -1,4 +1,4 @@
-"""A topic that the node publishes, and who is connected to it: what one cannot take now is dropped, never late."""
+"""A topic that the node publishes, and its subscribers. A message that one cannot take now is dropped, never late."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SEND_BUFFER = 2048  # bytes: what waits in the kernel is old
 
 
 class Subscriber:
-    """A connection of another node, which says first what it wants."""
+    """A connection from another node, which first sends its request."""
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
@@ -34,7 +34,7 @@ class Subscriber:
         self._blocked_from: float | None = None
 
     def send(self, data: bytes) -> bool:
-        """Send a block at once, or drop it and return False. Raises OSError if the connection is of no use any more."""
+        """Send a block at once, or drop it and return False. Raises OSError if the connection is broken."""
         now = time.monotonic()
         try:
             if self._rest:
@@ -65,18 +65,18 @@ class Publication:
 
     @property
     def names(self) -> set[str]:
-        """The nodes that are connected."""
+        """Names of the nodes that are connected."""
         with self._lock:
             return {subscriber.name for subscriber in self._subscribers}
 
     def send(self, body: bytes) -> int:
-        """Send a message to all who can take it now; return how many could."""
+        """Send a message to all subscribers that can take it now; return their number."""
         data = block(body)
         with self._lock:
             return sum([self._send(subscriber, data) for subscriber in list(self._subscribers)])
 
     def add(self, subscriber: Subscriber) -> bool:
-        """Add a subscriber that has been greeted, and send it the first message; False if there are too many."""
+        """Add a subscriber that was answered, and send it the first message; False if there are too many."""
         with self._lock:
             if len(self._subscribers) >= MOST_PEERS:
                 return False
@@ -89,7 +89,7 @@ class Publication:
         return True
 
     def remove(self, subscriber: Subscriber, why: str) -> None:
-        """Disconnect one subscriber."""
+        """Disconnect a subscriber."""
         with self._lock:
             self._remove(subscriber, why)
 
@@ -99,7 +99,7 @@ class Publication:
                 self._remove(subscriber, why)
 
     def finish(self) -> None:
-        """Let what was sent arrive, and nothing after it."""
+        """Let messages on their way arrive, and send no more."""
         with self._lock:
             for subscriber in self._subscribers:
                 try:

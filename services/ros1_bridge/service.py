@@ -1,4 +1,4 @@
-"""Owns the motors of a base with ROS 1: what the motor guard admits becomes its commands; its reports are published."""
+"""The motor owner of a base with ROS 1: sends the commands that the motor guard admits, and publishes its reports."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _CHECK_S = 0.5
 
 
 class Ros1Reader(Service):
-    """A service that publishes what a base says, and sends it nothing."""
+    """A service that publishes the base's reports, and sends nothing to it."""
 
     name = "ros1_reader"
     publishes: ClassVar[tuple[Channel, ...]] = PUBLISHES
@@ -50,7 +50,7 @@ class Ros1Reader(Service):
 
     @every(_CHECK_S)
     def check_threads(self) -> None:
-        """Raise DeviceError, which restarts this process, if a thread of it has ended."""
+        """Raise DeviceError, which restarts this process, if one of its threads has ended."""
         if not self.node.alive:
             raise DeviceError("a thread of the ROS node has ended")
 
@@ -71,7 +71,7 @@ class Ros1Reader(Service):
 
 
 class Ros1Bridge(Ros1Reader, MotorOwner):
-    """A service that drives the base, too. The lock of its multiplexer follows the latch: zeros alone stop no Husky."""
+    """A service that also drives the base. The multiplexer's lock is the latch: zeros do not stop a Husky."""
 
     name = "ros1_bridge"
     publishes = (*MotorOwner.publishes, *PUBLISHES)
@@ -98,7 +98,7 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
         return self.section.safety.drive_timeout_seconds
 
     def start(self) -> None:
-        """Begin as the saved state says: a base is locked before it can hear a command."""
+        """Start in the saved state: a stopped base is locked before it can receive a command."""
         self.on_stop(self._lock_file.close)
         MotorOwner.start(self)
         self.cmd_vel.latch(self.latched)
@@ -129,7 +129,7 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
 
     @every(_CHECK_S)
     def report_base(self) -> None:
-        """Tell the launcher whether the base can be driven. Raises DeviceError if nothing is repeated any more."""
+        """Tell the launcher whether the base can be driven. Raises DeviceError if commands are no longer repeated."""
         if not self.cmd_vel.alive:
             raise DeviceError("the thread that sends commands has ended")
         report = self.assess()
@@ -140,7 +140,7 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
             self.log.info("the base: %s%s", "ready" if state == "ready" else "cannot be driven", why and f", {why}")
 
     def assess(self) -> tuple[str, int | None, str]:
-        """Return the note of pebble.runtime.notes.Mcu; ``ready`` without an age is not known."""
+        """Return the fields of a note Mcu: state, age of the last report (None: unknown), and reason."""
         node, topic = self.node, self.section.ros.cmd_vel_topic
         if not self.cmd_vel.bases:
             return "absent", None, node.problem or f"nobody subscribes to {topic}"

@@ -74,11 +74,11 @@ class Telemetry:
 
     @property
     def navigates(self) -> bool:
-        """True if a planner pursues a goal."""
+        """True while a planner pursues a goal."""
         return time.monotonic() - self._navigates_at < NAVIGATES_S
 
     def _reader(self, topic: str, read: Callable[[bytes], None]) -> Callable[[bytes], None]:
-        """Return a function that reads a message, and counts one that is damaged."""
+        """Return a function that reads a message, and counts it if it is damaged."""
 
         def receive(body: bytes) -> None:
             try:
@@ -90,7 +90,7 @@ class Telemetry:
         return receive
 
     def _is_due(self, channel: Channel, metric: Metric, interval_s: float) -> bool:
-        """True if the metric is wanted, and not too soon after the last one."""
+        """True if the metric is enabled, and its interval is over."""
         now = time.monotonic()
         if not metric.enabled or now < self._due.get(channel, 0.0):
             return False
@@ -208,7 +208,7 @@ class Telemetry:
 
 
 def _stamp(header: Header) -> float:
-    """Return the time of the measurement, in seconds; by our clock where the sender does not say."""
+    """Return the time of the measurement, in seconds; the present time if the sender gives none."""
     return header.stamp or time.time()
 
 
@@ -221,7 +221,7 @@ def _place(position: messages.Numbers, yaw: float) -> dict[str, float]:
 
 
 def _items(parts: list[Health], most: int) -> list[dict[str, Any]]:
-    """Return the parts that are told: healthy ones only while there is room."""
+    """Return the diagnostics to publish: healthy parts only while there is room."""
     found: list[Health] = []
     for part in parts:
         if part.level > 0 or len(found) < most:
@@ -237,6 +237,6 @@ def _label(labels: tuple[str, ...], code: int) -> str:
 
 
 def _refuse_odd(*numbers: float) -> None:
-    """Raise ValueError for a number that JSON cannot carry: NaN or an infinity."""
+    """Raise ValueError for a number that JSON cannot hold: NaN or an infinity."""
     if not all(map(math.isfinite, numbers)):
         raise ValueError("a number is not finite")

@@ -9,21 +9,21 @@ MOST_MESSAGE = 1 << 20  # bytes of a message that is received
 
 
 class RosError(PebbleError):
-    """The master or a node refuses, or does not answer as one."""
+    """An error of the master or of a node: it refuses, or answers with something else."""
 
 
 def block(body: bytes) -> bytes:
-    """Return ``body`` after its length."""
+    """Return ``body`` with its length before it."""
     return struct.pack("<I", len(body)) + body
 
 
 def pack_header(**fields: str) -> bytes:
-    """Return the first block of a connection."""
+    """Return the first block of a connection, with these fields."""
     return block(b"".join(block(f"{key}={value}".encode()) for key, value in fields.items()))
 
 
 def parse_header(body: bytes) -> dict[str, str]:
-    """Return the fields of a header; what is damaged is left out."""
+    """Return the fields of a header; damaged ones are left out."""
     fields, at = {}, 0
     while at + 4 <= len(body):
         (size,) = struct.unpack_from("<I", body, at)
@@ -40,7 +40,7 @@ class Blocks:
         self.most, self._data = most, bytearray()
 
     def feed(self, chunk: bytes) -> list[bytes]:
-        """Return the blocks that are complete. Raises RosError for one that is too long."""
+        """Return the blocks that ``chunk`` completes. Raises RosError if a block is too long."""
         self._data += chunk
         blocks = []
         while len(self._data) >= 4:

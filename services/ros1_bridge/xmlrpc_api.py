@@ -22,14 +22,14 @@ _OLD_S = 2 * CALL_S  # a call of others that takes longer makes room for a new o
 
 
 class _Timed(xmlrpc.client.Transport):
-    """A transport that does not wait for ever."""
+    """A transport of XML-RPC with a time limit."""
 
     def make_connection(self, host: Any) -> HTTPConnection:
         return HTTPConnection(self.get_host_info(host)[0], timeout=CALL_S)
 
 
 def call(uri: str, method: str, *arguments: Any) -> Any:
-    """Call an API of ROS; return the value of the answer. Raises RosError."""
+    """Call a method of a ROS API; return the value in the answer. Raises RosError."""
     try:
         with xmlrpc.client.ServerProxy(uri, transport=_Timed()) as proxy:
             answer = getattr(proxy, method)(*arguments)
@@ -63,7 +63,7 @@ class _Handler(SimpleXMLRPCRequestHandler):
 
 
 class ApiServer(ThreadingMixIn, SimpleXMLRPCServer):
-    """A server that answers a bounded number of calls at once."""
+    """A server that answers a limited number of calls at once."""
 
     daemon_threads = True
     block_on_close = False
@@ -98,11 +98,11 @@ class ApiServer(ThreadingMixIn, SimpleXMLRPCServer):
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing: a caller that hangs up is its own affair."""
+        """Log nothing: a caller may hang up at any time."""
 
 
 class Answers(Protocol):
-    """The questions of a node's API to the node."""
+    """The node's answers to calls of its API."""
 
     master: str
 
@@ -114,7 +114,7 @@ class Answers(Protocol):
 
 
 def serve(node: Answers, host: str, on_refused: Callable[[], object]) -> ApiServer:
-    """Return the API of ``node``, on a free port of ``host``; it is not run yet."""
+    """Return a server of the API of ``node``, on a free port of ``host``, not yet running."""
     server = ApiServer(host, on_refused)
 
     def publisher_update(_caller: str, topic: str, uris: list[str]) -> list[Any]:

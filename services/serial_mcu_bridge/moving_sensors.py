@@ -1,4 +1,4 @@
-"""Sensors whose values change while the wheels turn: a sensor that repeats itself then is broken. Pure."""
+"""Detects broken sensors: their values must change while the wheels turn. Pure."""
 
 from collections import defaultdict
 from collections.abc import Hashable, Mapping
@@ -7,14 +7,14 @@ from pebble.runtime.source_check import REPEATS_S, SourceCheck
 
 
 class MovingSensors:
-    """The sensors of one board, by their names. At rest a sensor may repeat itself."""
+    """The sensors of one board, by their names. At rest, a sensor may repeat its value."""
 
     def __init__(self) -> None:
         self._checks: dict[str, SourceCheck] = defaultdict(SourceCheck)
         self._drives_until = float("-inf")
 
     def drive(self, until: float) -> None:
-        """Note the time until which the wheels are commanded; an earlier time than now ends the motion."""
+        """Note until when the wheels are commanded to move; a time in the past ends the motion."""
         self._drives_until = until
 
     def take(self, values: Mapping[str, Hashable], now: float) -> None:
@@ -23,7 +23,7 @@ class MovingSensors:
 
     @property
     def problem(self) -> str:
-        """The problem in words; empty if there is none. A sensor that never changes counts only if all stand still."""
+        """The problem in words, or empty. A sensor that has never changed counts only if no sensor changes."""
         still = [name for name, check in self._checks.items() if check.repeats]
         if len(still) < len(self._checks):
             still = [name for name in still if self._checks[name].changes]

@@ -1,4 +1,4 @@
-"""The base of all bridges: it owns the serial line and passes received bytes to the service's thread."""
+"""The base of all bridges: it owns the serial line, and passes received bytes to the service's thread."""
 
 import threading
 import time
@@ -27,7 +27,7 @@ _INPUT_LIMIT = 65_536  # bytes waiting for the service's thread; 1.4 s of a full
 
 
 class SerialService(Service, ABC):
-    """The service of a serial line; a subclass sets how its protocol uses the line, and parses the received bytes."""
+    """The service of a serial line. A subclass sets how its protocol uses the line, and parses received bytes."""
 
     name = "serial_mcu_bridge"
     end: ClassVar[bytes] = b"\n"  # of a text line, or a frame
@@ -70,11 +70,11 @@ class SerialService(Service, ABC):
 
     @property
     def options(self) -> SerialBridge:
-        """The config section of this serial line; with instances, the merged one of this instance."""
+        """Config section of this serial line; with instances, the merged section of this instance."""
         return self.config.services.serial_mcu_bridge
 
     def follow_driving(self) -> Subscription:
-        """Receive drive commands, for the sensors of a board that does not move the wheels itself."""
+        """Receive drive commands to judge sensors, on a board that does not itself move the wheels."""
 
         def note(drive: Drive) -> None:
             self.sensors.drive(self.clock() + self.options.safety.drive_timeout_seconds if drive.moves else 0.0)
@@ -88,7 +88,7 @@ class SerialService(Service, ABC):
         """Parse received bytes."""
 
     def on_line_state(self, state: LineState) -> None:
-        """React to a serial line that was opened, is ready, or has gone."""
+        """React to a serial line that was opened, is ready, or is gone."""
 
     # -- the line
 
@@ -105,19 +105,19 @@ class SerialService(Service, ABC):
         self.on_line_state(state)
 
     def note_report(self, understood: bool) -> None:
-        """Note a report: ``understood`` if it is of the board's protocol, and neither noise nor other text."""
+        """Note a report; ``understood``: it belongs to the board's protocol, and is neither noise nor other text."""
         if understood:
             opened, times = self._understood
             self._understood = self.line.opened, times + 1 if opened == self.line.opened else 1
 
     def note_start(self) -> None:
-        """Note that the board has started; a restart, if the board was heard before since the line was opened."""
+        """Note that the board has started: a restart, if it was heard since the line was opened."""
         opened, times = self._understood
         if opened == self.line.opened and times > 1:
             self._starts.began(time.monotonic())
 
     def note_clock(self, mcu_ms: int) -> None:
-        """Note the time of the board's clock: ``mcu_ms``, of 32 bits."""
+        """Note the board's 32-bit clock ``mcu_ms``."""
         self._starts.sent(self.line.opened, mcu_ms, time.monotonic())
 
     @every(CHECK_S)
@@ -145,7 +145,7 @@ class SerialService(Service, ABC):
 
     @every(HOLDERS_S)
     def name_holders(self) -> None:
-        """Warn of other programs at this device, which may open it although we have locked it."""
+        """Warn of other programs that have this device open, which is possible although we have locked it."""
         if self.line.state in (LineState.BOOTING, LineState.READY):
             threading.Thread(target=self._name_holders, name="holders", daemon=True).start()  # it takes a while
 
@@ -158,7 +158,7 @@ class SerialService(Service, ABC):
         self._holders = others
 
     def _queue_input(self, chunk: bytes) -> None:
-        """Queue input on the reading thread, which also parses it if the service is idle.
+        """Queue input on the reading thread; if the service is idle, parse it there as well.
 
         At most one job waits, however much the MCU sends, so that commands are not delayed.
         """
@@ -178,7 +178,7 @@ class SerialService(Service, ABC):
         self.on_input(chunk)
 
     def count_discarded(self, discarded: int) -> None:
-        """Count and log text lines that a splitter has discarded, ``discarded`` of them so far."""
+        """Count and log discarded text lines; ``discarded``: their number so far."""
         too_long = discarded and discarded - self.counters["lines_discarded"]
         if too_long:
             self.counters.add("lines_discarded", too_long)

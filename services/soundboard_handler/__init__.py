@@ -1,4 +1,4 @@
-"""Plays sound clips: one at a time, through the robot's player."""
+"""The player of sound clips: one at a time, by the robot's player program."""
 
 from pebble.extension import Extension, Program
 

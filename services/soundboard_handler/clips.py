@@ -1,4 +1,4 @@
-"""The folder of clips: which there are, and which one a command names."""
+"""The folder of clips: lists them, and finds the clip that a command names."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Clip(Struct, frozen=True):
 
 
 class Clips:
-    """The clips below ``folder``. ``problem`` is what the last scan could not read; empty if it read everything."""
+    """The clips below ``folder``. ``problem``: what the last scan could not read; empty if it has read everything."""
 
     def __init__(self, folder: Path) -> None:
         self.problem = ""
@@ -41,9 +41,8 @@ class Clips:
     def scan(self) -> list[str]:
         """Return the names of clips, sorted without regard to case.
 
-        All, or 256 KiB of them. ``find`` knows the others, too.
-
-        A file that a link leads to outside of the folder is left out, as by ``find``.
+        At most 256 KiB of names; ``find`` knows the others, too. A file to which a link leads outside of the folder is
+        left out, also by ``find``.
         """
         self.problem = ""
         root = self._folder.resolve()
@@ -56,9 +55,9 @@ class Clips:
         return clips[:listed]
 
     def find(self, name: str) -> Clip | None:
-        """Return the clip that a command names: relative to the folder, or absolute inside it.
+        """Return the clip that a command names; None if there is none.
 
-        None if there is none.
+        The name is relative to the folder, or absolute inside it.
         """
         root = self._folder.resolve()
         try:

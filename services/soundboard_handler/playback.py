@@ -1,4 +1,4 @@
-"""One clip in one player: a process in a group of its own, which ends with this service."""
+"""The playback of one clip: a player's process in its own group, which ends with this service."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Playback:
         self._on_change = partial(on_change, self)
 
     def start(self) -> None:
-        """Start the playback on the service's thread: a player ends with the thread that has started it."""
+        """Start the playback on the service's thread, because a player ends with the thread that has started it."""
         try:
             if self.clip.encoded:
                 self._start_decoded()
@@ -51,7 +51,7 @@ class Playback:
         self._post(self._on_change)
 
     def stop(self) -> None:
-        """End the playback soon. How a stopped player exits is no error."""
+        """End the playback soon. A stopped player's exit code is no error."""
         self.stopped = True
         if self.process is not None:
             self.process.signal(signal.SIGTERM)
@@ -67,13 +67,13 @@ class Playback:
 
     @property
     def _words(self) -> list[str]:
-        """Return the player of a wav file: ``{file}`` stands for its path, which is the last word otherwise."""
+        """Command line that plays a wav file. Its path replaces ``{file}``, or is added at the end."""
         command, path = list(self._config.section(SoundboardHandler).playback.player_command), str(self.clip.path)
         words = [word.replace("{file}", path) for word in command]
         return words if words != command else [*words, path]
 
     def _start_decoded(self) -> None:
-        """Decode on a thread of its own: no more than the pipe to the player holds."""
+        """Decode on another thread, only as fast as the player reads."""
         from pebble.extensions.media.sound_file import SoundFile  # only where a clip is decoded: it costs memory
 
         file = SoundFile(self.clip.path)

@@ -26,7 +26,7 @@ _LONGEST_NAME = 300  # characters in an error
 
 
 class _Request(Struct):
-    """A clip to play next, and how often."""
+    """A clip to play next, and the number of times."""
 
     clip: Clip
     times: float
@@ -34,7 +34,7 @@ class _Request(Struct):
 
 
 class SoundboardHandler(Service):
-    """The player of clips, one at a time: the next one starts when the player of the one before has ended."""
+    """The player of clips, one at a time: the next one starts when the player of the last one has ended."""
 
     name = "soundboard_handler"
     publishes = (SOUNDBOARD_FILES, SOUNDBOARD_STATUS)
@@ -64,9 +64,9 @@ class SoundboardHandler(Service):
 
     @on(SOUNDBOARD_COMMAND)
     def command(self, command: SoundboardCommand) -> None:
-        """Play or stop; ``action`` wins over ``enabled``."""
+        """Play or stop a clip; ``action`` wins over ``enabled``."""
         action = (command.action or "").strip().lower()
-        play = True if action in _PLAY else False if action in STOP_WORDS else command.enabled
+        play = action in _PLAY if action in (*_PLAY, *STOP_WORDS) else command.enabled
         if play is None:
             self.log.warning("ignored a command that neither plays nor stops: %.100r", command.action)
             return
@@ -80,14 +80,14 @@ class SoundboardHandler(Service):
 
     @on(MEDIA_REPORT)
     def media_report(self, report: MediaReport, program: str) -> None:
-        """Remember when talk-back had the loudspeaker."""
+        """Note when talk-back used the loudspeaker."""
         if program == "audio_receiver" and report.running and (report.doing or "").startswith("plays"):
             self._talk_back_at = self.clock()
 
     # -- which clip
 
     def _requested(self, command: SoundboardCommand) -> _Request | None:
-        """Return the clip to play; None, and an error, if there is none."""
+        """Return the clip to play; None, with an error in the status, if there is none."""
         name = command.file or ""
         if not name.strip():
             self._error = "Play command missing file"
@@ -114,7 +114,7 @@ class SoundboardHandler(Service):
     # -- playing
 
     def _replace(self, request: _Request | None) -> None:
-        """Stop the player; play ``request`` when it has ended."""
+        """Stop the player, and play ``request`` when it has ended."""
         self._request = request
         playback = self._playback
         if playback is not None and not playback.stopped:
@@ -124,7 +124,7 @@ class SoundboardHandler(Service):
             self._play_next()
 
     def _play_next(self) -> None:
-        """Play what is requested, if anything is."""
+        """Play the waiting request, if there is one."""
         self._playback = None
         if self._request is not None:
             self._request.starts += 1
@@ -134,7 +134,7 @@ class SoundboardHandler(Service):
             self._publish_status()
 
     def _changed(self, playback: Playback) -> None:
-        """Follow the player, which runs now or has ended."""
+        """React to a player that has started or ended."""
         if playback is not self._playback:
             return
         request = self._request

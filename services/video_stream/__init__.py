@@ -1,4 +1,4 @@
-"""Runs a foreign streaming program while video is requested."""
+"""The runner of a third party's streaming program, while video is requested."""
 
 from pebble.extension import Extension
 

@@ -38,7 +38,7 @@ def _check(reader: Reader, stream: VideoStream, path: Path) -> VideoStream:
 
 
 def _without_login(url: str) -> str:
-    """Return ``url`` without its user and password, where they can be told from its path."""
+    """Return ``url`` without user and password, if they can be told from its path."""
     before, slashes, after = url.partition("://")
     authority = re.match(r"[^/?#\s]*", after)
     place = authority[0] if authority else ""

@@ -1,4 +1,4 @@
-"""The service that runs a foreign streaming program while video is requested."""
+"""The service that runs a third party's streaming program while video is requested."""
 
 import signal
 from typing import Any
@@ -13,7 +13,7 @@ _STOP_S = 2.0  # between SIGTERM and SIGKILL; the launcher kills a service after
 
 
 class VideoStream(Service):
-    """The launcher runs this service while video is requested. What the program writes goes to the robot's log."""
+    """The service that runs while video is requested. The streaming program's output goes to the robot's log."""
 
     name = "video_stream"
 
@@ -37,7 +37,7 @@ class VideoStream(Service):
 
     @every(1.0)
     def poll(self) -> None:
-        """Fail when the program has ended: the launcher restarts this process, with longer and longer delays."""
+        """Fail when the program has ended: the launcher restarts this process, after longer and longer delays."""
         code = None if self._program is None else self._program.wait(0.0)
         if code is not None:
             raise DeviceError(f"{self.config.section(VideoStreamSection).command[0]} ended: {how_ended(code)}")

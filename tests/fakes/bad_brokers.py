@@ -1,4 +1,4 @@
-"""Servers at loopback addresses of which each fails a client in its own way, and names with several addresses."""
+"""Servers at loopback addresses that each fail a client in another way, and names with several addresses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Behaviour = Callable[[socket.socket], None]
 
 
 def mute(connection: socket.socket) -> None:
-    """Read, and say nothing."""
+    """Read, and answer nothing."""
     while connection.recv(4096):
         pass
 
@@ -47,7 +47,7 @@ def _late(connection: socket.socket) -> None:
 
 
 def _dripping(connection: socket.socket) -> None:
-    """One byte of a CONNACK whose rest never comes, and no end either."""
+    """Send the first byte of a CONNACK, and neither the rest nor an end."""
     for byte in (_GRANTED * 9)[:1] + b"\xff":
         connection.sendall(bytes((byte,)))
         time.sleep(0.1)
@@ -73,7 +73,7 @@ BEHAVIOURS: dict[str, Behaviour | None] = {
 
 @contextmanager
 def serving(address: str, port: int, behaviour: Behaviour | None) -> Iterator[None]:
-    """Accept connections until the end; each has a thread that ends with it."""
+    """Accept connections during the block; each has a thread."""
     if behaviour is None:
         yield
         return
@@ -96,7 +96,7 @@ def serving(address: str, port: int, behaviour: Behaviour | None) -> Iterator[No
 
 
 def resolving(names: dict[str, list[str]]) -> dict[str, str]:
-    """The environment of a Python process in which these names have these addresses, in this order."""
+    """Return the environment of a Python process in which these names have these addresses, in order."""
     text = " ".join(f"{name}={','.join(addresses)}" for name, addresses in names.items())
     path = [str(Path(__file__).parent / "hosts"), os.environ.get("PYTHONPATH", "")]
     return {**os.environ, "TEST_HOSTS": text, "PYTHONPATH": os.pathsep.join(filter(None, path))}

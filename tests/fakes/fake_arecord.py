@@ -1,4 +1,4 @@
-"""Plays arecord: the synthetic voice on stdout as raw s16le. ``FAKE=hangs`` stops after a second."""
+"""A fake arecord: the synthetic voice on stdout as raw s16le. ``FAKE=hangs`` stops after a second."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Plays rpicam-vid: the synthetic scene on stdout, as JPEG pictures or raw planes.
+"""A fake rpicam-vid: the synthetic scene on stdout, as JPEG pictures or raw planes.
 
-``FAKE`` in the environment: ``quiet`` (says nothing), ``hangs`` (stops after 5 pictures), ``ends`` (after 5),
-``refuses`` (at once, with a complaint).
+``FAKE`` in the environment: ``quiet`` (sends nothing), ``hangs`` (stops after 5 pictures), ``ends`` (after 5),
+``refuses`` (ends at once, with a complaint).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A child process for launcher tests: ``fake_service NAME BEHAVIOUR JOURNAL``. Writes to JOURNAL what happens to it."""
+"""A child process for launcher tests: ``fake_service NAME BEHAVIOUR JOURNAL``. It writes its events to JOURNAL."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def ask(notify: Notifier) -> None:
 
 
 def end(how: str) -> None:
-    """Every way a Python program can end by itself."""
+    """End in one of the ways in which a Python program can end by itself."""
     if how == "crash":
         sys.exit(3)
     if how == "word":
@@ -85,7 +85,7 @@ def end(how: str) -> None:
 
 
 def report_environment() -> None:
-    """Descriptors and signals as a program finds them."""
+    """Write down the descriptors and signals that the program finds."""
     found = {number: Path(f"/proc/self/fd/{number}") for number in range(1024)}
     kinds = (f"{number}={path.readlink().name.partition(':')[0]}" for number, path in found.items() if path.exists())
     note("fds:" + ",".join(kinds))

@@ -1,4 +1,4 @@
-"""Puts a fake program where programs are looked for, under the name of the real one."""
+"""Installs a fake program where programs are looked for, under the name of the real one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _STARTS = "FAKE_STARTS"  # a file with the process id of every start
 
 
 class Installed:
-    """A program called ``name`` that is ``python -m module``, found before any other of that name."""
+    """A program called ``name`` that runs ``python -m module``, found before any other of that name."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path, name: str, module: str) -> None:
         self._starts = folder / f"{name}.starts"
@@ -28,15 +28,15 @@ class Installed:
 
     @property
     def pids(self) -> list[int]:
-        """The process ids of all starts, in order."""
+        """Process ids of all its starts, in order."""
         return [int(line) for line in self._starts.read_text().split()] if self._starts.exists() else []
 
     def gone(self, pid: int, timeout: float = 5.0) -> bool:
-        """True if this process has ended and been reaped."""
+        """True if this process has ended and was reaped."""
         return until(lambda: not Path(f"/proc/{pid}").exists(), timeout)
 
 
 def signed_in() -> None:
-    """Called by a fake when it starts."""
+    """Note the start of a fake program, which calls this."""
     with Path(os.environ[_STARTS]).open("a") as starts:
         starts.write(f"{os.getpid()}\n")

@@ -1,7 +1,7 @@
 """Runs a ``pebble`` command line without what only Linux has: ``other_platform.py ARGUMENT…``.
 
-``import MODULE…`` imports modules instead, and ``each LINE…`` runs several command lines. Modules are hidden from our
-own code only, because the standard library chooses by the platform that it runs on; attributes are deleted after the
+``import MODULE…`` imports modules instead, and ``each LINE…`` runs several command lines. Modules are hidden only from
+our own code, because the standard library chooses by the platform on which it runs; attributes are deleted after the
 libraries have been imported.
 """
 
@@ -49,7 +49,7 @@ LIBRARIES = (
 
 
 def _socketpair(*_: object) -> tuple[socket.socket, socket.socket]:
-    """A pair like the one that the standard library makes on Windows."""
+    """Return a pair like the one that the standard library makes on Windows."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         first = socket.create_connection(server.getsockname())
         return first, server.accept()[0]

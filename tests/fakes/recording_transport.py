@@ -1,4 +1,4 @@
-"""A transport that writes what it publishes to a file, for tests of another process."""
+"""A transport that writes its messages to a file, for tests of another process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pebble.transports.base import Subscription
 
 
 class RecordingTransport(Transport):
-    """Appends one JSON line per message to ``file``; connected as soon as it is opened, unless ``hangs``."""
+    """A transport that appends a JSON line per message to ``file``. It is connected once open, unless ``hangs``."""
 
     def __init__(self, client_id: str, file: Path, *, will: Message | None = None, hangs: bool = False) -> None:
         super().__init__(client_id, will=will)

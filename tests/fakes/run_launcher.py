@@ -1,7 +1,7 @@
 """A launcher in a process of its own: ``run_launcher.py ROOT CONFIG TABLE RECORD [option…]``, with fakes around it.
 
-TABLE is JSON: a list of [name, module, arguments, stage] and perhaps an object of what else a program is; what is
-published goes to RECORD. Options: those of fake_announcer, ``hasty`` (2 s without a sign of life is stuck),
+TABLE is JSON: a list of [name, module, arguments, stage], perhaps with an object of a program's other properties.
+Messages are written to RECORD. Options: those of fake_announcer, ``hasty`` (2 s without a sign of life is stuck),
 ``signal`` (a stop signal comes while the first child is being started), ``tireless`` (nothing is a crash loop),
 ``forgetful`` (requests of an ended program expire after 1 s), ``missing`` (one more program, which does not exist),
 ``deny CALL ERRNO`` (the kernel refuses this system call, as in a container).

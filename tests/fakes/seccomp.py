@@ -1,4 +1,4 @@
-"""Has the kernel refuse one system call to this process and its children, as the filter of a container does."""
+"""Makes the kernel refuse a system call to this process and its children, as a container's filter does."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class _Program(ctypes.Structure):
 
 
 def deny(call: str, error: str) -> None:
-    """Refuse ``call`` with the errno of that name; for good. Raises OSError."""
+    """Refuse ``call`` with the errno of that name, for ever. Raises OSError."""
     refused = _ERRNO | getattr(errno, error)
     code = [(0x20, 0, 0, 0), (0x15, 0, 1, CALLS[call]), (0x06, 0, 0, refused), (0x06, 0, 0, _ALLOW)]
     raw = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *step) for step in code))

@@ -1,4 +1,4 @@
-"""A scripted self-describing MCU on a real pty, the bridge for it, and a robot's local transport."""
+"""A scripted self-describing MCU on a real pty, its bridge, and a robot's local transport."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ BOOT_S = 0.05  # before the HELLO: a host discards the input from before it open
 
 
 class ScriptedMcu:
-    """Answers DESCRIBE_REQ and PING, acknowledges commands, and sends the frames that a test passes to it.
+    """An MCU that answers DESCRIBE_REQ and PING, acknowledges commands, and sends a test's frames.
 
     ``stream`` sends a payload of its first interface periodically, numbered from 1 each time it is plugged in.
     """
@@ -96,7 +96,7 @@ class ScriptedMcu:
         return [received for _, received in list(self.received) if received.kind == wire.CMD]
 
     def obeyed(self, count: int = 1) -> list[tuple[int, bytes]]:
-        """Wait for so many commands; return the interface and the payload of each."""
+        """Wait for ``count`` commands; return the interface and the payload of each."""
         assert until(lambda: len(self.commands()) >= count)
         return [(command.interface, command.payload) for command in self.commands()]
 
@@ -164,9 +164,9 @@ class ScriptedMcu:
 
 
 class SerialRig:
-    """A local transport, a subscriber, and any number of serial lines with one MCU each, by instance name.
+    """A local transport, a subscriber, and any number of serial lines with an MCU each, by instance name.
 
-    On a ``network`` that it shares with others its robot has a name of its own.
+    On a ``network`` that several rigs share, its robot has a unique name.
     """
 
     def __init__(self, kind: str, folder: Path, network: LocalNetwork | None = None) -> None:
@@ -189,7 +189,7 @@ class SerialRig:
         return listener
 
     def mcu(self, manifest: M, name: str = "one", *, plugged: bool = True, sends_hello: bool = True) -> ScriptedMcu:
-        """Without its hello, a bridge asks an MCU for its manifest only a while after the port was opened."""
+        """Plug in an MCU, and return it. Without a hello, a bridge asks for its manifest only after a while."""
         mcu = self.mcus[name] = ScriptedMcu(self.folder / name, manifest, sends_hello=sends_hello)
         self._ends.callback(mcu.close)
         if plugged:
@@ -207,14 +207,14 @@ class SerialRig:
         return running
 
     def up(self, manifest: M, name: str = "one", **section: Any) -> tuple[ScriptedMcu, Running]:
-        """Plug an MCU in and start its bridge; returns once its manifest is published and its aliases are in use."""
+        """Plug an MCU in and start its bridge; return when its manifest is published and its aliases are in use."""
         mcu, running = self.mcu(manifest, name), self.bridge(name, **section)
         self.described(manifest.uid)
         assert self.claimed(name)
         return mcu, running
 
     def claimed(self, name: str = "one") -> bool:
-        """Wait until other devices have had time to object to the aliases, and those of commands are subscribed to."""
+        """Wait until other devices could have objected to the aliases, and those of commands are subscribed to."""
         service, done = self.lines[name].service, threading.Event()
         if not until(lambda: service.aliases.permitted, 5):  # type: ignore[attr-defined]
             return False
@@ -226,7 +226,7 @@ class SerialRig:
 
 
 def motion(ax: int = 9807) -> bytes:
-    """A payload of the inertial sensor's first interface."""
+    """Return a payload of the inertial sensor's first interface."""
     return struct.pack("<9h", ax, -20, 3, 100, -100, 1, 2512, 33, -7)
 
 

@@ -1,4 +1,4 @@
-"""The demo as a user starts it, and what it has left behind."""
+"""The demo, started as a user starts it, and what it leaves behind."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MARK = "PEBBLE_TEST_DEMO"
 
 
 class Demo:
-    """One run, with everything it starts marked by a variable that children inherit."""
+    """A run of the demo. All its processes inherit a variable that marks them."""
 
     def __init__(self, folder: Path, code: str, terminal: int | None = None) -> None:
         self.temporary = folder
@@ -40,7 +40,7 @@ class Demo:
         return self.log.read_text()
 
     def leftovers(self) -> list[str]:
-        """Command lines of living processes that this demo started."""
+        """Return the command lines of living processes that this demo started."""
         entry = f"{MARK}={self._mark}".encode()
         return [line for pid in _pids() if entry in _read(pid, "environ") and (line := _command(pid))]
 
@@ -70,7 +70,7 @@ def _command(pid: str) -> str:
 
 @pytest.fixture
 def temporary() -> Iterator[Path]:
-    """A short path: the robots' unix sockets are below it, and their paths are limited to 108 bytes."""
+    """Yield a short path for the robots' unix sockets, whose paths are limited to 108 bytes."""
     with tempfile.TemporaryDirectory(prefix="pebble-", dir="/tmp") as folder:
         yield Path(folder)
         assert until(lambda: not any(folder in _command(pid) for pid in _pids()))  # of a demo that was killed
@@ -78,7 +78,7 @@ def temporary() -> Iterator[Path]:
 
 @pytest.fixture
 def demos(temporary: Path) -> Iterator[list[Demo]]:
-    """Ends every demo that a test appends."""
+    """Yield a list; demos that a test appends to it are ended afterwards."""
     running: list[Demo] = []
     yield running
     for demo in running:
@@ -93,7 +93,7 @@ def start(demos: list[Demo], folder: Path, arguments: str, terminal: int | None 
 
 
 def page_of(demo: Demo) -> str:
-    """The address of the operator page, once it was printed."""
+    """Return the address of the operator page, once it was printed."""
     printed = re.compile(r"in a browser: (http://127.0.0.1:\d+/)\n").findall
     assert until(lambda: printed(demo.output), START_S), demo.output
     return str(printed(demo.output)[0])

@@ -1,4 +1,4 @@
-"""A stand-in for how the original's ``wheel-odometry`` reads hall samples: a POSIX shared memory by its name."""
+"""A reader of hall samples like the original's ``wheel-odometry``: a POSIX shared memory by its name."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Sample(NamedTuple):
 
 
 class HallReader:
-    """Maps the memory once; raises FileNotFoundError before there is one, and ValueError for one of another form."""
+    """A reader that maps the memory once. Raises FileNotFoundError without one, ValueError for another form."""
 
     def __init__(self, name: str) -> None:
         descriptor = os.open(Path("/dev/shm") / name, os.O_RDWR)
@@ -36,7 +36,7 @@ class HallReader:
         return int(_HEADER.unpack_from(self.memory)[-1])
 
     def read(self) -> list[Sample]:
-        """The samples since the last call that are still there."""
+        """Return the samples since the last call that are still there."""
         newest = self.newest
         first = max(self.number, newest - self.slots) + 1
         found = [

@@ -1,8 +1,8 @@
 """A machine for tests: a real systemd as PID 1 in namespaces of its own, on a copy of this machine's files.
 
-Below is an overlay whose lower layer is this machine's own root, so Debian's packages are those that are installed
-here. What the machine writes is in ``disk``, which stays from one boot to the next, and may lie below other machines.
-Its network is a loopback of its own. Needs root, overlayfs, cgroup2 and systemd.
+Its files are an overlay on this machine's root, so Debian's packages are those that are installed here. Its changes are
+in ``disk``, which stays from one boot to the next, and may lie below other machines. Its network is a loopback of its
+own. Needs root, overlayfs, cgroup2 and systemd.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ exec chroot . sh -c 'umount -l /run/host && exec env -i container=lxc PATH=/usr/
 
 
 def missing() -> str | None:
-    """Return what this machine lacks for one; None if nothing is."""
+    """Return what this machine lacks to run a test machine; None if it lacks nothing."""
     if os.geteuid() != 0:
         return "needs root: namespaces with mounts of their own"
     if not SYSTEMD.exists():
@@ -89,9 +89,10 @@ def _cgroups() -> Path | None:
 
 
 class Machine:
-    """One that can be booted, cut off and booted again.
+    """A machine that can be booted, cut off and booted again.
 
-    ``shared``: folders that it sees, read-only, below /mnt. ``like``: one that is off, whose files it begins with.
+    ``shared``: folders that it sees, read-only, below /mnt. ``like``: a machine that is off, with whose files it
+    begins.
     """
 
     def __init__(self, folder: Path, shared: Sequence[Path] = (), like: Machine | None = None) -> None:
@@ -138,7 +139,7 @@ class Machine:
         return cgroups / f"pebble-{os.getpid()}-{self.folder.name}"
 
     def boot(self) -> None:
-        """Start it, and wait until all that it starts has started."""
+        """Start the machine, and wait until its units have started."""
         self._cgroup.mkdir(exist_ok=True)
         enter = f'echo $$ >"{self._cgroup}/cgroup.procs" && exec "$@"'
         unshare = ["unshare", "--mount", "--pid", "--net", "--uts", "--ipc", "--cgroup", "--fork", "--kill-child"]
@@ -152,7 +153,7 @@ class Machine:
         )
 
     def _found(self) -> bool:
-        """Whether its PID 1 is systemd."""
+        """True if the machine's PID 1 is systemd."""
         assert self._boot is not None
         assert self._boot.poll() is None, f"no machine:\n{(self.folder / 'boot.log').read_text()}"
         children = Path(f"/proc/{self._boot.pid}/task/{self._boot.pid}/children")
@@ -164,7 +165,7 @@ class Machine:
         return False
 
     def cut(self) -> None:
-        """Take its power away."""
+        """Cut off the machine's power."""
         if self._boot is not None:
             if self._init:
                 with suppress(ProcessLookupError):
@@ -178,14 +179,14 @@ class Machine:
 
     @property
     def root(self) -> Path:
-        """Its files, as they are while it runs."""
+        """The machine's files, as they are while it runs."""
         return Path(f"/proc/{self._init}/root")
 
     @contextmanager
     def processes_watched(self) -> Iterator[set[bytes]]:
-        """The command lines and environments that its processes have during the block, as far as they are seen.
+        """Yield the command lines and environments that the machine's processes have during the block.
 
-        They are read one after the other without a pause; what lives for a few milliseconds may be missed.
+        They are read one after the other without a pause; a process that lives for a few milliseconds may be missed.
         """
         seen: set[bytes] = set()
         ending = threading.Event()
@@ -207,13 +208,13 @@ class Machine:
             thread.join()
 
     def command(self, *words: str) -> list[str]:
-        """Return what runs a command in it, as root."""
+        """Return the command line that runs a command in the machine, as root."""
         enter = ["nsenter", "-t", str(self._init), "-m", "-p", "-n", "-u", "-i", "-C", "-r", "-w"]
         path = "PATH=/usr/sbin:/usr/bin:/sbin:/bin"
         return [*enter, "env", "-i", path, "HOME=/root", "LANG=C.UTF-8", "TERM=dumb", *words]
 
     def run(self, *words: str, check: bool = True, timeout: float = 120, given: str = "") -> str:
-        """Run a command in it, with ``given`` as its input, and return what it writes to both outputs."""
+        """Run a command in the machine with ``given`` as its input; return its output and errors."""
         done = subprocess.run(
             self.command(*words), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, input=given.encode(),
             check=False, timeout=timeout,
@@ -226,7 +227,7 @@ class Machine:
         return self.run("sh", "-euc", script, **options)
 
     def connect(self, other: int, own_address: str, address: str) -> None:
-        """Connect it by a cable to the network namespace of another process; each end gets an address."""
+        """Connect the machine by a cable to the network namespace of another process; each end gets an address."""
         ends = (
             (self._init, own_address, (f"link add eth0 type veth peer name eth0 netns {other}",)),
             (other, address, ("link set lo up",)),
@@ -244,11 +245,11 @@ class Machine:
         return self.run("journalctl", "--no-pager", "--output=cat", "--unit", unit)
 
     def write(self, path: str, text: str) -> None:
-        """Write a file; missing folders are made."""
+        """Write a file of the machine, and its missing folders."""
         self.run("sh", "-euc", 'mkdir -p "$(dirname "$1")"; cat >"$1"', "write", path, given=text)
 
     def exposure(self, unit: str) -> float:
-        """What systemd-analyze makes of a unit that is loaded."""
+        """Return the exposure level that systemd-analyze reports for a loaded unit."""
         text = self.run("systemd-analyze", "security", "--no-pager", unit)
         (found,) = re.findall(r"Overall exposure level for \S+: ([0-9.]+)", text)
         return float(found)

@@ -11,7 +11,7 @@ MODULES = ROOT / "node_modules"
 
 
 def package(name: str) -> Path:
-    """Return the folder of a package; skips the test, and fails it for CI, where it or Node.js is missing."""
+    """Return the folder of a package. Without it or Node.js the test is skipped, or fails in CI."""
     folder = MODULES / name
     if not (folder.exists() and (MODULES / ".bin" / "node").exists()):
         missing = pytest.fail if os.environ.get("CI") == "true" else pytest.skip

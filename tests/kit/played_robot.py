@@ -1,4 +1,4 @@
-"""A robot at a broker that a test plays: it has no motors, but the real latch and lease, and records what arrives."""
+"""A robot at a broker that a test plays: it has no motors, but the real latch and lease, and records messages."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ HEARTBEAT_S = 0.25
 
 
 class RecordingRobot:
-    """Publishes heartbeats and capabilities, and records what arrives; it also takes stops.
+    """A robot that publishes heartbeats and capabilities, takes stops, and records what arrives.
 
     ``keeps``: it keeps control itself, as ``keeping`` does. ``named``: it takes commands with names, as a bridge gives
-    them to a robot, and drive commands of strangers; ``wire`` has the topics as they arrived. ``deaf``: it
-    answers no stop and no reset; ``late_s``: so late it does.
+    them to a robot, and drive commands of strangers; ``wire`` has the topics as they arrived. ``deaf``: it answers no
+    stop and no reset; ``late_s``: it answers them after this time.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class RecordingRobot:
         self.publish("capabilities", {"schema": "pebble-capabilities/v1", "t": 1, "value": value}, retain=True)
 
     def drives(self, since: float = 0.0) -> list[dict[str, Any]]:
-        """Return the drive commands that have arrived."""
+        """Return the drive commands that have arrived since ``since``."""
         topic = f"{self.base}/incoming/drive-values"
         return [payload for at, name, payload in list(self.received) if name == topic and at >= since]
 
@@ -84,7 +84,7 @@ class RecordingRobot:
         return {topic for _, topic, _ in list(self.received)}
 
     def times(self, metric: str) -> list[float]:
-        """Return when the commands of a metric have arrived."""
+        """Return the times at which commands of a metric have arrived."""
         return [at for at, topic, _ in list(self.received) if topic == f"{self.base}/incoming/{metric}"]
 
     def count(self, metric: str) -> int:
@@ -95,7 +95,7 @@ class RecordingRobot:
         self._transport.publish(topic, msgspec.json.encode(value), qos=QoS.DELIVERED, retain=retain)
 
     def remove(self, metric: str) -> None:
-        """Remove a retained value."""
+        """Remove a retained message."""
         self._transport.publish(f"{self.base}/outgoing/{metric}", b"", qos=QoS.DELIVERED, retain=True)
 
     def start(self) -> None:
@@ -133,26 +133,26 @@ class RecordingRobot:
                 return
 
     def answer(self, messages: list[Message]) -> None:
-        """Handle requests for control, or only time."""
+        """Handle requests for control, or, without messages, only the passing of time."""
         with self._answering:
             self._publish_all(self.keeping.take(messages, time.monotonic()) if self.keeping else [])
 
     def command(self, metric: str, body: object) -> None:
-        """Publish a command to it, as another client does."""
+        """Publish a command to the robot, as another client does."""
         payload = msgspec.json.encode(body)
         self._transport.publish(f"{self.base}/incoming/{metric}", payload, qos=QoS.DELIVERED)
 
     def stranger(self, **drive: float) -> None:
-        """Publish a drive command without any control, as the original's page does."""
+        """Publish a drive command without control, as the original's page does."""
         self.command("drive-values", drive)
 
     def stop(self, name: str = "0123456789abcdef", by: str = "ann@desk", why: str = "dog") -> None:
-        """Be stopped by another client."""
+        """Stop the robot as another client does."""
         body = msgspec.json.encode({"stop": name, "by": by, "why": why})
         self._publish_all(self.motors.take([Message(f"{self.base}/incoming/estop", body)]))
 
     def publish_states(self) -> None:
-        """Publish who has control, and what is stopped."""
+        """Publish the states of control and of the emergency stop."""
         self._publish_all(self.keeping.states() if self.keeping else [])
         self._publish_all([owner.state() for owner in self.motors.owners])
 

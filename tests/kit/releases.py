@@ -1,4 +1,4 @@
-"""Releases of a few bytes, signed as minisign does; its own secret keys are another matter, and need its passwords."""
+"""Releases of a few bytes, signed as minisign signs. Its own secret key files, which need a password, are not used."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WHEEL = "pebble_robot-0.3.0-py3-none-any.whl"
 
 
 class Key:
-    """A key of minisign's. The test key can be derived by everybody."""
+    """A key for minisign. Everybody can derive the test key."""
 
     def __init__(self, secret: bytes, key_id: bytes) -> None:
         self._secret, self._id = Ed25519PrivateKey.from_private_bytes(secret), key_id
@@ -35,7 +35,7 @@ class Key:
         return base64.b64encode(b"Ed" + self._id + self._secret.public_key().public_bytes_raw()).decode()
 
     def sign(self, path: Path, comment: str = "of a test") -> None:
-        """Write its ``.minisig``."""
+        """Write the ``.minisig`` of a file."""
         signature = self._secret.sign(hashlib.blake2b(path.read_bytes()).digest())
         whole = self._secret.sign(signature + comment.encode())
         first = base64.b64encode(b"ED" + self._id + signature).decode()
@@ -44,7 +44,7 @@ class Key:
 
 
 def release(folder: Path, key: Key, **changes: Any) -> Path:
-    """Write a release of two small files, signed by ``key``; ``changes`` are fields of RELEASE.json."""
+    """Write a release of two small files, signed by ``key``; return its folder. ``changes``: fields of RELEASE.json."""
     folder.mkdir()
     files = {WHEEL: b"a wheel", "robot.txt": b"its packages\n"}
     for name, data in files.items():

@@ -1,4 +1,4 @@
-"""A robot for tests of its programs: its local transport, a client that sees and sends, and programs as processes."""
+"""A robot for tests of its programs: its local transport, a client of it, and programs as processes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SILENCE_S = 5.0  # a machine that does too much at once is not a broker that sto
 
 
 class Listener:
-    """A client that subscribes to all outgoing topics of the robot and can send commands."""
+    """A client that subscribes to all outgoing topics of the robot, and can send commands."""
 
     def __init__(self, transport: Transport, base: str = BASE) -> None:
         self.received: list[Message] = []
@@ -60,11 +60,11 @@ class Listener:
         return [msgspec.json.decode(message.payload) for message in self.on(metric) if message.payload]
 
     def newest(self, metric: str) -> Any:
-        """Return what was published last; an empty dict before that, and once it was cleared."""
+        """Return the newest value on a topic; an empty dict if there is none, or it was cleared."""
         return next((msgspec.json.decode(raw) for raw in self.newest_raw(metric)), {})
 
     def became(self, metric: str, timeout: float = 15.0, **fields: Any) -> bool:
-        """Wait until the newest message on a topic has these fields."""
+        """Wait until the newest message on a topic has these fields; return whether it has."""
         return until(lambda: fields.items() <= self.newest(metric).items(), timeout)
 
     def described(self, uid: str | bytes) -> None:
@@ -72,11 +72,11 @@ class Listener:
         assert until(lambda: self.newest_raw(f"mcu/{uid!s}/describe"), 5), uid
 
     def got(self, metric: str) -> bool:
-        """Wait for a payload on this topic."""
+        """Wait for a payload on this topic; return whether it has come."""
         return until(lambda: self.payloads(metric), 5)
 
     def cleared(self, *metrics: str, timeout: float = 3.0) -> bool:
-        """Wait until the newest message on each topic is empty. True if there was none: wait for a value first."""
+        """Wait until the newest message on each topic is empty. Also True if there was none: wait for a value first."""
         return until(lambda: not any(self.newest_raw(metric) for metric in metrics), timeout)
 
     def values(self, metric: str) -> list[Any]:
@@ -84,12 +84,12 @@ class Listener:
         return [body["value"] for body in self.payloads(metric)]
 
     def first(self, metric: str) -> float:
-        """Return when the first message on this topic was received."""
+        """Return the time at which the first message on this topic was received."""
         pairs = zip(list(self.received), list(self.at), strict=False)
         return next(at for message, at in pairs if message.topic == f"{self.base}/outgoing/{metric}")
 
     def newest_raw(self, metric: str) -> list[bytes]:
-        """Return the payload of the newest message on a topic; an empty list if that message cleared the topic."""
+        """Return a list with the payload of the newest message on a topic; an empty list if it was cleared."""
         return [message.payload for message in self.on(metric)[-1:] if message.payload]
 
     def command(self, metric: str, body: Any, *, retain: bool = False) -> None:
@@ -129,7 +129,7 @@ class LocalNetwork:
         return parse(raw, folder=folder, env={})
 
     def robots_transport(self, config: Config, name: str, *, as_published: bool = False) -> Transport:
-        """Return the transport that a process of the robot would use."""
+        """Return the transport that the robot's process ``name`` would use."""
         if self.kind == "memory":
             return MemoryTransport(name, self._memory)
         return local_transport(config, name, as_published=as_published)
@@ -143,7 +143,7 @@ class LocalNetwork:
 
     @contextmanager
     def outage(self) -> Iterator[None]:
-        """Stop the broker meanwhile. MQTT only: peers on Zenoh exchange messages without a hub."""
+        """Stop the broker during the block. MQTT only: peers on Zenoh exchange messages without a hub."""
         self._broker.kill()
         yield
         self._broker.start()
@@ -153,7 +153,7 @@ class LocalNetwork:
 
 
 class Running:
-    """Runs a service on a thread of its own, as its process would; ``error`` is what ended it."""
+    """A service that runs on a thread, as it does in its process; ``error`` is the exception that ended it."""
 
     def __init__(self, service: Service) -> None:
         self.service = service
@@ -203,7 +203,7 @@ class Program(Forked):
         self.send_signal(signal.SIGTERM)
 
     def end(self, number: int = signal.SIGTERM) -> int | None:
-        """Send a signal, and return the exit code."""
+        """Send a signal; return the exit code."""
         if self.poll() is None:
             self.send_signal(number)
         code = self.wait(10)
@@ -214,8 +214,8 @@ class Program(Forked):
 class ProgramRobot:
     """A robot whose programs are processes, with a client on its local transport (``world``).
 
-    A robot on MQTT uses the broker at ``port``; the hub of one on Zenoh is its own. Its id is that of its folder
-    unless ``robot`` names it, because a broker retains what others have published.
+    A robot on MQTT uses the broker at ``port``; a robot on Zenoh has a hub of its own. Its id is the name of its
+    folder, unless ``robot`` names it, because a broker retains what others have published.
     """
 
     def __init__(
@@ -240,7 +240,7 @@ class ProgramRobot:
         self._ends.callback(self.world.transport.close)
 
     def write(self) -> Config:
-        """Write the config anew, as ``raw`` is now, and return it."""
+        """Write ``raw`` as the config file, and return the config."""
         self.path.write_text(json.dumps(self.raw))
         return load(self.path)
 
@@ -261,5 +261,5 @@ class ProgramRobot:
 
 
 def handled(service: type[Service]) -> list[Channel]:
-    """Return the channels that a service subscribes to, in this order."""
+    """Return the channels that a service subscribes to, in order."""
     return [getattr(service, name).channel for name in service_module._marked(service, "channel")]

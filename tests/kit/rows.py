@@ -1,8 +1,8 @@
-"""``make test`` tries some members of a rule where there are many; ``make test THOROUGH=1`` tries them all.
+"""The choice of rows for ``make test``: some of each long table; ``make test THOROUGH=1`` runs them all.
 
 Each line of ``rows.txt`` is a test whose rows are one rule for several transports, encodings, kinds of damage or ways
-to fail, and how many of them stay. What stays fails when the rule itself breaks; what is left out fails when it breaks
-for one member. Rows of other tests cost little, or each is a rule of its own.
+to fail, with the number of rows that stay. A remaining row fails when the rule itself breaks; a row left out fails when
+it breaks for one member. Rows of other tests cost little, or each is a rule of its own.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import pytest
 
 
 def table() -> dict[str, int]:
-    """How many rows stay, by file below ``tests/`` and test."""
+    """Return the number of rows that stay, by file below ``tests/`` and test."""
     rows, file = {}, ""
     for line in Path(__file__).with_suffix(".txt").read_text().splitlines():
         if line.startswith(" "):
@@ -28,7 +28,7 @@ def table() -> dict[str, int]:
 
 
 def fewer(items: Iterable[pytest.Item]) -> Iterator[pytest.Item]:
-    """Those of the collected rows that only ``make test THOROUGH=1`` tries."""
+    """Yield the collected rows that only ``make test THOROUGH=1`` runs."""
     groups: defaultdict[str, list[pytest.Item]] = defaultdict(list)
     for item in items:
         if item.get_closest_marker("thorough") is None:

@@ -14,9 +14,9 @@ _SMALLEST_BAND = 2 * ROWS  # pixels; with less, or below 2 pixels per column, it
 
 
 def read_counter(picture: Picture) -> int | None:
-    """Return the number of the frame, out of a picture of any size, in colour (h, w, 3) or grey (h, w).
+    """Return the number of the frame, read from a picture of any size, in colour (h, w, 3) or grey (h, w).
 
-    None where there is no counter, or a damaged one: one in 65,536 of those is read as a wrong number.
+    None if there is no counter, or it is damaged: one in 65,536 damaged ones is read as a wrong number.
     """
     height, width = picture.shape[:2]
     band = height // BAND
@@ -35,5 +35,5 @@ def _value(bits: NDArray[np.bool_]) -> int | None:
 
 
 def _samples(length: int, cells: int) -> NDArray[np.intp]:
-    """Return where to sample ``cells`` cells on ``length`` pixels: some places within each, away from its edges."""
+    """Return where to sample ``cells`` cells on ``length`` pixels: some places in each, away from its edges."""
     return (np.add.outer(np.arange(cells), _WITHIN) * length / cells).astype(np.intp).ravel()

@@ -1,7 +1,7 @@
-"""Random schedules: drawn from a seed, performed in a world with rules, and made short.
+"""Random schedules: drawn from a seed, performed in a world with rules, and shortened.
 
-``python -m tests.kit.schedules NAME`` runs those of one of the :data:`ENGINES`. What it prints of a schedule that
-violates a rule, its number and kind, repeats it.
+``python -m tests.kit.schedules NAME`` runs the schedules of one of the :data:`ENGINES`. It prints the number and kind
+of a schedule that violates a rule, by which the schedule can be repeated.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _PROGRESS_S = 5.0
 
 
 class ViolatedError(AssertionError):
-    """A rule does not hold in a schedule."""
+    """An error: a rule does not hold in a schedule."""
 
 
 def check(holds: bool, rule: str) -> None:
@@ -46,7 +46,7 @@ def check(holds: bool, rule: str) -> None:
 
 
 def small_numbers(chance: random.Random, count: int) -> Iterable[tuple[int, int]]:
-    """Numbers below 8 and below 64, for so many steps."""
+    """Return pairs of numbers below 8 and below 64, for ``count`` steps."""
     return [(chance.randrange(8), chance.randrange(64)) for _ in range(count)]
 
 
@@ -56,9 +56,9 @@ def perform_steps(world: Any, steps: list[Step]) -> None:
 
 
 class RandomSteps:
-    """Draws steps: schedules take ``mixes``, weights by action, in turn; most have the steps of ``begin`` first.
+    """A generator of steps. Schedules use ``mixes``, weights by action, in turn.
 
-    A number of ``begin`` that is None is drawn.
+    Most schedules first have the steps of ``begin``. A number of ``begin`` that is None is drawn.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class RandomSteps:
 
 @dataclass
 class Outcome:
-    """What a schedule has shown. ``counts`` are for the table; ``log`` says what happened."""
+    """The outcome of a schedule. ``counts`` are for the table; ``log`` says what happened."""
 
     problems: list[str] = field(default_factory=list)
     counts: dict[str, float] = field(default_factory=dict)
@@ -93,7 +93,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Result:
-    """One schedule that was performed."""
+    """The result of a schedule that was performed."""
 
     kind: str
     number: int
@@ -108,7 +108,7 @@ class Result:
 
 @dataclass(frozen=True, kw_only=True)
 class Engine:
-    """Schedules of one kind of world."""
+    """A runner of schedules for one kind of world."""
 
     draw: Callable[[str, int, int], Any]  # kind of world, seed, number
     world: Callable[[str], AbstractContextManager[Any]]  # of a kind
@@ -120,7 +120,7 @@ class Engine:
     repeats: bool = True  # the same schedule violates the same rule, so it can be made short
 
     def run(self, kind: str, seed: int, numbers: Iterable[int], *, verbose: bool = False) -> Iterator[Result]:
-        """Perform these schedules in as few worlds as possible: after a violation in a new one."""
+        """Perform these schedules in as few worlds as possible: after a violation a new world is made."""
         waiting = deque(numbers)
         while waiting:
             with self.world(kind) as world:
@@ -134,11 +134,11 @@ class Engine:
                         break
 
     def violation(self, world: Any, schedule: Any) -> str:
-        """The rule that is violated in this schedule; empty if none is."""
+        """Return the rule that is violated in this schedule; empty if there is none."""
         return next(iter(self._outcome(world, schedule).problems), "")
 
     def shortest(self, schedule: Steps, rule: str, kind: str = "") -> Steps:
-        """``schedule``, which violates the rule, without what does not matter for it."""
+        """Return ``schedule``, which violates the rule, without the steps that the violation does not need."""
         with self.world(kind) as world:
             return shrink(schedule, lambda shorter: self.violation(world, shorter) == rule)
 
@@ -150,7 +150,7 @@ class Engine:
 
 
 def shrink(schedule: Steps, fails: Callable[[Steps], bool], layouts: int = 10) -> Steps:
-    """The shortest schedule that still fails: parts are left out as long as possible, then numbers become 0."""
+    """Return the shortest schedule that still fails. Parts are left out as long as possible, then numbers become 0."""
     layout, steps = schedule
     size = len(steps) // 2
     while size:
@@ -174,7 +174,7 @@ def shrink(schedule: Steps, fails: Callable[[Steps], bool], layouts: int = 10) -
 
 @contextmanager
 def shared(nothing: Any = None) -> Iterator[Any]:
-    """A world of which nothing is shared by schedules."""
+    """Yield a world of which schedules share nothing."""
     yield nothing
 
 
@@ -215,7 +215,7 @@ def _schedules(options: argparse.Namespace, engine: Engine, module: str) -> int:
 
 
 def _parts(options: argparse.Namespace, kinds: list[str], engine: Engine) -> Iterator[tuple[str, range]]:
-    """The schedules, divided among the kinds of world, in parts for one world each."""
+    """Yield the schedules, divided among the kinds of world, in parts for one world each."""
     for index, kind in enumerate(kinds):
         share = options.schedules * (index + 1) // len(kinds) - options.schedules * index // len(kinds)
         numbers = range(options.number, options.number + share)
@@ -254,7 +254,7 @@ def _map(jobs: int, work: Callable[..., Any], *arguments: Iterable[Any]) -> Iter
 
 
 def table(results: list[Result]) -> str:
-    """Return a line for each kind of world and one for all; of counts the sums, or of the slowest one."""
+    """Return a line for each kind of world, and one for all; counts are summed, or those of the slowest."""
     groups: dict[str, list[Result]] = {}
     for name, one in [(one.kind, one) for one in results if one.kind] + [("all", one) for one in results]:
         groups.setdefault(name, []).append(one)

@@ -1,4 +1,4 @@
-"""Two slots below a root of their own, for tests of ``configs/slot/pebble-slot``: folders that only look so."""
+"""Two fake slots below a root of their own, for tests of ``configs/slot/pebble-slot``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ exit $code
 
 @dataclass(frozen=True)
 class Seen:
-    """What a machine would start from, what is active, and what the updater left."""
+    """The slot from which a machine would start, the active slot, and the updater's files."""
 
     current: str
     active: str
@@ -37,7 +37,7 @@ class Seen:
 
 
 class Slots:
-    """``whole`` are the slots that may start."""
+    """The fake slots; ``whole`` are those that may start."""
 
     def __init__(self, root: Path, whole: str = "ab", active: str = "a", trial: str = "") -> None:
         self.places, self._bin = Places(root), root / "bin"
@@ -62,7 +62,7 @@ class Slots:
         (self._bin / name).chmod(0o755)
 
     def run_counted(self, command: str, **environment: str) -> subprocess.CompletedProcess[str]:
-        """Run it with each program that it starts counted; ``BEFORE`` or ``AFTER`` one of them it is killed."""
+        """Run a command and count the programs that it starts. It is killed ``BEFORE`` or ``AFTER`` one of them."""
         for name in _COMMANDS:
             real = "true" if name == "systemctl" else f"/usr/bin/{name}"
             self._program(name, _COUNTING.format(name=name, real=real))
@@ -81,7 +81,7 @@ class Slots:
         )  # fmt: skip
 
     def judged(self, result: str, status: str) -> subprocess.CompletedProcess[str]:
-        """Settle as systemd does after the proof of the start that was chosen last."""
+        """Settle as systemd does, after the proof of the start that was chosen last."""
         self.run("judge")
         return self.decide(result, status)
 

@@ -1,4 +1,4 @@
-"""How alike two pieces of sound are."""
+"""Measures of how alike two pieces of sound are."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Samples = npt.NDArray[np.float64]
 
 
 def envelope(samples: Samples, rate: int) -> Samples:
-    """Return the loudness in steps of 20 ms: Opus preserves it, but not the waveform."""
+    """Return the loudness in steps of 20 ms, which Opus preserves, unlike the waveform."""
     step = rate // 50
     whole = samples[: len(samples) // step * step].reshape(-1, step)
     loudness: Samples = np.sqrt(np.mean(whole**2, axis=1))

@@ -1,4 +1,4 @@
-"""When the machine kept processes from running that were to run: what happened late meanwhile proves nothing."""
+"""Detects times at which the machine did not run processes that were ready: lateness then proves nothing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Stall = tuple[float, float]
 
 
 def lost_s(stalls: Iterable[Stall], since: float, until: float) -> float:
-    """Seconds of this time that are in one stall at least."""
+    """Return the seconds of this time that lie in at least one stall."""
     lost, end = 0.0, since
     for began, ended in sorted(stalls):
         began, ended = max(began, end), min(ended, until)
@@ -37,7 +37,7 @@ def lost_s(stalls: Iterable[Stall], since: float, until: float) -> float:
 
 
 class Stalls:
-    """One small process for each processor; it wakes every 10 ms, and tells when it did so 10 ms late or more."""
+    """A watch: a small process per processor wakes every 10 ms, and reports when it was 10 ms late or more."""
 
     def __init__(self) -> None:
         self._found: list[Stall] = []

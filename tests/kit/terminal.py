@@ -16,7 +16,7 @@ SHELL = {"PS1": "$ ", "TERM": "xterm", "COLUMNS": "200", "HISTFILE": "/dev/null"
 
 
 class Terminal:
-    """``shown`` is all that it has shown, or all since ``forget``."""
+    """The terminal. ``shown`` is everything that it has shown, since ``forget`` if that was called."""
 
     def __init__(self, *command: str, cwd: Path = ROOT) -> None:
         self.master, slave = pty.openpty()
@@ -62,11 +62,11 @@ class Terminal:
         os.write(self.master, keys)
 
     def hold(self, key: bytes) -> None:
-        """Repeat a key, as a terminal does after its first delay; b"" lets go."""
+        """Repeat a key, as a terminal does after its first delay; b"" releases it."""
         self._held = key
 
     def answers(self, prompt: str, text: str) -> None:
-        """Type a line once it asks so."""
+        """Type ``text`` as a line when the program shows ``prompt``."""
         self.shows(prompt)
         self._answered = len(self._shown)
         self.type(f"{text}\n".encode())
@@ -77,7 +77,7 @@ class Terminal:
         return until(lambda: text in self.shown, timeout)
 
     def shows(self, prompt: str, timeout_s: float = 60.0) -> None:
-        """Wait until it asks so, after the last answer."""
+        """Wait until the program shows ``prompt``, after the last answer."""
         assert until(lambda: prompt.encode() in self._shown[self._answered :], timeout_s), self.shown
 
     @property

@@ -1,11 +1,11 @@
-"""Runs tests in several processes: ``--workers 8``. They are forked once all tests are collected.
+"""A plugin that runs tests in several processes: ``--workers 8``. They are forked once all tests are collected.
 
 Tests without a mark come first, then those marked ``alone``, with fewer processes. Tests marked ``computing`` run
-meanwhile, when nothing else wants a processor. At last come those marked ``solo``, one after the other.
+beside them, when no other test needs a processor. Last come those marked ``solo``, one after the other.
 
 A worker gets the tests of one module after another, in the order in which they were collected, so each fixture of a
-module is made once; tests that share a fixture of their package are one module. Tests marked ``alone``, which take
-long, are given one by one unless they share a fixture. A worker that dies fails its test, and another goes on with the
+module is made once; tests that share a fixture of their package count as one module. Tests marked ``alone``, which take
+long, are given one by one unless they share a fixture. If a worker dies, its test fails, and another worker takes the
 rest.
 """
 
@@ -41,7 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @dataclass(frozen=True)
 class Lane:
-    """Tests that so many processes share."""
+    """Tests that a number of processes share."""
 
     processes: int
     idle: bool = False  # they run when nothing else wants a processor
@@ -57,7 +57,7 @@ class Worker(NamedTuple):
 
 
 class Workers:
-    """Forks workers, gives each of them modules, and passes on their reports; in the process that collects."""
+    """The process that collects: it forks workers, gives each of them modules, and passes on their reports."""
 
     def __init__(self) -> None:
         self._workers: dict[Connection, Worker] = {}
@@ -92,7 +92,7 @@ class Workers:
 
     @pytest.hookimpl(trylast=True)
     def pytest_unconfigure(self, config: pytest.Config) -> None:
-        """Ends without looking for garbage among all tests, and freeing them one by one: three seconds, measured."""
+        """End without collecting garbage among all tests and freeing them one by one, which takes three seconds."""
         config.get_terminal_writer().flush()
         sys.stdout.flush()
         sys.stderr.flush()
@@ -103,7 +103,7 @@ class Workers:
             self._fork(session, lane)
 
     def _wait(self, session: pytest.Session) -> None:
-        """Receive reports of all lanes."""
+        """Receive the reports of all lanes."""
         for connection in wait(list(self._workers)):
             self._receive(session, cast(Connection, connection))
         if reason := session.shouldfail or session.shouldstop:
@@ -173,7 +173,7 @@ class Workers:
 
 
 def lanes(items: Sequence[pytest.Item], processes: int) -> list[Lane]:
-    """Return the lane of the background, then the others in their order, the one of single tests last."""
+    """Return the background's lane, then the others in order, and last the lane of single tests."""
     computing, unmarked, alone, solo = Lane(IDLE, idle=True), Lane(processes), Lane(min(ALONE, processes)), Lane(1)
     marked = {"computing": computing, "solo": solo, "alone": alone}
     groups: dict[tuple[int, str], Indexes] = {}
@@ -188,29 +188,29 @@ def lanes(items: Sequence[pytest.Item], processes: int) -> list[Lane]:
 
 
 def module_of(item: pytest.Item) -> str:
-    """The same for tests of one module, or of one folder if they share a fixture of the whole."""
+    """Return a key that is equal for tests of one module, or of one folder if they share a fixture of it."""
     return str(item.path.parent if "package" in scopes(item) else item.path)
 
 
 def shared(item: pytest.Item) -> str:
-    """The same for tests that share a fixture which lives longer than one of them."""
+    """Return a key that is equal for tests that share a fixture which outlives a single test."""
     return module_of(item) if scopes(item) - {"function", "session"} else item.nodeid
 
 
 def scopes(item: pytest.Item) -> set[str]:
-    """Those of the fixtures of a test."""
+    """Return the scopes of a test's fixtures."""
     return {one[-1].scope for one in cast(Any, item)._fixtureinfo.name2fixturedefs.values()}
 
 
 class Terminal:
-    """What pytest's configuration looks for where its reporter was."""
+    """The object that pytest's configuration looks for in place of its reporter."""
 
     def __init__(self, config: pytest.Config) -> None:
         self._tw = config.get_terminal_writer()
 
 
 class Reports:
-    """Sends reports to the process that collected the tests."""
+    """A plugin that sends reports to the process that collected the tests."""
 
     def __init__(self, config: pytest.Config, connection: Connection) -> None:
         self._config, self._connection = config, connection
@@ -222,7 +222,7 @@ class Reports:
 
 
 def work(session: pytest.Session, connection: Connection) -> None:
-    """Run what the other process sends, in a worker."""
+    """Run, in a worker, the tests that the other process sends."""
     config = session.config
     plugins = config.pluginmanager
     terminal = Terminal(config)

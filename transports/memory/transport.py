@@ -1,4 +1,4 @@
-"""A network inside one process: the reference for the meaning of the promises, and a fast stand-in for tests.
+"""A network inside one process: the reference for the promises' meaning, and a fast substitute in tests.
 
 `MemoryHub` acts as the broker. It can be stopped and started, lose its retained messages, and crash a client.
 """
@@ -19,7 +19,7 @@ INBOX_LIMIT = 10_000  # undelivered messages per client
 
 
 class MemoryHub:
-    """The broker of `MemoryTransport`s; pass it as their settings. It runs from the start."""
+    """A broker for `MemoryTransport`s; pass it as their settings. It runs from the start."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -84,7 +84,7 @@ class MemoryHub:
                 client.receive(_Delivery(live, publisher))
 
     def now(self) -> float | None:
-        """Return the time at which messages are handed over; None in a simulated time."""
+        """Return the time at which messages are delivered; None in a simulated time."""
         return clock.since_boot()
 
     def _wake_all(self) -> None:
@@ -100,7 +100,7 @@ class _Delivery:
 
 
 class MemoryTransport(Transport):
-    """A client of a `MemoryHub`, with a receiving thread of its own, as a real one has."""
+    """A client of a `MemoryHub`. It has a receiving thread of its own, as real transports have."""
 
     def __init__(self, client_id: str, settings: MemoryHub, *, will: Message | None = None) -> None:
         super().__init__(client_id, will=will)
@@ -184,7 +184,7 @@ class MemoryTransport(Transport):
             self._work()
 
     def _work(self) -> None:
-        """React to the hub's start or stop, or deliver what has waited longest."""
+        """React to the hub's start or stop, or deliver the message that has waited longest."""
         with self._hub.lock:
             changed = self._attached != self._hub.era
             delivery = self._inbox.popleft() if self._inbox and not changed else None
@@ -218,10 +218,10 @@ class MemoryTransport(Transport):
                 return
             self._attached = self._hub.era
             self._hub.attach(self)
-            known = set(self._hub.retained)
+            retained_topics = set(self._hub.retained)
             for subscription in self._subscriptions:
                 self._send_retained(subscription)
-        self._initial_sync(known)
+        self._initial_sync(retained_topics)
 
 
 TRANSPORT = MemoryTransport

@@ -23,7 +23,7 @@ class Result(Enum):
 
 
 class BridgeMode:
-    """The next way to connect. Each connection tries bridge mode again, as the address may lead to another broker."""
+    """The choice whether to connect in bridge mode. Each connection tries it again: the broker may be another one."""
 
     def __init__(self) -> None:
         self.next_attempt = Attempt.BRIDGE

@@ -1,4 +1,4 @@
-"""Limits of a broker without retained messages, QoS 1 or wills, as MQTT 5 says or a CONNECT shows. Pure."""
+"""Limits of a broker that lacks retained messages, QoS 1 or wills: MQTT 5 tells them, or a CONNECT shows them. Pure."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _VALID_S: Final = 600.0  # after which the next connection is made with everythi
 
 
 class Limits(Struct, frozen=True):
-    """Limits within which a broker is used."""
+    """The functions of MQTT that may be used with a broker."""
 
     retain: bool = True
     qos: int = 1
     will: bool = True
 
     def fit(self, message: Message) -> Message:
-        """Return ``message`` with the QoS and the retain flag that this broker takes."""
+        """Return ``message`` with a QoS and retain flag that this broker accepts."""
         return Message(message.topic, message.payload, QoS(min(message.qos, self.qos)), message.retain and self.retain)
 
     def fit_will(self, will: Message | None) -> Message | None:
@@ -33,7 +33,7 @@ class Limits(Struct, frozen=True):
 
     @property
     def losses(self) -> str:
-        """The functions that this broker lacks, in words; empty if it lacks none."""
+        """The functions that this broker lacks, in words; empty if there are none."""
         lost = []
         if not self.retain:
             lost.append(
@@ -53,7 +53,7 @@ _STEPS: Final = (EVERYTHING, Limits(qos=0), Limits(retain=False), Limits(retain=
 
 
 class Asking(Enum):
-    """Another CONNECT that is tried at once, before the next one has its usual turn."""
+    """The kind of CONNECT that is tried at once, before the next regular attempt."""
 
     NOTHING = "none"
     WITHOUT_WILL = "a CONNECT without a will"

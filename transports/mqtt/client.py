@@ -1,8 +1,8 @@
 """A client of an MQTT broker for one connection: its socket, the bytes that wait to be written, and message ids.
 
-Not locked, and without a thread: the connection has both. One `recv` takes everything that has come, and one `send`
-writes a message or all acknowledgements of what was read: a general client library takes several of each, and makes
-objects that nobody here looks at.
+It has neither a lock nor a thread: the connection has both. One `recv` takes everything that has come, and one `send`
+writes a message, or all acknowledgements of what was read. A general client library needs several calls for each, and
+makes objects that are not used here.
 """
 
 import socket
@@ -29,7 +29,7 @@ _NOT_NOW = (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
 
 
 class Opening(NamedTuple):
-    """Parameters with which a connection is opened."""
+    """Parameters for opening a connection."""
 
     client_id: str
     settings: MqttSettings
@@ -40,16 +40,16 @@ class Opening(NamedTuple):
 
 
 def is_hang_up(error: OSError | None) -> bool:
-    """True if the other side has closed the connection, by FIN (None) or RST, rather than the network between."""
+    """True if the other side has closed the connection, by FIN (None) or RST; False if the network has failed."""
     return error is None or isinstance(error, ConnectionError | ssl.SSLEOFError)
 
 
 class TlsLateError(TimeoutError):
-    """Error of a TLS handshake that takes too long."""
+    """An error: the TLS handshake takes too long."""
 
 
 def begin_tls(plain: socket.socket, opening: Opening) -> ssl.SSLSocket:
-    """Return a non-blocking socket with TLS; ``plain`` is closed with it, or if the handshake fails. Raises OSError."""
+    """Return a non-blocking socket with TLS, which closes ``plain``; so does a failed handshake. Raises OSError."""
     assert opening.context is not None  # noqa: S101 - else there is no TLS
     name = opening.settings.host.partition("%")[0]  # certificates have addresses without a network card
     sock = opening.context.wrap_socket(plain, server_hostname=name, do_handshake_on_connect=False)
@@ -79,7 +79,7 @@ def _shake_hands(sock: ssl.SSLSocket, patience_s: float) -> None:
 
 
 class SendQuota:
-    """A bound on unanswered messages of QoS 1 (the broker's Receive Maximum); messages beyond the bound wait here."""
+    """A limit on unacknowledged messages of QoS 1 (the broker's Receive Maximum). Messages beyond it wait here."""
 
     def __init__(self, send: Callable[[bytes], None]) -> None:
         self._send = send
@@ -90,7 +90,7 @@ class SendQuota:
         self._left = self._most = most
 
     def takes(self, packet: bytes) -> bool:
-        """True if ``packet`` may be sent now, which then counts; else keeps ``packet``, to send it later."""
+        """Return True if ``packet`` may be sent now, and count it; else keep it, to send it later."""
         if self._left <= 0:
             self._held.append(packet)
             return False
@@ -105,14 +105,14 @@ class SendQuota:
 
 
 def keep_unsent(sock: socket.socket, size: int) -> None:
-    """Have the kernel accept only about ``size`` bytes beyond those on their way, if supported; 0: its own bound."""
+    """Let the kernel accept only about ``size`` bytes beyond those on their way, if supported; 0: its default."""
     if _NOTSENT_LOWAT is not None:
         with suppress(OSError):  # it may be closed already
             sock.setsockopt(socket.IPPROTO_TCP, _NOTSENT_LOWAT, size)
 
 
 def _mark(sock: socket.socket, dscp: int) -> None:
-    """Mark our packets for routers that serve marked packets first, where the system permits it."""
+    """Mark our packets for routers that forward marked packets first, if the system permits it."""
     v6 = sock.family == socket.AF_INET6
     with suppress(OSError):
         sock.setsockopt(
@@ -121,7 +121,7 @@ def _mark(sock: socket.socket, dscp: int) -> None:
 
 
 class Client:
-    """One connection's client. `open` waits for TCP and TLS, all else returns at once; `read` calls ``listener``."""
+    """The client of one connection. `open` waits, all else returns at once; `read` calls ``listener``."""
 
     def __init__(self, opening: Opening, listener: Listener, *, bridge: bool) -> None:
         settings = opening.settings
@@ -173,7 +173,7 @@ class Client:
     # -- reading
 
     def receive(self) -> int:
-        """Take bytes out of the socket, once all bytes taken before are read; return their number.
+        """Take bytes out of the socket, if all earlier bytes were read; return their number.
 
         If the other side has closed the connection, `socket` is None afterwards.
         """
@@ -195,18 +195,18 @@ class Client:
         return len(data)
 
     def read(self, most: int) -> int:
-        """Hand up to ``most`` packets to the listener; return how many bytes are left. Raises MalformedError."""
+        """Give up to ``most`` packets to the listener; return how many bytes are left. Raises MalformedError."""
         reader = self._reader
         reader.read(most)
         return reader.unread
 
     @property
     def owes(self) -> bool:
-        """True if there are messages to `acknowledge`."""
+        """True if messages were read that are not acknowledged."""
         return bool(self._reader.acks)
 
     def acknowledge(self) -> None:
-        """Send the acknowledgements of all messages read, in one piece; call this after the messages were handled."""
+        """Send the acknowledgements of all messages read, in one piece. Call this after the messages were handled."""
         reader = self._reader
         acks, reader.acks = bytes(reader.acks), bytearray()
         self._send(acks)
@@ -244,10 +244,10 @@ class Client:
         self._send(packets.PINGREQ)
 
     def disconnect(self) -> None:
-        """Send DISCONNECT, and close so that it arrives, because a connection that is reset may lose it.
+        """Send DISCONNECT, and close the socket in a way that lets it arrive.
 
-        A connection with unread data is reset when it is closed, and a proxy on the way then resets the broker's. So
-        bytes that come until the broker closes it, or for `_ENDING_S`, are read and thrown away.
+        A connection with unread data is reset when it is closed, and a proxy then resets the broker's, which may lose
+        the DISCONNECT. So bytes that come until the broker closes it, or for `_ENDING_S`, are read and thrown away.
         """
         self._send(packets.DISCONNECT)
         if self.waiting:

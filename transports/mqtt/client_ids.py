@@ -1,4 +1,4 @@
-"""Client ids, which name connections at a broker. Pure but for random digits."""
+"""Client ids, which identify connections at a broker. Pure but for random digits."""
 
 import re
 import secrets
@@ -8,7 +8,7 @@ _OTHER = re.compile(r"[^A-Za-z0-9_-]")  # some brokers refuse dots, blanks or sl
 
 
 def unique(name: str) -> str:
-    """Return an id that cannot be guessed: ``name`` (``pebble_robots_goob_remote_bridge``) and 16 random digits.
+    """Return ``name`` (``pebble_robots_goob_remote_bridge``) and 16 random digits: an id that cannot be guessed.
 
     A broker closes the connection of a client when another one connects with its id (MQTT-3.1.4-2).
     """
@@ -16,7 +16,7 @@ def unique(name: str) -> str:
 
 
 def _escaped(name: str) -> str:
-    """Return the name in letters that all brokers take; a hash tells names apart that would else be equal."""
+    """Return the name in letters that all brokers accept, with a hash if another name could become equal."""
     text = _OTHER.sub("_", name)
     if text == name.replace("/", "_"):
         return text

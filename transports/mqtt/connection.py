@@ -1,8 +1,8 @@
 """One connection to an MQTT broker, from CONNECT to its loss.
 
-It is discarded as a whole, so that nothing in a queue can outlive a disconnect (T4, T19). One network thread calls
+It is discarded as a whole, so that no queued message can outlive a disconnect (T4, T19). One network thread calls
 `pump`, any thread calls `publish`. One lock guards the client: two threads would mix the bytes of two packets, and
-OpenSSL does not support reading and writing at once. It is not held while a handler runs.
+OpenSSL does not support reading and writing at once. The lock is not held while a handler runs.
 """
 
 import socket
@@ -48,14 +48,14 @@ _ABORT = struct.pack("ii", 1, 0)  # SO_LINGER that makes close() drop what was n
 
 
 class Owner(Sink, Protocol):
-    """The transport of a connection."""
+    """The transport that owns a connection."""
 
     def note_answers(self, refused: Mapping[str, bool]) -> None:
-        """Note the broker's answers to these filters; each is refused or not (T21). Called on the network thread."""
+        """Note for each filter whether the broker refuses it (T21). Called on the network thread."""
 
 
 def ignore(_messages: list[Message]) -> None:
-    """Discard messages; :meth:`Connection.pump` takes this before a connection is accepted, and at its end."""
+    """Discard messages. :meth:`Connection.pump` gets this before a connection is accepted, and at its end."""
 
 
 class Connection:
@@ -94,9 +94,9 @@ class Connection:
     # -- opening and closing
 
     def connect(self, stopping: threading.Event) -> float:
-        """Connect and wait for the broker's CONNACK, or for ``stopping``; raises Lost.
+        """Connect and wait for the broker's CONNACK, or for ``stopping``; return the seconds until it came.
 
-        Returns how many seconds the broker took to answer.
+        Raises Lost.
         """
         dialled = time.monotonic()
         try:
@@ -139,7 +139,7 @@ class Connection:
             self._in_flight.end()
 
     def disconnect(self) -> None:
-        """Send DISCONNECT, on which the broker discards our will."""
+        """Send DISCONNECT, which makes the broker discard our will."""
         with self._lock:
             self._client.disconnect()
 
@@ -148,7 +148,7 @@ class Connection:
         self._poll.wake()
 
     def suit(self, *, thin: bool) -> None:
-        """Adapt to the link to the broker; see `Transport.is_thin`."""
+        """Adapt to a thin link to the broker, or to a wide one; see `Transport.is_thin`."""
         with self._lock:
             sock = self._client.socket
             if sock is not None and thin is not self.pings.is_thin:
@@ -160,8 +160,8 @@ class Connection:
     def pump(self, timeout: float, receive: Callable[[list[Message]], None]) -> None:
         """Wait up to ``timeout`` seconds for the socket, read and write, and deliver messages. Raises Lost.
 
-        Answers to subscriptions are noted first. Then ``receive`` gets the messages, and after them each `PendingAck`
-        whose answer has come is completed: no retained message is delivered after the confirmation of its subscription.
+        Answers to subscriptions are noted first. Then ``receive`` gets the messages. Last, each answered `PendingAck`
+        is completed: no retained message is delivered after the confirmation of its subscription.
         """
         readable, now = self._wait(timeout)
         client, incoming = self._client, self.incoming
@@ -200,8 +200,8 @@ class Connection:
     def _wait(self, timeout: float) -> tuple[bool, float]:
         """Return whether the socket is readable, and the time when this was known.
 
-        Bytes that are in the socket already have come at an unknown time, unless it was empty just before: so it is
-        polled without a wait first, unless that was done a moment ago.
+        Bytes that are already in the socket have come at an unknown time, unless it was empty just before. So it is
+        first polled without a wait, unless that was done a moment ago.
         """
         if not self._poll.registered:
             self._register()
@@ -284,7 +284,7 @@ class Connection:
         return True
 
     def takes(self, message: Message) -> bool:
-        """True if the broker has not said that ``message`` is too large."""
+        """True unless the broker has said that ``message`` is too large."""
         if self.max_packet is None:
             return True
         return _OVERHEAD + len(message.topic.encode()) + len(message.payload) <= self.max_packet
@@ -313,7 +313,7 @@ class Connection:
         return self._request(self._client.unsubscribe, filters, [])
 
     def _request(self, send: Callable[[Sequence[T]], int], filters: Sequence[T], asked: Sequence[str]) -> PendingAck:
-        """Send a few filters in each packet, and return the answer to the last packet, which comes after the others."""
+        """Send a few filters in each packet; return the pending answer to the last packet, which comes last."""
         ack = PendingAck()
         with self._lock:
             for at in range(0, len(filters), FILTERS):
@@ -343,7 +343,7 @@ class Connection:
 
     @property
     def drained(self) -> bool:
-        """True if all accepted messages are written, and acknowledged where that is due."""
+        """True if all accepted messages are written, and acknowledged if they have QoS 1."""
         with self._lock:
             return not (self._in_flight.unacked or self._backlog.waiting or self._client.waiting)
 
@@ -383,11 +383,11 @@ class Connection:
 
     @property
     def lost_bytes(self) -> int:
-        """The bytes of the largest message for which the broker was silent to the end of the connection."""
+        """Bytes of the largest message after which the broker was silent until the connection ended."""
         return self._in_flight.lost_bytes
 
     def written_before_loss(self) -> dict[str, int] | None:
-        """Return the bytes by topic for which the broker may have closed the connection; None for another reason."""
+        """Return the bytes by topic that may be why the broker closed the connection; None for another reason."""
         with self._lock:
             incoming = self.incoming
             if not (incoming.may_concern_message or (self._client.hung_up and not incoming.reason)):

@@ -1,4 +1,4 @@
-"""Makes connections to a broker: at the address whose turn it is, and as the broker there accepts them."""
+"""Makes connections to a broker, at the present address of its host and in a way that the broker accepts."""
 
 import threading
 import time
@@ -24,7 +24,7 @@ _HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connec
 
 
 class Dialler:
-    """The maker of connections: remembers how the attempts at a broker have ended, and makes the next attempt."""
+    """A maker of connections. It remembers how attempts at a broker have ended, and chooses the next way by that."""
 
     def __init__(
         self, client_id: str, settings: MqttSettings, will: Message | None, client_class: type[Client] = Client
@@ -66,7 +66,7 @@ class Dialler:
         return self.addresses.where
 
     def connect(self, owner: Owner, counters: Counters, stopping: threading.Event) -> Connection:
-        """Return a connection that is accepted. Raises Lost."""
+        """Return a connection that the broker has accepted. Raises Lost."""
         if self.limits.wants_probe or (self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PROBE):
             self._probe(owner, counters, stopping)
         plain = self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PLAIN
@@ -104,7 +104,7 @@ class Dialler:
 
     @property
     def _asks_for_bridge_mode(self) -> bool:
-        """True if bridge mode is to be tried; MQTT 5 has options of its own for the same."""
+        """True if bridge mode is to be tried. With MQTT 5 it is not needed."""
         return self._settings.as_published and self._settings.protocol == "3.1.1"
 
     def _probe(self, owner: Owner, counters: Counters, stopping: threading.Event) -> None:
@@ -141,14 +141,14 @@ class Dialler:
 
     @property
     def loses_large(self) -> bool:
-        """True if the way to the broker seems to lose large packets; connections use small segments then."""
+        """True if the way to the broker seems to lose large packets; connections then use small segments."""
         return self._large_lost >= _LARGE_LOST and not self._settings.max_segment
 
     def _may_have_lost_large(self, lost: Lost) -> bool:
         """True if the connection may have ended because large packets are lost on the way, in either direction.
 
-        Signs are a late TLS, as certificates are large; silence after a large message of ours; and silence soon after
-        the broker has accepted us, as messages that it retains may be large.
+        Signs of that are a late TLS, as certificates are large; silence after a large message of ours; and silence soon
+        after the broker has accepted us, as its retained messages may be large.
         """
         attempt = self.attempt
         if attempt is None or not isinstance(lost, Silent):
@@ -168,7 +168,7 @@ class Dialler:
         return self.loses_large
 
     def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
-        """True if the broker has gone: nothing listens, or it hangs up while it ends; remembers the time."""
+        """True if the broker has gone: nothing listens, or it hangs up while it ends. Remembers the time."""
         now, silent = time.monotonic(), isinstance(lost, Silent)  # then it may be we who stood still
         if connected:
             self._gone_at = now
@@ -180,9 +180,9 @@ class Dialler:
         return was_ended
 
     def failed(self, problem: str, held_s: float) -> tuple[str, bool]:
-        """End the turn of the address, unless its broker is to be asked once more in another way.
+        """End the turn of the address, unless its broker will be asked once more in another way.
 
-        Returns the problem in words, empty if there is none yet, and True if the problem is worth a line in the log.
+        Return the problem in words (empty if there is none yet), and True if it is worth a line in the log.
         """
         addresses, asks_again = self.addresses, self.limits.asks_again
         if self._is_last_attempt and not asks_again:

@@ -1,26 +1,26 @@
-"""Reasons why a connection to an MQTT broker is not made, or ends."""
+"""Reasons why a connection to an MQTT broker could not be made, or has ended."""
 
 from pebble.transports.mqtt.bridge_mode import Result
 
 
 class Lost(Exception):  # noqa: N818  (an event, not a mistake)
-    """Loss of a connection, or failure to make one. Its text explains why."""
+    """An error: a connection could not be made, or is lost. Its text explains why."""
 
 
 class Silent(Lost):
-    """Silence: the other side does not answer."""
+    """An error: the other side does not answer."""
 
 
 class Absent(Lost):
-    """Absence: nothing listens there."""
+    """An error: nothing listens at the address."""
 
 
 class TlsLate(Lost):
-    """Delay of TLS, after TCP was there in time."""
+    """An error: TLS takes too long, although TCP was connected in time."""
 
 
 class Refused(Lost):
-    """Refusal of our CONNECT, or a connection closed instead of an answer."""
+    """An error: the broker refused our CONNECT, or closed the connection instead of answering."""
 
     def __init__(self, text: str, result: Result = Result.FAILED) -> None:
         super().__init__(text)

@@ -1,8 +1,8 @@
-"""The filters of one MQTT connection: those subscribed to at the broker (T11), and the one for own messages (T7). Pure.
+"""The filters of one MQTT connection: those subscribed to at the broker (T11), and the filter for own messages (T7).
 
-A broker may send a message once per matching filter. Measured on mosquitto 2.0.11: MQTT 5 always does, 3.1.1 never, and
-bridge mode does for retained messages only. Overlapping filters are therefore merged into one that covers them;
-messages that it matches in excess are sorted out by exact matching on arrival.
+Pure. A broker may send a message once per matching filter. Measured on mosquitto 2.0.11: MQTT 5 always does, 3.1.1
+never, and bridge mode does for retained messages only. Overlapping filters are therefore merged into one that covers
+them; the messages that it matches in excess are sorted out by exact matching on arrival.
 """
 
 import threading
@@ -22,32 +22,32 @@ def overlap(first: str, second: str) -> bool:
     begin, other_begin = beginning(first), beginning(second)
     if not (begin.startswith(other_begin) or other_begin.startswith(begin)):
         return False
-    left, right = first.split("/"), second.split("/")
-    if "$" in (left[0][:1], right[0][:1]) and left[0] != right[0]:
+    first_levels, second_levels = first.split("/"), second.split("/")
+    if "$" in (first_levels[0][:1], second_levels[0][:1]) and first_levels[0] != second_levels[0]:
         return False  # wildcards do not match a first level with a $
-    for a, b in zip(left, right, strict=False):
-        if a == "#" or b == "#":
+    for first_level, second_level in zip(first_levels, second_levels, strict=False):
+        if first_level == "#" or second_level == "#":
             return True
-        if a != b and "+" not in (a, b):
+        if first_level != second_level and "+" not in (first_level, second_level):
             return False
-    longer = max(left, right, key=len)
-    shorter = min(len(left), len(right))
-    return len(left) == len(right) or longer[shorter] == "#"
+    longer = max(first_levels, second_levels, key=len)
+    shorter = min(len(first_levels), len(second_levels))
+    return len(first_levels) == len(second_levels) or longer[shorter] == "#"
 
 
 def cover(first: str, second: str) -> str:
     """Return a filter that matches everything that either of two overlapping filters matches, level by level."""
-    left, right = first.split("/"), second.split("/")
+    first_levels, second_levels = first.split("/"), second.split("/")
     levels: list[str] = []
-    for a, b in zip(left, right, strict=False):
-        if a == "#" or b == "#":
+    for first_level, second_level in zip(first_levels, second_levels, strict=False):
+        if first_level == "#" or second_level == "#":
             return "/".join([*levels, "#"])
-        levels.append(a if a == b else "+")
-    return "/".join(levels if len(left) == len(right) else [*levels, "#"])
+        levels.append(first_level if first_level == second_level else "+")
+    return "/".join(levels if len(first_levels) == len(second_levels) else [*levels, "#"])
 
 
 class BrokerFilters:
-    """The filters a client has subscribed to at its broker; no two of them overlap."""
+    """The filters that a client has subscribed to at its broker; no two of them overlap."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()  # to be held: it guards the filters, and their connection
@@ -92,7 +92,7 @@ class BrokerFilters:
 class OwnMessageFilter:
     """A filter that recognises own retained messages that come back, and retained messages that come twice.
 
-    For as-published connections, where retained and live messages look alike (T7): check those with ``retain`` set.
+    For as-published connections, where retained and live messages look alike (T7). Check messages with ``retain``.
     """
 
     def __init__(self) -> None:
@@ -102,7 +102,7 @@ class OwnMessageFilter:
         self._repeats: set[str] = set()  # topics whose retained message will come a second time
 
     def begin(self) -> None:
-        """Start a new connection: every retained message is new again, except our own."""
+        """Start a new connection, on which every retained message is new, except our own."""
         self._seen.clear()
         self._repeats.clear()
 
@@ -112,11 +112,11 @@ class OwnMessageFilter:
 
     def subscribe_again(self, filter_: str) -> None:
         """Expect the retained messages that ``filter_`` matches to be sent once more."""
-        seen = list(self._seen) if is_pattern(filter_) else [filter_] if self._seen.has(filter_) else []
-        self._repeats.update(topic for topic in seen if overlap(topic, filter_))
+        topics = list(self._seen) if is_pattern(filter_) else [filter_] if self._seen.has(filter_) else []
+        self._repeats.update(topic for topic in topics if overlap(topic, filter_))
 
     def is_echo(self, message: Message) -> bool:
-        """True if this is our own retained message, sent back to us; else forgets ours, which is outdated."""
+        """True if this is our own retained message, sent back to us; else forget ours, which is outdated."""
         if message.topic not in self._own:
             return False
         if self._own.get(message.topic) == _digest(message):
@@ -125,10 +125,10 @@ class OwnMessageFilter:
         return False
 
     def is_repeat(self, message: Message) -> bool:
-        """True, once, if the broker sends a retained message again due to `subscribe_again`; remembers each message."""
-        seen, digest = self._seen.get(message.topic), _digest(message)
+        """True, once, if the broker repeats a retained message because of `subscribe_again`. Remembers each message."""
+        known_digest, digest = self._seen.get(message.topic), _digest(message)
         self._seen[message.topic] = digest
-        if seen != digest or message.topic not in self._repeats:
+        if known_digest != digest or message.topic not in self._repeats:
             return False
         self._repeats.discard(message.topic)
         return True

@@ -1,4 +1,4 @@
-"""Packets from a broker on one MQTT connection: read in batches, and made into messages that have an age."""
+"""Reads packets from a broker on one MQTT connection, in batches, and makes messages with an age of them."""
 
 import logging
 from typing import Protocol
@@ -27,16 +27,16 @@ _LACKS = {reasons.NO_RETAIN: Result.RETAIN_REFUSED, reasons.NO_QOS: Result.QOS_R
 
 
 class Sink(Protocol):
-    """The owner of a connection, called on the network thread with its lock held: it must neither wait nor publish."""
+    """The receiver of packets, called on the network thread with the connection's lock: it must not wait or publish."""
 
     policy: TopicPolicy
 
     def note_refusal(self, topic: str, why: str) -> None:
-        """Note that the broker does not take a message of this topic (MQTT 5)."""
+        """Note that the broker does not accept messages of this topic (MQTT 5)."""
 
 
 class Incoming:
-    """The listener of a connection's client, under the connection's lock. ``where``: the broker's address in words."""
+    """The listener of a connection's client; under the connection's lock. ``where``: the broker's address in words."""
 
     def __init__(
         self,
@@ -84,9 +84,9 @@ class Incoming:
         Several pieces may have come, and TLS unpacks one after the other.
         """
         age, began_with, size = self.age, self._packets, 0
-        while (left := began_with + _BATCH - self._packets) > 0:
+        while (packets_left := began_with + _BATCH - self._packets) > 0:
             before = self._packets
-            size += self._read_piece(client, now, left)
+            size += self._read_piece(client, now, packets_left)
             if not self.more or self._packets == before:
                 break
             now = clock.since_boot()
@@ -99,27 +99,27 @@ class Incoming:
             age.waiting.empty(age.received_at)
 
     def _read_piece(self, client: Client, now: float, most: int) -> int:
-        """Read up to ``most`` packets, from the bytes left over or else from the socket; return their bytes.
+        """Read up to ``most`` packets from the bytes left over, or else from the socket; return how many bytes.
 
         Afterwards `more` is True if there may be more packets. Raises Lost.
         """
         unread = self._left or self._receive(client, now)
         self.age.update(now, client.socket)
         try:
-            self._left = left = client.read(most)
+            self._left = bytes_left = client.read(most)
         except MalformedError as error:
             raise Lost(f"{self.where} does not speak MQTT: {error}") from None
         if self._refusal is not None:
             raise self._refusal
         if self.reason:
             client.close()
-        self.more = left > 0 or not client.drained
+        self.more = bytes_left > 0 or not client.drained
         if self.more:
-            self.age.waiting.read(unread - left)
-        return unread - left
+            self.age.waiting.read(unread - bytes_left)
+        return unread - bytes_left
 
     def _receive(self, client: Client, now: float) -> int:
-        """Take a piece out of the socket and return its number of bytes; note how many bytes there were."""
+        """Take a piece out of the socket, and note its size for the messages' ages; return its number of bytes."""
         age, waiting = self.age, self.age.waiting
         age.received_at = now
         if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:
@@ -135,13 +135,13 @@ class Incoming:
 
     @property
     def lost(self) -> Lost:
-        """The error of a connection that the other side has closed, with the reason."""
+        """Error for a connection that the other side has closed, with the reason."""
         why, id_ = self.reason or f"{self.where} closed the connection", self._settings.client_id
         if id_ is not None and self.accepted is not None and self._taken_over:
             why += f' (does another client use the client id "{id_}"? a broker lets in only the newest)'
-        if asked := self._in_flight.asked:
-            more = f" and {len(asked) - _SHOWN} more" if len(asked) > _SHOWN else ""
-            why += f", asked to deliver {', '.join(asked[:_SHOWN])}{more}"
+        if filters := self._in_flight.asked:
+            more = f" and {len(filters) - _SHOWN} more" if len(filters) > _SHOWN else ""
+            why += f", asked to deliver {', '.join(filters[:_SHOWN])}{more}"
         return Lost(why)
 
     # -- called by the client
@@ -200,7 +200,7 @@ class Incoming:
             self.age.delay.acknowledged(sent_at, now)
 
     def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
-        """Make a message of a publication. Hot."""
+        """Make a message of a PUBLISH packet, with its age, and keep it for delivery. Hot."""
         age, retain = self.age, bool(first & RETAIN)
         if retain:
             age.has_retained = True

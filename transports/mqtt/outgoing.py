@@ -38,9 +38,9 @@ _NEVER = 0xFFFFFFFF  # no round trip was measured yet
 
 
 class Backlog:
-    """LATEST messages for a socket that accepts no more, in order (T4).
+    """LATEST messages that wait for a socket which accepts no more, in order (T4).
 
-    A new message replaces the oldest when there are too many; a retained message is replaced only by a newer one of
+    When there are too many, a new message replaces the oldest. A retained message is replaced only by a newer one of
     its topic.
     """
 
@@ -62,7 +62,7 @@ class Backlog:
         return topic in self.waiting
 
     def put(self, message: Message) -> int:
-        """Append ``message``; return how many messages were dropped for it."""
+        """Append ``message``; return how many messages were dropped to make room."""
         if message.retain:
             replaced = self.waiting.pop(message.topic, None) is not None
             self.waiting[message.topic] = message
@@ -81,7 +81,7 @@ class Backlog:
         return self._remove(next(iter(self.waiting)))
 
     def supersede(self, newer: Message) -> int:
-        """Drop messages that wait on the topic of a DELIVERED one that is sent ahead (T8); return how many."""
+        """Drop waiting messages on the topic of a DELIVERED message that is sent before them (T8); return how many."""
         stale = [
             key
             for key, message in self.waiting.items()
@@ -125,7 +125,7 @@ class _Unconfirmed(Struct):
 
 
 class InFlightTable:
-    """The acknowledgements and answers the broker owes. Message ids are MQTT's, times are seconds of one clock."""
+    """The acknowledgements and answers that the broker owes. Message ids are MQTT's; times are seconds of one clock."""
 
     def __init__(self) -> None:
         self._round_trips: deque[float] = deque(maxlen=ROUND_TRIPS)  # the latest, seconds
@@ -152,7 +152,7 @@ class InFlightTable:
 
     @property
     def waiting_since(self) -> float | None:
-        """The time since when DELIVERED messages wait and none was acknowledged; None if none waits."""
+        """Time since when DELIVERED messages wait and none was acknowledged; None if none waits."""
         return max(next(iter(self._unacked.values()))[1], self._acked_at) if self._unacked else None
 
     def unconfirmed_retained(self) -> list[Message]:
@@ -166,9 +166,9 @@ class InFlightTable:
             self._unconfirmed[message.topic] = _Unconfirmed(message)
 
     def sent(self, message: Message, mid: int, now: float) -> None:
-        """Note that ``message`` went out under the id ``mid``. Hot."""
-        size, known = len(message.payload), self._accepted.get(message.topic)
-        if known is None or size > known[1]:
+        """Note that ``message`` was written with the id ``mid``. Hot."""
+        size, largest = len(message.payload), self._accepted.get(message.topic)
+        if largest is None or size > largest[1]:
             _note(self._written, message.topic, now, size)
         if message.qos is QoS.DELIVERED:
             self._unacked[mid] = (message.topic, now)
@@ -180,7 +180,7 @@ class InFlightTable:
                 entry.ping = self._ping_number + 1
 
     def acknowledge(self, mid: int, now: float) -> float | None:
-        """Process a PUBACK; return when its message was sent, None if it belongs to no known message."""
+        """Process a PUBACK; return the time when its message was sent, None if the message is unknown."""
         if mid not in self._unacked:
             return None
         self._acked_at = now
@@ -194,9 +194,9 @@ class InFlightTable:
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
-        """Return the bytes by topic of lately written messages that no answer to a ping has confirmed.
+        """Return the bytes by topic of recent messages that no answer to a ping has confirmed.
 
-        They are the first messages of their topics on this connection, or larger than those before.
+        Only messages that are the first of their topic on this connection, or larger than those before, are in it.
         """
         sizes: dict[str, int] = {}
         for written in (*(written for _, _, written in self._pings), self._written):
@@ -225,7 +225,7 @@ class InFlightTable:
         return [filter_ for _, filters in self._requests.values() for filter_ in filters]
 
     def complete(self) -> None:
-        """Complete the answered requests, once the messages received before the answers have been delivered."""
+        """Complete the answered requests. Call this after delivering the messages received before the answers."""
         answered, self.answered = self.answered, []
         for ack in answered:
             ack.complete()
@@ -256,16 +256,16 @@ class InFlightTable:
 
     @property
     def round_trip_s(self) -> float:
-        """The shortest recent round trip, so that a delayed answer gives the next stall no extra time."""
+        """The shortest recent round trip: a delayed answer must not give the next stall extra time."""
         return min(self._round_trips, default=0.0)
 
     def newest_answer(self, now: float) -> tuple[int, float]:
-        """Return the number of answered pings, and the seconds that the newest answer took, or a longer ping waits."""
+        """Return the number of answered pings, and the seconds of the newest answer or of a longer wait for one."""
         waits = now - self._pings[0][0] if self._pings else 0.0
         return self._pong_number, max(self._newest_s, waits)
 
     def end(self) -> None:
-        """Complete all pending answers, because none can come any more."""
+        """Complete all pending answers, because none can come after the connection's end."""
         unanswered = self._pings[0][2] if self._pings else self._written
         self.lost_bytes = max((size for _, size in unanswered.values()), default=0)
         self.complete()
@@ -276,22 +276,22 @@ class InFlightTable:
 
 
 def _note(table: dict[str, tuple[float, int]], topic: str, at: float, size: int) -> None:
-    """Note a message in ``table``, unless one as large is there already, or there is no room."""
-    known = table.get(topic)
-    if (known is None and len(table) < TOPICS) or (known is not None and size > known[1]):
+    """Note a message in ``table``, if there is room and no message as large is noted there."""
+    noted = table.get(topic)
+    if (noted is None and len(table) < TOPICS) or (noted is not None and size > noted[1]):
         table[topic] = at, size
 
 
 def unconfirmed_bytes(sock: socket.socket) -> int:
-    """Return bytes the kernel has accepted and the other side's TCP has not acknowledged, sent or not (SIOCOUTQ).
+    """Return how many accepted bytes the other side's TCP has not acknowledged, sent or not (SIOCOUTQ).
 
-    0 where the system does not say.
+    0 where the system does not tell.
     """
     return _kernel_bytes(sock, "TIOCOUTQ")
 
 
 def readable_bytes(sock: socket.socket | None) -> int:
-    """Return bytes that the kernel has received and we have not read (FIONREAD); 0 where the system does not say."""
+    """Return how many received bytes wait in the kernel (FIONREAD); 0 where the system does not tell."""
     return 0 if sock is None else _kernel_bytes(sock, "FIONREAD")
 
 
@@ -305,12 +305,12 @@ def _kernel_bytes(sock: socket.socket, request: str) -> int:
 
 
 def shortest_round_trip_s(sock: socket.socket) -> float:
-    """Return the kernel's own measurement over the last minutes; 0 where it has none."""
+    """Return TCP's shortest round trip of the last minutes, as the kernel measured it; 0 if it does not tell."""
     return _round_trip_s(sock, _MIN_RTT_AT)
 
 
 def present_round_trip_s(sock: socket.socket) -> float:
-    """Return the kernel's own measurement, smoothed; 0 where it has none."""
+    """Return TCP's present round trip, smoothed by the kernel; 0 if it does not tell."""
     return _round_trip_s(sock, _RTT_AT)
 
 

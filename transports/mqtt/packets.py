@@ -1,6 +1,6 @@
-"""MQTT's packets as bytes, 3.1.1 and 5: what a client writes, and what it reads. Knows neither sockets nor clocks.
+"""MQTT's packets as bytes, 3.1.1 and 5: those that a client writes and reads. Knows neither sockets nor clocks.
 
-Sources are MQTT 3.1.1 and MQTT 5.0 (OASIS), chapters 2 and 3 of each. ``modern`` is version 5.
+Sources are MQTT 3.1.1 and MQTT 5.0 (OASIS), chapters 2 and 3 of each. ``modern`` means version 5.
 """
 
 import struct
@@ -37,14 +37,14 @@ _TEXTS = {0x03: 1, 0x08: 1, 0x09: 1, 0x12: 1, 0x15: 1, 0x16: 1, 0x1A: 1, 0x1C: 1
 
 
 class MalformedError(Exception):
-    """Error for bytes that are no MQTT. Its text says what is wrong."""
+    """An error: the received bytes are not MQTT. Its text says what is wrong."""
 
 
 # -- what a client writes
 
 
 class Filter(Struct, frozen=True):
-    """One filter of a SUBSCRIBE; the options but ``qos`` are of MQTT 5."""
+    """A filter of a SUBSCRIBE, with its options; all but ``qos`` belong to MQTT 5."""
 
     text: str
     qos: int
@@ -63,7 +63,7 @@ def connect(
     username: str | None,
     password: str | None,
 ) -> bytes:
-    """Return a CONNECT with a clean session. ``bridge``: in bridge mode, which is 3.1.1's only."""
+    """Return a CONNECT with a clean session. ``bridge``: in bridge mode, which only 3.1.1 has."""
     flags, payload = _CLEAN, _text(client_id)
     properties = b"\0" if modern else b""
     if will is not None:
@@ -143,7 +143,7 @@ def _variable(size: int) -> bytes:
 
 
 class Accepted(Struct, frozen=True):
-    """The properties of a CONNACK without an error; None: not given."""
+    """Properties of a CONNACK without an error; None if the broker gives no value."""
 
     max_packet: int | None = None  # bytes that the broker takes
     receive_maximum: int | None = None  # messages of QoS 1 that may be unacknowledged
@@ -152,44 +152,44 @@ class Accepted(Struct, frozen=True):
 
 
 class Listener(Protocol):
-    """Handlers of packets, called in the order of the packets."""
+    """Handlers of packets, called in the order in which packets came."""
 
     def on_accepted(self, accepted: Accepted) -> None: ...
 
     def on_refused(self, code: int) -> None:
-        """Take a CONNACK with an error; ``code`` is 3.1.1's or MQTT 5's, each as the broker sent it."""
+        """Handle a CONNACK with an error; ``code`` is 3.1.1's or MQTT 5's, as the broker sent it."""
 
     def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
-        """Take a PUBLISH; ``first`` is the first byte of the packet, with QoS and retain."""
+        """Handle a PUBLISH; ``first`` is the first byte of the packet, with QoS and retain."""
 
     def on_puback(self, mid: int, code: int) -> None:
-        """Take a PUBACK; ``code`` is MQTT 5's, from 128 on a refusal."""
+        """Handle a PUBACK; ``code`` is MQTT 5's: a refusal from 128 on."""
 
     def on_answer(self, mid: int, codes: bytes) -> None:
-        """Take a SUBACK, with a code for each filter, or an UNSUBACK; from 128 on a code is a refusal."""
+        """Handle a SUBACK, with a code for each filter, or an UNSUBACK. Codes from 128 on are refusals."""
 
     def on_pong(self) -> None: ...
 
     def on_disconnect(self, code: int) -> None: ...
 
     def on_too_long(self, topic: bytes, length: int) -> None:
-        """Note that a PUBLISH of ``length`` bytes was discarded."""
+        """Note that a PUBLISH of ``length`` bytes was discarded because it is too long."""
 
     def skips(self, topic: bytes) -> bool:
         """True if a retained message of this topic is not wanted."""
 
 
 class Quota(Protocol):
-    """A count of the messages that the broker has not acknowledged; it is called before the listener."""
+    """A counter of the messages that the broker has not acknowledged; called before the listener."""
 
     def begin(self, most: int) -> None:
-        """Note how many unacknowledged messages the broker takes."""
+        """Set how many unacknowledged messages the broker accepts."""
 
     def acknowledged(self) -> None: ...
 
 
 class Reader:
-    """A parser that makes packets out of bytes as they come; ``acks`` collects the answers that are to be written."""
+    """A parser of packets from received bytes; ``acks`` collects the acknowledgements to be written."""
 
     def __init__(self, listener: Listener, quota: Quota, *, modern: bool) -> None:
         self.acks = bytearray()
@@ -202,7 +202,7 @@ class Reader:
 
     @property
     def unread(self) -> int:
-        """Bytes that wait for the next `read`: whole packets, and the beginning of another."""
+        """Number of bytes that wait for the next `read`: whole packets, and the beginning of another."""
         return len(self._data) - self._at
 
     @property
@@ -211,7 +211,7 @@ class Reader:
         return len(self._partial)
 
     def feed(self, data: bytes) -> None:
-        """Take received bytes; call this when nothing is `unread`."""
+        """Give received bytes to the parser, when nothing is `unread`."""
         if self._discarded:
             data = self._discard(data)
         if self._partial:
@@ -223,7 +223,7 @@ class Reader:
         self._data, self._at = data, 0
 
     def read(self, most: int) -> int:
-        """Hand up to ``most`` whole packets to the listener; return how many. Raises MalformedError. Hot."""
+        """Give up to ``most`` whole packets to the listener; return how many. Raises MalformedError. Hot."""
         data, end, count = self._data, len(self._data), 0
         if not data:
             return 0
@@ -268,7 +268,7 @@ class Reader:
         self._data, self._at = b"", 0
 
     def _publish(self, data: bytes, first: int, start: int, stop: int) -> None:
-        """Hand a PUBLISH to the listener. Hot."""
+        """Give a PUBLISH to the listener. Hot."""
         end = start + 2 + int.from_bytes(data[start : start + 2], "big")
         body, topic = end, data[start + 2 : end]
         qos = first & ANY_QOS
@@ -306,7 +306,7 @@ class Reader:
             self._listener.on_disconnect(body[0] if body else 0)
 
     def _properties_size(self, body: bytes) -> int:
-        """Return the number of bytes of the properties behind the first two bytes; 0 on 3.1.1."""
+        """Return the size of the properties after the first two bytes; 0 on 3.1.1."""
         if not self._modern:
             return 0
         size, start = _read_variable(body, 2)
@@ -316,8 +316,8 @@ class Reader:
         if body[1]:
             self._listener.on_refused(body[1])
             return
-        given = properties(body[2 : 2 + self._properties_size(body)])
-        accepted = Accepted(*map(given.get, (_MAXIMUM_PACKET, _RECEIVE_MAXIMUM, _MAXIMUM_QOS, _RETAIN_AVAILABLE)))
+        values = properties(body[2 : 2 + self._properties_size(body)])
+        accepted = Accepted(*map(values.get, (_MAXIMUM_PACKET, _RECEIVE_MAXIMUM, _MAXIMUM_QOS, _RETAIN_AVAILABLE)))
         if accepted.receive_maximum is not None:
             self._quota.begin(accepted.receive_maximum)
         self._listener.on_accepted(accepted)
@@ -353,7 +353,7 @@ _SHORTEST = {_CONNACK: 2, _PUBACK: 2, _PUBREL: 2, _SUBACK: 3, _UNSUBACK: 2, _PIN
 
 
 def _read_variable(data: bytes, at: int) -> tuple[int, int]:
-    """Return a length, -1 if its end is missing, and the place after it. Raises MalformedError."""
+    """Return a length, or -1 if its end is missing, and the place after it. Raises MalformedError."""
     value = shift = 0
     for byte in data[at : at + 4]:
         at += 1

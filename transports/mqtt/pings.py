@@ -1,4 +1,4 @@
-"""The pings of one MQTT connection: answers show that the broker lives, how far it has read, and how late it is."""
+"""The pings of one MQTT connection. Answers show that the broker lives, how far it has read, and how late it is."""
 
 import random
 from math import inf
@@ -16,7 +16,7 @@ _LEAST_SHARE = 0.75  # of the interval between pings: answers to regular ones co
 
 
 class Pings:
-    """The schedule of pings. The connection's lock is held."""
+    """The schedule of pings. Call it with the connection's lock held."""
 
     def __init__(self, settings: MqttSettings, in_flight: InFlightTable, age: ReadAge) -> None:
         self._in_flight, self._age = in_flight, age
@@ -43,7 +43,7 @@ class Pings:
         client.ping()
 
     def send_after_stall(self, client: Client, now: float) -> None:
-        """Send a ping once after each time without reading: its answer follows all that waited at the broker."""
+        """Send one ping after a time without reading: its answer comes after everything that waited at the broker."""
         since = self._age.waiting.checked_at
         if since != self._stalled_since:
             self._stalled_since = since

@@ -1,4 +1,4 @@
-"""A poll of a socket, from which other threads can wake the one that waits."""
+"""A poll of a socket, which other threads can interrupt."""
 
 import select
 import socket
@@ -10,7 +10,7 @@ NOTHING = (False, False, False)  # is readable, writable, or was woken
 
 
 class SocketPoll:
-    """A wait until a socket is readable or has an error, or (with ``write``) writable, or `wake` was called."""
+    """A poll that waits until a socket is readable, has an error or (with ``write``) is writable, or until `wake`."""
 
     def __init__(self) -> None:
         self._wakeup = WakeupPipe()
@@ -25,7 +25,7 @@ class SocketPoll:
             self._poll.register(self._wake, select.POLLIN)
 
     def wait(self, seconds: float, *, write: bool) -> tuple[bool, bool, bool]:
-        """Return which of the three holds: readable, writable, woken."""
+        """Return (readable, writable, woken) after at most this time."""
         if self._poll is None:
             readable, writable, woken = self._select(seconds, write=write)
         else:
@@ -33,11 +33,11 @@ class SocketPoll:
                 self._write = write
                 self._poll.modify(self._sock, select.POLLIN | (select.POLLOUT if write else 0))
             readable = writable = woken = False
-            for descriptor, seen in self._poll.poll(ceil(seconds * 1000)):
+            for descriptor, events in self._poll.poll(ceil(seconds * 1000)):
                 if descriptor == self._wake:
                     woken = True
                 else:
-                    readable, writable = bool(seen & ~select.POLLOUT), bool(seen & select.POLLOUT)
+                    readable, writable = bool(events & ~select.POLLOUT), bool(events & select.POLLOUT)
         if woken:
             self._wakeup.clear()
         return readable, writable, woken

@@ -17,10 +17,10 @@ _UPLINK_S = 0.5  # TCP's round trips may be so much longer than usual: more may 
 
 
 class WaitingTime:
-    """The time since when the bytes that are read next may have waited in a socket; all times are of one clock.
+    """The earliest time since which the next bytes may have waited in a socket; all times are of one clock.
 
-    Two facts are known: when the socket was last empty, and how many bytes were in it at one moment since. Bytes that
-    are read after those have arrived later than that moment.
+    Two facts are known: when the socket was last empty, and how many bytes were in it at one moment after that. Bytes
+    that are read after those have arrived later than that moment.
     """
 
     def __init__(self, now: float) -> None:
@@ -46,7 +46,7 @@ class BrokerDelay:
     """The time for which messages that are received now have waited at the broker: it answers a ping after them.
 
     A ping that itself took long to get there, behind our own data, tells nothing. The usual time of an answer is no
-    delay: that of the shortest one of this connection, and TCP's own round trips, which do not wait for the broker.
+    delay: that of the shortest answer of this connection, and TCP's own round trips, which do not wait for the broker.
 
     A broker that stood still then reads a packet of each client in turn: it may have answered all our pings before it
     has read the last old message of another client. So if nothing at all has come since an overdue ping was sent, the
@@ -68,15 +68,15 @@ class BrokerDelay:
         self._prompt = 0  # answers in a row that came right after the newest of several pings
 
     def usual(self, seconds: float) -> None:
-        """Note the time of an answer that did not wait."""
+        """Note how long an answer took that did not wait anywhere."""
         self._shortest = min(self._shortest, seconds)
 
     def asked(self, now: float, *, clear: bool) -> None:
-        """Note that a ping was sent; ``clear``: nothing of ours was on its way."""
+        """Note that a ping was sent; ``clear``: no other data of ours was on its way."""
         self._asked.append((now, now, clear))
 
     def stalled(self, since: float, now: float) -> None:
-        """Note a ping after a time without reading: messages beyond the size of a socket have waited at the broker."""
+        """Note a ping after a time without reading: what a socket cannot hold has waited at the broker."""
         self._asked.append((since, now, True))
 
     def answered(self, now: float) -> None:
@@ -94,7 +94,7 @@ class BrokerDelay:
             self._newest = 0.0
 
     def acknowledged(self, sent_at: float, now: float) -> None:
-        """Note an answer to a message sent at ``sent_at``: pings before it were answered, or their answers are lost."""
+        """Note a PUBACK for a message sent at ``sent_at``: earlier pings were answered, or their answers are lost."""
         while self._asked and self._asked[0][1] < sent_at:
             self._asked.popleft()
         self._newest = min(self._newest, now - sent_at)
@@ -104,7 +104,7 @@ class BrokerDelay:
         self._delivered = self._read
 
     def delivery(self, now: float) -> tuple[float, float]:
-        """Return the age of the newest ping whose earlier messages are all delivered, and how late its answer was."""
+        """Return the age of the newest ping before which everything is delivered, and how late its answer was."""
         sent_at, took = self._delivered
         waits = now - self._asked[0][1] if self._asked else 0.0
         return now - sent_at, max(took, waits) - self._shortest
@@ -155,6 +155,6 @@ class ReadAge:
         self.arriving_at = clock.since_boot()
 
     def note_handled(self) -> None:
-        """Note that retained messages were handled: that may have taken longer than an answer may."""
+        """Note that retained messages were handled, which may have taken longer than an answer to a ping may."""
         self.note_arriving()
         self.has_retained = False

@@ -1,4 +1,4 @@
-"""Topics on which a broker takes no messages: it says so on MQTT 5, or hangs up on them, as 3.1.1 has no words for it.
+"""Topics on which a broker accepts no messages: it says so on MQTT 5; on 3.1.1 it can only hang up.
 
 A topic is withheld after three losses in a row, each soon after a message on it. If several topics are withheld, they
 are tried one at a time from then on, so that only the topic at fault stays withheld. Pure but for the log.
@@ -24,14 +24,14 @@ _NOT_TAKEN_S = 600.0  # between two log lines about one topic
 
 
 class Withheld(NamedTuple):
-    """Messages of one topic that are not sent: those of ``size`` bytes and more, until it is tried."""
+    """A topic whose messages are not sent, until it is tried: messages of ``size`` bytes and more."""
 
     size: int
     tried_at: float
 
 
 class Trial(NamedTuple):
-    """A topic that was withheld and is sent again: it is free at ``ends_at``, unless the connection is lost before."""
+    """A withheld topic that is sent again: it is free at ``ends_at``, unless the connection is lost before."""
 
     topic: str
     ends_at: float
@@ -40,7 +40,7 @@ class Trial(NamedTuple):
 class RefusedTopics:
     """A table of topics that are not sent, because the broker closes the connection for them.
 
-    Topics that match ``vital`` are withheld only if the messages are large. The transport's lock for publishing guards
+    Topics that match ``vital`` are withheld only for large messages. The transport's lock for publishing guards
     ``withheld`` and the trial.
     """
 
@@ -54,14 +54,14 @@ class RefusedTopics:
         self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)
 
     def accepts(self, message: Message) -> bool:
-        """True if ``message`` may be sent: its topic is not withheld, or on trial."""
+        """True if ``message`` may be sent: its topic is not withheld, or is on trial."""
         entry = self.withheld.get(message.topic)
         if entry is None or len(message.payload) < entry.size:
             return True
         return self._trial is not None and self._trial.topic == message.topic
 
     def admits(self, message: Message, now: float) -> bool:
-        """True if ``message`` may be sent; begins the trial of a withheld topic that is due."""
+        """True if ``message`` may be sent. Begins the trial of a withheld topic if that is due."""
         if self._trial is None and not self.accepts(message) and self._is_due(message.topic, now):
             self._trial = Trial(message.topic, now + WINDOW_S)
         return self.accepts(message)
@@ -70,7 +70,7 @@ class RefusedTopics:
         return now >= max(self.withheld[topic].tried_at, self._quiet_at)
 
     def due(self, messages: Mapping[str, Message], where: str, now: float) -> Iterator[Message]:
-        """End a trial that has succeeded, and yield the retained message of the topic that is tried next."""
+        """End a trial that has succeeded, and yield the retained message of the next topic to try."""
         if self._trial is not None:
             if now < self._trial.ends_at:
                 return
@@ -85,7 +85,7 @@ class RefusedTopics:
                 return
 
     def note_loss(self, where: str, written: Mapping[str, int] | None, now: float) -> None:
-        """Note a lost connection. ``written``: bytes by topic, just before; None if no message was the reason."""
+        """Note a lost connection. ``written``: bytes by topic before the loss; None if no message was the reason."""
         written, trial, self._trial = written or {}, self._trial, None
         self._quiet_at = now + QUIET_S
         if trial is not None and {topic for topic in written if not self._is_vital(topic)} == {trial.topic}:

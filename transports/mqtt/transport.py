@@ -36,7 +36,7 @@ _IDLE_S = 60.0  # the connection wakes up earlier, for its pings
 
 
 class _Run:
-    """One run of the network thread, and requests of other threads to it."""
+    """One run of the network thread, with the requests of other threads to it."""
 
     def __init__(self, target: Callable[[_Run], None], name: str) -> None:
         self.stopping = threading.Event()
@@ -72,7 +72,7 @@ class MqttTransport(Transport):
 
     @property
     def not_taken(self) -> Mapping[str, tuple[str, float]]:
-        """Topics on which the broker takes no messages: why, and when that was last in the log."""
+        """Topics that the broker does not accept: why, and when that was last logged."""
         return self._refused.not_taken
 
     @property
@@ -112,7 +112,7 @@ class MqttTransport(Transport):
         self._network.thread.start()
 
     def _close(self, will: Message | None) -> None:
-        """End the network thread, without waiting if it is connecting: then it ends by itself, within HANDSHAKE_S."""
+        """End the network thread. If it is connecting, do not wait: it ends by itself within HANDSHAKE_S."""
         run = self._network
         if run is None:
             return
@@ -170,8 +170,8 @@ class MqttTransport(Transport):
                 return
             for name in names:
                 self._own_message_filter.subscribe_again(name)
-            asked = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
-            acks = [asked, connection.ping(), connection.unsubscribe(names)]
+            answer = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
+            acks = [answer, connection.ping(), connection.unsubscribe(names)]
         for ack in acks:
             ack.wait(deadline - time.monotonic())
 
@@ -225,7 +225,7 @@ class MqttTransport(Transport):
             stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
 
     def _run_connection(self, run: _Run) -> None:
-        """Run one connection from its start to its end; raises Lost unless it ends by `close`."""
+        """Run one connection from its start to its end. Raises Lost unless `close` has ended it."""
         self._dialler.begin()
         connection = self._dialler.connect(self, self.counters, run.stopping)
         run.renewal = ""
@@ -266,7 +266,7 @@ class MqttTransport(Transport):
             raise
 
     def _note_loss(self, connection: Connection, lost: Lost) -> None:
-        """Note which messages the broker may have closed the connection for."""
+        """Note the messages for which the broker may have closed the connection."""
         written = None if isinstance(lost, Silent) else connection.written_before_loss()
         with self._publishing:
             self._refused.note_loss(connection.where, written, time.monotonic())
@@ -285,29 +285,29 @@ class MqttTransport(Transport):
         self._dialler.reported = limits
 
     def _synchronize(self, connection: Connection, stopping: threading.Event) -> None:
-        """Query which of our retained messages the broker has, subscribe, and send those that it lacks."""
+        """Ask which of our retained messages the broker has, subscribe, and send those that it lacks."""
         self._renew()
         self._own_message_filter.begin()
         if self._dialler.stalled:
             self._let_catch_up(connection, stopping)
-        known = self._query_own(connection, stopping)
+        known_topics = self._query_own(connection, stopping)
         with self._filters.lock:
             self._connection = connection
             subscribed = connection.subscribe([(filter_, self._no_local(filter_)) for filter_ in self._filters])
             copied = connection.ping()
         self._await(connection, subscribed, stopping, self._deliver_all)
         self._await(connection, copied, stopping, self._deliver_all)
-        self._initial_sync(known)
+        self._initial_sync(known_topics)
 
     def _let_catch_up(self, connection: Connection, stopping: threading.Event) -> None:
         """Wait before subscribing, because a broker that was suspended first forwards old messages of others."""
         end = time.monotonic() + _CATCH_UP_S
-        while not stopping.is_set() and (left := end - time.monotonic()) > 0:
-            connection.pump(left, ignore)
+        while not stopping.is_set() and (remaining_s := end - time.monotonic()) > 0:
+            connection.pump(remaining_s, ignore)
         self._dialler.stalled = False
 
     def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
-        """Return own topics that need not be sent again: the broker has our newest message, or others publish there.
+        """Return the own topics that need not be sent again: the broker has our newest value, or one by others.
 
         Also sets ``went_back``. The messages have arrived when a ping is answered, because they have QoS 0.
         """
@@ -343,7 +343,7 @@ class MqttTransport(Transport):
         return retained
 
     def _accepts(self, connection: Connection, message: Message) -> bool:
-        """True if the broker takes this retained message, as far as is known."""
+        """True if the broker accepts this retained message, as far as is known."""
         return connection.takes(message) and self._refused.accepts(message)
 
     def _await(
@@ -360,10 +360,10 @@ class MqttTransport(Transport):
             since, answer_s = max(asked_at, connection.incoming.age.arriving_at), _ANSWER_S
             if connection.pings.is_thin:
                 since, answer_s = max(since, connection.incoming.answered_at), connection.pings.silence_limit_s
-            left = since + answer_s - clock.since_boot()
-            if left < 0:
+            remaining_s = since + answer_s - clock.since_boot()
+            if remaining_s < 0:
                 raise Silent(f"{connection.where} does not answer")
-            connection.pump(left, receive)
+            connection.pump(remaining_s, receive)
 
     def _deliver_all(self, messages: list[Message]) -> None:
         subscriptions = self._subscriptions

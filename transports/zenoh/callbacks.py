@@ -1,19 +1,19 @@
-"""Makes Zenoh callbacks of functions by ``direct(f)``: they run on the thread that receives, which is the fastest way.
+"""Makes Zenoh callbacks by ``direct(f)``: they run on the thread that receives, which is the fastest way.
 
-Two things about these threads are looked after.
+Two problems of these threads, which are Rust's, are solved here.
 
-They keep Python's state. Zenoh's threads are Rust's. For each callback Python makes such a thread a state, with memory
-of its own from the kernel, and frees it afterwards: an mmap, an munmap and the faults of new pages for each message
-(Python 3.11), 5 % of what one costs. A state that was asked for once more than it is given back stays
-(PyGILState_Ensure of Python's C API), also when its thread ends: some 17 KB. Zenoh has a few threads for all sessions
-of a process, and seldom a new one (forty sessions, one after the other: five); so that no number of them matters, only
-the first ones keep it.
+1. Python's state. For each callback Python makes a state for such a thread, with memory from the kernel, and frees it
+afterwards: an mmap, an munmap and the faults of new pages for each message (Python 3.11), 5 % of its cost. If the state
+is requested once more than it is released (PyGILState_Ensure of Python's C API), it stays, also when its thread ends:
+some 17 KB. Zenoh has a few threads for all sessions of a process, and seldom a new one (forty sessions, one after the
+other: five). Even so, only the first threads keep their state.
 
-They are relieved. One of these threads at a time waits for all sockets. It runs the callbacks of what has come itself,
-and no other one waits meanwhile unless it is given something to do. A callback that has to wait, for room for what it
-publishes or for another thread that waits for room, would wait until Zenoh closes that connection: it does not notice
-that there is room again. So where a callback takes long, a guard lets another of Zenoh's threads do something. Measured
-with 1.10.2: of 2,000 messages of 1 KB that a callback publishes 1,000 are lost without it, and none with it.
+2. Blocking. One of these threads at a time waits for all sockets. It runs the callbacks itself, and meanwhile no other
+thread waits for the sockets unless it is given something to do. A callback that has to wait, for room for its own
+message or for another thread that waits for room, would wait until Zenoh closes that connection, because no thread
+notices that there is room again. So where a callback takes long, a guard gives another of Zenoh's threads something to
+do. Measured with 1.10.2: of 2,000 messages of 1 KB that a callback publishes 1,000 are lost without the guard, and none
+with it.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ ensure_state = ctypes.pythonapi.PyGILState_Ensure
 
 
 class Calls:
-    """Counters of one thread: callbacks begun, callbacks ended, and the number begun that the guard saw last."""
+    """Counters of one thread: callbacks begun, callbacks ended, and the number begun when the guard last looked."""
 
     __slots__ = ("begun", "ended", "known", "ran")
 
@@ -52,7 +52,7 @@ class Calls:
 
 
 class Guard:
-    """A watch for callbacks that take long: it has another of Zenoh's threads wait for the sockets in their place."""
+    """A watch for callbacks that take long: it makes another of Zenoh's threads wait for the sockets instead."""
 
     def __init__(self) -> None:
         self.rests = True
@@ -64,17 +64,17 @@ class Guard:
         self._sessions: list[zenoh.Session] = []
 
     def use(self, session: zenoh.Session) -> None:
-        """Note a session by which a thread can be given work. Any session will do, as all share Zenoh's threads."""
+        """Remember a session, through which a thread can be given work. Any session does: all share Zenoh's threads."""
         with self._lock:
             self._sessions.append(session)
 
     def forget(self, session: zenoh.Session) -> None:
-        """Forget a session, before it is closed, because a reference would keep its memory and files."""
+        """Forget a session before it is closed: a reference would keep its memory and files."""
         with self._lock:
             self._sessions = [other for other in self._sessions if other is not session]
 
     def watch(self, calls: Calls) -> bool:
-        """Look after a thread; False if there are too many."""
+        """Watch a thread's callbacks; False if there are too many threads."""
         with self._lock:
             if len(self._calls) >= MOST:
                 return False
@@ -109,7 +109,7 @@ class Guard:
             self.rests, quiet = False, 0
 
     def _look(self) -> bool:
-        """Look for callbacks, and help if one takes long; True if any has begun since the last look, or still runs."""
+        """Help if a callback takes long; True if any has begun since the last check, or still runs."""
         active = self._suspects = False
         for calls in self._calls:
             begun, runs = calls.begun, calls.begun != calls.ended
@@ -140,7 +140,7 @@ use, forget = guard.use, guard.forget
 
 
 def _begin() -> Calls:
-    """Note the first callback on this thread, and return the count of its callbacks."""
+    """Note the first callback on this thread; return the thread's counters."""
     calls = _own.calls = Calls()
     # A thread of Python's has its state, and waits for no sockets: it publishes to a handler of its own session.
     if isinstance(threading.current_thread(), threading._DummyThread) and guard.watch(calls):
@@ -149,9 +149,9 @@ def _begin() -> Calls:
 
 
 def direct(function: Callable[[Any], None], at_end: Callable[[], None] | None = None) -> zenoh.handlers.Callback[Any]:
-    """Return a callback that runs on Zenoh's receiving thread; by default Zenoh queues, and then blocks that thread.
+    """Return a callback that runs on Zenoh's receiving thread. By default Zenoh queues, and may then block that thread.
 
-    ``at_end`` is called when nothing can come any more.
+    ``at_end`` is called when no more calls can come.
     """
 
     def run(received: Any) -> None:

@@ -1,4 +1,4 @@
-"""The messages of one client to the hub: its will, its retained messages, and queries for those of all."""
+"""The messages of a client to the hub: its will, its retained messages, and queries for retained messages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GOODBYE_S = 0.3  # the longest wait for an answer when closing
 
 
 class HubConnection:
-    """The connection to a hub; a new one begins each time `watch` sees a hub. ``name`` names this client's session."""
+    """The connection to a hub. Each hub that `watch` sees begins a new one. ``name``: this client's session."""
 
     def __init__(
         self, client_id: str, will: Message | None, own: OwnRetained, count: Callable[[], object], account: str = ""
@@ -39,7 +39,7 @@ class HubConnection:
         self._connection = 0
 
     def open(self) -> None:
-        """Begin a connection: the client is opened, or opened again."""
+        """Begin a connection for a client that was opened, perhaps again."""
         self.name, self.watch = "", HubWatch()
 
     def renew(self) -> None:
@@ -49,7 +49,7 @@ class HubConnection:
     # -- sending
 
     def put(self, session: zenoh.Session, message: Message, *, again: bool) -> None:
-        """Send a retained message to the hub, before the live one: a subscription made in between gets one of the two.
+        """Send a retained message to the hub, before the live one, so that a subscription in between gets one of them.
 
         ``again``: the message was published before, and running siblings have it.
         """
@@ -66,19 +66,19 @@ class HubConnection:
         session.put(wire.RETAINED + topic_to_key(message.topic), message.payload, attachment=stamp.pack(), **wire.BLOCK)
 
     def put_removals(self, session: zenoh.Session, topics: Iterable[str]) -> None:
-        """Send the removals of those of ``topics`` that we have removed, once more."""
+        """Send again the removals of those of ``topics`` that this client has removed."""
         for topic in [topic for topic in topics if topic in self._removed]:
             self._put(session, Message(topic, b"", QoS.DELIVERED, retain=True), self.retained_count)
 
     # -- queries
 
     def hello(self) -> bytes:
-        """Return a hello, with our will and digests of our retained messages."""
-        gone: dict[str, int | None] = {topic_to_key(topic): None for topic in self._removed}
+        """Return a hello message with our will and the digests of our retained messages."""
+        removals: dict[str, int | None] = {topic_to_key(topic): None for topic in self._removed}
         retained: dict[str, int | None] = {
             topic_to_key(topic): wire.digest(message.payload) for topic, message in self._own.items() if message.payload
         }
-        return wire.encode(wire.Hello(self.name, self.retained_count, self._will, gone | retained))
+        return wire.encode(wire.Hello(self.name, self.retained_count, self._will, removals | retained))
 
     def greet(self, session: zenoh.Session, hello: bytes, timeout: float) -> set[str] | None:
         """Send a hello; return the topics that the hub lacks, or None if no hub answers in time."""
@@ -86,11 +86,11 @@ class HubConnection:
         return None if answer is None else {key_to_topic(key) for key in wire.decode_keys(answer)}
 
     def leave(self, session: zenoh.Session) -> None:
-        """Have the hub forget our will."""
+        """Tell the hub to forget our will."""
         wire.ask(session, wire.asked(wire.BYE, self._account), wire.encode(self.name), GOODBYE_S)
 
     def fetch(self, session: zenoh.Session, subscriptions: Iterable[Subscription], counts: dict[str, int]) -> None:
-        """Query retained messages and wait for them, so that none comes after messages published later.
+        """Ask for retained messages and wait for them, so that none arrives after messages published later.
 
         ``counts``: how many retained messages each sibling has sent; the hub answers once it has received those.
         """

@@ -1,4 +1,4 @@
-"""A transport's own messages on the way to its own direct handlers."""
+"""Delivers a transport's own messages to its own direct handlers."""
 
 import threading
 

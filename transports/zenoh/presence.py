@@ -21,7 +21,7 @@ _LOST_SESSIONS_LIMIT = 1000  # sessions whose return would be noticed
 
 
 class HubView(msgspec.Struct, frozen=True):
-    """The hubs that are there. ``version`` changes with every event, ``connection`` only when a hub appears."""
+    """The hubs that are present. ``version`` changes with every event, ``connection`` only when a hub appears."""
 
     version: int
     connection: int
@@ -29,7 +29,7 @@ class HubView(msgspec.Struct, frozen=True):
 
 
 class HubWatch:
-    """A watch for hubs, and for connections that were down. Level-triggered: a waiter gets the newest view."""
+    """A watch for hubs, and for connections that were interrupted. A waiter always gets the newest view."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -49,7 +49,7 @@ class HubWatch:
         session.info.declare_transport_events_listener(connections, history=True)
 
     def wait(self, seen: int, timeout: float | None) -> HubView | None:
-        """Wait at most ``timeout`` seconds for a version that is not ``seen``, and return the view; None if closed."""
+        """Return the view once its version is not ``seen``, or after ``timeout`` seconds; None if closed."""
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._view.version != seen, timeout)
             return None if self.closed else self._view
@@ -72,7 +72,7 @@ class HubWatch:
                 self._change(hubs=self._view.hubs - {name})
 
     def _on_connection(self, event: zenoh.TransportEvent) -> None:
-        """Note a session that comes back under its id: it was running, and we have missed its messages."""
+        """Note that a session has come back under its id: it was running, and we have missed its messages."""
         session = str(event.transport.zid)
         with self._changed:
             if event.kind == zenoh.SampleKind.DELETE:
@@ -111,19 +111,19 @@ class Barrier:
     def synchronize(self, expected: Callable[[], dict[str, str]], timeout: float) -> dict[str, int]:
         """Wait up to ``timeout`` seconds for all ``expected`` siblings (name to a description for logs).
 
-        Returns how many retained messages each of them has sent, by name.
+        Return how many retained messages each of them has sent, by name.
         """
         end = time.monotonic() + timeout
         pause, longest = _PAUSE_S
         answers: dict[str, int] = {}
-        while wanted := self._missing(expected(), answers):
-            left = end - time.monotonic()
-            if left <= 0:
-                names = ", ".join(sorted(wanted.values()))
+        while missing := self._missing(expected(), answers):
+            remaining_s = end - time.monotonic()
+            if remaining_s <= 0:
+                names = ", ".join(sorted(missing.values()))
                 log.warning("%s did not answer within %.1f s and will not be waited for again", names, timeout)
-                self._silent |= wanted.keys()
+                self._silent |= missing.keys()
                 break
-            if not self._ask(set(wanted), answers, left):
+            if not self._ask(set(missing), answers, remaining_s):
                 time.sleep(pause)
                 pause = min(2 * pause, longest)
         self._silent -= set(answers)
@@ -134,7 +134,7 @@ class Barrier:
 
     def _ask(self, wanted: set[str], answers: dict[str, int], left: float) -> bool:
         done = threading.Event()
-        asked = wanted if self._by_name else ["*"]
+        names = wanted if self._by_name else ["*"]
         ended: list[None] = []
 
         def take(reply: zenoh.Reply) -> None:
@@ -145,10 +145,10 @@ class Barrier:
 
         def end() -> None:
             ended.append(None)
-            if len(ended) == len(asked):
+            if len(ended) == len(names):
                 done.set()
 
-        for name in asked:
+        for name in names:
             self._session.get(
                 SYNC + name,
                 zenoh.handlers.Callback(take, end, indirect=False),

@@ -17,7 +17,7 @@ _V = TypeVar("_V")
 
 
 class Publishers:
-    """A declared Zenoh publisher for each topic of this client, up to a number.
+    """The declared Zenoh publishers of this client, one for each topic, up to a limit.
 
     ``is_invented(topic)`` is True for topics that strangers chose: no publisher is declared for these.
     """
@@ -43,7 +43,7 @@ class Publishers:
             self.thread = 0
 
     def put_late(self, session: zenoh.Session, message: Message) -> None:
-        """Send a retained message that others have missed; this client itself finds it at the hub."""
+        """Send a retained message that others have missed. This client gets it from the hub."""
         treatment = wire.TREATMENTS[message.qos, self._urgent.get(message.topic, False)]
         stamp = wire.pack_live(message.qos, retain_requested=message.retain)
         key, others = topic_to_key(message.topic), zenoh.Locality.REMOTE

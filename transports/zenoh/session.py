@@ -1,4 +1,4 @@
-"""Configures, opens and closes the Zenoh sessions of a robot, those of the hub and of its peers alike.
+"""Configures, opens and closes the Zenoh sessions of a robot, both the hub's and its peers'.
 
 Zenoh's defaults are not used: they listen on all interfaces and join multicast groups.
 """
@@ -56,7 +56,7 @@ def unix_endpoint(path: Path) -> str:
 
 
 def _numbered(endpoint: str) -> str:
-    """Return an endpoint with the number of a network card in place of its name, which Zenoh does not know."""
+    """Return an endpoint with a network card's number in place of its name, which Zenoh does not accept."""
     start, zone, rest = endpoint.partition("%")
     name, bracket, port = rest.partition("]")
     try:
@@ -86,7 +86,7 @@ def session_config(
 
 
 def open_session(config: str) -> zenoh.Session:
-    """Open a session. Raises ZError if that fails now, TransportError in a process forked from one with a session."""
+    """Open a session. Raises ZError if that fails now, TransportError if this process was forked with a session."""
     _refuse_fork()
     # Read once, before the first session; here, because a forked service has another environment than this module's.
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
@@ -162,7 +162,7 @@ def _tls(tls: TlsSettings | None) -> dict[str, Any]:
 
 
 def _access_control(names: tuple[str, ...] | None) -> dict[str, Any]:
-    """Let connections of this machine do everything, and those whose certificate has one of ``names``.
+    """Return rules that permit everything to this machine and to certificates with one of ``names``.
 
     Zenoh does not refuse the others, but drops all that they send, and sends them nothing.
     """
@@ -189,7 +189,7 @@ _registered = False
 
 
 def _refuse_fork() -> None:
-    """Raise in a forked child: a session is dead there without an error, and opening a new one hangs for ever."""
+    """Raise TransportError in a forked child: its session is dead without an error, and another would hang for ever."""
     global _opened_by
     check_process(_opened_by)
     _opened_by = os.getpid()
@@ -202,7 +202,7 @@ def check_process(opened_by: int | None) -> None:
 
 
 def close_at_exit(owner: _Closable) -> None:
-    """Close ``owner`` before the interpreter waits for threads: a live callback would hang the exit for ever (T17).
+    """Close ``owner`` before the interpreter waits for threads: a live callback would block the exit for ever (T17).
 
     ``atexit`` is too late for that, so this uses what concurrent.futures uses.
     """

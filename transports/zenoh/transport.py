@@ -109,7 +109,7 @@ class ZenohTransport(Transport):
             presence.ready()
 
     def _start_client(self) -> bool:
-        """Try until a hub answers: a session in client mode cannot open without one."""
+        """Try until a hub answers, without which a session in client mode cannot open; True if it has opened."""
         account = self.settings.account
         hub = [] if self.settings.connect else [self.settings.run_dir / HUB_SOCKET]
         config = session_config(self.settings, "client", listen=[], connect=hub)
@@ -171,19 +171,19 @@ class ZenohTransport(Transport):
     def _run(self) -> None:
         if self.settings.client and not self._start_client():
             return
-        seen, linked = 0, 0  # version of the newest view handled; its connection that works, 0: none
+        version, linked = 0, 0  # version of the newest view handled; its connection that works, 0: none
         self._wait_for_siblings_once()
         watch = self._hub.watch
-        while (view := watch.wait(seen, _RETRY_S if watch.hubs and not linked else None)) is not None:
+        while (view := watch.wait(version, _RETRY_S if watch.hubs and not linked else None)) is not None:
             try:
-                linked = self._follow(view, seen, linked)
+                linked = self._follow(view, version, linked)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 if self._hub.watch.closed:
                     return
                 log.exception("%s: unexpected failure of the connection to the hub", self.client_id)
                 linked = 0
                 self._hub.watch.wait_closed(HUB_ANSWER_S)
-            seen = view.version
+            version = view.version
 
     def _synchronize(self, timeout: float) -> dict[str, int]:
         """Wait until all siblings know our declarations; return how many retained messages each has sent."""
@@ -204,7 +204,7 @@ class ZenohTransport(Transport):
         self._opened.set()
 
     def _follow(self, view: HubView, seen: int, linked: int) -> int:
-        """Process a change of hubs or connections; return the hub connection that works now, 0 for none."""
+        """Process a change of hubs or connections; return the number of the working hub connection, 0 for none."""
         if not view.hubs:
             self.problem = f"the hub of {self.settings.run_dir} is away"
             self._set_state(State.CONNECTING)
@@ -216,7 +216,7 @@ class ZenohTransport(Transport):
         return linked
 
     def _connect_hub(self) -> bool:
-        """Send the hub our will and what it lacks, and query its retained messages."""
+        """Send our will and missing messages to the hub, and ask for its retained messages."""
         session = self._session
         self._set_state(State.CONNECTING)
         if session is None or not self._send_hello(session):
@@ -228,13 +228,13 @@ class ZenohTransport(Transport):
         return True
 
     def _send_hello(self, session: zenoh.Session) -> bool:
-        """Store the will at the hub and send messages that it lacks, until it lacks none that it has room for."""
+        """Store our will at the hub, and send messages until it lacks none that it has room for."""
         end = time.monotonic() + HUB_ANSWER_S
         sent: set[str] = set()
-        while (left := end - time.monotonic()) > 0:  # looked at once: Zenoh refuses what is not positive
+        while (remaining_s := end - time.monotonic()) > 0:  # looked at once: Zenoh refuses what is not positive
             with self._publishing:  # which takes a moment on a busy machine
                 hello = self._hub.hello()
-            lacking = self._hub.greet(session, hello, left)
+            lacking = self._hub.greet(session, hello, remaining_s)
             if lacking is None:
                 return False
             if not self._send_lacking(session, lacking - sent):  # it had no room for what it lacks again
@@ -254,7 +254,7 @@ class ZenohTransport(Transport):
             return owed
 
     def _refresh(self) -> None:
-        """Query all retained messages, as on a new connection, because connections have been down."""
+        """Ask for all retained messages, as on a new connection, because connections were interrupted."""
         with self._connecting:
             if self._session is None:
                 return

@@ -1,8 +1,8 @@
-"""The protocol between a robot's Zenoh sessions besides payloads: keys, stamps and the queries to the hub.
+"""The protocol between a robot's Zenoh sessions, apart from payloads: keys, stamps and queries to the hub.
 
 A live message carries its quality, whether it was published with retain, and when it was sent. A retained message is
-sent under ``@retain/`` with the name of the session that wrote it, and how many such it had sent by then. ``@`` chunks
-match no wildcard, so no ordinary subscription receives these.
+sent under ``@retain/`` with the name of the session that wrote it, and how many such messages it had sent by then.
+``@`` chunks match no wildcard, so no ordinary subscription receives these.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ since_boot_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_BOO
 
 
 class LiveStamp(msgspec.Struct, frozen=True):
-    """The attachment of a live message; ``sent_ns`` counts since ``boot``, both are 0 if it has none."""
+    """The attachment of a live message; ``sent_ns`` counts since ``boot``. Both are 0 if the message has none."""
 
     qos: QoS
     retain_requested: bool | None
@@ -79,7 +79,7 @@ def pack_live(qos: QoS, *, retain_requested: bool) -> bytes:
 
 
 def read_live(attachment: zenoh.ZBytes | None) -> LiveStamp:
-    """Read a stamp; messages of other programs have none."""
+    """Return the stamp of a live message; an empty one for messages of other programs."""
     data = b"" if attachment is None else attachment.to_bytes()
     if len(data) != _LIVE.size:
         return LiveStamp(QoS.LATEST, None, 0, 0)
@@ -88,10 +88,10 @@ def read_live(attachment: zenoh.ZBytes | None) -> LiveStamp:
 
 
 class Stamp(msgspec.Struct, frozen=True):
-    """The origin of a retained message. ``retained_count`` 0: it was sent again, or made by the hub.
+    """The origin of a retained message. ``retained_count`` 0: it was sent again, or the hub made it.
 
-    Both are believed, because a hub is not told from which session a message has come. A client that may retain on a
-    topic can therefore have a session pass over its message, or a query answered half a second too early.
+    The fields are not checked, because a hub is not told from which session a message has come. A client that may
+    retain on a topic can therefore have a session pass over its message, or a query answered half a second too early.
     """
 
     qos: QoS
@@ -112,7 +112,7 @@ class Stamp(msgspec.Struct, frozen=True):
 
 
 class Will(msgspec.Struct, frozen=True, array_like=True):
-    """The will of a client. Its id ``client`` stays the same over restarts, unlike the name of its session."""
+    """The will of a client. Its id ``client`` stays the same after a restart, unlike the name of its session."""
 
     topic: str
     payload: bytes
@@ -126,9 +126,9 @@ class Will(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Hello(msgspec.Struct, frozen=True, array_like=True):
-    """The message with which a client begins. ``own`` has a digest for each key that it retains, None for removed ones.
+    """The first message of a client. ``own`` has a digest for each key that it retains, None for a removed key.
 
-    A field may be added at the end: msgspec skips what it does not know.
+    A field may be added at the end: msgspec skips unknown ones.
     """
 
     name: str
@@ -151,7 +151,7 @@ def asked(what: str, account: str) -> str:
 
 
 def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> bytes | None:
-    """Send a query and return the answer of the hub; None if none comes within ``timeout`` seconds.
+    """Send a query to the hub, and return its answer; None if none comes within ``timeout`` seconds.
 
     Where a hub has just died, the query ends for others long after the next hub has answered it.
     """
@@ -174,7 +174,7 @@ def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> byt
 
 
 def account_of(key: str, what: str) -> str:
-    """Return the account that asks the hub; empty: this machine. Raises ValueError for what no account asks."""
+    """Return the account in a query's key; empty: this machine. Raises ValueError for what no account may send."""
     account = key.removeprefix(what).removeprefix("/")
     if not key.startswith(what) or "*" in account or "/" in account or OF in account:
         raise ValueError(f"{key} is no query of an account")

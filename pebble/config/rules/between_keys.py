@@ -57,7 +57,7 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
 
 
 def _transport(reader: Reader, transport: TransportSection, path: Path) -> TransportSection:
-    """Check the encryption of a Zenoh robot that other machines reach: certificates decide who may connect."""
+    """Check that a Zenoh robot which other machines reach is encrypted: certificates decide who may connect."""
     encrypted = next((endpoint for endpoint in transport.listen if endpoint.startswith(_TLS)), None)
     if transport.allowed_names is not None and not any(
         endpoint.startswith(_TLS) for endpoint in (*transport.listen, *transport.connect)
@@ -104,9 +104,9 @@ def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
 
 
 def _without_uplink(notes: Notes, root: Root) -> Root:
-    """Let a bridge without a remote host, as in the original's examples, use the robot's own broker.
+    """Return ``root`` with the robot's own broker as the bridge's remote broker, if no remote host is set.
 
-    Operators connect to that broker. A Zenoh robot has none, and runs without a bridge.
+    In the original's examples, operators connect to that. A Zenoh robot has no broker, and runs without a bridge.
     """
     bridge, transport = root.services.mqtt_bridge, root.transport
     if not bridge.enabled or bridge.remote_mqtt.host or (bridge.remote is not None and bridge.remote.kind != "mqtt"):
@@ -178,14 +178,14 @@ def _tls(reader: Reader, tls: Tls, path: Path) -> Tls:
 
 
 def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
-    given = [key for key in ("password", "password_file", "password_env") if getattr(mqtt, key) is not None]
-    if len(given) > 1:
-        reader.notes.problem((*path, given[1]), f"is a second password beside {given[0]}, leave one of them")
+    keys = [key for key in ("password", "password_file", "password_env") if getattr(mqtt, key) is not None]
+    if len(keys) > 1:
+        reader.notes.problem((*path, keys[1]), f"is a second password beside {keys[0]}, leave one of them")
         return mqtt
     if mqtt.username is not None and len(mqtt.username.encode()) > _LONGEST_TEXT:
         reader.notes.problem((*path, "username"), f"is longer than MQTT carries, {_LONGEST_TEXT} bytes")
-    if given and mqtt.username is None:
-        reader.notes.warning((*path, given[0]), "is not sent: there is no username")
+    if keys and mqtt.username is None:
+        reader.notes.warning((*path, keys[0]), "is not sent: there is no username")
     password: str | None = mqtt.password
     if mqtt.password_env is not None:
         password = _variable(reader, mqtt.password_env, (*path, "password_env"))
@@ -197,7 +197,7 @@ def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
     if password is None:
         return mqtt
     if len(password.encode()) > _LONGEST_TEXT:
-        reader.notes.problem((*path, *given), f"holds more than MQTT carries, {_LONGEST_TEXT} bytes")
+        reader.notes.problem((*path, *keys), f"holds more than MQTT carries, {_LONGEST_TEXT} bytes")
     return replace(mqtt, password=Secret(password))
 
 

@@ -1,4 +1,4 @@
-"""Checks of the security level: it refuses ways to the robot without a login."""
+"""Checks of the security level: every connection that would let a client in without a login is refused."""
 
 import re
 from collections.abc import Iterator
@@ -66,7 +66,7 @@ def _check_links(notes: Notes, root: Root) -> None:
 
 
 def _endpoints(root: Root) -> Iterator[tuple[Path, str]]:
-    """Return the Zenoh endpoints that lead beyond this machine, with their places in the config."""
+    """Yield the Zenoh endpoints that lead beyond this machine, with their places in the config."""
     return (row for row in zenoh_endpoints(root) if not _is_near(row[1]))
 
 
@@ -84,7 +84,7 @@ def _is_near(endpoint: str) -> bool:
 
 
 def _check_sides(notes: Notes, root: Root) -> None:
-    """Refuse ways past the bridge, which checks the names at the level ``named``."""
+    """Refuse connections that bypass the bridge: at the level ``named`` only the bridge checks the names."""
     bridge, transport = root.services.mqtt_bridge, root.transport
     why = 'at security.level "named" the bridge checks names'
     if not bridge.enabled:
@@ -104,5 +104,5 @@ def _check_sides(notes: Notes, root: Root) -> None:
 
 
 def place_of(mqtt: Mqtt) -> tuple[str, int]:
-    """Return host and port of a broker; "" for every name of this machine."""
+    """Return host and port of a broker; the host is "" for every name of this machine."""
     return ("" if is_loopback(mqtt.host) else mqtt.host), mqtt.port

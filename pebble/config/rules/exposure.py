@@ -1,4 +1,4 @@
-"""Warnings of ways in which others can read or overhear a secret of a config."""
+"""Warnings about secrets of a config that other users can read, or that can be overheard."""
 
 import os
 import stat
@@ -35,7 +35,7 @@ def warn_of_logins_in_clear(notes: Notes, root: Root) -> None:
 
 
 def warn_of_known_id(notes: Notes, root: Root) -> None:
-    """Warn of a client id in the config: another account could log in with it, which ends the robot's connection."""
+    """Warn of a client id in the config: another client that logs in with it ends the robot's connection."""
     bridge = root.services.mqtt_bridge
     path = ("services", "mqtt_bridge", "remote_mqtt", "client_id")
     if root.security.level != "open" and bridge.enabled and bridge.remote is None and bridge.remote_mqtt.client_id:

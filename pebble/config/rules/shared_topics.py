@@ -1,4 +1,4 @@
-"""Renamed topics in a config, and two channels that share one."""
+"""Topics that the config renames, and topics that two channels share."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -12,7 +12,7 @@ _SERIAL = ("services", "serial_mcu_bridge")
 
 
 def shared_topics(root: Root) -> Iterator[tuple[Path, Channel]]:
-    """Yield each key whose topic belongs to another channel, too, with that channel.
+    """Yield each key whose topic also belongs to another channel, with that channel.
 
     Several serial lines may share the topics of one channel: all of them obey a drive command.
     """
@@ -39,7 +39,7 @@ def renamed_commands(root: Root) -> Iterator[tuple[Path, str]]:
 
 
 def _keys(channel: Channel, root: Root) -> Iterator[tuple[Path, str | None]]:
-    """Yield the keys that may rename the channel, one for each serial line, and its topic there; None: not renamed."""
+    """Yield each key that may rename the channel, with its topic, or None if it is not set; one per serial line."""
     if channel.override is None:
         yield (), None
         return

@@ -1,4 +1,4 @@
-"""Calibration: the wheels of a robot by straight runs and spins, its camera by pictures of a tag."""
+"""Calibration of a robot: its wheels by straight runs and spins, its camera by pictures of a tag."""
 
 from pebble.extension import Command, Extension
 

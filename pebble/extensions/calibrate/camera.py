@@ -1,4 +1,4 @@
-"""The calibration of a camera by pictures of one tag, held in all parts of the picture, near and far."""
+"""Calibrates a camera by pictures of one tag, held in all parts of the picture, near and far."""
 
 from collections.abc import Iterable, Iterator
 from itertools import chain
@@ -35,7 +35,7 @@ class Lens(NamedTuple):
 
 
 def view_of(tag: Tag, size: tuple[int, int]) -> View | None:
-    """Return the place of a tag in a picture of this size; None: it is too small."""
+    """Return the place of a tag in a picture of this size; None if the tag is too small in it."""
     width, height = size
     share = tag.area / (width * height)
     if share < LEAST_SHARE:
@@ -50,9 +50,9 @@ def collect(
 ) -> tuple[list[Floats], tuple[int, int]]:
     """Return the corners of the tag in up to 27 different places, and the width and height of the pictures.
 
-    ``still``: every picture counts; otherwise the tag has to rest, and 15 places that are well spread suffice.
+    ``still``: every picture counts. Otherwise the tag must be at rest, and 15 well-spread places are enough.
     """
-    taken: dict[View, Floats] = {}
+    by_view: dict[View, Floats] = {}
     size, resting = (0, 0), 0
     before: Floats | None = None
     for picture in pictures:
@@ -64,20 +64,20 @@ def collect(
         rests = before is not None and float(np.abs(tag.corners - before).max()) < _STILL_PX
         resting, before = resting + 1 if rests else 0, tag.corners
         view = view_of(tag, size) if still or resting >= _STILL_PICTURES else None
-        if view is None or view in taken:
+        if view is None or view in by_view:
             continue
-        taken[view] = tag.corners
-        missing = [name for names in (_ROWS, _COLUMNS, _DISTANCES) for name in names if name not in {*chain(*taken)}]
+        by_view[view] = tag.corners
+        missing = [name for names in (_ROWS, _COLUMNS, _DISTANCES) for name in names if name not in {*chain(*by_view)}]
         person.tell(
-            f"{len(taken)} of {LEAST_PICTURES}: {' '.join(view)}; next: {', '.join(missing) or 'another place'}"
+            f"{len(by_view)} of {LEAST_PICTURES}: {' '.join(view)}; next: {', '.join(missing) or 'another place'}"
         )
-        if not still and len(taken) >= LEAST_PICTURES and not missing:
+        if not still and len(by_view) >= LEAST_PICTURES and not missing:
             break
-    return list(taken.values()), size
+    return list(by_view.values()), size
 
 
 def solve(corners: list[Floats], size: tuple[int, int], size_m: float) -> Lens:
-    """Return the camera. Raises PebbleError for too few pictures, or an error of more than a pixel."""
+    """Return the calibrated camera. Raises PebbleError for too few pictures, or an error of more than a pixel."""
     import cv2
 
     if len(corners) < LEAST_PICTURES:
@@ -116,7 +116,7 @@ def save(path: Path, lens: Lens, tag_id: int, size_m: float, family: str) -> Non
 
 
 def read_folder(folder: Path) -> Iterator[Any]:
-    """Yield the pictures of a folder, by their names. Raises PebbleError for pictures of several sizes, or none."""
+    """Yield the pictures of a folder in the order of their names. PebbleError for none, or different sizes."""
     import cv2
 
     shape: tuple[int, ...] | None = None
@@ -135,6 +135,6 @@ def read_folder(folder: Path) -> Iterator[Any]:
 
 
 def tape_line(lens: Lens, size_m: float) -> str:
-    """Return a sentence by which a tape shows whether the calibration is right."""
+    """Return a sentence that tells how to check the calibration with a tape measure."""
     wide = lens.matrix[0, 0] * size_m
     return f"check it: where the black square is {wide:.0f} pixels wide, a tape from the lens to it reads 1.00 m"

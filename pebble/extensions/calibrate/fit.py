@@ -1,4 +1,4 @@
-"""The least-squares fit of two wheels to straight runs and spins: millimetres per step of each, and the track."""
+"""Fits two wheels to straight runs and spins by least squares: millimetres per step of each, and the track."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ LIMIT_SIGMA = 3.0  # a run with a larger residual is repeated
 
 
 class Run(NamedTuple):
-    """A run: the counted steps of both wheels, reverse negative, and how the robot has really moved."""
+    """A run: the counted steps of both wheels (reverse negative), and the robot's true movement."""
 
     name: str
     left: float
@@ -23,7 +23,7 @@ class Run(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """The errors of the truth, rms."""
+    """The rms errors of the measured truth."""
 
     mm: float
     straight_rad: float
@@ -39,7 +39,7 @@ NOISE = {
 
 
 class Fit(NamedTuple):
-    """The wheels that fit all runs best; ``mm`` and ``sigma`` are the residual of each run and its share of noise."""
+    """The wheels that fit all runs best; ``mm`` and ``sigma``: each run's residual, in mm and relative to the noise."""
 
     left_step_mm: float
     right_step_mm: float
@@ -53,25 +53,26 @@ class Fit(NamedTuple):
 
     @property
     def worst(self) -> int | None:
-        """The run that fits least, if noise does not explain it."""
+        """Index of the run that fits worst, if noise does not explain it; else None."""
         worst = max(range(len(self.sigma)), key=self.sigma.__getitem__)
         return worst if self.sigma[worst] > LIMIT_SIGMA else None
 
 
 def fit(runs: Sequence[Run], noise: Noise, step_mm: tuple[float, float], track_mm: float) -> Fit:
-    """Return the wheels that fit ``runs``, beginning with these lengths.
+    """Return the wheels that fit ``runs``, starting from these lengths.
 
-    A straight gives two equations, its way and its turn; a spin one, its turn. Each is weighted by its noise.
+    A straight run gives two equations, for its way and its turn; a spin gives one, for its turn. Each is weighted by
+    its noise.
     """
     wheels: NDArray[Any] = np.array([*step_mm, track_mm])
     for _ in range(_ITERATIONS):
         differences, slopes = _equations(runs, noise, wheels)
         wheels = wheels + np.linalg.lstsq(slopes, differences, rcond=None)[0]
     differences, _ = _equations(runs, noise, wheels)
-    rest = iter(np.abs(differences))
+    residuals = iter(np.abs(differences))
     sigma, mm = [], []
     for run in runs:
-        way, turn = (0.0 if run.mm is None else float(next(rest))), float(next(rest))
+        way, turn = (0.0 if run.mm is None else float(next(residuals))), float(next(residuals))
         sigma.append(max(way, turn))
         mm.append(math.hypot(way * _way_mm(run, noise), turn * _turn_rad(run, noise, wheels[2]) * wheels[2] / 2))
     left, right, track = map(float, wheels)
@@ -79,7 +80,7 @@ def fit(runs: Sequence[Run], noise: Noise, step_mm: tuple[float, float], track_m
 
 
 def _equations(runs: Sequence[Run], noise: Noise, wheels: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the residual of each equation, divided by its noise, and its derivatives by the three lengths."""
+    """Return the residuals of the equations, divided by the noise, and their derivatives by the three lengths."""
     left_mm, right_mm, track = wheels
     differences, slopes = [], []
     for run in runs:

@@ -1,4 +1,4 @@
-"""The legs of a calibration: the robot drives or spins so far, within limits of way and time, and its steps counted."""
+"""The legs of a calibration: single drives and spins, limited in way and time, whose steps are counted."""
 
 import math
 import queue
@@ -29,7 +29,7 @@ _LOOK_S = 10.0  # for the next picture of it
 
 
 class Counts(NamedTuple):
-    """The steps of both wheels, reverse negative, and the turn by the inertial sensor; None: there is none."""
+    """The steps of both wheels (reverse negative), and the turn by the inertial sensor, None without one."""
 
     left: float
     right: float
@@ -37,9 +37,9 @@ class Counts(NamedTuple):
 
 
 class Legs:
-    """The robot as its calibration drives it. ``expected``: its wheels, as they are believed to be before it.
+    """The robot during its calibration. ``expected``: the lengths of its wheels as assumed before.
 
-    ``mm_s`` is its speed at half power. Every leg raises PebbleError if it is not driven to its end, or Stopped.
+    ``mm_s`` is its speed at half power. Every leg raises PebbleError if it cannot be driven to its end, or Stopped.
     """
 
     def __init__(
@@ -65,11 +65,11 @@ class Legs:
             robot.on(channel, lambda value, take=take, **_: self._inputs.put((take, value, clock())))
 
     def watch(self, finder: TagFinder, tag_id: int) -> None:
-        """Keep this tag in sight in all straight legs, and end spins at it."""
+        """Keep this tag in sight in all straight legs, and end spins when it is ahead."""
         self._finder, self._tag_id = finder, tag_id
 
     def rest(self, seconds: float) -> None:
-        """Let the robot stand. Raises PebbleError if it has no hall sensors, or its wheels turn."""
+        """Let the robot stand. Raises PebbleError if it has no hall sensors, or if its wheels turn."""
         self._wait(_SAMPLES_S, lambda: self._samples > 0)
         if not self._samples:
             key = "services.serial_mcu_bridge.telemetry.publish_touch_sensors"
@@ -81,7 +81,7 @@ class Legs:
             raise PebbleError("its wheels turn although it rests: end what drives it, and begin again")
 
     def straight(self, name: str, mm: float) -> Counts:
-        """Drive ``mm`` by the counts; negative is back."""
+        """Drive ``mm`` by the counts; negative is backwards. Return the counts."""
 
         def ends(counts: Counts) -> bool:
             left, right = self._way_mm(counts)
@@ -93,7 +93,7 @@ class Legs:
         return self._drive(name, (0.0, math.copysign(POWER, mm)), abs(mm) / self._mm_s, ends)
 
     def spin(self, name: str, turns: int) -> Counts:
-        """Spin ``turns`` on the spot, by the counts, and on to the tag if there is one; negative is clockwise."""
+        """Spin ``turns`` on the spot by the counts, and on to the tag if there is one; negative is clockwise."""
         mm = abs(turns) * math.pi * self._expected.track_width_mm
         side = -math.copysign(1.0, turns)
         fast_mm = mm if self._finder is None else mm * _BEFORE_TAG
@@ -136,9 +136,9 @@ class Legs:
         ends: Callable[[Counts], bool],
         late: str = "is it slower than --speed says?",
     ) -> Counts:
-        """Drive until ``ends`` of the counts since the start is true, and wait until the wheels stand.
+        """Drive until ``ends`` is true for the counts since the start, and the wheels stand; return the counts.
 
-        ``late``: what is wrong if that takes too long.
+        ``late``: the reason in the error if that takes too long.
         """
         robot, start = self._robot, self._counts()
         until = self._clock() + MOST * expected_s + 0.5  # motors take a moment to their speed
@@ -155,7 +155,7 @@ class Legs:
         return _difference(start, self._counts())
 
     def _check_sight(self, name: str, *, forward: bool) -> None:
-        """Raise PebbleError if the tag is too near, or was in no picture for half a second."""
+        """Raise PebbleError if the tag is too near, or was seen in no picture for half a second."""
         if self._finder is None:
             return
         place, now = self._sight(), self._clock()
@@ -178,7 +178,7 @@ class Legs:
         return place is not None and abs(place.angle_rad - start.angle_rad) < _AT_TAG_RAD
 
     def _sight(self, max_age: float = 0.3) -> Place | None:
-        """Return where the tag is in a new picture of the last ``max_age`` seconds; None if it is in none."""
+        """Return the place of the tag in a picture of the last ``max_age`` seconds; None if it is in none."""
         assert self._finder is not None  # noqa: S101 - only a calibration with a tag looks
         self._wait(0.01)
         before, picture = self._picture, self._robot.picture(max_age)
@@ -198,7 +198,7 @@ class Legs:
         return Counts(value["left_mm"] / left, value["right_mm"] / right, gyro)
 
     def _wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
-        """Handle what arrives for ``seconds``, or until ``until()`` is true."""
+        """Handle messages for ``seconds``, or until ``until()`` is true."""
         end = self._clock() + seconds
         while self._clock() < end and not until():
             self._robot.sleep(min(0.01, seconds))

@@ -1,4 +1,4 @@
-"""The calibration of the wheels: straights there and back, spins, and a file that wheel odometry uses."""
+"""Calibrates the wheels: straight runs there and back, spins, and a file that wheel odometry uses."""
 
 import math
 import time
@@ -25,7 +25,7 @@ _AHEAD_M = 0.2  # more than the tag's least distance, at the end of a straight
 
 
 class Wanted(Struct, frozen=True, kw_only=True):
-    """The runs that are wanted, and the truth that they are compared with."""
+    """The runs to drive, and the truth with which they are compared."""
 
     truth: Literal["tape", "tag", "gyro"] = "tape"
     length_m: float = 1.5
@@ -46,11 +46,11 @@ class Person(Protocol):
         """Show a line."""
 
     def ask(self, question: str) -> str:
-        """Return what the person types."""
+        """Return the answer that the person types."""
 
 
 class _Movement(NamedTuple):
-    """The movement of a straight run: along its arc, reverse negative; the turn is counter-clockwise."""
+    """The movement of a straight run: its way along the arc (reverse negative), and its counter-clockwise turn."""
 
     mm: float
     turn_rad: float
@@ -78,7 +78,7 @@ def calibrate(robot: Robot, person: Person, wanted: Wanted, clock: Callable[[], 
 
 
 def check(wanted: Wanted) -> None:
-    """Raise PebbleError for too few runs, or an odd number of straights."""
+    """Raise PebbleError for too few runs, or an odd number of straight ones."""
     if wanted.straights < LEAST_STRAIGHTS or wanted.spins < LEAST_SPINS:
         least = f"{LEAST_STRAIGHTS} straights and {LEAST_SPINS} spins"
         raise PebbleError(f"{least} are the least: with fewer the result is twice as wrong")
@@ -184,7 +184,7 @@ class _Session:
         return arc(along, numbers[1] if side else along * math.tan(half))
 
     def _numbers(self, what: str, count: int, plausible: Callable[[list[float]], bool]) -> list[float]:
-        """Ask until ``count`` plausible numbers are typed; return them."""
+        """Ask for ``count`` numbers until they are plausible; return them."""
         while True:
             try:
                 numbers = [float(word) for word in self._person.ask(f"    {what}: ").split()]
@@ -204,13 +204,13 @@ class _Session:
 
 
 def arc(along_mm: float, left_mm: float) -> _Movement:
-    """Return the movement on an arc to a place, measured along and left of the first heading; back is negative."""
+    """Return the movement on an arc to a place, measured along and left of the first heading; backwards is negative."""
     half = math.atan2(math.copysign(1.0, along_mm) * left_mm, abs(along_mm))
     return _along(math.copysign(math.hypot(along_mm, left_mm), along_mm), half)
 
 
 def between(start: Place, end: Place) -> _Movement:
-    """Return the movement between two places of one tag, on an arc."""
+    """Return the movement on an arc between two places from which one tag was seen."""
     (near, right), (far, far_right) = ((_floor(place) * 1000, place.angle_rad) for place in (end, start))
     half = math.atan2(
         near * math.sin(right) - far * math.sin(far_right), near * math.cos(right) + far * math.cos(far_right)

@@ -1,4 +1,4 @@
-"""The engine of all checks: a check as a row of a table, and how such a table is run."""
+"""Checks as rows of a table, and how such a table is run."""
 
 from __future__ import annotations
 

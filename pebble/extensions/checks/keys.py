@@ -18,7 +18,7 @@ def keys_text() -> str:
 
 
 def _chapters(kind: type[Section], path: str, places: dict[type[Section], str]) -> Iterator[str]:
-    """Yield one table per section, depth first; a section class used in several places is described at the first."""
+    """Yield one table per section, depth first. A class that several sections share has one table, at the first."""
     places[kind] = path
     to_describe: list[tuple[type[Section], str]] = []
     rows = []
@@ -43,14 +43,15 @@ def _chapters(kind: type[Section], path: str, places: dict[type[Section], str]) 
 
 
 def _suffix_of(field: FieldInfo) -> str:
-    """Return the text that marks a field of several sections: by name, or in a list."""
+    """Return the text that follows a key with several sections: ``.<name>`` for a table, ``[]`` for a list, or ""."""
     return {dict: ".<name>", tuple: "[]"}.get(get_origin(unwrap(field.type)[0]), "")
 
 
 def _section_of(field: FieldInfo) -> type[Section] | None:
     kind, _ = unwrap(field.type)
-    inner = get_args(kind)[-1] if get_origin(kind) is dict else get_args(kind)[0] if get_origin(kind) is tuple else kind
-    return inner if isinstance(inner, type) and issubclass(inner, Section) else None
+    if get_origin(kind) in (dict, tuple):
+        kind = get_args(kind)[get_origin(kind) is dict]  # of a table's values, or a list's entries
+    return kind if isinstance(kind, type) and issubclass(kind, Section) else None
 
 
 def _meaning(field: FieldInfo) -> str:

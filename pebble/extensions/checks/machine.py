@@ -42,7 +42,7 @@ def synchronised() -> bool | None:
 
 
 def output_of(program: str, *arguments: str, seconds: float = 5.0, **user: Any) -> str:
-    """Return the standard output of a system program, run as ``user``. Raises PebbleError."""
+    """Return a system program's standard output, run as ``user``. Raises PebbleError."""
     command: tuple[str, ...] = (program, *arguments)
     try:
         done = run(command, seconds, cwd="/", **user)
@@ -56,7 +56,7 @@ def output_of(program: str, *arguments: str, seconds: float = 5.0, **user: Any) 
 
 
 def printed(*command: str) -> str:
-    """Return the standard output of a system program; empty if it is not installed or does not end in time."""
+    """Return a system program's standard output; empty if it is not installed or does not end in time."""
     try:
         return output_of(*command)
     except PebbleError:

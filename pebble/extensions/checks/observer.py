@@ -1,4 +1,4 @@
-"""A robot as a client sees it: all that it publishes, and the commands that it is sent."""
+"""An observer of a robot: all messages that it publishes, and commands to it, as one client sees them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _RETAINED_S = 1.0  # some brokers send what is retained a moment after the subsc
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A received message: when it arrived (monotonic) and its value by the contract, or ``wrong``: why it has none."""
+    """A received message: its time of arrival (monotonic), and its value or, in ``wrong``, why it has none."""
 
     at: float
     metric: str  # below the base: ``outgoing/online``
@@ -101,13 +101,13 @@ class Observer:
         return wait_for(holds, seconds)
 
     def look(self, seconds: float) -> float:
-        """Read messages for ``seconds``; return when that began."""
+        """Read messages for ``seconds``; return the time when that began."""
         began = time.monotonic()
         self.wait(lambda: False, seconds)
         return began
 
     def answers(self, condition: Callable[[], object], seconds: float = ANSWER_S) -> bool:
-        """True if ``condition`` comes to hold in the time that a robot has for an answer."""
+        """True if ``condition`` becomes true within the time that a robot has for an answer."""
         began = time.monotonic()
         done = self.wait(condition, seconds)
         if done:
@@ -120,24 +120,24 @@ class Observer:
         return 2 * self._slowest_s
 
     def happens(self, condition: Callable[[], object]) -> bool:
-        """True if ``condition`` comes to hold while a violation of a duty would show."""
+        """True if ``condition`` becomes true within the time in which a breach of a duty would show."""
         return self.wait(condition, self.patience_s)
 
     # -- what is sent
 
     def send(self, channel: c.Channel, value: object) -> float:
-        """Publish a command, as bytes or as its struct; return when (monotonic)."""
+        """Publish a command, as bytes or as its struct; return the time (monotonic)."""
         payload = value if isinstance(value, bytes) else codec.encode(channel, value)
         self.transport.publish(channel.topic(self.base), payload, qos=QoS(channel.default_qos), urgent=True)
         return time.monotonic()
 
     def sent(self, seconds: float) -> float:
-        """Wait until the broker has acknowledged all commands, at most ``seconds``; return when (monotonic)."""
+        """Wait until the broker has acknowledged all commands, at most ``seconds``; return the time (monotonic)."""
         self.wait(lambda: self.transport.outgoing.waiting == 0, seconds)
         return time.monotonic()
 
     def send_as(self, account: str, channel: c.Channel, value: object) -> bool:
-        """Publish a command under another account, "" for none; True if the broker delivers it."""
+        """Publish a command under another account ("": none); True if the broker delivers it."""
         payload = value if isinstance(value, bytes) else codec.encode(channel, value)
         topic = channel.topic(self.base)
         with self.beside("conform-other", f"{self.base}/{c.INCOMING}/#") as (beside, messages):

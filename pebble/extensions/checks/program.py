@@ -23,7 +23,7 @@ class Finished(NamedTuple):
 def run(command: Sequence[str], timeout_s: float, *, stderr: int = subprocess.PIPE, **options: Any) -> Finished:
     """Run a program until it ends, even if children that it leaves behind keep its output open.
 
-    ``options``: further ones of subprocess. Raises OSError and, after killing the program, subprocess.TimeoutExpired.
+    ``options``: more options of subprocess. Raises OSError and, after killing the program, subprocess.TimeoutExpired.
     """
     deadline, nothing = time.monotonic() + timeout_s, subprocess.DEVNULL
     with subprocess.Popen(command, stdin=nothing, stdout=subprocess.PIPE, stderr=stderr, **options) as process:

@@ -110,7 +110,7 @@ def config_of_running(config: Config) -> Iterator[CheckResult]:
 
 
 def operator_page(config: Config) -> Iterator[CheckResult]:
-    """Check that the page that the robot serves can start.
+    """Check that the page which the robot serves can start.
 
     If the page has users, only the robot's own user can check that.
     """

@@ -1,4 +1,4 @@
-"""Fleets: accounts of brokers and people of the operator page, their rights, certificates, the audit, and gateways."""
+"""Fleets: brokers' accounts and the page's people, their rights, certificates, the audit, and gateways."""
 
 from pebble.extension import Command, Extension
 

@@ -1,4 +1,4 @@
-"""Changes of a fleet: writes its table into the files of brokers and hubs, and makes mosquitto reload them."""
+"""Applies changes of a fleet: writes the files of brokers and hubs from its table, and makes mosquitto reload them."""
 
 import os
 import signal
@@ -21,9 +21,8 @@ _STARTING_S = 3.0  # a small board loads many accounts
 def make(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None, others: Sequence[str] = ()) -> None:
     """Write all files of a new fleet. Raises PebbleError.
 
-    ``passwords``: those of its first accounts. ``others``: further machines of the fleet, which the broker's
-    certificate names too and which its authority may sign for. A broker that is ``included`` has its configuration
-    elsewhere.
+    ``passwords``: those of its first accounts. ``others``: more machines of the fleet, which the broker's certificate
+    also names and for which its authority may sign. The configuration of a broker that is ``included`` is elsewhere.
     """
     if (folder / CONF).exists():
         raise FleetError(f"{folder / CONF} exists already: name another folder")
@@ -39,7 +38,7 @@ def make(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None,
 
 
 def names_of(server: Server) -> list[str]:
-    """Return the names for the broker's certificate. The last ones are for programs of the broker's own machine."""
+    """Return the names for the broker's certificate; the last ones are for programs on the broker's machine."""
     return list(dict.fromkeys((server.host, "localhost", _LOOPBACK)))
 
 
@@ -49,9 +48,9 @@ def write_conf(folder: Path, fleet: Fleet) -> None:
 
 
 def conf_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
-    """Yield each line of `mosquitto.conf` that :func:`write_conf` did not write: it may open another listener.
+    """Yield each line of `mosquitto.conf` that :func:`write_conf` has not written: it may open another listener.
 
-    Such lines may be there for a reason, so no command removes them.
+    Such a line may have a reason, so no command removes it.
     """
     file = folder / CONF
     try:
@@ -67,7 +66,7 @@ def conf_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
 
 
 def apply(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None) -> str:
-    """Write the rules, make broker and hubs use them, then write `fleet.json`. Return what was done, in words.
+    """Write the rules, make broker and hubs use them, then write `fleet.json`; return in words what was done.
 
     ``passwords``: new ones. Raises FleetError if the broker does not use the rules; then `fleet.json` stays as it is.
     """
@@ -84,7 +83,7 @@ def apply(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None
 
 
 def copies(folder: Path, fleet: Fleet) -> Iterator[str]:
-    """Yield the places to which the folder's rules were copied; a change counts there once they are copied again."""
+    """Yield the places to which the folder's rules were copied. A change applies there once they are copied again."""
     again = f"its copies of {folder / ACL} and {PASSWORDS}: copy them again, and send it SIGHUP"
     yield from (f"broker {server.host}:{server.port} obeys {again}" for server in fleet.brokers[1:])
     if fleet.hubs == "elsewhere":
@@ -118,7 +117,7 @@ def pid_of(folder: Path) -> int | None:
 
 
 def _is_broker(pid: int) -> bool:
-    """True if this process is mosquitto. The pid file is not proof: the folder's owner can write any number into it."""
+    """True if this process is mosquitto. The pid file is no proof: the folder's owner can write any number there."""
     try:
         if is_root():  # others see that of their own only; " (deleted)" is behind it after an upgrade
             return bytes(Path(f"/proc/{pid}/exe").readlink()).removesuffix(b" (deleted)").endswith(b"/mosquitto")
@@ -155,13 +154,13 @@ def write_rules(folder: Path, fleet: Fleet, passwords: Mapping[str, broker_files
 
     Accounts without a password cannot log in.
     """
-    known = {name: passwords[name] for name in fleet.accounts if name in passwords}
-    for name, text in ((PASSWORDS, broker_files.passwords_text(known)), (ACL, broker_files.acl_text(fleet))):
+    stored = {name: passwords[name] for name in fleet.accounts if name in passwords}
+    for name, text in ((PASSWORDS, broker_files.passwords_text(stored)), (ACL, broker_files.acl_text(fleet))):
         write(folder / name, text.encode(), 0o600, FleetError)
 
 
 def _reload(folder: Path) -> str:
-    """Make mosquitto reload its files and disconnect accounts that lost their access. Return what was done."""
+    """Make mosquitto reload its files, and disconnect accounts that lost their access; return what was done."""
     pid = pid_of(folder)
     if pid is None:
         return f"in {folder / ACL}: mosquitto does not run"
@@ -181,7 +180,7 @@ def _reload(folder: Path) -> str:
 
 
 def _handles_signal(pid: int) -> bool:
-    """Wait until mosquitto handles SIGHUP.
+    """Wait until mosquitto handles SIGHUP; return whether it does.
 
     It listens before that, and the signal would end it (2.0.11, measured).
     """

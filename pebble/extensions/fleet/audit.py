@@ -34,7 +34,7 @@ DELETE FROM audit WHERE number IN (
 
 
 class Entry(Struct, frozen=True):
-    """A row of the audit. ``at``: epoch seconds. ``count``: this many further rows of the last minute were left out."""
+    """A row of the audit. ``at``: epoch seconds. ``count``: how many more rows of the same minute it stands for."""
 
     at: float
     what: str
@@ -78,13 +78,13 @@ class Audit:
         return [Entry(*row) for row in reversed(rows)]
 
     def close(self) -> None:
-        """Write the waiting rows, for at most a few seconds."""
+        """Write the waiting rows, for a few seconds at most."""
         self._writer.close()
         with self._lock:
             self._database.close()
 
     def _store(self, rows: list[Row]) -> None:
-        """Store all rows. Raises DatabaseError or OSError; then none is stored."""
+        """Store all rows, or none: then it raises DatabaseError or OSError."""
         with self._lock:
             if removed := self._database.removed:
                 raise OSError(removed)
@@ -100,7 +100,7 @@ class Audit:
 
 
 def _values(row: Row) -> tuple[float | str | int, ...]:
-    """Return the values of a row in the form that is stored.
+    """Return the values of a row in their stored form.
 
     A row without its texts stands for rows that differ too much to be counted together.
     """

@@ -1,4 +1,4 @@
-"""A small certificate authority, made with the package cryptography. It signs only for machines of its own network."""
+"""A small certificate authority, made by the package cryptography. It signs only for machines of its own network."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -36,10 +36,10 @@ class Authority:
     file: Path
 
     def sign(self, name: str, hosts: Sequence[str], file: Path, key_file: Path, *, is_client: bool) -> None:
-        """Write a certificate and a new key, for a machine that listens at ``hosts``, logs in with it, or both.
+        """Write a certificate and a new key, for a machine that listens at ``hosts``, or that logs in, or both.
 
         ``name`` must not look like a host: OpenSSL would apply the authority's name constraints to it. Raises
-        CertificateError for hosts that it may not sign for.
+        CertificateError for hosts for which it may not sign.
         """
         _check_permitted(self, hosts)
         usages = [x509.oid.ExtendedKeyUsageOID.SERVER_AUTH] if hosts else []
@@ -62,7 +62,7 @@ def make(file: Path, key_file: Path, hosts: Sequence[str]) -> None:
 
 
 def read(file: Path, key_file: Path) -> Authority:
-    """Read an authority from its two files. Raises CertificateError."""
+    """Return the authority in these two files. Raises CertificateError."""
     certificate = certificate_in(file)
     try:
         key: Any = load_pem_private_key(read_plain(key_file), None)
@@ -74,7 +74,7 @@ def read(file: Path, key_file: Path) -> Authority:
 
 
 def certificate_in(file: Path) -> x509.Certificate:
-    """Read a certificate from a file. Raises CertificateError."""
+    """Return the certificate in a file. Raises CertificateError."""
     try:
         return x509.load_pem_x509_certificate(read_plain(file))
     except OSError as error:

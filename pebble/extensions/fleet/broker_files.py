@@ -79,7 +79,7 @@ def passwords_text(passwords: Mapping[str, Hashed]) -> str:
 
 
 def passwords_in(text: str) -> dict[str, Hashed]:
-    """Return the hashed passwords in such a text, by account. Raises ValueError for a line that is none."""
+    """Return the hashed passwords in such a text, by account. Raises ValueError for any other line."""
     passwords = {}
     for line in filter(None, map(str.strip, text.splitlines())):
         name, _, rest = line.partition(":")
@@ -91,7 +91,7 @@ def passwords_in(text: str) -> dict[str, Hashed]:
 
 
 def rules_in(acl: str) -> Iterator[str]:
-    """Yield each rule with its account's name; "" for rules before the first account, which hold for everybody."""
+    """Yield each rule with its account's name; "" for rules before the first account, which apply to all."""
     name = "everybody"
     for line in filter(None, map(str.strip, acl.splitlines())):
         word, _, rest = line.partition(" ")

@@ -17,7 +17,7 @@ _CERTIFICATE = re.compile(rb"-----BEGIN CERTIFICATE-----[\w+/=\s]+-----END CERTI
 
 
 class CertificateError(PebbleError):
-    """An error with certificates. Example: ``tls/ca.pem exists: …``."""
+    """An error with a certificate. Example: ``tls/ca.pem exists: …``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ def init(folder: Path, names: Sequence[str]) -> None:
 def renew(folder: Path, names: Sequence[str] = ()) -> None:
     """Write a new server certificate and key by the folder's authority. Raises CertificateError.
 
-    For ``names``, or for the names of the certificate before.
+    Its names are ``names``, or those of the present certificate.
     """
     from pebble.extensions.fleet import authority
 
@@ -85,7 +85,7 @@ def show(file: Path) -> Shown:
 
 
 def only_certificates(content: bytes) -> bytes:
-    """Return only the certificates in a file.
+    """Return only the certificates in the content of a file.
 
     They are sent to others, and a config may name any file.
     """

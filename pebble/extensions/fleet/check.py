@@ -1,4 +1,4 @@
-"""Differences between a fleet's table and its files, and certificates that end soon, a line each."""
+"""Finds differences between a fleet's table and its files, and certificates that expire soon; a line each."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,12 +36,12 @@ def _certificates(folder: Path, fleet: Fleet) -> Iterator[str]:
 
 def _of_acl(folder: Path, fleet: Fleet) -> Iterator[str]:
     try:
-        there = dict.fromkeys(rules_in(read_plain(folder / ACL).decode()))
+        present_rules = dict.fromkeys(rules_in(read_plain(folder / ACL).decode()))
     except OSError as error:
         raise FleetError(f"{error.filename}: {error.strerror}") from None
     wanted = dict.fromkeys(rules_in(acl_text(fleet)))
-    yield from (f"one rule too many: {rule}" for rule in there if rule not in wanted)
-    yield from (f"one rule too few: {rule}" for rule in wanted if rule not in there)
+    yield from (f"one rule too many: {rule}" for rule in present_rules if rule not in wanted)
+    yield from (f"one rule too few: {rule}" for rule in wanted if rule not in present_rules)
 
 
 def _of_passwords(folder: Path, fleet: Fleet) -> Iterator[str]:

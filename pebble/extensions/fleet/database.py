@@ -17,7 +17,7 @@ _BUSY_S = 5.0  # another process may be writing
 
 
 class DatabaseError(PebbleError):
-    """A file that cannot be read or written now. Example: ``people.sqlite: database or disk is full``."""
+    """An error: a file cannot be read or written now. Example: ``people.sqlite: database or disk is full``."""
 
     def __init__(self, path: Path | None, error: Exception) -> None:
         self.why = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
@@ -25,10 +25,10 @@ class DatabaseError(PebbleError):
 
 
 class Database:
-    """A connection to a SQLite file, for use under a lock; each statement is a transaction.
+    """A connection to a SQLite file, used under a lock; each statement is a transaction.
 
-    ``path`` None: in memory. If the file is removed or replaced, the connection goes on with the one that it opened. A
-    new file, and what SQLite writes beside it, is readable by its owner only. Raises PebbleError if it cannot be
+    ``path`` None: in memory. If the file is removed or replaced, the connection continues with the file that it opened.
+    A new file, and what SQLite writes beside it, is readable only by its owner. Raises PebbleError if it cannot be
     opened; ``upgrade`` changes the tables of older versions.
     """
 
@@ -87,7 +87,7 @@ class Database:
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
-        """Execute the block's statements together: all of them, or none if it raises. Raises DatabaseError."""
+        """Execute the statements of the block together: all of them, or none if one raises. Raises DatabaseError."""
         with self._errors():
             connection = self._connection
             connection.execute("BEGIN IMMEDIATE")

@@ -1,4 +1,4 @@
-"""The folder of a broker's fleet, with `fleet.json`: the accounts and their roles. It holds no secret."""
+"""The folder of a broker's fleet, with `fleet.json`: the accounts and their roles. It holds no secrets."""
 
 import logging
 import os
@@ -32,14 +32,14 @@ _METRIC = re.compile(r"[^/#$+\x00-\x20\x7f]+|\+")  # one level
 
 
 class FleetError(PebbleError):
-    """An account, folder or broker that cannot be used. Example: ``hall/fleet.json has no account 'ann'``."""
+    """An error: an account, a folder or a broker cannot be used. Example: ``hall/fleet.json has no account 'ann'``."""
 
 
 class Server(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The place where a broker of the fleet listens. ``unencrypted``: a port for boards that have no TLS.
+    """The place where a broker of the fleet listens. ``unencrypted``: a port for boards without TLS.
 
-    ``included``: it is the mosquitto of its machine, which reads `mosquitto.conf` as a part of its own, and which
-    programs of that machine reach at ``PLAIN_PORT`` of loopback: there TLS would keep out a robot whose clock is unset.
+    ``included``: it is the mosquitto of its machine, which includes `mosquitto.conf` in its own configuration. Programs
+    of that machine reach it at ``PLAIN_PORT`` of loopback, where TLS would keep out a robot whose clock is not set.
     """
 
     host: str
@@ -81,7 +81,7 @@ class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def load(folder: Path) -> Fleet:
-    """Read a folder's fleet. Raises FleetError with the mistake in it."""
+    """Return the fleet of a folder. Raises FleetError with the mistake in it."""
     file = folder / FLEET
     try:
         fleet = msgspec.json.decode(read_plain(file), type=Fleet)
@@ -156,7 +156,7 @@ def _refused_base(base: str, *, several: bool) -> str:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, so that one command at a time changes it. Raises FleetError if there is no folder."""
+    """Hold the folder's lock: only one command at a time changes it. Raises FleetError if there is no folder."""
     try:
         descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | _NO_LINK, 0o600)
     except OSError as error:

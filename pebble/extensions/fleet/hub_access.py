@@ -86,8 +86,8 @@ def written(access: Access) -> bytes:
 def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dict[str, Any]:
     """Return Zenoh's access_control: this machine may do everything, an account what its row grants.
 
-    Equal grants become one rule, because Zenoh reads only 1 MB a second at its start. Accounts without a row are not
-    disconnected: Zenoh drops their messages and sends them none.
+    Equal grants become one rule, because Zenoh reads only 1 MB a second at its start. An account without a row is not
+    disconnected: Zenoh drops its messages and sends it none.
     """
     rules: dict[Grant, dict[str, Any]] = {}
     subjects: list[Mapping[str, Any]] = []
@@ -106,10 +106,10 @@ def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dic
 
 
 def first(commands: Sequence[str], stops: Sequence[str]) -> dict[str, Any]:
-    """Return Zenoh's qos: among what other machines send, only ``stops`` have the first priority, and only they block.
+    """Return Zenoh's qos: of other machines' messages only ``stops`` have the first priority, and only they block.
 
-    Otherwise the sender chooses: commands with the first priority would delay stops, and a blocking sender would make
-    the hub disconnect a slow receiver. Both parameters are keys; ``stops`` are among ``commands``.
+    Otherwise the sender would choose: commands with the first priority would delay stops, and a blocking sender would
+    make the hub disconnect a slow receiver. Both parameters are keys; ``stops`` are among ``commands``.
     """
     rows = (("commands", commands, _COMMANDS), ("stops", stops, _STOPS))
     fields = {"messages": ["put"], "flows": [*IN], "link_protocols": OTHER_MACHINES}
@@ -126,7 +126,7 @@ def _named(names: Sequence[str]) -> dict[str, Any]:
 
 
 class AccountAdmission(Admission):
-    """The admission of clients at a hub, including accounts of other machines, by the access file."""
+    """The hub's rules for clients, including accounts of other machines, from the access file."""
 
     def __init__(self, file: Path, wills: Sequence[tuple[str, bool]], unretained: Sequence[str] = ()) -> None:
         super().__init__(wills, unretained)
@@ -141,19 +141,19 @@ class AccountAdmission(Admission):
         return {"access_control": control, "qos": qos}
 
     def hello(self, account: str, hello: wire.Hello) -> wire.Hello | None:
-        """Return ``hello`` reduced to what the account may do; None if it is not to be answered.
+        """Return ``hello`` reduced to what the account may do; None if it gets no answer.
 
-        An account may only use session names that begin with its own.
+        An account may use only session names that begin with its own name.
         """
         if not account:
             return hello
-        known = self.accounts.get(account)
-        if known is None or not self.owns(account, hello.name):
+        rules = self.accounts.get(account)
+        if rules is None or not self.owns(account, hello.name):
             self.log(account, "hello", "its session must be named after an account that is known")
             return None
-        offered = hello.own if known.retains else {}
-        own = {key: digest for key, digest in offered.items() if _any(known.retains, key_to_topic(key))}
-        return replace(hello, will=self._of_account(account, known, hello.will), own=own)
+        offered = hello.own if rules.retains else {}
+        allowed = {key: digest for key, digest in offered.items() if _any(rules.retains, key_to_topic(key))}
+        return replace(hello, will=self._of_account(account, rules, hello.will), own=allowed)
 
     def owns(self, account: str, session: str) -> bool:
         return not account or session.startswith(account + wire.OF)

@@ -1,8 +1,8 @@
 """Accounts of senders at the level ``named``: read from topics, written into payloads. Pure.
 
-The broker vouches for the account in ``incoming/by/{account}/{metric}``. On the robot itself the topic has no account,
-and the payload has the sender: ``"by": "otto"``, or ``"page-1/ann"`` where a page server adds the person. A message
-without ``by`` is from a program of the robot.
+The broker checks the account in ``incoming/by/{account}/{metric}``. On the robot itself the topic has no account, and
+the payload has the sender: ``"by": "otto"``, or ``"page-1/ann"`` where a page server adds the person. A message without
+``by`` is from a program of the robot.
 """
 
 from functools import lru_cache
@@ -64,7 +64,7 @@ class CheckedNames(Names):
     def sign(self, sender: Sender, message: Message) -> Signed | Drop:
         """Return ``message`` with its sender in the payload, or why it is refused. Called for each message.
 
-        A ``by`` that the sender wrote is a claim: from an account it becomes the person, from a stranger it is removed.
+        A ``by`` that the sender wrote is a claim. From an account it becomes the person, from a stranger it is removed.
         A stop needs no account; its claim stays, with a mark.
         """
         subject, account, payload = sender.subject, sender.account, message.payload
@@ -100,7 +100,7 @@ def _moved(message: Message, topic: str, payload: bytes) -> Message:
 
 
 def _doubted(payload: bytes) -> bytes:
-    """Mark the claimed sender of a stop that has no account; return the payload unchanged if it cannot be read."""
+    """Return a stop without an account with its claimed sender marked; unchanged if it cannot be read."""
     fields = _object(payload)
     body = {} if fields is None else _body(fields)
     claim = body.get("by")
@@ -123,7 +123,7 @@ def _is_zero(channel: Channel, payload: bytes) -> bool:
 
 
 def _is_group(payload: bytes) -> bool:
-    """True if the payload is a group, before a key that is there twice becomes one."""
+    """True if the payload is a valid group: it is checked before decoding joins keys that occur twice."""
     try:
         return bool(groups.decode(payload))
     except PayloadError:
@@ -131,7 +131,7 @@ def _is_group(payload: bytes) -> bool:
 
 
 def _object(payload: bytes) -> dict[str, Any] | None:
-    """Return the JSON object in ``payload`` as all readers of the contract parse it; None if they cannot."""
+    """Return the JSON object in ``payload`` as every reader of the contract parses it; None if they cannot."""
     try:
         usual = payload[:1] == b"{" and payload[-1:] == b"}" and len(payload) <= _USUAL_BYTES
         if usual and payload.isascii() and b"\0" not in payload:  # else there may be something around it

@@ -42,11 +42,11 @@ CREATE TABLE IF NOT EXISTS settings (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 
 
 class PeopleError(PebbleError):
-    """A name, password or role that cannot be used. Example: ``alice exists already``."""
+    """An error: a name, password or role cannot be used. Example: ``alice exists already``."""
 
 
 class TooManyTriesError(PebbleError):
-    """Too many password tries from one address or for one name; the next is possible after ``wait_s`` seconds."""
+    """An error: too many password tries from one address or for one name. ``wait_s``: seconds until the next."""
 
     def __init__(self, wait_s: float) -> None:
         self.wait_s = wait_s
@@ -62,7 +62,7 @@ class User:
 
 
 class People:
-    """The table of people and sessions. Thread-safe; reads the file on each call, as other processes may change it.
+    """The table of people and sessions. Thread-safe. It reads the file on each call: other processes may change it.
 
     ``path`` None: in memory. Passwords are stored as scrypt hashes, session tokens as their SHA-256.
     """
@@ -135,16 +135,16 @@ class People:
     def check(self, name: str, password: str, address: str) -> User | None:
         """Return the person with this name and password. Blocks for about 20 ms, 60 with accents.
 
-        It takes as long for unknown names. Raises TooManyTriesError. With its tries used up, a name can still log in
-        from an address where it has a session, so that others cannot lock a person out.
+        It takes as long for unknown names. Raises TooManyTriesError. When a name's tries are used up, it can still log
+        in from an address where it has a session, so that others cannot lock a person out.
         """
         self._count_try(name, address)
         looked_up = name if NAME.fullmatch(name) else ""
         rows = self._rows("SELECT name, role, salt, hash FROM people WHERE name = ?", looked_up)
         stored_name, role, salt, expected = rows[0] if rows else ("", "", b"no such person..", self._no_hash)
         typed = password[: 2 * MAX_PASSWORD]  # so long may one be whose accents are letters of their own
-        given = [_hash(spelling, salt) for spelling in _spellings(typed)]
-        is_right = any(hmac.compare_digest(digest, expected) for digest in given)
+        hashes = [_hash(spelling, salt) for spelling in _spellings(typed)]
+        is_right = any(hmac.compare_digest(digest, expected) for digest in hashes)
         if not is_right or not stored_name or len(normalize("NFC", typed)) > MAX_PASSWORD:
             return None
         self._addresses.give_back(network_of(address))
@@ -152,7 +152,7 @@ class People:
         return User(stored_name, Role(role))
 
     def start_session(self, user: User, address: str = "") -> str:
-        """Start a session; return its token, the only copy of it."""
+        """Start a session; return its token, which is stored nowhere."""
         token = secrets.token_urlsafe(32)
         now = self._clock()
         self._change("DELETE FROM sessions WHERE expires <= ?", now)
@@ -175,9 +175,10 @@ class People:
         return token
 
     def session(self, token: str) -> Session | None:
-        """Return the session of this token, with the person's present role.
+        """Return the session of this token, with the person's present role; None if there is none.
 
-        While the file cannot be read, the last known answer is returned, so that the driver can go on and stop robots.
+        While the file cannot be read, the last known answer is returned, so that the driver can continue and stop
+        robots.
         """
         digest, now = _digest(token), self._clock()
         try:
@@ -251,7 +252,7 @@ def _exists(name: str) -> PeopleError:
 
 
 def has_user(path: Path | None, name: str = "") -> bool:
-    """True if the database has this person, or without a name any person. Raises DatabaseError."""
+    """True if the database has this person, or, without a name, any person. Raises DatabaseError."""
     if path is None:
         return False
     try:
@@ -274,7 +275,7 @@ def _has_user(path: Path, name: str) -> bool:
 
 
 def usable(password: str) -> str:
-    """Return the password in composed form (NFC), in which it is stored. Raises PeopleError."""
+    """Return the password in the form in which it is stored (NFC). Raises PeopleError."""
     password = normalize("NFC", password)
     if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:
         raise PeopleError(f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters")

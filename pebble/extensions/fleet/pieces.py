@@ -1,4 +1,4 @@
-"""Parts of configs for a fleet's accounts: the address to connect to, and the account's credentials."""
+"""Parts of configs for a fleet's accounts: the address to connect to, and the credentials."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def of_broker(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str,
     server = fleet.brokers[0]
     login = {"host": server.host, "port": server.port, "username": name, "password": secret}
     link = login | {"tls": {"enabled": True, "ca_cert": certificates.CA_CERT}}
-    found = {"local_mqtt": link} if board else {"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": link}}}
-    return {**_who(fleet, name), **found}
+    part = {"local_mqtt": link} if board else {"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": link}}}
+    return {**_who(fleet, name), **part}
 
 
 def of_certificate(fleet: Fleet, name: str) -> dict[str, Any]:
-    """Return the part of a config for the holder of a certificate, or a file of its own for it.
+    """Return the part of a config for the owner of a certificate, or a file for it.
 
     Key and authority are in the same folder.
     """
@@ -46,7 +46,7 @@ def hub_file(keys: str) -> dict[str, Any]:
 
 
 def boards_file(fleet: Fleet, name: str, below: str) -> dict[str, Any]:
-    """Return the file of a gateway for boards that have an account as a neighbour.
+    """Return the file of a gateway for boards whose account is a neighbour's.
 
     ``below``: the path prefix of the fleet's folder in that file.
     """
@@ -76,7 +76,7 @@ def _tls(ca: str, keys: str) -> dict[str, Any]:
 def _who(fleet: Fleet, name: str) -> dict[str, Any]:
     """Return the robot section and the security level of an account's config.
 
-    The base must be the account's: it may do nothing below another one, and its messages would be dropped in silence.
+    The base must belong to the account: messages below any other base would be dropped in silence.
     """
     account = fleet.accounts[name]
     parts = dict(zip(("system", "type", "id"), account.bases[0].split("/"), strict=True))

@@ -1,4 +1,4 @@
-"""Conversion of a fleet made for mosquitto's dynamic-security plugin, by an earlier version, into one of files."""
+"""Converts a fleet made for mosquitto's dynamic-security plugin, by an earlier version, to one of files."""
 
 import json
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ SECURITY = "dynamic-security.json"
 
 
 def convert(folder: Path, fleet: Fleet) -> tuple[Fleet, list[str]]:
-    """Write the plugin's passwords and the table's rules as files. Return the fleet and the accounts left out.
+    """Write the plugin's passwords and the table's rules as files; return the fleet and the accounts left out.
 
     Raises FleetError. The plugin's own file stays; mosquitto uses it until its configuration is changed.
     """
@@ -28,12 +28,12 @@ def convert(folder: Path, fleet: Fleet) -> tuple[Fleet, list[str]]:
     except (ValueError, KeyError, TypeError):
         raise FleetError(f"{file} is no file of the dynamic-security plugin: restore it from a copy") from None
     after = replace(fleet, rules="files")
-    known = {
+    hashed = {
         name: Hashed(client["salt"], client["password"], client["iterations"])
         for name, client in clients.items()
         if _gets_in(name, client)
     }
-    write_rules(folder, after, known)
+    write_rules(folder, after, hashed)
     save(folder, after)
     return after, list(_left_out(fleet, clients))
 
@@ -47,6 +47,6 @@ def _left_out(fleet: Fleet, clients: dict[str, dict[str, Any]]) -> Iterator[str]
 
 
 def _gets_in(name: str, client: dict[str, Any]) -> bool:
-    """True if the plugin accepts this account, with its role and a password in the form of our files."""
+    """True if the plugin lets this account in, with its role and a password in the form of our files."""
     has_role = any(role.get("rolename") == f"account-{name}" for role in client.get("roles", ()))
     return has_role and not client.get("disabled") and all(map(client.get, ("salt", "password", "iterations")))

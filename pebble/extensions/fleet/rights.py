@@ -1,4 +1,4 @@
-"""The rights on a robot, and the commands that each right allows.
+"""The rights on a robot, and the commands that each permits.
 
 pebble/extensions/fleet/roles.py gives rights to roles. A robot uses this table for commands without an account.
 """

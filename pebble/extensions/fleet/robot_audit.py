@@ -1,4 +1,4 @@
-"""The robot's audit: a log of JSON lines about who did what, written by the bridge as commands pass.
+"""The robot's audit: a log of JSON lines about who did what, which the bridge writes when commands pass.
 
 Forwarding never waits for it. It holds no driving commands, and no parameters or keys of others.
 """
@@ -93,14 +93,14 @@ class Audit(Observer):
                     self.note(channel.kind.name.lower(), _sender(by), **_place(by), name=name, on=on)
 
     def refused(self, drop: Drop, channel: Channel | None, by: str | None) -> None:
-        """Add a row for a refused message; only for a limited number of strangers."""
+        """Add a row for a refused message; for strangers only up to a number of them."""
         if drop in _REFUSED:
             name, who = "" if channel is None else channel.metric, _sender(by)
             row = {"t": round(time.time(), 3), "what": "refused", "who": who, **_place(by), "name": name}
             self._writer.add({**row, "why": drop.value}, most=OF_STRANGERS)
 
     def control(self, state: ControlState) -> None:
-        """Add rows for who gained and who lost control, as reported by the motor owner."""
+        """Add rows for the gain and the loss of control, as the motor owner reports them."""
         before, self._holder = self._holder, state
         if before is None or (before.key, before.boot) == (state.key, state.boot):
             return
@@ -113,7 +113,7 @@ class Audit(Observer):
         self.note("stop-not-confirmed", owner=owner, stop=str(stop.stop))
 
     def _noted_before(self, stop: str, who: str) -> bool:
-        """True if this sender's stop has a row already; remembers the stop.
+        """True if this sender's stop already has a row; else remember the stop.
 
         A stop may arrive twice, with an account and without; the two count as different senders.
         """
@@ -123,7 +123,7 @@ class Audit(Observer):
         return repeated
 
     def _append(self, rows: list[Row]) -> None:
-        """Write all rows; if that raises OSError the file is as before."""
+        """Write all rows. If that raises OSError, the file is as before."""
         lines = b"".join(msgspec.json.encode(row) + b"\n" for row in rows)
         self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if self._path.exists() and self._path.stat().st_size >= _MOST_BYTES:
@@ -144,7 +144,7 @@ class Audit(Observer):
 
 
 def _sender(by: str | None, command: Any = None) -> str:
-    """Return the account, or else the sender that the payload claims, marked as unchecked."""
+    """Return the account, or else the payload's claimed sender, marked as unchecked."""
     claim = getattr(command, "by", None)
     name = shown(claim.rstrip(_UNCHECKED), _NAME) if isinstance(claim, str) else ""
     if by == ROBOT:

@@ -1,7 +1,7 @@
 """The table of roles and the rights of each.
 
-The rules of brokers, the rights of people on the operator page, and the tables of docs/ext/fleet.md are made from it;
-rights.py has the channels of each right.
+The rules of brokers, the rights of people on the operator page, and the tables of docs/ext/fleet.md are made from it.
+The channels of each right are in rights.py.
 """
 
 import re
@@ -95,7 +95,7 @@ class Extra(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True)
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """A login. ``id`` names it in the audit; it cannot be used to log in."""
+    """A login. ``id`` identifies it in the audit, and cannot be used to log in."""
 
     id: str
     user: str
@@ -116,7 +116,7 @@ def rights(roles: Iterable[str], level: SecurityLevel) -> frozenset[Right]:
 
 
 def page_rights(role: Role, level: SecurityLevel = "open") -> frozenset[str]:
-    """Return what a person may do on the operator page beyond what everybody may."""
+    """Return the rights of a person on the operator page beyond those of everybody."""
     return frozenset(right.value for right in rights((role,), level) - _EVERYBODY)
 
 
@@ -162,7 +162,7 @@ def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
 
 
 def covered(right: Right, metric: str) -> str:
-    """Return a metric of the contract that a filter of ``extra`` covers although another right writes it."""
+    """Return a metric of the contract that a filter of ``extra`` matches although another right writes it."""
     for channel in c.CHANNELS:
         if channel.direction == INCOMING and channel not in WRITES[right]:
             declared = re.sub(r"{[^}]*}", "+", channel.metric)
@@ -172,7 +172,7 @@ def covered(right: Right, metric: str) -> str:
 
 
 def _overlap(filter_: str, other: str) -> bool:
-    """True if some topic matches both filters; neither has a #."""
+    """True if some topic matches both filters, which have no #."""
     levels = filter_.split("/"), other.split("/")
     same = all("+" in pair or pair[0] == pair[1] for pair in zip(*levels, strict=False))
     return len(levels[0]) == len(levels[1]) and same

@@ -1,4 +1,4 @@
-"""A writer of audit rows on a thread of its own, so that no caller waits for the disk."""
+"""Writes audit rows on another thread, so that no caller waits for the disk."""
 
 import logging
 import threading
@@ -20,10 +20,10 @@ Row = dict[str, Any]
 
 
 class RowWriter:
-    """A queue of rows that ``store`` gets in their order. Thread-safe.
+    """A queue of rows, which ``store`` gets in order. Thread-safe.
 
-    If ``store`` raises OSError or PebbleError, the rows wait, and it is logged once. A row has its time ``t``, its kind
-    ``what``, and more; kinds are a fixed set.
+    If ``store`` raises OSError or PebbleError, the rows wait, and that is logged once. A row has its time ``t``, its
+    kind ``what``, and more; kinds are a fixed set.
     """
 
     def __init__(self, store: Callable[[list[Row]], None], clock: Callable[[], float] = time.monotonic) -> None:
@@ -41,7 +41,7 @@ class RowWriter:
         self._thread.start()
 
     def close(self) -> None:
-        """Store the waiting rows, for a bounded time."""
+        """Store the waiting rows, for a limited time."""
         self._closing.set()
         self._wake.set()
         self._thread.join(_END_S)
@@ -49,9 +49,9 @@ class RowWriter:
             log.error("audit: %d rows are lost", lost)
 
     def add(self, row: Row, like: Hashable = None, most: int = DIFFERENT) -> None:
-        """Store ``row``, or only count it if a row ``like`` it was stored in this window.
+        """Store ``row``, or only count it if a row ``like`` it was already stored in this window.
 
-        Without ``like``, rows are alike if they differ in their time only.
+        Without ``like``, rows are alike if they differ only in their time.
         """
         like = (tuple(row.items())[1:],) if like is None else like
         now = self._clock()
@@ -67,7 +67,7 @@ class RowWriter:
         self._wake.set()
 
     def _end_window(self, now: float) -> None:
-        """Queue a row with the count for each kind that was only counted, and reset the counts."""
+        """Queue a row with the number of rows for each kind that was only counted, and reset the counts."""
         for row, count in self._counts.values():
             if count:
                 self._put({**row, "count": count})

@@ -1,4 +1,4 @@
-"""A limit on password tries, so that guessing would take years."""
+"""A limit on password tries: guessing would take years."""
 
 import ipaddress
 import threading
@@ -33,7 +33,7 @@ class Tries:
             return 0.0
 
     def give_back(self, key: str) -> None:
-        """Uncount a try with the right password."""
+        """Uncount a try, because its password was right."""
         with self._lock:
             times = self._times.get(key[:64])
             if times:

@@ -1,4 +1,4 @@
-"""The rules of a Zenoh hub, from the same table as a broker's: the rights of each account, named in its certificate."""
+"""The rules of a Zenoh hub, from the same table as a broker's: the rights of each account in a certificate."""
 
 from collections.abc import Iterable, Iterator, Sequence
 
@@ -51,7 +51,7 @@ def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
 
 
 def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: bool) -> Iterator[Grant]:
-    """Yield only the grants that an account's client needs; it cannot act as a hub or answer queries of others."""
+    """Yield the grants that an account's client needs. It cannot act as a hub, or answer queries of others."""
     if is_hub:
         yield from EVERYTHING
         return

@@ -1,4 +1,4 @@
-"""Robots live in the Foxglove app."""
+"""A live view of robots in the Foxglove app."""
 
 from pebble.extension import Command, Extension
 

@@ -1,4 +1,4 @@
-"""The JSON channels of robots as Foxglove understands them: JSON Schema in the part that its parser reads."""
+"""The JSON channels of robots for Foxglove, with JSON Schemas in the subset that its parser reads."""
 
 from functools import cache
 from typing import Any, Final

@@ -1,4 +1,4 @@
-"""A robot's pictures or sound for Foxglove: requested while a client subscribes, converted, published."""
+"""A robot's pictures or sound for Foxglove: requested while a client subscribes, converted, and published."""
 
 import asyncio
 import logging
@@ -47,7 +47,7 @@ class Waiting(NamedTuple):
 
 
 class MediaFeed:
-    """The request for a medium of one robot, and its payloads; ``run`` is its task on the event loop.
+    """A medium of one robot: the request for it, and its payloads. ``run`` is its task on the event loop.
 
     Payloads are converted on a thread, a few at a time, because decoding a picture takes milliseconds.
     """
@@ -99,7 +99,7 @@ class MediaFeed:
         self._work.set()
 
     def _drop(self) -> None:
-        """Drop the oldest payload; of pictures all, because each builds on those before it."""
+        """Drop the oldest payload. Of pictures drop all, because each builds on those before it."""
         is_video = self._medium == "video"
         count = len(self.waiting) if is_video else 1
         for _ in range(count):
@@ -122,10 +122,7 @@ class MediaFeed:
         return next((name for name in _WITHOUT_PYAV[self._medium] if name in encodings), _AS_CONFIGURED)
 
     def _take_picture(self, payload: bytes) -> bool:
-        """True if the payload is a picture that can be shown.
-
-        Notices missing pictures, and requests a key frame then.
-        """
+        """True if the payload is a picture that can be shown. If pictures are missing, a key frame is requested."""
         header = self._sequence.take(payload)
         if header is None:
             return False

@@ -1,4 +1,4 @@
-"""Robots of a broker for Foxglove: their channels, declared as topics appear, and their telemetry."""
+"""The robots of a broker for Foxglove: channels, declared when topics appear, and telemetry."""
 
 import asyncio
 import logging
@@ -53,7 +53,7 @@ class Robots:
 
     @property
     def refused(self) -> int:
-        """Return how many payloads could not be shown: no JSON, damaged, or a picture that builds on a missing one."""
+        """Return how many payloads could not be shown: not JSON, damaged, or a picture that builds on a missing one."""
         return self._refused + sum(feed.refused for feed in self._feeds.values())
 
     def receive(self, message: Message, at: float) -> None:
@@ -105,10 +105,10 @@ class Robots:
         remember = message.retain or (channel is not None and channel.default_retain)
         converted = self._telemetry.convert(topic, payload)
         if converted is not None:
-            made, below = converted.message, f"{topic}/{converted.ending}"
-            if not self._server.declared(below):
-                self._server.declare(protobuf_spec(below, made, self._schemas))
-            self._server.publish(below, stamped(made, time_of(payload, at_ns)), at_ns, remember=remember)
+            protobuf, subtopic = converted.message, f"{topic}/{converted.ending}"
+            if not self._server.declared(subtopic):
+                self._server.declare(protobuf_spec(subtopic, protobuf, self._schemas))
+            self._server.publish(subtopic, stamped(protobuf, time_of(payload, at_ns)), at_ns, remember=remember)
             return
         data = as_object(payload)
         if data is None:

@@ -28,7 +28,7 @@ class Settings(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """The numbers of the program's last line."""
+    """The figures in the program's last line."""
 
     robots: int
     published: int
@@ -79,6 +79,6 @@ async def _show(settings: Settings, broker: Broker, robots: Robots, on_ready: Ca
 
 
 def _call(loop: asyncio.AbstractEventLoop, robots: Robots, topic: str, on: bool) -> None:
-    """Call ``robots`` on the event loop's thread after a (un)subscription; does nothing if the loop has ended."""
+    """Call ``robots`` on the event loop's thread after a subscription or its end; do nothing if the loop has ended."""
     with contextlib.suppress(RuntimeError):
         loop.call_soon_threadsafe(lambda: robots.wake(topic, subscribed=on))

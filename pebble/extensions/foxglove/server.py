@@ -24,7 +24,7 @@ _HOW: Final = 'pip install "pebble-robot[foxglove]"'
 
 
 class ChannelSpec(NamedTuple):
-    """The description of a channel by which Foxglove decodes it."""
+    """A channel's description, by which Foxglove decodes it."""
 
     topic: str
     encoding: str  # of its messages: json or protobuf
@@ -91,9 +91,9 @@ class Server:
         return topic in self._channels
 
     def declare(self, spec: ChannelSpec) -> None:
-        """Advertise a channel, once, for good.
+        """Advertise a channel, once and for ever.
 
-        Beyond the limit it is not advertised, and what is published on it is dropped.
+        Beyond the limit of channels it is not advertised, and its messages are dropped.
         """
         if spec.topic in self._channels or len(self._channels) >= MOST_CHANNELS:
             return

@@ -1,4 +1,4 @@
-"""Lines of `pebble check` for a robot in a container: what cannot work there."""
+"""Lines of `pebble check` about a robot in a container: what cannot work there."""
 
 import os
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ from pebble.motors.state_file import CONTAINER, StateFile
 
 
 def facts(config: Config) -> Facts:
-    """Return the lines in a container, and none elsewhere."""
+    """Return these lines in a container, and none elsewhere."""
     return Facts(table=tuple(("container", line) for line in _lines(config) if CONTAINER in os.environ))
 
 

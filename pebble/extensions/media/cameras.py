@@ -35,10 +35,9 @@ def camera(
     """Iterate over the pictures of a robot on this machine: always the newest, never a queue of old ones.
 
     ``robot`` is its id (``"goob"``), its base topic (``"pebble/robots/goob"``), its config file, or its run directory.
-    Pictures are arrays of (height, width, 3) bytes, blue first, and may be changed. With ``width`` they are scaled
-    to that many pixels, which for a JPEG camera also saves most of the decoding. With ``views`` they may
-    be views of the camera's memory: use them at once, and discard the result if ``Camera.frame.valid()`` is false
-    afterwards.
+    Pictures are arrays of (height, width, 3) bytes, blue first, and may be changed. With ``width`` they are scaled to
+    that many pixels, which for a JPEG camera also saves most of the decoding. With ``views`` they may be views of the
+    camera's memory: use them at once, then discard the result if ``Camera.frame.valid()`` is false.
 
     Raises DeviceError if no such robot runs here, and while waiting if no picture comes for ``timeout`` seconds.
     """
@@ -59,7 +58,7 @@ class Camera:
 
     @property
     def counters(self) -> dict[str, int]:
-        """The numbers of frames that were read, skipped and lost so far: see `FrameReader`."""
+        """Numbers of frames that were read, skipped and lost so far: see `FrameReader`."""
         return self._reader.counters.snapshot()
 
     def __iter__(self) -> Self:
@@ -125,11 +124,11 @@ def _run_dir(robot: str | Path, env: Mapping[str, str]) -> Path:
 
 
 def _usual_places(robot: str, env: Mapping[str, str]) -> list[Path]:
-    """Return the run directories of a robot started in this environment, or in one without a login's folder."""
+    """Return the usual run directories of a robot: in this environment, and without a login's folder."""
     levels = robot.split("/")
     if len(levels) not in (1, 3):
         raise ConfigError(f"camera: {robot} is neither a robot's id nor a base topic nor a config file")
     usual = Robot(id=robot)
     identity = Identity(*levels) if len(levels) == 3 else Identity(usual.system, usual.type, usual.id)
     bare = {name: value for name, value in env.items() if name not in ("XDG_RUNTIME_DIR", "RUNTIME_DIRECTORY")}
-    return list(dict.fromkeys(default_run_folder(identity.base, known) for known in (env, bare)))
+    return list(dict.fromkeys(default_run_folder(identity.base, variables) for variables in (env, bare)))

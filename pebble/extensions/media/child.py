@@ -1,4 +1,4 @@
-"""A program that a service starts: in a group of its own, and ended with the service, however that ends."""
+"""A child process of a service, in a process group of its own, which ends with the service in any case."""
 
 import errno
 import os
@@ -16,11 +16,11 @@ _POLL_S = 0.01
 
 
 class Child:
-    """A running program; what it starts is killed when it has ended. Any thread may call any method.
+    """A running program. The programs that it starts are killed when it has ended. Any thread may call any method.
 
-    It gets ``tie``, else SIGKILL, when the thread that starts it has ended. Raises OSError and ValueError if it cannot
-    be started.
-    ``streams`` are ``stdin`` (nothing unless given), ``stdout`` and ``stderr``, as subprocess has them.
+    When the thread that starts it has ended, it gets the signal ``tie``, by default SIGKILL. ``streams`` are ``stdin``
+    (nothing unless given), ``stdout`` and ``stderr``, as in subprocess. Raises OSError and ValueError if it cannot be
+    started.
     """
 
     def __init__(
@@ -43,9 +43,9 @@ class Child:
         self._lock = threading.Lock()  # no signal once it is reaped: its number may be another process's by then
 
     def pipe(self, name: str) -> IO[bytes]:
-        """Return this end of a stream for which ``subprocess.PIPE`` was given."""
-        found: IO[bytes] = getattr(self._process, name)
-        return found
+        """Return our end of a stream for which ``subprocess.PIPE`` was given."""
+        stream: IO[bytes] = getattr(self._process, name)
+        return stream
 
     def signal(self, number: int) -> None:
         """Send a signal to the program's group, if the program still runs."""
@@ -55,7 +55,7 @@ class Child:
                     os.killpg(self.pid, number)
 
     def wait(self, timeout_s: float = float("inf")) -> int | None:
-        """Wait for the program's end, at most ``timeout_s``; return ``code``, None if the program still runs."""
+        """Wait for the program's end, at most ``timeout_s``; return its exit code, None if it still runs."""
         deadline = time.monotonic() + timeout_s
         while self.code is None and not self._has_ended(wait=timeout_s == float("inf")):
             if time.monotonic() >= deadline:
@@ -69,13 +69,13 @@ class Child:
         return self.code
 
     def finish(self, timeout_s: float) -> int:
-        """Wait for the program's end, at most ``timeout_s``, then kill it; return ``code``."""
+        """Wait for the program's end, at most ``timeout_s``, then kill it; return its exit code."""
         if self.wait(timeout_s) is None:
             self.signal(signal.SIGKILL)
         return self.wait() or 0
 
     def watch(self, ended: Callable[[int], None]) -> None:
-        """Call ``ended(code)`` on a thread of its own when the program has ended."""
+        """Call ``ended(code)`` on another thread when the program has ended."""
         name = f"pebble-child {self.pid}"
         threading.Thread(target=lambda: ended(self.wait() or 0), name=name, daemon=True).start()
 
@@ -93,11 +93,11 @@ def how_ended(code: int) -> str:
 
 
 def tied_to_parent(command: Sequence[str], number: signal.Signals | None = None) -> list[str]:
-    """Extend ``command`` so that the process gets ``number``, else SIGKILL, when the thread that starts it has ended.
+    """Return ``command`` extended so that the process gets a signal when the thread that starts it has ended.
 
-    This holds from some milliseconds after the start, when setpriv has asked the kernel for it. Raises
-    FileNotFoundError if there is no such program. Not by ``preexec_fn``: between fork and exec, Python 3.11.2 may wait
-    for ever for a lock that a thread of Zenoh held.
+    ``number``: the signal, by default SIGKILL. This holds from some milliseconds after the start, when setpriv has
+    asked the kernel for it. Raises FileNotFoundError if there is no such program. ``preexec_fn`` does not do: between
+    fork and exec, Python 3.11.2 may wait for ever for a lock that a thread of Zenoh held.
     """
     if shutil.which(command[0]) is None:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), command[0])

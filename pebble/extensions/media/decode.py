@@ -1,4 +1,4 @@
-"""Decodes video payloads of every encoding; a damaged picture is refused, and a key frame is wanted instead."""
+"""Decodes video payloads of every encoding. A damaged picture is refused; then a key frame is needed."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -30,7 +30,7 @@ class VideoDecoder:
     """A decoder of the payloads of one topic: json, pbvd, pbvz, h264 and raw JPEG, in any order.
 
     After a lost frame, a restart of the sender or a refused payload it returns nothing until the next key frame. Damage
-    is found by the checksums of json, pbvz and h264; of pbvd and raw JPEG, which have none, by their structure.
+    is found by the checksums of json, pbvz and h264. pbvd and raw JPEG have none: there it is found by their structure.
     """
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class VideoDecoder:
         self._h264: H264Decoder | None = None
 
     def feed(self, payload: bytes) -> Decoded | None:
-        """Return the picture of this payload; None if it is refused or waits for a key frame.
+        """Return the picture of this payload; None if it is refused, or a key frame must come first.
 
         Never raises for a payload.
         """
@@ -82,7 +82,7 @@ class VideoDecoder:
 
 
 def _read(payload: bytes) -> tuple[PictureHeader, bytes]:
-    """Return the header and what has to be decoded. Raises PayloadError for everything that is no picture."""
+    """Return the header of ``payload`` and the bytes to decode. Raises PayloadError if it is no picture."""
     if len(payload) > MAX_PAYLOAD:
         raise PayloadError(f"{len(payload)} bytes, more than {MAX_PAYLOAD}")
     header = read_header(payload)

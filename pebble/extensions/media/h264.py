@@ -1,8 +1,9 @@
-"""H.264 through PyAV: one access unit per picture, without delay: no picture waits for a later one.
+"""H.264 through PyAV: one access unit per picture, without delay, as no picture waits for a later one.
 
-Annex B with parameter sets in every key frame, so a receiver can begin at any of them (ITU-T H.264, annex B, 7.4.1.2).
-The last NAL unit is a seal: type 31, which the standard leaves to applications and decoders skip, with the CRC-32 of
-all before it. Neither a PBVD packet nor a slice has a length, and FFmpeg shows a slice that lacks its last bytes.
+The format is Annex B, with parameter sets in every key frame, so a receiver can begin at any of them (ITU-T H.264,
+annex B, 7.4.1.2). The last NAL unit of a picture is our seal: the CRC-32 of everything before it, as type 31, which the
+standard leaves to applications and decoders skip. It is needed because neither a PBVD packet nor a slice has a length,
+and FFmpeg shows a slice whose last bytes are missing.
 """
 
 from __future__ import annotations
@@ -41,10 +42,10 @@ def quality_to_crf(quality: float) -> float:
 
 
 class H264Encoder:
-    """BGR pictures to access units; ``interval``: pictures from one key frame to the next.
+    """An encoder of BGR pictures to access units; ``interval``: pictures from one key frame to the next.
 
-    Another size or quality starts a new encoder, with a key frame. So does a picture that rests: its key frames are
-    sharp, and what follows leaves them as they are.
+    Another size or quality starts a new encoder, with a key frame. So does a picture that stays the same: its key frame
+    is sharp, and the following units change nothing in it.
     """
 
     def __init__(self, fps: float, interval: int) -> None:
@@ -64,7 +65,7 @@ class H264Encoder:
         self._resting = 0  # pictures that have not differed from it
 
     def encode(self, picture: Pixels, quality: float, *, keyframe: bool = False) -> bytes:
-        """Return one access unit. A last odd row or column is left out: colour is stored for two by two pixels."""
+        """Return one access unit. An odd last row or column is left out: colour is stored for two by two pixels."""
         height, width = picture.shape[0] & ~1, picture.shape[1] & ~1
         if min(height, width) < SMALLEST_EDGE:
             raise PebbleError(f"h264: a picture of {picture.shape[1]}x{picture.shape[0]} is too small")
@@ -85,7 +86,7 @@ class H264Encoder:
         return seal(b"".join(bytes(packet) for packet in packets))
 
     def _rests(self, picture: Pixels) -> bool:
-        """True if the picture shows what those of the last second showed."""
+        """True if the picture is the same as those of the last second."""
         reduced = cv2.resize(picture, _GRID, interpolation=cv2.INTER_AREA)
         if self._reduced is None or cv2.absdiff(reduced, self._reduced).max() > _RESTS:
             self._reduced, self._resting = cast(Pixels, reduced), 0
@@ -119,14 +120,14 @@ class H264Encoder:
 
 
 class H264Decoder:
-    """Access units to BGR pictures, as strict as FFmpeg can be: a picture it had to repair is refused."""
+    """A decoder of access units to BGR pictures. As far as FFmpeg tells, a picture that it repaired is refused."""
 
     def __init__(self) -> None:
         self._av = pyav.load("h264")
         self._context: av.VideoCodecContext | None = None
 
     def decode(self, unit: bytes, *, keyframe: bool) -> Pixels:
-        """Decode a unit. Raises PayloadError for what is cut, damaged or too large; a key frame has to be next then."""
+        """Return a unit's picture. PayloadError if it is cut, damaged or too large: then a key frame must come."""
         try:
             return self._picture(self._frame(unit, keyframe))
         except PayloadError:
@@ -170,13 +171,13 @@ class H264Decoder:
 
 
 def seal(unit: bytes) -> bytes:
-    """Return the unit with its checksum: seven bits to a byte, highest first, the top bit set: no start code arises."""
+    """Return the unit with its checksum, in bytes of seven bits with the top bit set: no start code arises."""
     crc = zlib.crc32(unit)
     return unit + _SEAL + bytes(crc >> shift & 0x7F | 0x80 for shift in (28, 21, 14, 7, 0))
 
 
 def unseal(sealed: bytes) -> bytes:
-    """Return the unit without its seal; PayloadError if that is missing or wrong."""
+    """Return the unit without its seal. Raises PayloadError if the seal is missing or wrong."""
     unit = sealed[:-_SEAL_BYTES]
     if seal(unit) != sealed:
         raise PayloadError("h264: cut short or damaged")

@@ -1,4 +1,4 @@
-"""The unacknowledged messages of a connection, from which follows how fast it is. Pure: times are passed in."""
+"""The unacknowledged messages of a connection, which show how fast it is. Pure: times are passed in."""
 
 from collections import deque
 from typing import NamedTuple
@@ -10,11 +10,11 @@ class Sent(NamedTuple):
 
 
 class InFlight:
-    """The unacknowledged messages of one connection, oldest first; ``limit`` bounds how many are remembered.
+    """The unacknowledged messages of one connection, oldest first; ``limit``: the most that are remembered.
 
-    TCP acknowledges bytes in order. Of the unacknowledged bytes the newest message has up to its size, the one before
-    it the next, and so on: a message is acknowledged when none are left for it. ``slack`` bytes of pings and headers
-    may be unacknowledged although the message before them is not.
+    TCP acknowledges bytes in order, so the unacknowledged bytes belong to the newest messages: up to its size to the
+    newest, then to the one before it, and so on. A message for which no bytes are left is acknowledged. ``slack`` bytes
+    of pings and headers may be unacknowledged although the message before them is not.
     """
 
     def __init__(self, slack: int, limit: int | None = None) -> None:
@@ -32,7 +32,7 @@ class InFlight:
         self._messages.append(Sent(size, now))
 
     def acknowledge(self, waiting: int) -> list[Sent]:
-        """Remove and return the acknowledged messages, while ``waiting`` bytes are unacknowledged."""
+        """Remove and return the messages that are acknowledged when ``waiting`` bytes are not."""
         acknowledged = []
         newer = sum(message.size for message in self._messages)
         while self._messages:
@@ -43,9 +43,9 @@ class InFlight:
         return acknowledged
 
     def age_s(self, now: float) -> float:
-        """Return seconds since the oldest message was sent; 0 without one."""
+        """Return the seconds since the oldest unacknowledged message was sent; 0 if there is none."""
         return now - self._messages[0].at if self._messages else 0.0
 
     def clear(self) -> None:
-        """Forget all: the connection is lost, and all messages with it."""
+        """Forget all messages: the connection is lost, and they with it."""
         self._messages.clear()

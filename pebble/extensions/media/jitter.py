@@ -1,6 +1,6 @@
-"""A jitter buffer: packets as the network delivers them to sound in order, evenly, without gaps. Pure: times come in.
+"""A jitter buffer: takes packets as the network delivers them, and returns sound in order, evenly, without gaps.
 
-Times are seconds on the caller's monotonic clock. One thread at a time may call a buffer.
+Pure. Times are seconds on the caller's monotonic clock. One thread at a time may call a buffer.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ _DELAY_LIMIT_S: Final = 0.2  # a caller that takes this late does not have to ca
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """The samples to play next: (samples, channels)."""
+    """Samples to play next: (samples, channels)."""
 
     samples: Samples
     rate: int
@@ -44,16 +44,16 @@ class Chunk:
 
 
 def ahead(sequence: int, of: int) -> int:
-    """Return the way to ``sequence`` in packets; negative if it is the older. 1 follows the last."""
+    """Return how many packets ``sequence`` is after ``of``, 1 for the next; negative if it is older."""
     distance = (sequence - of) % _NUMBERS
     return distance if distance <= _NUMBERS // 2 else distance - _NUMBERS
 
 
 class Depth:
-    """The target of how much sound waits: enough for the network's jitter, and no more.
+    """The amount of sound that should wait: enough for the network's jitter, and no more.
 
-    A late packet raises the target by its lateness; calm times lower it again. What has been too much through a whole
-    window was not needed: the sender's clock is faster than the player's, or a stall has ended.
+    A late packet raises the target by its lateness; calm times lower it again. Sound that was too much during a whole
+    window is not needed: the sender's clock is faster than the player's, or a stall has ended.
     """
 
     WINDOW_S = 1.0
@@ -74,7 +74,7 @@ class Depth:
         self._calm_since = now
 
     def excess(self, waiting_s: float, now: float) -> float:
-        """Return seconds of sound to leave out now, while ``waiting_s`` wait. Usually 0."""
+        """Return the seconds of sound to leave out now, while ``waiting_s`` seconds wait. Usually 0."""
         self._lowest = min(self._lowest, waiting_s)
         if now - self._calm_since >= self._CALM_S:
             self.target_s, self._calm_since = max(self._least_s, self.target_s - self._STEP_S), now
@@ -86,9 +86,9 @@ class Depth:
 
 
 class JitterBuffer:
-    """A buffer: :meth:`put` what arrives, :meth:`take` what is to be played and write it to the player at once.
+    """A buffer: :meth:`put` packets as they arrive; :meth:`take` the sound to play, and write it to the player at once.
 
-    At most ``limit`` packets wait; the oldest is dropped for the newest. A gap is filled with at most
+    At most ``limit`` packets wait; then the oldest is dropped for the newest. A gap is filled with at most
     ``concealment_ms`` of estimated sound, which fades; then the next received packet is played, or nothing if the
     sender has stopped.
 
@@ -142,7 +142,7 @@ class JitterBuffer:
         self._make_room()
 
     def _is_old(self, number: int, captured_ms: int) -> bool:
-        """True if this number was played or given up. If it was captured later, the sender has restarted instead."""
+        """True if this packet was played or given up. If it was captured later, the sender has restarted: False."""
         if self._expected is None or ahead(number, self._expected) >= 0:
             self._behind = 0
             return False
@@ -171,7 +171,7 @@ class JitterBuffer:
     # -- out
 
     def wait(self, now: float) -> float | None:
-        """Return seconds until :meth:`take` may have something; None as long as nothing arrives."""
+        """Return the seconds until :meth:`take` may have something; None while only an arriving packet helps."""
         if not self._playing and not self._waiting:
             return None
         return max(0.0, self._due - now)
@@ -247,15 +247,15 @@ class JitterBuffer:
 
     def _leave_out(self, received: ReceivedSound, excess: float) -> ReceivedSound:
         """Return the packet to play without ``excess`` seconds, its beginning faded over from ``received``."""
-        newest, left = received, excess
-        while self._waiting and left > len(newest.samples) / newest.rate - _ROUNDING_S:
-            left -= len(newest.samples) / newest.rate
+        newest, remaining_s = received, excess
+        while self._waiting and remaining_s > len(newest.samples) / newest.rate - _ROUNDING_S:
+            remaining_s -= len(newest.samples) / newest.rate
             newest = self._decode(self._first()) or newest
             self.counters.add("skipped")
         return _faded_over(received, newest)
 
     def _conceal(self, gap_s: float) -> Chunk | None:
-        """Return a piece of estimated sound, until the gap is filled or ``concealment_ms`` are used up."""
+        """Return a piece of estimated sound; None when the gap is filled, or ``concealment_ms`` are used up."""
         last = self._last
         if last is None:
             return None
@@ -270,7 +270,7 @@ class JitterBuffer:
         return Chunk(to_int16(estimate * gain[:, None]), last.rate, last.channels, concealed=True)
 
     def _estimated(self, last: ReceivedSound, size: int) -> Samples:
-        """Return the codec's estimate, else the last packet backwards and forwards in turn, which makes no step."""
+        """Return the codec's estimate, or else the last packet, in turn backwards and forwards: without a step."""
         if self._spare is None or not len(self._spare):
             self._spare = self._decoder.conceal()
         if self._spare is not None:

@@ -1,4 +1,4 @@
-"""Checks a JPEG before it is decoded, so that half a picture is never shown as a whole one."""
+"""Checks a JPEG before it is decoded, so that a part of a picture is never shown as a whole one."""
 
 from typing import Final, TypeAlias, cast
 
@@ -21,7 +21,7 @@ Pixels: TypeAlias = NDArray[np.uint8]
 
 
 def decode_jpeg(jpeg: bytes) -> Pixels:
-    """Return a whole picture: BGR, shape (height, width, 3), the caller's own. Raises PayloadError for anything else.
+    """Return a whole picture as a new array: BGR, (height, width, 3). Raises PayloadError for anything else.
 
     Bits flipped within the coefficients go undetected: JPEG has no checksum; TCP and zlib have.
     """
@@ -40,10 +40,10 @@ def decode_jpeg(jpeg: bytes) -> Pixels:
 
 
 def jpeg_size(jpeg: bytes) -> tuple[int, int]:
-    """Return width and height of a JPEG; PayloadError if it is too large, no JPEG, or has no end.
+    """Return the width and height of a JPEG. Raises PayloadError if it is too large, is no JPEG or has no end.
 
-    libjpeg fills what is missing with grey and calls it a picture. An end marker cannot occur within a scan (FF is
-    stuffed there), so one behind the size tells a whole picture from a part of one.
+    libjpeg fills missing parts with grey and reports a picture. An end marker cannot occur within a scan (FF is stuffed
+    there), so an end marker after the size shows that the picture is whole.
     """
     if len(jpeg) > MAX_BYTES:
         raise PayloadError(f"JPEG: {len(jpeg)} bytes, more than {MAX_BYTES}")
@@ -61,7 +61,7 @@ def jpeg_size(jpeg: bytes) -> tuple[int, int]:
 
 
 def _check(jpeg: bytes, frame: int, width: int, height: int) -> None:
-    """Raise PayloadError unless the picture is whole and within the limits. ``frame``: where its size stands."""
+    """Raise PayloadError unless the picture is whole and within the limits. ``frame``: the place of its size."""
     if not (0 < width <= MAX_EDGE and 0 < height <= MAX_EDGE):
         raise PayloadError(f"JPEG: {width}x{height}, larger than {MAX_EDGE}x{MAX_EDGE} or nothing")
     if jpeg.find(_EOI, frame) < 0:

@@ -20,10 +20,10 @@ def add(reference: Pixels, difference: Pixels, out: Pixels | None = None) -> Pix
 
 
 class JpegDelta:
-    """An encoder of pictures, one after the other.
+    """An encoder of a sequence of pictures.
 
     It decodes its own JPEGs, so a difference also corrects the errors of the one before. (Differences from the camera's
-    previous picture, as the paper's first encoder made them, add the errors up until the next full picture.)
+    previous picture, as the paper's first encoder made them, add up the errors until the next full picture.)
     """
 
     def __init__(self, interval: int) -> None:
@@ -36,7 +36,7 @@ class JpegDelta:
         self._difference: Pixels | None = None
 
     def encode(self, picture: Pixels, quality: float, *, keyframe: bool = False) -> bytes:
-        """Return a JPEG of ``quality`` (1..100). Another size than before makes a full picture by itself."""
+        """Return a JPEG of ``quality`` (1..100). A picture of another size than the last becomes a full picture."""
         reference = self._reference if self._chained else None
         self.keyframe = keyframe or reference is None or reference.shape != picture.shape
         if self.keyframe or reference is None:
@@ -53,7 +53,7 @@ class JpegDelta:
         return jpeg
 
     def _is_reference(self) -> bool:
-        """True if the next picture builds on this one, because it is no full one."""
+        """True if the next picture is a difference from this one."""
         self._chained = self._since_keyframe + 1 < self._interval
         return self._chained
 
@@ -63,6 +63,6 @@ class JpegDelta:
 
 
 def _jpeg(picture: Pixels, quality: float) -> bytes:
-    """Return a JPEG with Huffman tables of its own: at low quality a quarter smaller, for 0.4 ms more at 640x480."""
+    """Return a JPEG with optimized Huffman tables: at low quality a quarter smaller, for 0.4 ms more at 640x480."""
     options = [cv2.IMWRITE_JPEG_QUALITY, round(min(100, max(1, quality))), cv2.IMWRITE_JPEG_OPTIMIZE, 1]
     return cv2.imencode(".jpg", picture, options)[1].tobytes()

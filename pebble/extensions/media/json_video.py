@@ -27,7 +27,7 @@ def pack(frame: int, keyframe: bool, captured_ms: int | None, jpeg: bytes) -> by
 
 
 def jpeg_of(raw: bytes) -> bytes:
-    """Return the JPEG in a message. Raises PayloadError for anything that is no complete one."""
+    """Return the JPEG in a message. Raises PayloadError if the message is incomplete, or something else."""
     try:
         packed = _decoder.decode(raw).data
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:
@@ -36,7 +36,7 @@ def jpeg_of(raw: bytes) -> bytes:
 
 
 def inflate(packed: bytes, limit: int) -> bytes:
-    """Unpack the one complete zlib stream in ``packed``. Raises PayloadError for anything else.
+    """Return the content of ``packed``, one complete zlib stream. Raises PayloadError for anything else.
 
     The limit matters because a few kilobytes may unpack to gigabytes. zlib ends with a checksum of the content.
     """

@@ -1,4 +1,4 @@
-"""Sections of a robot's capabilities: pictures and sound before a service sends them, and lists of files."""
+"""Sections of a robot's capabilities: pictures and sound, before a service sends any, and lists of files."""
 
 from msgspec.structs import replace
 
@@ -12,7 +12,7 @@ from pebble.runtime.addresses import Addresses
 
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
-    """Return ``value`` with pictures and sound that are not available yet."""
+    """Return ``value`` with offers of pictures and sound that are not available yet."""
     addresses = Addresses(config)
     return replace(value, video=_video(config, addresses), audio=_audio(config, addresses))
 
@@ -59,5 +59,5 @@ def files_offer(config: Config, command: c.Channel, files: c.Channel, status: c.
 
 
 def _first(*values: float | None) -> float | None:
-    """Return the first value that was set: 0 is one."""
+    """Return the first argument that is not None; 0 counts as a value."""
     return next((value for value in values if value is not None), None)

@@ -1,12 +1,12 @@
-"""Opus for PBAT codec 2, by PyAV's libopus, and how several Opus packets share one PBAT body.
+"""Opus for PBAT codec 2, by PyAV's libopus, and the form in which several Opus packets share a PBAT body.
 
-The body is one or more Opus packets, each behind its length in bytes as u16, big-endian as the header is. All of them
-belong together in time; ``samples`` of the header counts what all of them decode to, at the header's rate, which is one
-of RATES. Three short packets instead of one long one, because a decoder conceals each by itself.
+The body is one or more Opus packets, each after its length in bytes as a big-endian u16. They all belong to one time
+stamp; ``samples`` in the header counts what they decode to together, at the header's rate, one of RATES. Several short
+packets are used instead of a long one because a decoder conceals each lost packet by itself.
 
-Facts: RFC 6716 (3.1: the first byte tells a packet's length in time; a frame of no more than its first byte asks the
-decoder to conceal one). FFmpeg's decoder always yields 48 kHz and offers no other way to conceal; what in-band FEC adds
-to the next packet only decoders with an own libopus make use of.
+Facts: RFC 6716 (3.1: the first byte tells a packet's duration; a frame that consists of its first byte only asks the
+decoder to conceal one). FFmpeg's decoder always yields 48 kHz, and has no other way to conceal. The in-band FEC in the
+next packet is used only by decoders that have a libopus of their own.
 """
 
 import struct
@@ -39,7 +39,7 @@ def join(packets: list[bytes]) -> bytes:
 def split(body: bytes) -> list[bytes]:
     """Return the Opus packets of a PBAT body.
 
-    Raises PayloadError unless it is made of whole ones, from 1 to BUNDLE_LIMIT.
+    Raises PayloadError unless the body consists of 1 to BUNDLE_LIMIT whole packets.
     """
     packets = list(_pieces(body))
     if not 1 <= len(packets) <= BUNDLE_LIMIT:
@@ -79,7 +79,7 @@ def _codec(av: Any, mode: str) -> Any:
 
 
 class OpusEncoder:
-    """Frames of ``frame_ms`` (one of FRAMES_MS) at one of RATES, mono or stereo, to one Opus packet each."""
+    """An encoder of frames of ``frame_ms`` (one of FRAMES_MS) at one of RATES, mono or stereo, to one packet each."""
 
     def __init__(self, rate: int, channels: int, *, frame_ms: int, bitrate: int) -> None:
         self._av = pyav.load("opus")
@@ -105,7 +105,7 @@ class OpusEncoder:
 
 
 class OpusDecoder:
-    """Opus packets to samples at ``rate`` (one of RATES), mono or stereo whatever they were made of."""
+    """A decoder of Opus packets to samples at ``rate`` (one of RATES), mono or stereo whatever the packets hold."""
 
     def __init__(self, rate: int, channels: int) -> None:
         self._av = pyav.load("opus")
@@ -116,16 +116,13 @@ class OpusDecoder:
         self._mode: bytes | None = None  # first byte of the last packet: what a concealed one is like
 
     def decode(self, packet: bytes) -> Samples:
-        """Return the samples of a packet, (samples, channels). Raises PayloadError for what is no Opus packet."""
+        """Return the samples of a packet, (samples, channels). Raises PayloadError if it is no Opus packet."""
         samples = self._decode(packet)
         self._mode = bytes([packet[0] & 0xFC])  # 0xFC: one frame, not several
         return samples
 
     def conceal(self) -> Samples:
-        """Return an estimate of one more frame, which fades when called again and again.
-
-        Empty before the first packet.
-        """
+        """Return an estimate of one more frame, which fades as this is called again. Empty before the first packet."""
         if self._mode is None:
             return np.zeros((0, self._channels), np.int16)
         return self._decode(self._mode)

@@ -1,4 +1,4 @@
-"""Binary media headers: PBAT for sound, PBVD for pictures. Pure: bytes in, bytes out.
+"""Binary headers of media: PBAT for sound, PBVD for pictures. Pure: bytes in, bytes out.
 
 Layouts: paper 8.9 and A.8.8, and the newest revision of the reference implementation. All numbers are big-endian.
 """
@@ -29,7 +29,7 @@ class Codec(IntEnum):
 
 
 class PictureKind(IntEnum):
-    """The kind of the body of a PBVD packet. Old decoders ignore flags, so every new meaning is a new kind."""
+    """The kind of a PBVD packet's body. Old decoders ignore flags, so every new meaning is a new kind."""
 
     JPEG = 1  # a full picture
     DELTA_JPEG = 2  # reference + (decoded - 128)
@@ -43,7 +43,7 @@ KEY_FRAME: Final = 1  # flag of H264
 
 @dataclass(frozen=True, slots=True)
 class Sound:
-    """A PBAT packet. ``samples`` counts per channel; ``captured_ms`` is epoch time of the first of them."""
+    """A PBAT packet. ``samples`` counts per channel; ``captured_ms`` is the epoch time of the first sample."""
 
     codec: int
     channels: int
@@ -98,7 +98,7 @@ class Picture:
 
     @classmethod
     def unpack(cls, raw: bytes) -> Picture:
-        """Return the packet in ``raw``. Raises PayloadError for anything but a PBVD packet of version 1."""
+        """Return the packet in ``raw``. Raises PayloadError if it is no PBVD packet of version 1."""
         if len(raw) < _PICTURE.size:
             raise PayloadError(f"PBVD: {len(raw)} bytes, less than its header")
         magic, version, kind, flags, frame, captured_ms = _PICTURE.unpack_from(raw)

@@ -1,4 +1,4 @@
-"""Samples as arrays: other rates, other numbers of channels. Pure."""
+"""Conversions of samples in arrays: their rate, format and number of channels. Pure."""
 
 from math import ceil, gcd
 from typing import Any
@@ -14,18 +14,18 @@ _PHASES = 512  # at most; rates whose ratio needs more are met to 1/512 of a sam
 
 
 def to_samples(pcm: bytes, channels: int) -> Samples:
-    """Return interleaved s16le as (samples, channels); an unfinished sample at the end is left out."""
+    """Return interleaved s16le as an array (samples, channels). An unfinished last sample is left out."""
     whole = len(pcm) // (2 * channels) * channels
     return np.frombuffer(pcm, "<i2", whole).reshape(-1, channels)
 
 
 def to_bytes(samples: Samples) -> bytes:
-    """Return interleaved s16le."""
+    """Return an array of samples as interleaved s16le."""
     return samples.astype("<i2", copy=False).tobytes()
 
 
 def remix(samples: Samples, channels: int) -> Samples:
-    """Return another number of channels: the mean of all of them on each, which is enough for a robot."""
+    """Return the samples with another number of channels, each the mean of all: enough for a robot."""
     if samples.shape[1] == channels:
         return samples
     mean = samples.mean(axis=1, dtype=np.float32)
@@ -33,13 +33,13 @@ def remix(samples: Samples, channels: int) -> Samples:
 
 
 def to_int16(samples: npt.NDArray[np.floating[Any]]) -> Samples:
-    """Return the samples rounded, and clipped instead of wrapped."""
+    """Return the samples rounded to s16; values out of range are clipped."""
     clipped: Samples = np.rint(np.clip(samples, -32768, 32767)).astype(np.int16)
     return clipped
 
 
 class Resampler:
-    """One stream from one rate to another by a windowed sinc, without a seam between chunks; delays by about 1 ms.
+    """A converter of one stream to another rate by a windowed sinc, without seams; delays by about 1 ms.
 
     Chunks that hold a whole number of output samples yield exactly that many.
     """
@@ -62,15 +62,15 @@ class Resampler:
         count = max(0, ceil((windows * self._up - self._at) / self._down))
         at = self._at + self._down * np.arange(count, dtype=np.int64)
         phases = at % self._up * len(self._filter) // self._up
-        seen = np.lib.stride_tricks.sliding_window_view(held, self._taps, axis=0)[at // self._up]
-        mixed = np.einsum("nck,nk->nc", seen, self._filter[phases], optimize=False)
+        views = np.lib.stride_tricks.sliding_window_view(held, self._taps, axis=0)[at // self._up]
+        mixed = np.einsum("nck,nk->nc", views, self._filter[phases], optimize=False)
         self._at += self._down * count - windows * self._up
         self._tail = held[windows:]
         return to_int16(mixed)
 
 
 def _filter(phases: int, taps: int, passed: float) -> npt.NDArray[np.float32]:
-    """Return the low pass, (phases, taps), as seen from each position between two samples; each row sums up to 1."""
+    """Return the low pass, (phases, taps), for each position between two samples; each row sums up to 1."""
     offsets = np.arange(taps) - (taps / 2 - 1) - np.arange(phases)[:, None] / phases
     shape = np.sinc(offsets * passed) * np.cos(np.pi * np.clip(offsets / taps, -0.5, 0.5)) ** 2
     normal: npt.NDArray[np.float32] = (shape / shape.sum(axis=1, keepdims=True)).astype(np.float32)

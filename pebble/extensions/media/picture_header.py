@@ -1,4 +1,4 @@
-"""Reads what surrounds a picture on the wire, without decoding the picture. Pure; imports neither cv2 nor PyAV."""
+"""Reads the header around a picture on the wire, without decoding the picture. Pure; needs neither cv2 nor PyAV."""
 
 from typing import Annotated, Final, NamedTuple
 
@@ -33,7 +33,7 @@ _json = msgspec.json.Decoder(_JsonHead)
 
 
 class PictureHeader(NamedTuple):
-    """``keyframe``: the picture needs none before it. ``frame`` and ``captured_ms`` are None where they are missing."""
+    """The header. ``keyframe``: no earlier picture is needed. ``frame`` and ``captured_ms``: None if missing."""
 
     encoding: str  # json | pbvd | pbvz | h264 | jpeg
     keyframe: bool
@@ -42,7 +42,7 @@ class PictureHeader(NamedTuple):
 
 
 def read_header(payload: bytes) -> PictureHeader | None:
-    """Return the header of a payload of any encoding; None if it is none of them."""
+    """Return the header of a payload of any encoding; None if it is no picture."""
     if payload.startswith(PBVD):
         return _read_pbvd(payload)
     if payload.startswith(_SOI):
@@ -62,7 +62,7 @@ def follows(last: PictureHeader | None, header: PictureHeader) -> bool:
 
 
 class PictureSequence:
-    """A watch that notices missing pictures: those after a missing one are of no use until the next key frame."""
+    """A detector of missing pictures: those after a missing picture are of no use until the next key frame."""
 
     def __init__(self) -> None:
         self.complete = False  # none is missing before the newest
@@ -76,7 +76,7 @@ class PictureSequence:
         return header
 
     def interrupt(self) -> None:
-        """Count the next picture as missing what is before it."""
+        """Treat the picture before the next one as missing."""
         self.complete, self._last = False, None
 
 
@@ -115,5 +115,5 @@ def _milliseconds(stamp: float | None) -> int | None:
 
 
 def _plausible(captured_ms: int) -> int | None:
-    """Return a moment that can be written as a date, or None."""
+    """Return ``captured_ms`` if it can be written as a date, else None."""
     return captured_ms if 0 < captured_ms < _LATEST_MS else None

@@ -1,4 +1,4 @@
-"""PyAV, which H.264 and Opus need: imported only where it is used, because that costs some 20 MB and 100 ms."""
+"""PyAV, for H.264 and Opus. It is imported only where it is used, because that costs some 20 MB and 100 ms."""
 
 from importlib.util import find_spec
 from typing import Any, Final
@@ -18,12 +18,12 @@ def installed() -> bool:
 
 
 def available(encodings: tuple[str, ...]) -> tuple[str, ...]:
-    """Return those of ``encodings`` that this installation can make."""
+    """Return the ``encodings`` that this installation can make."""
     return tuple(name for name in encodings if name not in NEED_PYAV or installed())
 
 
 def load(codec: str) -> Any:
-    """Return the module ``av``; raises PebbleError where it is missing."""
+    """Return the module ``av``. Raises PebbleError if it is not installed."""
     try:
         import av
         import av.error

@@ -1,4 +1,4 @@
-"""A meter of messages and bits per second, and of their age. Pure: times are passed in."""
+"""A meter of messages and bits per second, and of the age of messages. Pure: times are passed in."""
 
 import statistics
 from collections import deque
@@ -15,9 +15,9 @@ class Arrival(NamedTuple):
 
 
 class RateMeter:
-    """Measures the newest messages: up to ``limit`` of them, none older than ``window_s``.
+    """A meter of the newest messages: up to ``limit`` of them, none older than ``window_s``.
 
-    A rate counts what came after the first of them, divided by the time from the first to the last. One thread may add
+    A rate is the number of messages after the first, divided by the time from the first to the last. One thread may add
     while others read.
     """
 
@@ -45,7 +45,7 @@ class RateMeter:
         return 8 * sum(arrival.size for arrival in recent[1:]) / seconds if seconds > 0 else 0.0
 
     def age_s(self, now: float) -> float | None:
-        """Return the median age of the messages; None if none of them has one."""
+        """Return the median age of the messages; None if no message has a time stamp."""
         ages = [arrival.age_s for arrival in self._recent(now)[0] if arrival.age_s is not None]
         return statistics.median(ages) if ages else None
 

@@ -1,4 +1,4 @@
-"""Rests between pictures or sound on a thin link. Pure: times are passed in."""
+"""Pauses between pictures or sound on a thin link. Pure: times are passed in."""
 
 from typing import Final
 
@@ -8,9 +8,9 @@ _LONGEST_S: Final = 30.0  # the link may be a better one by then
 
 
 class Rests:
-    """The rests after slow pictures or sound, because on a thin link commands share what the modem carries.
+    """The pauses after slow pictures or sound: commands share the modem's capacity with them.
 
-    The next picture or sound waits for the end of the rest. ``on`` False: there are none.
+    The next picture or sound waits for the end of the pause. ``on`` False: there are no pauses.
     """
 
     def __init__(self, on: bool) -> None:
@@ -18,7 +18,7 @@ class Rests:
         self._until = float("-inf")
 
     def note(self, took_s: float, now: float) -> None:
-        """Note ``took_s``: for how long a message that was confirmed just now has kept the connection busy."""
+        """Note a message that was just confirmed, after it kept the connection busy for ``took_s``."""
         if self.on and took_s > SLOW_S:
             self._until = max(self._until, now + min(_TIMES * took_s, _LONGEST_S))
 

@@ -1,6 +1,6 @@
 """A moving scene computed from the frame's number alone: for robots without a camera, tests and measurements.
 
-The counter in it can be read back from what is left of a picture after lossy encoding and resizing.
+The scene shows its number in a form that can be read back after lossy encoding and resizing.
 """
 
 from binascii import crc_hqx
@@ -44,7 +44,7 @@ def noise(seed: int, count: int) -> NDArray[np.float32]:
 
 
 class Scene:
-    """A scene that draws any of its frames into an array of the caller. The same number gives the same pixels."""
+    """A scene that draws any of its frames into an array of the caller. A number always gives the same pixels."""
 
     def __init__(self, width: int, height: int) -> None:
         self.width, self.height = width, height
@@ -100,13 +100,13 @@ def _bits(value: int) -> NDArray[np.bool_]:
 
 
 def _swing(number: int, period: int, room: int) -> int:
-    """Return a position that goes to and fro between 0 and ``room``."""
+    """Return a position that moves to and fro between 0 and ``room``."""
     phase = number % period / period
     return int(max(0, room) * abs(2 * phase - 1))
 
 
 def _landscape(width: int, height: int) -> Picture:
-    """Return a texture with detail of all sizes, as nature has it, whose right edge continues at its left."""
+    """Return a texture with detail of all sizes, as in nature; its right edge continues at its left edge."""
     light = _grids(0, octaves=6, contrast=100)
     tints = [_grids(100 * channel, octaves=2, contrast=40) for channel in (1, 2, 3)]
     picture = np.empty((height, width, 3), np.uint8)
@@ -120,7 +120,7 @@ def _landscape(width: int, height: int) -> Picture:
 
 
 def _grids(seed: int, *, octaves: int, contrast: float) -> list[NDArray[np.float32]]:
-    """Return grids of random points, from few and strong to many and weak."""
+    """Return grids of random numbers, from coarse and strong to fine and weak."""
     shapes = [((3 << octave) + 1, 4 << octave) for octave in range(octaves)]
     return [
         (noise(seed + octave, rows * columns).reshape(rows, columns) - 0.5) * np.float32(contrast / 1.6**octave)
@@ -129,12 +129,12 @@ def _grids(seed: int, *, octaves: int, contrast: float) -> list[NDArray[np.float
 
 
 def _texture(grids: list[NDArray[np.float32]], rows: NDArray[np.float32], width: int) -> NDArray[np.float32]:
-    """Return the sum of the grids, each stretched over the picture; only the given rows, 0 (top) to 1."""
+    """Return the sum of the grids, each stretched over the picture, for ``rows`` from 0 (top) to 1."""
     return np.asarray(sum(_stretched(grid, rows, width) for grid in grids), np.float32)
 
 
 def _stretched(grid: NDArray[np.float32], rows: NDArray[np.float32], width: int) -> NDArray[np.float32]:
-    """Return the grid's values over the picture, linear between its points; it wraps around from right to left."""
+    """Return the grid's values over the picture, linear between its points; the right edge meets the left one."""
     x = np.arange(width, dtype=np.float32) * grid.shape[1] / width
     y = rows * (grid.shape[0] - 1)
     left, top = x.astype(np.intp), y.astype(np.intp)
@@ -144,7 +144,7 @@ def _stretched(grid: NDArray[np.float32], rows: NDArray[np.float32], width: int)
 
 
 def _tag(cell: int) -> Picture:
-    """Return the AprilTag with its quiet zone, ``cell`` pixels per cell."""
+    """Return the AprilTag with its white border, ``cell`` pixels per cell."""
     cells = np.full((_TAG_CELLS, _TAG_CELLS), 215, np.uint8)
     cells[1:-1, 1:-1] = 40
     cells[2:-2, 2:-2] = [[215 if bit == "1" else 40 for bit in row] for row in _TAG_BITS]

@@ -1,4 +1,4 @@
-"""Sound to PBAT packets and back. Order and timing of playback are the jitter buffer's."""
+"""Encodes sound to PBAT packets, and decodes them. The jitter buffer puts them in order and times them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,13 +25,13 @@ _GAP_MS = 60  # a capture time further than this from where the last chunk ended
 
 
 def sequence_numbers() -> Iterator[int]:
-    """Yield 1, 2, 3 … 0xFFFFFFFF, 1 …: one for each packet of a process, whatever its encoding."""
+    """Yield 1, 2, 3 … 0xFFFFFFFF, 1 …: a number for each packet of a process, of any encoding."""
     while True:
         yield from range(1, SEQUENCE_LIMIT)
 
 
 class _Intake:
-    """The converter of sound to the rate and channels on the wire; it cuts the sound into equal frames."""
+    """A converter of sound to the rate and channels on the wire, cut into equal frames."""
 
     def __init__(self, rate: int, channels: int, rate_out: int, channels_out: int) -> None:
         self.rate, self.channels = rate_out, channels_out
@@ -41,14 +41,14 @@ class _Intake:
         self._next_ms: float | None = None  # when the first sample of the next chunk should have been captured
 
     def has_gap(self, captured_ms: int) -> bool:
-        """Return True if sound is missing before ``captured_ms``; then the samples left over are dropped."""
+        """True if sound is missing before ``captured_ms``. Then the remaining samples before it are dropped."""
         if self._next_ms is None or abs(captured_ms - self._next_ms) <= _GAP_MS:
             return False
         self._left = self._left[:0]
         return True
 
     def frames(self, pcm: bytes, captured_ms: int, size: int) -> Iterator[tuple[Samples, int]]:
-        """Yield frames of ``size`` samples, each with the epoch milliseconds of its first one."""
+        """Yield frames of ``size`` samples, each with the epoch milliseconds of its first sample."""
         fed = to_samples(pcm, self._fed_channels)
         start_ms = captured_ms - 1000 * len(self._left) / self.rate
         held = np.concatenate((self._left, self._resampler.feed(remix(fed, self.channels))))
@@ -62,7 +62,7 @@ class _Intake:
 class SoundEncoder:
     """An encoder that takes any amount of s16le and returns whole packets; the rest waits for more samples.
 
-    ``bundle`` Opus packets are in one of ours; without ``codec`` it holds the samples as they are.
+    A packet holds ``bundle`` Opus packets, or the samples unchanged if there is no ``codec``.
     """
 
     def __init__(
@@ -77,11 +77,11 @@ class SoundEncoder:
 
     @property
     def part_way(self) -> bool:
-        """True if an unfinished packet already holds encoded sound."""
+        """True if an unfinished PBAT packet already holds encoded sound."""
         return bool(self._ready)
 
     def encode(self, pcm: bytes, captured_ms: int) -> list[bytes]:
-        """Return no, one or several PBAT packets; ``captured_ms`` is epoch time of the first sample."""
+        """Return the PBAT packets that are now complete; ``captured_ms`` is the epoch time of the first sample."""
         packets = []
         if self._intake.has_gap(captured_ms):
             self._ready = []
@@ -112,11 +112,11 @@ def make_sound_encoder(
     sent_channels: int | None = None,
     numbers: Iterator[int] | None = None,
 ) -> SoundEncoder:
-    """Make an encoder of sound with ``rate`` and ``channels``.
+    """Return an encoder of sound with ``rate`` and ``channels``.
 
     It sends ``sent_rate`` and ``sent_channels``, as far as the encoding has them. Opus packets last ``chunk_ms``
     rounded up to 20, 40 or 60, and ``bundle`` of them (at most 3) share a PBAT packet. Raises PebbleError for an
-    unknown name and for one this installation cannot make.
+    encoding that is unknown, or not installed.
     """
     numbers = sequence_numbers() if numbers is None else numbers
     rate_out, channels_out = sent_rate or rate, sent_channels or channels
@@ -134,7 +134,7 @@ def make_sound_encoder(
 
 @dataclass(frozen=True, slots=True)
 class ReceivedSound:
-    """A packet that was decoded: samples are (samples, channels)."""
+    """The sound of a packet; samples are (samples, channels)."""
 
     samples: Samples
     rate: int
@@ -150,7 +150,7 @@ class ReceivedSound:
 
 
 def unpack(payload: bytes) -> Sound:
-    """Return the packet in ``payload``, if it may be played. Raises PayloadError for anything else."""
+    """Return the PBAT packet in ``payload``. Raises PayloadError if it must not be played."""
     sound = Sound.unpack(payload)
     if sound.channels > CHANNELS_LIMIT or sound.rate < LOWEST_RATE:
         raise PayloadError(f"PBAT: {sound.channels} channels at {sound.rate} Hz cannot be played")
@@ -174,7 +174,7 @@ def _check_opus(sound: Sound) -> None:
 
 
 class SoundDecoder:
-    """Packets to samples, in the order they are fed; any may differ from the one before in codec, rate and channels.
+    """A decoder of packets to samples, in the order of :meth:`feed`; codec, rate and channels may change at any time.
 
     ``counters``: packets, refused.
     """
@@ -195,7 +195,7 @@ class SoundDecoder:
     def decode(self, sound: Sound) -> ReceivedSound:
         """Return the sound of a packet from :func:`unpack`. Raises PayloadError if it cannot be decoded.
 
-        Raises PebbleError for Opus where PyAV is missing.
+        Raises PebbleError for Opus if PyAV is not installed.
         """
         format_ = (sound.codec, sound.rate, sound.channels)
         if format_ != self._format:
@@ -207,11 +207,11 @@ class SoundDecoder:
         return ReceivedSound(samples, sound.rate, sound.channels, sound.captured_ms, sound.sequence, encoding)
 
     def conceal(self) -> Samples | None:
-        """Return an estimate of one more frame by the codec itself; None if it cannot conceal."""
+        """Return the codec's estimate of one more frame; None if it makes none."""
         if self._opus is None:
             return None
-        made = self._opus.conceal()
-        return made if len(made) else None
+        samples = self._opus.conceal()
+        return samples if len(samples) else None
 
     def _samples(self, sound: Sound) -> Samples:
         if self._opus is None:

@@ -1,4 +1,4 @@
-"""Compressed sound files as samples, a piece at a time, by PyAV; and a writer of wav files."""
+"""Reads compressed sound files as samples, a piece at a time, by PyAV; writes wav files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FORMATS: Final = {".mp3": "mp3", ".ogg": "ogg", ".flac": "flac"}
 
 
 class SoundFile:
-    """An open file. ``rate`` is in Hz; ``channels`` is 1 or 2."""
+    """An open sound file. ``rate`` is in Hz; ``channels`` is 1 or 2."""
 
     def __init__(self, path: Path) -> None:
         """Open the file. Raises PebbleError if there is no sound in it, and OSError if it cannot be read."""
@@ -43,7 +43,7 @@ class SoundFile:
         self._container.close()
 
     def chunks(self) -> Iterator[bytes]:
-        """Interleaved s16le until the end. Raises PebbleError where it cannot be decoded."""
+        """Yield interleaved s16le until the end of the file. Raises PebbleError if it cannot be decoded."""
         layout = "mono" if self.channels == 1 else "stereo"
         try:
             resampler = self._av.AudioResampler(format="s16", layout=layout, rate=self.rate)

@@ -20,7 +20,7 @@ _HIGHEST_HZ = 4_000  # of the harmonics
 
 
 class Speech:
-    """Samples of any rate in Hz, and the same on every channel. The same number gives the same sample, everywhere."""
+    """A source of samples of any rate in Hz, equal on all channels. A number gives the same sample everywhere."""
 
     def __init__(self, rate: int, channels: int = 1) -> None:
         self.rate, self.channels = rate, channels

@@ -1,4 +1,4 @@
-"""Video encoders by name: a picture in, one MQTT payload out."""
+"""Video encoders by name: they make an MQTT payload of each picture."""
 
 from typing import Final
 
@@ -18,18 +18,18 @@ _H264_INTERVAL_S: Final = 4.0  # a receiver that misses a frame requests a key f
 
 
 class VideoEncoder:
-    """One stream to one topic; frames are numbered from 0, by one."""
+    """An encoder of one stream; its frames are numbered from 0."""
 
     def __init__(self, name: str, codec: H264Encoder | JpegDelta, quality: float) -> None:
-        """Store the arguments. ``quality``, 1..100 as of a JPEG, may change."""
+        """Store the arguments. ``quality``, 1..100 as of a JPEG, may be changed later."""
         self.name, self.quality = name, quality
         self.last_was_keyframe = False
         self._codec, self._frame = codec, 0
 
     def encode(self, picture: Pixels, captured_ms: int, *, keyframe: bool = False) -> bytes:
-        """Return one MQTT payload; with ``keyframe`` a full picture.
+        """Return the MQTT payload of ``picture``; with ``keyframe`` a full picture.
 
-        ``picture``: BGR, uint8, (height, width, 3), only read.
+        ``picture``: BGR, uint8, (height, width, 3); it is not changed.
         """
         body = self._codec.encode(picture, self.quality, keyframe=keyframe)
         self.last_was_keyframe = full = self._codec.keyframe
@@ -51,8 +51,9 @@ def make_encoder(
 ) -> VideoEncoder:
     """Return the encoder called ``name``: json, pbvd or h264.
 
-    ``keyframe_interval``: pictures from one key frame to the next; None means as many as come in a third of a second
-    (the paper's rule), for h264 in four. Raises ConfigError for an unknown name, PebbleError saying what to install.
+    ``keyframe_interval``: pictures from one key frame to the next. None: the pictures of a third of a second (the
+    paper's rule), for h264 of four seconds. Raises ConfigError for an unknown name, and PebbleError that says what to
+    install.
     """
     if keyframe_interval is None:
         keyframe_interval = round(fps * _H264_INTERVAL_S) if name == "h264" else int(fps / 3)

@@ -1,4 +1,4 @@
-"""Robots of a broker as metrics for Prometheus."""
+"""An exporter of the robots of a broker as metrics for Prometheus."""
 
 from pebble.extension import Command, Extension
 

@@ -1,4 +1,4 @@
-"""The robots that are exported, by the messages that they publish, and the text format. Pure."""
+"""The robots that are exported, as known from their messages, and Prometheus' text format. Pure."""
 
 import re
 from collections import defaultdict
@@ -36,7 +36,7 @@ class Samples:
         self._lines: defaultdict[str, list[str]] = defaultdict(list)
 
     def add(self, metric: str, value: float | None, **labels: str) -> None:
-        """Add a sample; None adds nothing."""
+        """Add a sample, unless ``value`` is None."""
         if value is not None:
             named = ",".join(f'{name}="{_escaped(text)}"' for name, text in labels.items())
             self._lines[metric].append(f"{metric}{{{named}}} {value:.12g}\n")
@@ -50,7 +50,7 @@ class Samples:
 
 
 class Robot:
-    """One robot: the view of an operator's program, and the figures that the view does not keep."""
+    """A robot as an operator's program sees it, with figures that such a view does not keep."""
 
     def __init__(self, base: str, now: float) -> None:
         self.view = RobotView(base)
@@ -63,7 +63,7 @@ class Robot:
         self._loss: dict[str, float] = {}
 
     def receive(self, channel: c.Channel | None, message: Message, now: float, wall: float) -> None:
-        """Take a message that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds)."""
+        """Handle a message that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds)."""
         self.view.receive(channel, message, now, wall)
         self.heard_at = self.view.liveness.received_at or self.heard_at
         self._meter.add(now, 0 if message.retain else len(message.payload))
@@ -89,7 +89,7 @@ class Robot:
                 self._loss[name] = dropped / handled
 
     def add_to(self, samples: Samples, now: float) -> None:
-        """Add what is known of the robot; if it is silent, only that, and which of its owners are stopped."""
+        """Add the samples of the robot. Of a silent robot add only that, and which of its owners are stopped."""
         robot, view = id_of(self.view.base), self.view
         online = view.online(now) is True
         samples.add("pebble_robot_online", online, robot=robot)
@@ -125,7 +125,7 @@ class Robots:
         self._unlisted: set[str] = set()  # heard of since the last scrape
 
     def receive(self, message: Message, now: float, wall: float) -> None:
-        """Take a message of any robot; an empty one adds none."""
+        """Handle a message of any robot. An empty message does not add an unknown robot."""
         address = parse_topic(message.topic)
         if address is None or address.identity.is_server:
             return
@@ -139,7 +139,7 @@ class Robots:
             self.robots[base].receive(channel_of(f"{address.direction}/{address.metric}"), message, now, wall)
 
     def add_to(self, samples: Samples, now: float) -> None:
-        """Add all robots, and forget those that were silent for too long."""
+        """Add the samples of all robots, and forget robots that were silent for too long."""
         self.robots = {base: robot for base, robot in self.robots.items() if now - robot.heard_at < FORGOTTEN_S}
         for robot in self.robots.values():
             robot.add_to(samples, now)
@@ -149,7 +149,7 @@ class Robots:
 
 
 def _named(entries: dict[str, T]) -> dict[str, T]:
-    """Return the entries whose names may be labels."""
+    """Return the entries whose names are valid as labels."""
     return {name: entry for name, entry in list(entries.items())[:MOST_NAMES] if _valid_level(name)}
 
 

@@ -1,4 +1,4 @@
-"""The server that Prometheus scrapes, and its connection to the robots' broker."""
+"""The HTTP server that Prometheus scrapes, with its connection to the robots' broker."""
 
 import asyncio
 import hmac
@@ -20,14 +20,14 @@ _MAX_REQUEST: Final = 8192  # bytes
 
 
 class Exporter:
-    """The robots of one broker, as an HTTP server. Everything runs on the event loop."""
+    """An HTTP server with the robots of one broker. Everything runs on the event loop."""
 
     def __init__(self, settings: MqttSettings, token: str) -> None:
         self._robots, self._broker = Robots(), Broker(settings, "pebble-exporter")
         self._authorization = f"Bearer {token}".encode() if token else b""
 
     async def serve(self, host: str, port: int, on_ready: Callable[[str], None]) -> None:
-        """Serve until a signal ends it; a broker that is away is waited for. Raises PebbleError."""
+        """Serve until a signal ends it, and wait for the broker while it is away. Raises PebbleError."""
         with ending_event() as ended:
             try:
                 server = await asyncio.start_server(self._answer, host, port, limit=_MAX_REQUEST)
@@ -49,7 +49,7 @@ class Exporter:
         self._robots.receive(message, at, time.time() - (time.monotonic() - at))
 
     def scrape(self) -> str:
-        """Return all metrics; without a broker nothing is known of robots."""
+        """Return all metrics; those of robots only while the broker is connected."""
         now, samples = time.monotonic(), Samples()
         if self._broker.connected:
             self._robots.add_to(samples, now)

@@ -1,4 +1,4 @@
-"""Operators: the client library and the commands that use it."""
+"""Operators: the client library, and the commands that use it."""
 
 from pebble.extension import Command, Extension
 

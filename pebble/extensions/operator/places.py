@@ -16,7 +16,7 @@ class Places:
 
     @cached_property
     def etc(self) -> Path:
-        """Config, passwords and certificates: ``root:pebble``, files 0640."""
+        """Folder of config, passwords and certificates: ``root:pebble``, files 0640."""
         return self.root / "etc/pebble"
 
     @cached_property
@@ -30,27 +30,27 @@ class Places:
 
     @cached_property
     def manifest(self) -> Path:
-        """A list of an earlier setup, which nothing reads now."""
+        """Path of an earlier setup's list, which is no longer read."""
         return self.etc / "setup.json"
 
     @cached_property
     def state(self) -> Path:
-        """The stop, and all that survives a power cut: ``pebble:pebble``, 0700. ``$STATE_DIRECTORY`` of the unit."""
+        """Folder of the stop and all that survives a power cut: ``pebble:pebble``, 0700; ``$STATE_DIRECTORY``."""
         return self.root / "var/lib/pebble"
 
     @cached_property
     def slots(self) -> Path:
-        """The folder of ``a`` and ``b``, each a virtual environment, and of the link ``active``."""
+        """Folder of ``a`` and ``b``, each a virtual environment, and of the link ``active``."""
         return self.root / "opt/pebble"
 
     @cached_property
     def slot_state(self) -> Path:
-        """The folder of ``trial``, ``refused`` and ``sequence``: of ``pebble-slot`` and of updates."""
+        """Folder of ``trial``, ``refused`` and ``sequence``, for ``pebble-slot`` and updates."""
         return self.root / "var/lib/pebble-update"
 
     @cached_property
     def current_slot(self) -> Path:
-        """The link that ``pebble-slot choose`` sets at each start; the unit runs what it points to."""
+        """Link that ``pebble-slot choose`` sets at each start; the unit runs the slot to which it points."""
         return self.root / "run/pebble-slot/current"
 
     @cached_property
@@ -60,7 +60,7 @@ class Places:
 
     @cached_property
     def broker_folder(self) -> Path:
-        """Accounts, rules and certificate of the robot's own broker: a folder of `pebble fleet`."""
+        """Folder of the robot's own broker, as of `pebble fleet`: accounts, rules and certificate."""
         return self.root / "etc/mosquitto/pebble"
 
     @cached_property
@@ -70,11 +70,11 @@ class Places:
 
     @cached_property
     def people(self) -> Path:
-        """The users of the robot's page. The file keeps its name when the robot gets another."""
+        """File with the users of the robot's page. It keeps its name when the robot gets another."""
         return self.state / "people.sqlite"
 
     def named(self, path: Path) -> str:
-        """Return the path without this root: as programs on the machine name it."""
+        """Return the path without this root, as programs on the machine name it."""
         return f"/{path.relative_to(self.root)}"
 
 

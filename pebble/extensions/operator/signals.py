@@ -1,4 +1,4 @@
-"""The signals that end a command: handled in a ``with`` block, or raised as KeyboardInterrupt."""
+"""Handles the signals that end a command: in a ``with`` block, or as KeyboardInterrupt."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def handled_by(handler: Callable[[int, FrameType | None], Any], *more: int) -> Iterator[None]:
-    """Call ``handler`` on the signals that end a program, and on ``more``, during the block. Main thread only."""
+    """Call ``handler`` during the block on the signals that end a program, and on ``more``. Main thread only."""
     before = {number: signal.signal(number, handler) for number in (*ending_signals(), *more)}
     try:
         yield
@@ -41,7 +41,7 @@ def interrupted_by_signals() -> Iterator[None]:
 
 @contextmanager
 def ending_event() -> Iterator[asyncio.Event]:
-    """Yield an event that these signals set.
+    """Yield an event that is set by the signals that end a program.
 
     Not every platform lets an event loop handle signals.
     """

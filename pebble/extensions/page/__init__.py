@@ -1,4 +1,4 @@
-"""The operator page: one process between browsers and the remote broker, and the page that it serves."""
+"""The operator page: a process between browsers and the remote broker, and the page that it serves."""
 
 from pebble.extension import Command, Extension, Program
 

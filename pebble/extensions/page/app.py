@@ -127,7 +127,7 @@ def _static_of(request: Request) -> StaticFiles:
 
 
 async def _authority(request: Request) -> Response:
-    """Answer with the certificate of our authority, which phones are asked to trust; it is public."""
+    """Answer with the certificate of our authority, which phones are asked to trust and which is public."""
     path = request.app.state.settings.authority
     content = b"" if path is None or not path.is_file() else certificates.only_certificates(path.read_bytes())
     if not content:
@@ -136,7 +136,7 @@ async def _authority(request: Request) -> Response:
 
 
 async def _health(request: Request) -> Response:
-    """Answer 200 while the broker is connected. It tells nothing else, because it needs no login."""
+    """Answer 200 while the broker is connected, and nothing more: this needs no login."""
     connected = request.app.state.broker.connected
     return PlainTextResponse("ok" if connected else "no broker", 200 if connected else 503, headers=NO_STORE)
 
@@ -156,7 +156,7 @@ async def _snapshot(request: Request) -> Response:
 
 
 async def _estop(request: Request) -> Response:
-    """Stop robots for a page whose control socket is closed or, as a plain form, for a page that does not start."""
+    """Stop robots for a page whose control socket is closed or, as a plain form, for a page that did not start."""
     answer = _stopped_page if content_type(request.headers) == FORM else _plain
     session = login.session_of(request)
     if session is None:
@@ -274,7 +274,7 @@ async def _serve(
 
 
 async def _while_allowed(websocket: WebSocket, session: Session, work: Coroutine[Any, Any, None]) -> None:
-    """Run the work of a socket until it is done or the session is revoked."""
+    """Run the work of a socket until it is done, or the session is revoked."""
     server: Server = websocket.app.state.server
     people, check_at = server.people_version, time.monotonic() + CHECK_S
     serving = asyncio.ensure_future(work)

@@ -106,7 +106,7 @@ class WebInterface(Section, frozen=True, kw_only=True):
 
 
 def _check(reader: Reader, web: WebInterface, path: Path) -> WebInterface:
-    """Warn of settings that keep the page from starting. They are no error, as the robot drives without a page."""
+    """Warn of settings with which the page cannot start. They are no errors: the robot drives without a page."""
     if not web.local and web.tls.certificate is None and not web.plain_http:
         reader.notes.warning(
             (*path, "host"),

@@ -1,4 +1,4 @@
-"""The control socket of one page: its commands, and the states sent to it."""
+"""The control socket of one page: its commands, and the states that it is sent."""
 
 import asyncio
 import secrets
@@ -38,11 +38,11 @@ _decoder = msgspec.json.Decoder(m.FromPage)
 
 
 class Leave(Exception):  # noqa: N818 - not an error
-    """The end of a connection by the server, after which the page may connect again."""
+    """An exception: the server ends the connection; the page may connect again."""
 
 
 class Control:
-    """A connection that was accepted and has a session; ``serve`` returns at its end."""
+    """An accepted connection with a session; ``serve`` returns at its end."""
 
     def __init__(
         self, server: Server, websocket: WebSocket, session: Session, check: Callable[[], Session | None]
@@ -60,7 +60,7 @@ class Control:
         self._moved: set[str] = set()  # robots moved since this page has control, for the audit
 
     async def serve(self) -> None:
-        """Serve until the page or the server ends the connection; then what the page moved has been stopped."""
+        """Serve until the page or the server ends the connection; then the motion that the page caused is stopped."""
         sender: asyncio.Task[None] | None = None
         try:
             self._begin(await asyncio.wait_for(self._receive(), HELLO_S))
@@ -206,7 +206,7 @@ class Control:
         self._wake.set()
 
     def _command(self, op: m.RobotOp) -> None:
-        """Publish a command for a robot, once. It is not repeated; the robot's states show its effect."""
+        """Publish a command to a robot, once. It is not repeated; the robot's states show its effect."""
         if not self._may(robot_commands.right(op), op):
             return
         if why := (self._why_not if robot_commands.moves(op) else "") or self._server.drivers.refusals.of_op(op):
@@ -353,14 +353,14 @@ class Control:
             await self._websocket.send_text(encode(self._waiting.popleft()))
         drivers = {key for key in self._interest.dirty if key[1] == "web/driver"}
         self._interest.dirty -= drivers
-        taken, large = self._server.robots.take(self._interest, now, large=self._large_due)
+        changed, large = self._server.robots.take(self._interest, now, large=self._large_due)
         self._large_due = self._large_due and not large
         if self._interest.more:
             self._wake.set()
-        values = taken + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)
-        gone, self._interest.gone = tuple(self._interest.gone), set()
-        if values or gone:
-            await self._websocket.send_text(encode(m.State(now=1000 * time.time(), set=values, gone=gone)))
+        values = changed + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)
+        removed, self._interest.gone = tuple(self._interest.gone), set()
+        if values or removed:
+            await self._websocket.send_text(encode(m.State(now=1000 * time.time(), set=values, gone=removed)))
         await self._send_logs()
 
     def _driver(self, ref: str) -> m.DriverView:
@@ -369,7 +369,7 @@ class Control:
         return replace(view, by=by, device=view.device if by == view.by else "", asks=person(view.asks, login=login))
 
     async def _send_logs(self) -> None:
-        """Send a part of the log at each echo, so that on a slow connection pings wait behind no more than that."""
+        """Send a part of the log at each echo, so that on a slow connection no more than that delays pings."""
         ref = self._interest.watched
         lines = self._server.robots.logs.get(ref)
         if lines is not None and (run := self._logs.take(lines)) is not None:

@@ -1,4 +1,4 @@
-"""The newest log lines of one component, numbered, so that a page sees which are missing. Pure."""
+"""The newest log lines of one component, numbered, so that a page notices missing ones. Pure."""
 
 import secrets
 from collections import deque
@@ -20,7 +20,7 @@ _SYNONYMS = {"WARN": "WARNING", "ERR": "ERROR", "FATAL": "CRITICAL", "TRACE": "D
 
 
 class Run(NamedTuple):
-    """Consecutive lines; ``first`` is the number of the first one."""
+    """A sequence of consecutive lines; ``first`` is the number of the first one."""
 
     first: int
     lines: tuple[msgspec.Raw, ...]
@@ -36,7 +36,7 @@ class LogLines:
         self._number = 0  # of the newest line, with those that were dropped
 
     def add(self, payload: bytes) -> None:
-        """Add a payload of the log topic; a line that cannot be shown counts as dropped."""
+        """Add a payload of the log topic. A line that cannot be shown counts as dropped."""
         self._number += 1
         line = line_of(payload)
         if line is None:
@@ -62,14 +62,14 @@ class LogLines:
 
 
 class LogReader:
-    """A page's position in the lines of the component that it watches; it gets one part at each echo."""
+    """A page's position in the lines of the component that it watches. It gets one part at each echo."""
 
     def __init__(self) -> None:
         self._on = self._due = False  # due: the page has received the part before
         self._sent = "", 0  # the origin and number of the last line
 
     def begin(self, origin: str, number: int, *, on: bool) -> None:
-        """Note that the page has the lines up to this one; ``on`` False: it wants no more."""
+        """Note that the page has the lines up to ``number``; ``on`` False: it wants no more."""
         self._on, self._sent, self._due = on, (origin, number), True
 
     def end(self) -> None:
@@ -90,7 +90,7 @@ class LogReader:
 
 
 class Line(msgspec.Struct, omit_defaults=True):
-    """A line as pages get it. ``t``: epoch milliseconds.
+    """A line in the form for pages. ``t``: epoch milliseconds.
 
     Some robots send plain text, or fields with other names.
     """

@@ -1,4 +1,4 @@
-"""The components that pages have open, and the subscriptions that only those need."""
+"""The components that pages have open, and the subscriptions for only those."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class OpenComponents:
 
     @property
     def known(self) -> set[str]:
-        """Return the components about which anything is received or remembered here."""
+        """Return the components whose messages are received or remembered here."""
         return {*self._pages, *self._subscriptions, *self._wanted, *self._flags}
 
     def __contains__(self, ref: object) -> bool:
@@ -79,7 +79,7 @@ class OpenComponents:
         self._broker.loop.call_later(self._keep_s, self._closed, ref)
 
     def _closed(self, ref: str) -> None:
-        """Note, after a delay, that a page was closed, so that a reloaded page still finds everything."""
+        """Note that a page was closed, after a delay in which a reloaded page still finds everything."""
         self._pages[ref] -= 1
         if not self._pages[ref]:
             del self._pages[ref]
@@ -94,7 +94,7 @@ class OpenComponents:
             self._spawn(self._follow(ref))
 
     async def _follow(self, ref: str) -> None:
-        """Subscribe and unsubscribe until the subscriptions are those that are needed."""
+        """Subscribe and unsubscribe until there are exactly the needed subscriptions."""
         failed: set[str] = set()  # they are tried again, but logged once
         try:
             done = self._subscriptions.setdefault(ref, {})
@@ -123,7 +123,7 @@ class OpenComponents:
             self._following.discard(ref)
 
     def _forget(self, ref: str) -> None:
-        """Unsubscribe from a component and forget it. Pages may open addresses that are no component."""
+        """Unsubscribe from a component and forget it, which may be none: pages may open any address."""
         self._subscriptions.pop(ref, None)
         self._wanted.pop(ref, None)
         self._flags.pop(ref, None)

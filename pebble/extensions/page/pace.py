@@ -1,4 +1,4 @@
-"""A bound on the work that one page can ask of the server; a page beyond it is read more slowly. Pure."""
+"""A limit on the work that one page can cause at the server; a page beyond it is read more slowly. Pure."""
 
 PER_S = 100.0  # a page that drives sends 25 messages a second
 BURST = 200.0
@@ -12,7 +12,7 @@ class Pace:
         self._left, self._at = BURST, now
 
     def take(self, cost: float, now: float) -> float:
-        """Take a token; return how many seconds to wait before the request is handled."""
+        """Take ``cost`` tokens; return how many seconds to wait before the request is handled."""
         self._left = min(BURST, self._left + PER_S * (now - self._at)) - cost
         self._at = now
         return max(0.0, -self._left / PER_S)

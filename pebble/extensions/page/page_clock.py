@@ -1,7 +1,7 @@
-"""Bounds of the age of one page's messages, from pings that the page echoes. Pure: times are passed in.
+"""Limits of the age of one page's messages, from pings that the page echoes. Pure: times are passed in.
 
-The page's clock has an unknown offset. An echo carries the page's time of some moment between sending the ping and
-receiving the echo, which bounds the offset on both sides: so a delay that is always there counts as well.
+The page's clock has an unknown offset. An echo carries the page's time at some moment between the sending of the ping
+and the arrival of the echo, which limits the offset on both sides: so a constant delay counts as well.
 """
 
 from collections import deque
@@ -20,7 +20,7 @@ _JUDGED = 4  # answers by which people are told that a connection is slow
 
 
 class ClockJumpError(PebbleError):
-    """A jump of the page's or the server's clock: one was suspended. The page has to connect again."""
+    """An error: the page's or the server's clock has jumped, as after a suspend. The page must connect again."""
 
 
 class PageClock:
@@ -37,7 +37,7 @@ class PageClock:
     def shown_round_trip_s(self) -> float | None:
         """Return the second longest of the last four round trips, as one slow answer is no slow connection.
 
-        If the last round trip is late, it is returned instead.
+        If the last echo is late, its delay is returned instead.
         """
         if self.round_trip_s is None or self.round_trip_s >= LATE_S:
             return self.round_trip_s
@@ -52,7 +52,7 @@ class PageClock:
         return number
 
     def echo(self, number: int, t_ms: float, now: float) -> None:
-        """Handle the answer to a ping; one that was never sent is ignored. Raises ClockJumpError."""
+        """Handle the answer to a ping. The answer to a ping that was never sent is ignored. Raises ClockJumpError."""
         sent = self._sent.pop(number, None)
         if sent is None:
             return

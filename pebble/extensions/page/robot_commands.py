@@ -1,4 +1,4 @@
-"""Pages' requests to robots besides driving: the right that each needs, and the message to publish. Pure."""
+"""Requests of pages to robots besides driving: the right that each needs, and the message to publish. Pure."""
 
 from typing import Any, NamedTuple
 
@@ -30,7 +30,7 @@ def right(op: m.RobotOp) -> str:
 
 
 def ends(op: m.RobotOp) -> bool:
-    """True if the request ends something; then it is sent whatever state the component is in."""
+    """True if the request ends something. Then it is sent whatever the component's state."""
     match op:
         case m.SoundboardOp(file="") | m.AutonomyOp(file="") | m.FlagOp(on=False) | m.OutletOp(on=False):
             return True
@@ -40,14 +40,14 @@ def ends(op: m.RobotOp) -> bool:
 
 
 def moves(op: m.RobotOp) -> bool:
-    """True if the request may move something or switch it on; then it needs a connection that may drive."""
+    """True if the request may move something or switch it on. Then it needs a connection that may drive."""
     return isinstance(op, m.AutonomyOp | m.McuOp | m.OutletOp) and not ends(op)
 
 
 def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
     """Return why a component with these capabilities does not get this request; empty if it does.
 
-    Empty too if the capabilities do not mention it.
+    Also empty if the capabilities do not mention it.
     """
     if isinstance(op, m.McuOp) and op.name == _DESCRIBE:
         return f"{op.name} is no command of a microcontroller"
@@ -80,7 +80,7 @@ def publication(op: m.RobotOp, capabilities: dict[str, Any]) -> Message:
 
 
 def _action_topic(op: m.ActionOp, channel: Channel, capabilities: dict[str, Any]) -> str:
-    """Return the topic of an action, the first one that the capabilities name."""
+    """Return the topic of an action: the first one that the capabilities name."""
     sections = (section_of(capabilities, section) for section in _sections(op))
     topics = (section.get(key) for section in sections for key in ("flag_topic", "topic"))
     return next((str(topic) for topic in topics if names(op.ref, topic, channel)), channel.topic(op.ref))

@@ -1,6 +1,6 @@
-"""The newest value of every metric of every component, and which values each page has not received yet.
+"""The newest value of every metric of every component, and which of them each page still needs.
 
-There is no queue: a slow page receives newest values less often. A page that connects again receives all.
+There is no queue: a slow page gets newest values less often. A page that connects again gets all of them.
 """
 
 import logging
@@ -44,7 +44,7 @@ class _Value(NamedTuple):
 
 
 class Component:
-    """A component, from the messages it publishes."""
+    """A component, from the messages that it publishes."""
 
     def __init__(self, ref: str) -> None:
         self.ref = ref
@@ -61,7 +61,7 @@ class Component:
 
 
 def liveness_of(robot: RobotView, now: float) -> m.Liveness:
-    """Return whether it is online, as pages are shown it."""
+    """Return whether a component is online, in the form for pages."""
     liveness = robot.liveness
     return m.Liveness(
         online=robot.online(now),
@@ -78,7 +78,7 @@ def _ms(seconds: float | None) -> float | None:
 
 
 class Interest:
-    """A page's view: the values that it has not received yet, and the component it has open."""
+    """A page's subscription: the values that it still needs, and the component that it has open."""
 
     def __init__(self, changed: Callable[[], None]) -> None:
         self.watched = ""
@@ -121,36 +121,38 @@ class Robots:
         return topic_of(ref, self.capabilities(ref), channel)
 
     def aliases(self, ref: str) -> list[str]:
-        """Return the metrics beyond the contract under which its microcontrollers publish, by their manifests."""
+        """Return the metrics beyond the contract under which the component's MCUs publish, by their manifests."""
         component = self.components.get(ref)
         declared = () if component is None else component.aliases.values()
         return list(dict.fromkeys(chain.from_iterable(declared)))[:MAX_ALIASES]
 
     def value(self, ref: str, metric: str) -> msgspec.Raw | None:
-        """Return the newest value, also of a server's metric."""
+        """Return the newest value, also of a metric of the server; None if there is none."""
         value = self._find(ref, metric)
         return None if value is None else value.raw
 
     def take(
         self, interest: Interest, now: float, *, large: bool
     ) -> tuple[tuple[tuple[str, str, Any, float], ...], bool]:
-        """Return the values this page has not received yet (None: removed), and whether a large one is among them.
+        """Return the values that this page still needs (None: removed), and whether a large one is among them.
 
-        The values count as received from now on. The component that the page has open comes first. At most one large
-        value is taken, and only with ``large``. The others, and what does not fit into this message, wait for the next.
+        They count as sent from now on. The component that the page has open comes first. At most one large value is
+        taken, and only with ``large``. The others, and what does not fit into this message, wait for the next.
         """
         dirty, interest.dirty = interest.dirty, set()
-        taken, has_large, left = [], False, MAX_STATE_BYTES
+        taken, has_large, room = [], False, MAX_STATE_BYTES
         for ref, metric in sorted(dirty, key=lambda key: key[0] != interest.watched):
-            kept = self._find(ref, metric)
-            size = 0 if kept is None else len(bytes(kept.raw))
-            if left <= 0 or (size > LARGE_BYTES and (has_large or not large)):
+            stored = self._find(ref, metric)
+            size = 0 if stored is None else len(bytes(stored.raw))
+            if room <= 0 or (size > LARGE_BYTES and (has_large or not large)):
                 interest.dirty.add((ref, metric))
                 continue
             has_large = has_large or size > LARGE_BYTES
-            left -= size
-            taken.append((ref, metric, None, 0.0) if kept is None else (ref, metric, kept.raw, 1000 * (now - kept.at)))
-        interest.more = left <= 0
+            room -= size
+            taken.append(
+                (ref, metric, None, 0.0) if stored is None else (ref, metric, stored.raw, 1000 * (now - stored.at))
+            )
+        interest.more = room <= 0
         return tuple(taken), has_large
 
     def _find(self, ref: str, metric: str) -> _Value | None:
@@ -167,7 +169,7 @@ class Robots:
         interest.dirty |= set(self._all(FLEET)) | set(self._server)
 
     def watch(self, interest: Interest, ref: str) -> None:
-        """Send further metrics of ``ref`` to this page."""
+        """Send this page further metrics of ``ref``."""
         interest.watched = ref
         component = self.components.get(ref)
         if component is not None:
@@ -204,7 +206,7 @@ class Robots:
         self.receive_as(address.identity.base, address.metric, message, now)
 
     def receive_as(self, ref: str, metric: str, message: Message, now: float, channel: c.Channel | None = None) -> None:
-        """Handle a message as this metric, whatever its topic is called.
+        """Handle a message as one on ``metric``, whatever its topic is called.
 
         ``channel``: how to decode it, if the contract does not have it.
         """
@@ -223,7 +225,7 @@ class Robots:
             self._interpret(component, metric, channel, message, now)
 
     def forget(self, ref: str) -> None:
-        """Remove a component, if it is there; it comes back with its next message."""
+        """Remove a component, if it is there. It comes back with its next message."""
         component = self.components.pop(ref, None)
         if component is not None:
             self._bytes -= sum(len(bytes(value.raw)) for value in component.values.values())
@@ -235,10 +237,10 @@ class Robots:
             interest.notify()
 
     def refresh(self, now: float) -> None:
-        """Send what changes with time; call it every 0.25 s.
+        """Send values that change with time. Call this every 0.25 s.
 
         Whether a component is online is sent at once. Ages are sent for open components, and for at most a third of the
-        others, so that no page has to draw all of them at once and a thousand robots are no flood.
+        others, so that no page has to draw all of them at once, and a thousand robots cause no flood.
         """
         older: list[Component] = []
         opened = {interest.watched for interest in self.interests}
@@ -325,7 +327,7 @@ class Robots:
             self._refresh(component, now)  # it may be back before the next round
 
     def show_offer(self, component: Component, now: float) -> None:
-        """Show pages the capabilities that it announces or is assumed to have, until it publishes its own."""
+        """Send pages the capabilities that a component announces, or is assumed to have, until it publishes its own."""
         if not component.robot.capabilities:
             self._remove_value(component, c.CAPABILITIES.metric)
             return
@@ -343,7 +345,7 @@ class Robots:
                 interest.notify()
 
     def mark_drivers(self, refs: Collection[str]) -> None:
-        """Update who drives these robots for all pages."""
+        """Update, for all pages, who drives these robots."""
         for interest in self.interests if refs else ():
             interest.dirty |= {(ref, "web/driver") for ref in refs}
             interest.notify()

@@ -36,7 +36,7 @@ def main(arguments: list[str]) -> int:
 
 
 def settings_or_all_problems(config: Config) -> WebSettings:
-    """Return the settings of the page.
+    """Return the settings of the page. Raises ConfigError.
 
     The error names all problems at once, also a missing user.
     """
@@ -44,10 +44,10 @@ def settings_or_all_problems(config: Config) -> WebSettings:
         return settings_of(config)
     except ConfigError as error:
         try:
-            more = _without_user(config)
+            missing_user = _without_user(config)
         except PebbleError as other:
-            more = [str(other)]
-        raise ConfigError([*error.problems, *more]) from None
+            missing_user = [str(other)]
+        raise ConfigError([*error.problems, *missing_user]) from None
 
 
 def _settings_of_process(path: str) -> WebSettings:

@@ -1,4 +1,4 @@
-"""The program that serves the operator page until a signal ends it."""
+"""Serves the operator page until a signal ends it."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _server_context(certificate: Path, key: Path | None) -> ssl.SSLContext:
 
 
 def renew_certificate(listening: ssl.SSLContext, certificate: Path, key: Path | None) -> None:
-    """Make ``listening`` use the certificate files' present content for each new connection."""
+    """Let new connections at ``listening`` use the present content of the certificate's files."""
     files = [certificate] if key is None else [certificate, key]
     newest = Renewed(files, lambda: _server_context(certificate, key), listening)
 
@@ -86,7 +86,7 @@ def renew_certificate(listening: ssl.SSLContext, certificate: Path, key: Path | 
 
 
 class HttpProtocol(H11Protocol):
-    """An HTTP connection that is closed if no request comes, for which uvicorn has no limit."""
+    """An HTTP connection that is closed if no request comes; uvicorn has no limit for that."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -148,7 +148,7 @@ def listen(settings: WebSettings) -> socket.socket:
 
 
 def url_of(settings: WebSettings, listener: socket.socket) -> str:
-    """Return the address for a browser on this machine, or the name by which others reach it."""
+    """Return the address for a browser on this machine, or with the name by which others reach it."""
     host = settings.names[0] if settings.names else settings.host
     if host in _ALL_ADDRESSES:  # no browser can open these
         names = certificates.show(settings.certificate).names if settings.certificate else ()

@@ -1,4 +1,4 @@
-"""The state of one server: messages from the broker, requests of pages, and what is due."""
+"""The state of one server: messages from the broker, requests of pages, and tasks that are due."""
 
 import asyncio
 import logging
@@ -49,7 +49,7 @@ _ESTOP_METRIC = "web/estop"
 
 
 class Server:
-    """All state of one server. Used on one event loop."""
+    """The whole state of one server. Used on one event loop."""
 
     def __init__(self, settings: WebSettings, people: People, audit: Audit) -> None:
         self.settings, self.people, self.audit = settings, people, audit
@@ -95,7 +95,7 @@ class Server:
             self.spawn(self.pictures.look_in_turn())
 
     async def close(self) -> None:
-        """Stop what pages move, then disconnect."""
+        """Stop the motion that pages cause, then disconnect."""
         try:
             self.drivers.closed_all()
             for task in list(self._tasks):
@@ -150,14 +150,14 @@ class Server:
     # -- to the broker
 
     def _send(self, messages: list[Message]) -> None:
-        """Publish messages of stops, on a connection that receives nothing and so delays nothing."""
+        """Publish messages of stops, on a connection that receives nothing, and therefore is not delayed."""
         send(self._publish_stop, messages)
 
     def _publish_stop(self, topic: str, payload: bytes, *, qos: QoS) -> bool:
         return any(broker.publish(topic, payload, qos=qos) for broker in (self.stop_broker, self.broker))
 
     def _hear(self, now: float) -> None:
-        """Stop further robots during a stop of all, when their heartbeats arrive on a connection of their own."""
+        """During a stop of all, stop robots whose heartbeats arrive on the heartbeats' own connection."""
         if self._heartbeats is None:
             if self.stops.collecting:
                 self._heartbeats = Heartbeats(in_small_segments(self.settings.broker))
@@ -169,14 +169,14 @@ class Server:
             self.spawn(asyncio.to_thread(heartbeats.close))
 
     def _has_sent(self) -> bool:
-        """True if little waits to be sent.
+        """True if few messages wait to be sent.
 
-        Repeating the stop of a thousand robots before that would only delay it.
+        Before that, repeating the stop of a thousand robots would only delay it.
         """
         return self.stop_broker.transport.outgoing.waiting < _MANY_WAIT
 
     def stop(self, ref: str, name: str, session: Session, device: str, why: str, address: str = "") -> None:
-        """Stop one component, or all (""): sent at once, and repeated until confirmed."""
+        """Stop one component, or all (""): at once, and repeatedly until it is confirmed."""
         by = f"{session.user} on {device}" if device else session.user
         if ref and not _is_base(ref):
             return
@@ -186,13 +186,13 @@ class Server:
         self.audit.write("stop", ref=ref or "all", user=session.user, device=device, address=address, detail=why)
 
     def _is_wanted(self, ref: str) -> bool:
-        """True if a page has the component open, drives it or has stopped it."""
+        """True if a page has the component open, drives it, or has stopped it."""
         return ref in self.open_components or self.drivers.drives(ref) or self.stops.names(ref)
 
     # -- names
 
     def level(self, ref: str) -> SecurityLevel:
-        """Return how strictly that robot checks accounts: as it publishes, else as the server's config says."""
+        """Return how strictly that robot checks accounts: as it publishes, or else by the server's config."""
         robot = self.robots.view(ref)
         if robot is None or not robot.estop.has_capabilities:
             return self.settings.level
@@ -241,7 +241,7 @@ class Server:
                 log.exception("a round of the server failed")
 
     async def _watch_people(self) -> None:
-        """Notice removed people soon; each page checks its session only rarely."""
+        """Notice removed people soon; a page itself checks its session only rarely."""
         while True:
             with suppress(DatabaseError):  # which the looks at sessions report
                 self.people_version = await asyncio.to_thread(self.people.version)

@@ -1,4 +1,4 @@
-"""The parts of robots' payloads on which the page's cards rely, checked here so that the page need not. Pure."""
+"""Checks the parts of robots' payloads on which the page's cards rely, so that the page need not. Pure."""
 
 from collections.abc import Callable
 from functools import partial
@@ -127,7 +127,7 @@ _INSIDE = msgspec.json.Decoder(_Wrapped)
 
 
 def shown(channel: c.Channel | None, raw: bytes, payload: Any) -> bytes:
-    """Return the JSON that pages get of ``payload``: ``raw`` itself, unless a card relies on certain fields."""
+    """Return the JSON of ``payload`` for pages: ``raw`` itself, unless a card relies on certain fields."""
     show = None if channel is None else _SHOWN.get(channel.metric)
     relied = payload if show is None else show(payload)
     if relied is payload:
@@ -138,7 +138,7 @@ def shown(channel: c.Channel | None, raw: bytes, payload: Any) -> bytes:
 
 
 def with_name(raw: bytes, name: str) -> bytes:
-    """Return capabilities, as ``shown`` returns them, with this name if the robot has none."""
+    """Return the capabilities with this name if the robot has none; ``raw`` is from ``shown``."""
     payload = msgspec.json.decode(raw)
     value = _inner(payload)
     if not isinstance(value, dict) or value.get("identity", {}).get("name"):
@@ -160,7 +160,7 @@ def _is(kind: Any, payload: object) -> bool:
 
 
 def _object(kind: Any, payload: Any) -> Any:
-    """Return the object if it is of this type, else an empty one."""
+    """Return the object if it is of this type, else an empty object."""
     return payload if _is(kind, payload) else {}
 
 
@@ -176,7 +176,7 @@ def _readable(kind: Any, entries: object) -> list[Any]:
 def _media(payload: Any) -> Any:
     """Return the reports if all are valid.
 
-    Each is checked by itself, as msgspec builds a dict's decoder anew with each call.
+    Each is checked separately, as msgspec would build a dict's decoder at each call.
     """
     reports = _inner(payload)
     return reports if isinstance(reports, dict) and all(_is(_Medium, report) for report in reports.values()) else {}
@@ -216,8 +216,8 @@ def _capabilities(payload: Any) -> Any:
     value = _inner(payload)
     if not isinstance(value, dict):
         return {}
-    kept = {name: section for name, section in value.items() if _is(_SECTIONS.get(name, Any), section)}
-    return payload if kept == value and value is not payload else {"value": kept}
+    valid = {name: section for name, section in value.items() if _is(_SECTIONS.get(name, Any), section)}
+    return payload if valid == value and value is not payload else {"value": valid}
 
 
 _SHOWN: dict[str, Callable[[Any], Any]] = {

@@ -1,6 +1,6 @@
-"""Boards that send heartbeats and no capabilities, as the original's do, and who lets pages drive them.
+"""Silent boards, which send heartbeats but no capabilities, as the original's do, and who lets pages drive them.
 
-The config allows it, or a person with the right; that is stored until it is withdrawn, or until the board publishes
+The config permits it, or a person with the right; that is stored until it is withdrawn, or the board publishes
 capabilities.
 """
 
@@ -35,7 +35,7 @@ _NAMED = f'At level named it is driven only with "plain": true, in fleet.json an
 
 
 class Permission(Struct, frozen=True):
-    """A permission for pages to drive a board: by whom, and along which axes; no axes: a refusal."""
+    """A permission for pages to drive a board: its giver, and the axes; no axes: a refusal."""
 
     by: str = ""
     axes: tuple[str, ...] = ()
@@ -60,7 +60,7 @@ class SilentBoards:
         self._boards: dict[str, _Board] = {}
 
     def refresh(self, now: float, spawn: Spawn) -> None:
-        """Find boards that have become silent, or no longer are; call it a few times a second."""
+        """Find boards that have become silent, or are no longer. Call this a few times a second."""
         silent = {ref: component for ref, component in self._robots.components.items() if component.robot.silent}
         for ref in self._boards.keys() - silent:
             if (subscription := self._boards.pop(ref).subscription) is not None:

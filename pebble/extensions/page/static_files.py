@@ -69,7 +69,7 @@ class StaticFiles:
         self._packed = {name: _packed(name, content) for name, content in self.files.items()}
 
     def _imported(self, *names: str) -> list[str]:
-        """Return the modules that these import before they run, directly or not."""
+        """Return the modules that these import before they run, also indirectly."""
         modules = dict.fromkeys(names)
         for name in (waiting := list(names)):
             for path in _IMPORT.findall(self.files.get(name, b"")):
@@ -80,7 +80,7 @@ class StaticFiles:
         return [name for name in modules if name not in names]
 
     def page(self, request: Request) -> Response:
-        """Return the operator page; its address decides which screen it shows."""
+        """Return the operator page. Its address decides which screen it shows."""
         # with no-referrer, browsers do not say where a form comes from
         headers = {**NO_STORE, "content-security-policy": self._policy, "referrer-policy": "same-origin"}
         name = "robot.html" if request.url.path.startswith("/r/") else "fleet.html"
@@ -94,8 +94,8 @@ class StaticFiles:
     def answer(self, request: Request, name: str, headers: dict[str, str]) -> Response:
         """Return the file ``name``, compressed if the browser accepts that; 404 if there is none.
 
-        A number as query marks a module that is fetched again because one of its imports was lost: its imports get the
-        query too, except those that have run since the start.
+        A number as query marks a module that is fetched again because one of its imports was lost. Its imports get the
+        query, too, except those that have run since the start.
         """
         if name not in self.files:
             return PlainTextResponse("not found", 404)
@@ -106,8 +106,8 @@ class StaticFiles:
 
     def _renewed(self, name: str, match: re.Match[bytes], query: bytes) -> bytes:
         path = match[1]
-        whole = posixpath.normpath(posixpath.join(posixpath.dirname(name), path.decode()))
-        return match[0] if whole in self._first else match[0].replace(path, path + b"?" + query)
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(name), path.decode()))
+        return match[0] if target in self._first else match[0].replace(path, path + b"?" + query)
 
 
 def root_of(request: Request) -> str:
@@ -142,7 +142,7 @@ def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
 
 
 def stripped(source: bytes, suffix: str) -> bytes:
-    """Return a file without indentation, comments and empty lines, which is a sixth smaller."""
+    """Return a file without indentation, comments and empty lines, which makes it a sixth smaller."""
     text = source.decode()
     if suffix in ("css", "js", "mjs"):
         text = _COMMENTS.sub("", text)

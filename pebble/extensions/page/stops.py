@@ -1,4 +1,4 @@
-"""The emergency stops that pages have sent, repeated until they are confirmed, and how pages see them. Pure.
+"""The emergency stops that pages have sent: repeated until they are confirmed, and shown to pages. Pure.
 
 The robot keeps the stop; see docs/emergency-stop.md.
 """
@@ -24,7 +24,7 @@ class Stops:
     """The stops of a server. Publish what its methods return, and pass robots' messages to ``receive``."""
 
     def __init__(self, again: Callable[[], bool] = lambda: True) -> None:
-        """Prepare an empty table. ``again``: called; False while sent messages still wait, so that none is repeated."""
+        """Make an empty table. ``again()`` returns False while sent messages still wait, so that none is repeated."""
         self._again, self._repeats = again, True
         self.changed: set[str] = set()  # robots whose view may be another one now
         self._senders: dict[str, tuple[StopSender, float]] = {}  # by name, the newest last
@@ -71,13 +71,13 @@ class Stops:
             self.changed |= set(sender.robots)
 
     def robots_of(self, name: str) -> tuple[list[str], list[str]]:
-        """Return the robots that have confirmed this stop or have no motors, and the others."""
+        """Return two lists: the robots that have confirmed this stop or have no motors, and the others."""
         robots = self._senders[name][0].robots if name in self._senders else {}
         done = {ref: stop.progress in (Progress.CONFIRMED, Progress.SPARED) for ref, stop in robots.items()}
         return [ref for ref in done if done[ref]], [ref for ref in done if not done[ref]]
 
     def user(self, name: str) -> str | None:
-        """Return the user of this stop; None if it is unknown here, or stands for several users."""
+        """Return the user of this stop; None if it is unknown here, or has several users."""
         return self._users.get(name)
 
     def names(self, ref: str) -> bool:
@@ -89,13 +89,13 @@ class Stops:
         return any(ref in sender.robots for sender, _ in self._senders.values())
 
     def holds(self, ref: str) -> bool:
-        """True if a stop is being repeated to a robot that cannot latch it, so that driving would end it."""
+        """True if a stop is being repeated to a robot that cannot latch it: a drive command would end it."""
         stop = self._newest(ref)[1]
         return stop is not None and stop.sending and not stop.estop.available
 
     @property
     def collecting(self) -> bool:
-        """True if a stop of all still goes to newly heard robots."""
+        """True if a stop of all is still sent to newly heard robots."""
         return "" in self._names and self._senders[self._names[""]][0].collecting
 
     def omitted(self, now: float) -> bool:
@@ -131,7 +131,7 @@ class Stops:
         return messages
 
     def view(self, estop: RobotEstop) -> m.EstopView:
-        """Return what pages see of the emergency stop of one component."""
+        """Return the emergency stop of one component in the form for pages."""
         name, stop = self._newest(estop.base)
         sending, text = ("", "") if stop is None else _progress(stop)
         self._shown[estop.base] = sending, text
@@ -155,7 +155,7 @@ class Stops:
     def _replaced(self, ref: str, user: str, now: float) -> bool:
         """Make room for a stop, by removing an older one of the same robots first.
 
-        Return True if the new one is this user's alone.
+        True if the new one belongs to this user alone.
         """
         is_own = True
         if (older := self._names.get(ref)) is not None:
@@ -170,7 +170,7 @@ class Stops:
         return is_own
 
     def _worth(self, name: str) -> tuple[bool, bool, bool]:
-        """Return a stop's rank: those that are over, unheard of, or of one robot alone are removed first."""
+        """Return a stop's rank for keeping it: stops that are over, never heard of, or of one robot go first."""
         robots = self._senders[name][0].robots.values()
         heard = not self._refs[name] or any(robot.live or robot.estop.has_capabilities for robot in robots)
         return name not in self._over, heard, not self._refs[name]

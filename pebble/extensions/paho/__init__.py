@@ -1,4 +1,4 @@
-"""MQTT by the package paho-mqtt, as a transport that is found by its entry point."""
+"""A transport for MQTT by the package paho-mqtt, found by its entry point."""
 
 from pebble.extension import Extension
 

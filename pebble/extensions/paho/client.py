@@ -1,4 +1,4 @@
-"""The same as Pebble's own client of MQTT, by paho. It costs about half as much again in processor time, and 5 MB."""
+"""A client like Pebble's own client of MQTT, by paho. It takes half as much processor time again, and 5 MB."""
 
 import socket
 import ssl
@@ -22,7 +22,7 @@ _IN_FLIGHT = 65_535  # messages of QoS 1; their number is bounded by the connect
 
 
 class _Paho(paho.Client):
-    """paho, with pings of our own (its keepalive is too slow for T19), and a limit to what it collects."""
+    """A client of paho with pings of our own (its keepalive is too slow for T19), and limited queues."""
 
     listener: Listener
     opening: Opening
@@ -50,7 +50,7 @@ class _Paho(paho.Client):
 
     @property
     def _too_long(self) -> bool:
-        """True if the packet that arrives is discarded, but for its head."""
+        """True if the arriving packet is discarded, except its head."""
         return bool(self._in_packet["have_remaining"]) and self._in_packet["remaining_length"] > MAX_PACKET
 
     def _handle_publish(self) -> MQTTErrorCode:
@@ -63,7 +63,7 @@ class _Paho(paho.Client):
         return self._send_puback(int.from_bytes(packet[end : end + 2])) if first & ANY_QOS else MQTTErrorCode(0)
 
     def _skips_retained(self, packet: bytearray, end: int, start: int) -> bool:
-        """True if the retained PUBLISH that arrived, whose topic ends at ``end``, is not wanted. Removals are."""
+        """True if the arrived retained PUBLISH, whose topic ends at ``end``, is not wanted. Removals are wanted."""
         if self._protocol == MQTTProtocolVersion.MQTTv5 and start < len(packet):
             start += 1 + packet[start]  # of properties, of which nobody needs 128 bytes
         return len(packet) > start and self.listener.skips(bytes(packet[2:end]))
@@ -161,7 +161,7 @@ class PahoClient:
         return self.unread
 
     def acknowledge(self) -> None:
-        """Do nothing: no acknowledgement is owed."""
+        """Do nothing: paho sends acknowledgements."""
 
     # -- writing
 

@@ -1,4 +1,4 @@
-"""The transport ``paho``: that of MQTT, on the client of paho-mqtt instead of Pebble's own."""
+"""The transport ``paho``: MQTT, by the client of paho-mqtt instead of Pebble's own."""
 
 from pathlib import Path
 from typing import Any, ClassVar, cast
@@ -25,7 +25,7 @@ class PahoTransport(MqttTransport):
 
 
 def _from_config(*, tls: dict[str, Any] | None = None, as_published: bool = True, **fields: Any) -> MqttSettings:
-    """Return the settings of these fields, whose files are texts."""
+    """Return the settings of these fields, in which files are texts."""
     certificates = None if tls is None else TlsSettings(**_with_paths(tls))
     return MqttSettings(**_with_paths(fields), tls=certificates, as_published=as_published)
 

@@ -1,4 +1,4 @@
-"""Recordings: what robots and operators published, in MCAP files."""
+"""Recordings of the messages of robots and operators, in MCAP files."""
 
 from pebble.extension import Command, Extension
 

@@ -1,7 +1,7 @@
-"""The contents of recordings, read from their summaries where they have some."""
+"""The contents of recordings, read from their summaries if they have one."""
 
 import json
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,9 +42,9 @@ class FileInfo:
 
 
 def look_at(path: Path, *, whole: bool = False, since_ns: int = 0, until_ns: int = FOREVER_NS) -> FileInfo:
-    """Return a file's contents from its summary, or by reading it completely. Raises RecordingError.
+    """Return a file's contents, from its summary or by reading all of it. Raises RecordingError.
 
-    It is read completely if it has no summary or with ``whole``. Only messages from ``since_ns`` to before ``until_ns``
+    All of it is read if it has no summary, or with ``whole``. Only messages from ``since_ns`` to before ``until_ns``
     count.
     """
     try:
@@ -126,26 +126,26 @@ class Query:
 
 
 def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> None:
-    """Raise RecordingError if no recording of ``places`` has this robot or topic, as it may be mistyped.
+    """Raise RecordingError if no recording of ``places`` has the robot or topic of the query: it may be mistyped.
 
     If a file cannot be read completely, its names are unknown; then nothing is raised, since the file's problem is
     reported.
     """
     if query.robot is None and not query.topics:
         return
-    found: list[Channel] = []
+    channels: list[Channel] = []
     for path in paths:
         try:
             with RecordingFile(path) as file:
-                for _ in file.read(chooses=lambda _channel: False) if file.statistics is None else ():
-                    pass
-                found += file.channels.values()
+                if file.statistics is None:  # the channels are known once all of it was read
+                    deque(file.read(chooses=lambda _channel: False), maxlen=0)
+                channels += file.channels.values()
                 if file.problem:
                     return
         except RecordingError:
             return
-    check_name("robot", query.robot, {robot for channel in found if (robot := robot_of(channel))}, places)
-    topics = {channel.topic for channel in found if query.robot in (None, robot_of(channel))}
+    check_name("robot", query.robot, {robot for channel in channels if (robot := robot_of(channel))}, places)
+    topics = {channel.topic for channel in channels if query.robot in (None, robot_of(channel))}
     for filter_ in query.topics:
         if not any(_matches(filter_, topic) for topic in topics):
             check_name("topic", filter_, {topic for topic in topics if not topic.startswith("$")}, places)

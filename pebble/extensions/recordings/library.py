@@ -1,4 +1,4 @@
-"""Recordings as one stream of messages in the order of time, in however many files."""
+"""One stream of messages, in the order of time, from any number of recordings."""
 
 from collections.abc import Iterable, Iterator
 from functools import partial
@@ -22,17 +22,17 @@ def files(places: Iterable[Path]) -> list[Path]:
 
     Raises RecordingError if there are none.
     """
-    found: list[Path] = []
+    paths: list[Path] = []
     for place in places:
         if place.is_dir():
-            found += sorted(recordings_in(place))
+            paths += sorted(recordings_in(place))
         elif _begins_as_mcap(place) or place.name.endswith((SUFFIX, ACTIVE)):
-            found.append(place)
+            paths.append(place)
         else:
             raise RecordingError(f"{place}: is not a recording (MCAP)")
-    if not found:
+    if not paths:
         raise RecordingError(f"{', '.join(map(str, places))}: there is no recording")
-    return found
+    return paths
 
 
 def recordings_in(folder: Path) -> Iterator[Path]:
@@ -56,7 +56,7 @@ def merged(
     chooses: Chooses = lambda _channel: True,
     damages: Damages | None = None,
 ) -> Iterator[Recorded]:
-    """Yield the messages of all files from ``since_ns`` to before ``until_ns``, by the time of their arrival.
+    """Yield the messages of all files from ``since_ns`` to before ``until_ns``, in the order of their arrival.
 
     A file is open only while its messages are due; chunks outside the period are not decompressed. Damage of the read
     parts is put into ``damages``. Raises RecordingError.
@@ -75,8 +75,8 @@ def merged(
 
 def problems(damages: Damages) -> list[str]:
     """Return a line for each file that could not be read completely."""
-    found = ((path, damage.report(active=path.name.endswith(ACTIVE))) for path, damage in damages.items())
-    return [f"{path}: {text}" for path, text in found if text]
+    reports = ((path, damage.report(active=path.name.endswith(ACTIVE))) for path, damage in damages.items())
+    return [f"{path}: {text}" for path, text in reports if text]
 
 
 def _messages(path: Path, since_ns: int, until_ns: int, chooses: Chooses, damages: Damages) -> Iterator[Recorded]:

@@ -28,12 +28,10 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 def parse_period(since: str | None, until: str | None, *, now: datetime) -> tuple[int, int]:
     """Return the period from ``since`` to before ``until``, in nanoseconds since 1970.
 
-    0 and FOREVER_NS where there is none.
-
-    A time of day is the latest one that is not after ``now``; as ``until`` with a ``since``, the first one after that.
-    A day as ``until`` is included. Times without a zone are in that of ``now``, or this machine's if that has none.
-    Raises PebbleError with one line that shows how to write it, also for a time that is twice or never that day because
-    clocks are changed.
+    An empty text means 0, or FOREVER_NS. A time of day is the latest one that is not after ``now``; as ``until`` with a
+    ``since``, the first one after that. A day as ``until`` is included. Times without a zone are in that of ``now``, or
+    this machine's if that has none. Raises PebbleError with one line that shows how to write it, also for a time that
+    occurs twice, or never, on that day because clocks are changed.
     """
     since_ns = 0 if since is None else _since(*_zoned("--since", since.strip(), now))
     until_ns = FOREVER_NS
@@ -84,14 +82,14 @@ def _until(text: str, since_ns: int | None, now: datetime) -> int:
 
 def _latest(option: str, text: str, now: datetime) -> int:
     moments = _times_of_day(_clock(option, text), now, range(-2, 1))
-    ns, moment = max(known for known in _known(moments, now.tzinfo) if known[0] <= _ns(now))
+    ns, moment = max(time for time in _known(moments, now.tzinfo) if time[0] <= _ns(now))
     _check_shown(option, text, moment, now.tzinfo)
     return ns
 
 
 def _first_after(option: str, text: str, since_ns: int, now: datetime) -> int:
     moments = _times_of_day(_clock(option, text), _at(since_ns, now.tzinfo), range(3))
-    ns, moment = min(known for known in _known(moments, now.tzinfo) if known[0] > since_ns)
+    ns, moment = min(time for time in _known(moments, now.tzinfo) if time[0] > since_ns)
     _check_shown(option, text, moment, now.tzinfo)
     return ns
 
@@ -105,7 +103,7 @@ def _known(moments: list[datetime], zone: tzinfo | None) -> Iterator[tuple[int, 
 
 
 def _readings(moment: datetime, zone: tzinfo | None) -> set[int]:
-    """Return the times at which a zone's clocks show ``moment``: two or none when they are changed."""
+    """Return the times at which a zone's clocks show ``moment``: usually one, two or none when they are changed."""
     return {_ns(moment.replace(tzinfo=zone, fold=fold)) for fold in (0, 1)}
 
 
@@ -131,7 +129,7 @@ def _clock(option: str, text: str) -> time:
 
 
 def _moment(option: str, text: str, now: datetime, days: int = 0) -> int:
-    """Parse a time; return nanoseconds since 1970. Raises PebbleError.
+    """Return the time in a text, in nanoseconds since 1970. Raises PebbleError.
 
     A date without a time means its beginning, plus ``days``.
     """

@@ -1,6 +1,6 @@
-"""The facts in a payload: its own stamp, and whether it is media. Pure.
+"""Time stamps in payloads, and whether a payload is media. Pure.
 
-Stamps of JSON are ``t`` in milliseconds or ``timestamp`` in seconds (paper A.4.2); media have theirs in the header
+JSON has ``t`` in milliseconds or ``timestamp`` in seconds (paper A.4.2); media have a stamp in the header
 (``pebble.extensions.media.packets``).
 """
 
@@ -37,10 +37,10 @@ def stamp_ns(payload: bytes) -> int:
     first = payload[:1]
     if first == b"{":
         try:
-            found = _stamped.decode(payload)
+            stamps = _stamped.decode(payload)
         except (ValueError, RecursionError):  # msgspec's are ValueErrors
             return 0
-        return _in_ns(found.timestamp if found.t is None else found.t)
+        return _in_ns(stamps.timestamp if stamps.t is None else stamps.t)
     header = _media_header(payload[:_MEDIA_HEAD]) if first == b"P" else None
     return 0 if header is None else _in_ns(header.captured_ms, 10**6)
 
@@ -85,7 +85,7 @@ def _media_header(payload: bytes) -> Picture | Sound | None:
 
 
 def _in_ns(stamp: float | None, unit: int = 0) -> int:
-    """Return a stamp in nanoseconds, exact to a microsecond; 0 if it is none.
+    """Return a stamp in nanoseconds, exact to a microsecond; 0 if it is not a stamp.
 
     ``unit``: in nanoseconds; 0: guessed from the stamp's size.
     """

@@ -1,6 +1,6 @@
-"""Numbers of scripts' runs, by which a motor owner tells an old run from a new one.
+"""Run numbers of scripts, by which a motor owner tells an old run from a new one.
 
-Which of two is newer, :func:`pebble.motion.arbiter.newer` decides: the numbers have no end.
+:func:`pebble.motion.arbiter.newer` decides which of two is newer: the numbers have no end.
 """
 
 import fcntl
@@ -32,10 +32,10 @@ _EPOCH_S = 1_735_689_600  # 2025-01-01: counted from here, seconds fit into a ru
 
 
 class LocalScripts:
-    """A lock that each script of the robot's own holds, or its manager for it, from before it gets its number.
+    """A lock held by each script of this robot, or its manager for it, from before it gets its run number.
 
-    So a number that is taken while none runs is older than that of every script that starts later. The kernel frees
-    the lock of a process that was killed.
+    So a number that is taken while no script runs is older than the number of every later script. The kernel releases
+    the lock of a killed process.
     """
 
     def __init__(self, config: Config) -> None:
@@ -43,7 +43,7 @@ class LocalScripts:
         self._held: int | None = None
 
     def hold(self) -> None:
-        """Note that a script runs. Without the lock it starts all the same: neighbours then take no number, either."""
+        """Note that a script runs. Without the lock it starts all the same; then neighbours take no number, either."""
         if self._held is None:
             try:
                 self._held = self._open()
@@ -58,7 +58,7 @@ class LocalScripts:
 
     @contextmanager
     def none_runs(self) -> Iterator[bool]:
-        """Give True if no script runs; none begins in the block then. Give False if one runs, or that is unknown."""
+        """Yield True if no script runs, and prevent one during the block; False if one runs, or that is unknown."""
         try:
             file = self._open()
         except OSError as error:
@@ -95,8 +95,8 @@ def next_run(config: Config, barred: int = 0, received: int = 0) -> int:
     """Return the number of a run that starts now: newer than ``barred``, which motor owners report.
 
     It is also above ``received`` and above every earlier run of this robot, unless these are not ahead of ``barred``:
-    then a stranger has sent a number far ahead. Several processes may call this at once. Without the file, or with a
-    damaged one, it counts from the clock. Raises PebbleError if another process does not give the file free.
+    then a stranger has sent a number far ahead. Several processes may call this at once. If the file is missing or
+    damaged, it counts from the clock. Raises PebbleError if another process does not release the file.
     """
     return _next(config.state_file("autonomy-run"), barred, time.time, received)
 
@@ -122,7 +122,7 @@ def _next(path: Path, barred: int, wall_clock: Callable[[], float], received: in
 
 
 def _lock(file: int, path: Path, how: int = fcntl.LOCK_EX) -> None:
-    """Wait for other processes, but not for one that is frozen meanwhile. Raises PebbleError."""
+    """Lock a file, waiting for other processes, but not for a frozen one. Raises PebbleError."""
     deadline = time.monotonic() + _LOCKED_S
     while True:
         try:
@@ -144,13 +144,13 @@ def _read(file: int, path: Path, wall_clock: Callable[[], float]) -> int:
 
 
 def _from_clock(wall_clock: Callable[[], float]) -> int:
-    """Return seconds since 2025; 0 by a clock that was never set or is far ahead."""
+    """Return the seconds since 2025; 0 if the clock was never set, or is far ahead."""
     seconds = int(wall_clock()) - _EPOCH_S
     return seconds if 0 < seconds < LAST_RUN // 2 else 0
 
 
 def _above(barred: int, *used: int) -> int:
-    """Return the number after the furthest of ``barred`` and ``used`` that still leaves a newer one."""
+    """Return the number after the furthest of ``barred`` and ``used`` that leaves room for a newer one."""
     base = barred or newest(used)
     ahead = ((run - base) & LAST_RUN for run in used if run and newer(following(run), base))
     return following((base + max(ahead, default=0)) & LAST_RUN)

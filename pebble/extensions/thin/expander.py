@@ -1,4 +1,4 @@
-"""Takes groups of streams apart beside a broker, so that every tool there sees the plain topics."""
+"""Splits groups of streams beside a broker, so that every tool there sees the plain topics."""
 
 import logging
 import re
@@ -27,7 +27,7 @@ _BASE = re.compile(rf"((?:[^/]+/){{2}}[^/]+)/(?:{INCOMING}|{OUTGOING})/")
 
 
 class _Robot:
-    """The state of a robot with groups, as an expander follows it; times are those of its clock."""
+    """The state of a robot that sends groups, as an expander knows it; times are on the expander's clock."""
 
     def __init__(self) -> None:
         self.named = False
@@ -37,11 +37,11 @@ class _Robot:
 
 
 class Expander:
-    """An expander on a connection; its owner calls :meth:`announce` every ANNOUNCE_S.
+    """An expander of groups on a connection; its owner calls :meth:`announce` every ANNOUNCE_S.
 
-    If there are several, the one with the smallest id works. Each goes by the announcements as the broker passes them
-    on, its own included: all see them between the same groups, so no group is taken apart twice. Members become nothing
-    but streams: no state, stop or command is published for a robot.
+    Of several expanders the one with the smallest id works. Each decides by the announcements as the broker passes them
+    on, its own included: all see them between the same groups, so no group is split twice. Members become only streams:
+    no state, stop or command is published for a robot.
     """
 
     def __init__(self, transport: Transport, clock: Callable[[], float] = time.monotonic, id_: str = "") -> None:
@@ -52,7 +52,7 @@ class Expander:
         self._lock = threading.RLock()
 
     def start(self) -> None:
-        """Subscribe; announcements of others come first."""
+        """Subscribe, first to the announcements of other expanders."""
         for suffix, receive in (
             (EXPANDER.suffix, self._receive_other),
             (f"{INCOMING}/{BY}/+/{EXPANDER.metric}", self._receive_other),
@@ -62,7 +62,7 @@ class Expander:
             self._transport.subscribe(f"{_ANY}/{suffix}", receive, qos=QoS.DELIVERED, direct=True)
 
     def announce(self) -> None:
-        """Tell robots that send groups that this expander is there, unless another one is."""
+        """Announce this expander to robots that send groups, unless another expander works."""
         with self._lock:
             silent_since = self._clock() - HEARD_S
             robots = [base for base, robot in self._robots.items() if robot.other_at < silent_since]
@@ -70,7 +70,7 @@ class Expander:
             self._transport.publish(EXPANDER.topic(base), msgspec.json.encode({"id": self.id}), qos=QoS.DELIVERED)
 
     def is_named(self, base: str) -> bool:
-        """True if a robot takes commands only with an account's name in the topic."""
+        """True if a robot takes commands only on topics with an account's name."""
         robot = self._robots.get(base)
         return robot is not None and robot.named
 

@@ -1,4 +1,4 @@
-"""Passes groups of commands into a robot: checked member by member, then whole, then as copies of the members."""
+"""Forwards groups of commands into a robot: each member is checked; then the whole and copies of the members pass."""
 
 import logging
 from collections.abc import Callable, Iterable
@@ -36,12 +36,12 @@ _log = RateLimitedLog(logging.getLogger(__name__), period_s=60.0)
 
 
 def encoded(members: Iterable[groups.Member]) -> bytes:
-    """Return a group of members as all readers understand it."""
+    """Return a group of members as JSON that every reader understands in the same way."""
     return msgspec.json.encode({member.metric: msgspec.Raw(member.payload) for member in members})
 
 
 def copy_of(member: groups.Member) -> bytes:
-    """Return the payload for programs that know no groups; marked as a copy if motor owners take the group itself."""
+    """Return a member as a payload for programs that know no groups; marked if motor owners take the group itself."""
     if member.channel not in MARKED:
         return member.payload
     return msgspec.json.encode(msgspec.json.decode(member.payload) | {groups.MARK: True})
@@ -60,7 +60,7 @@ def is_marked(raw: bytes) -> bool:
 
 
 class _Part(NamedTuple):
-    """A member as a message of its own, and how it passes; or why not."""
+    """A member as a message of its own, with how it is forwarded, or why it is not."""
 
     member: groups.Member
     subject: Subject
@@ -69,11 +69,11 @@ class _Part(NamedTuple):
 
 
 class GroupGate:
-    """A gate before a forwarder, for messages from outside; others go on to :attr:`pass_on`.
+    """A gate before a forwarder, for messages from outside. Messages that are no groups go on to :attr:`pass_on`.
 
     A group passes if each member would: it is published whole, and then each member by itself. Motor owners obey the
-    whole and ignore the copies, which are marked. A group of which a member may not pass is dropped, but for members
-    that only end something. Marked copies from outside are refused: observers would see motion that is not there.
+    whole and ignore the copies, which are marked. If a member may not pass, the group is dropped, except for members
+    that only end something. Marked copies from outside are refused: observers would see motion that does not happen.
     """
 
     def __init__(self, forwarder: Forwarder, addresses: Addresses, note_drive: Callable[[bytes], None]) -> None:
@@ -139,7 +139,7 @@ class GroupGate:
 def gate_of(
     config: Config, addresses: Addresses, forwarder: Forwarder, note_drive: Callable[[bytes], None]
 ) -> GroupGate | None:
-    """Return the gate of a robot that takes groups, in its place before the forwarder; None for others."""
+    """Return the gate of a robot that takes groups, installed before the forwarder; None for other robots."""
     if not config.services.mqtt_bridge.link.groups:
         return None
     gate = GroupGate(forwarder, addresses, note_drive)
@@ -148,7 +148,7 @@ def gate_of(
 
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
-    """Return the capabilities with the metrics that this robot takes in a group."""
+    """Return the capabilities with the metrics that this robot accepts in a group."""
     link = config.services.mqtt_bridge.link
     if not link.groups:
         return value

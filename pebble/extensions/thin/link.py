@@ -1,6 +1,6 @@
-"""The capacity of the way to the remote broker: its level by measurement, and the bytes that may be on it. Pure.
+"""The capacity of the way to the remote broker: its measured level, and how many bytes may be on their way. Pure.
 
-Losses alone lower nothing: a lost packet that is sent again delays an answer, but not TCP's own round trips.
+Losses alone do not lower the level: a lost packet that is sent again delays an answer, but not TCP's own round trips.
 """
 
 from collections import deque
@@ -31,7 +31,7 @@ _RUN_S = 1.0  # late commands that are further apart are no run
 
 
 class _Rule(Struct, frozen=True):
-    """The end of a level: ``worse_s`` of queue in two of three answers, or no queue for ``rise_s``."""
+    """A rule for leaving a level: ``worse_s`` of queue in two of three answers, or ``rise_s`` without a queue."""
 
     worse_s: float
     rise_s: float
@@ -45,7 +45,7 @@ _RULES: dict[LinkLevel, _Rule] = {
 
 
 class ShortestTrip:
-    """The shortest round trip of the last ten minutes: over a shorter time a queue that stays would become the norm."""
+    """The shortest round trip of the last ten minutes. In a shorter time a lasting queue would become the norm."""
 
     def __init__(self) -> None:
         self._parts: deque[tuple[float, float]] = deque()  # when each began, and the shortest in it
@@ -65,7 +65,7 @@ class ShortestTrip:
 
 
 class Crowd:
-    """The finding that a queue stands: operators and streams then send less until it has drained."""
+    """Detects a standing queue. Operators and streams then send less until it has drained."""
 
     def __init__(self) -> None:
         self.stands = False
@@ -81,10 +81,11 @@ class Crowd:
 
 
 class LinkMeter:
-    """A meter of the level of a link (thin to wide), from answers to pings.
+    """A meter of the level of a link (thin to wide), by the answers to pings.
 
-    At `auto` the level depends on the queue: how much longer answers take than the fastest one. It changes down early
-    and up late: after each rise that fails, the time without a queue before the next rise doubles, up to ten minutes.
+    At `auto` the level depends on the queue: how much longer answers take than the fastest one. The level falls early
+    and rises late: after each rise that fails, the time without a queue before the next rise doubles, up to ten
+    minutes.
     """
 
     def __init__(self, profile: str, kbit: float | None = None) -> None:
@@ -102,7 +103,7 @@ class LinkMeter:
 
     @property
     def crowded(self) -> bool:
-        """True if more is on its way, in either direction, than drains."""
+        """True if more is on its way than drains, in either direction."""
         return self._crowd.stands
 
     @property
@@ -110,7 +111,7 @@ class LinkMeter:
         return self._shortest.seconds
 
     def follow(self, answer: Answer | None, now: float) -> None:
-        """Follow the newest answer of the connection: it counts once, its absence again and again."""
+        """Update the level by the newest answer: the same answer counts once, a missing one at every call."""
         if answer is None:
             self.lost()
         elif answer.number != self._answers or (
@@ -130,7 +131,7 @@ class LinkMeter:
             self._decide(now)
 
     def lost(self) -> None:
-        """Note that the connection is lost; the next measurements are of another connection."""
+        """Note that the connection is lost; the next measurements belong to another connection."""
         self._answers = 0
         self._crowd = Crowd()
         self._forget()
@@ -164,10 +165,10 @@ class LinkMeter:
 
 
 class Room:
-    """The bytes that may be on their way to the remote broker, so that nothing waits there for long.
+    """The number of bytes that may be on their way to the remote broker, so that nothing waits there for long.
 
-    For a known link they drain within 150 ms beyond a round trip. Else they are learned: a little more with each
-    message that is confirmed without delay, a good deal less with one that is not.
+    If the link's capacity is known, they drain within 150 ms beyond a round trip. Otherwise the number is learned: it
+    grows a little with each message that is confirmed without delay, and shrinks much with each that is not.
     """
 
     def __init__(self, kbit: float | None = None) -> None:
@@ -178,7 +179,7 @@ class Room:
         self._used = False  # a message found no room
 
     def poll(self, waiting: int, round_trip_s: float, now: float) -> None:
-        """Note how many bytes are not confirmed; the shortest round trip is merely the way there and back."""
+        """Note how many bytes are not confirmed. The shortest round trip counts as the mere way there and back."""
         self._waiting = waiting
         confirmed = self._in_flight.acknowledge(waiting)
         if self._rate is not None:
@@ -190,9 +191,10 @@ class Room:
         self._used = False
 
     def takes(self, rank: Rank, size: int, now: float) -> bool:
-        """Return True if ``size`` bytes of this rank are sent now, and note them; one message is always on its way.
+        """Return True if ``size`` bytes of this rank may be sent now, and note them.
 
-        A message that is larger than the room takes all of it: the last ranks leave some for it.
+        A message may always be on its way. If it is larger than the room it takes all of it: the last ranks leave some
+        room for it.
         """
         fits = not self._waiting or self._waiting + min(size, self._bytes) <= self._bytes * rank
         self._used = self._used or not fits
@@ -205,7 +207,7 @@ class Room:
 class LateRun:
     """A count of late commands in a row, from senders that do not adapt to the link.
 
-    A command that is on time, or a pause, starts the count again.
+    A command in time, or a pause, restarts the count.
     """
 
     def __init__(self) -> None:
@@ -213,7 +215,7 @@ class LateRun:
         self._since = self._newest_at = 0.0
 
     def note(self, late: bool, now: float) -> None:
-        """Count a ``late`` command that does not tell its age; one that is on time starts the count again."""
+        """Count a ``late`` command that does not tell its age; a command in time restarts the count."""
         if not late:
             self.count = 0
             return
@@ -222,5 +224,5 @@ class LateRun:
         self.count, self._newest_at = self.count + 1, now
 
     def seconds(self, now: float) -> float:
-        """Return for how long commands have been late without a break; 0 if none was."""
+        """Return for how long all commands have been late; 0 if the last one was in time."""
         return now - self._since if self.count else 0.0

@@ -1,4 +1,4 @@
-"""Lets programs that send pictures or sound wait while a person drives: both share what a modem carries."""
+"""Lets programs that send pictures or sound wait while a person drives: they share the modem with the commands."""
 
 from collections.abc import Callable, Collection
 from typing import Final
@@ -8,7 +8,7 @@ HOLD_S: Final = 5.0  # after the newest command that moves something: each begin
 
 
 class MediaHold:
-    """A note to the launcher which of ``programs`` wait; ``send_one`` returns False if the launcher is busy."""
+    """Requests to the launcher that ``programs`` wait; ``send_one`` returns False if the launcher is busy."""
 
     def __init__(self, programs: Collection[str], send_one: Callable[[str, bool], bool]) -> None:
         self._sent = dict.fromkeys((name for name in HELD if name in programs), False)
@@ -16,11 +16,11 @@ class MediaHold:
         self._driven_at = float("-inf")
 
     def note_drive(self, now: float) -> None:
-        """Note that a command that moves something has come over a thin link. Any thread may call this."""
+        """Note a command over a thin link that moves something. Any thread may call this."""
         self._driven_at = now
 
     def send(self, now: float) -> None:
-        """Send the holds that have changed with time, and again those that the launcher did not accept."""
+        """Send the requests that have changed with time, and again those that the launcher has not accepted."""
         on = now - self._driven_at < HOLD_S
         for program, sent in self._sent.items():
             if sent is not on and self._send_one(program, on):

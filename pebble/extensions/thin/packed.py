@@ -1,6 +1,6 @@
-"""Several streams in one message, by their metrics below ``outgoing/``: JSON, or deflated JSON. Pure.
+"""Several streams in one message, as JSON by their metrics below ``outgoing/``, perhaps deflated. Pure.
 
-The first byte of deflated JSON is the number of its dictionary, 1 to 31; JSON begins with a brace.
+The first byte of deflated JSON is the number of its dictionary, 1 to 31; plain JSON begins with a brace.
 """
 
 import zlib
@@ -23,7 +23,7 @@ def joined(streams: Mapping[str, bytes]) -> bytes:
 
 
 def packed(text: bytes, dict_id: int, dictionary: bytes) -> bytes:
-    """Return ``text`` as it is sent: deflated with a dictionary, or unchanged without one."""
+    """Return ``text`` as it is sent: deflated with the dictionary, or unchanged if there is none."""
     if not dictionary:
         return text
     deflater = zlib.compressobj(9, zlib.DEFLATED, -15, 9, zlib.Z_DEFAULT_STRATEGY, dictionary)
@@ -31,7 +31,7 @@ def packed(text: bytes, dict_id: int, dictionary: bytes) -> bytes:
 
 
 def unpacked(raw: bytes, dictionaries: Mapping[int, bytes]) -> dict[str, bytes]:
-    """Return the streams in a message. Raises PayloadError for what cannot be read."""
+    """Return the streams in a message. Raises PayloadError if it cannot be read."""
     if raw and raw[0] <= LAST_DICT:
         if raw[0] not in dictionaries:
             raise PayloadError(f"its dictionary {raw[0]} is not known")

@@ -1,4 +1,4 @@
-"""Rules between the keys of groups and those of links and serial lines."""
+"""Rules between the config keys of groups and those of links and serial lines."""
 
 from pebble.config.problems import Path
 from pebble.config.reader import Reader, Rule
@@ -8,7 +8,7 @@ _LINK: Path = ("services", "mqtt_bridge", "link")
 
 
 def _check(reader: Reader, root: Root, _: Path) -> Root:
-    """Note groups that would not say which wheels they move."""
+    """Note a problem if a group would not tell which wheels it moves."""
     serial = root.services.serial_mcu_bridge
     topics = {line.topics.drive_values for line in (serial, *serial.instances.values())}
     if root.services.mqtt_bridge.link.groups and len(topics) > 1:

@@ -1,7 +1,7 @@
-"""A sieve for messages that leave a robot over a thin link: the newest of each stream, while there is room.
+"""A sieve for messages that leave a robot over a thin link: it passes the newest of each stream, as room allows.
 
-Pure: the owner guards it, and sends the messages that come out of it. Stops and all other messages *to* the robot never
-come here, nor do flags, and states that are ``prompt``.
+Pure: the owner guards it with a lock, and sends what it yields. It never gets stops or other messages *to* the robot,
+nor flags and states that are ``prompt``.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,7 +21,7 @@ OVERDUE_S = 10.0  # a message that has waited for so long gives way no more
 
 
 class Rank(IntEnum):
-    """The order in which messages wait: streams as soon as there is little room, heartbeats last."""
+    """Order in which messages wait: streams as soon as there is little room, heartbeats last."""
 
     STREAM = 1
     STATE = 2
@@ -29,7 +29,7 @@ class Rank(IntEnum):
 
 
 class Waiting(Struct, frozen=True):
-    """The newest message of a topic, which has not been sent."""
+    """The newest message of a topic, not yet sent."""
 
     rank: Rank
     subject: Subject
@@ -61,7 +61,7 @@ class Sieve:
         return len(self._waiting)
 
     def takes_event(self, message: Message) -> bool:
-        """Return True if an event is sent now; else note since when one has waited. Events wait elsewhere, in order."""
+        """Return True if an event may be sent now; else note since when events wait, which is elsewhere."""
         overdue = self._event_is_overdue
         if (overdue or Rank.STATE not in self._short) and self._takes(Rank.STATE, _size(message)):
             self._event_since = inf
@@ -70,7 +70,7 @@ class Sieve:
         return False
 
     def keeps(self, subject: Subject, message: Message, forward: Forward) -> bool:
-        """Keep ``message`` and return True; return False if it is sent now. If there is no room, it may be dropped."""
+        """Keep ``message`` and return True, or drop it for lack of room; return False if it is to be sent now."""
         rank, topic = rank_of(subject, message), message.topic
         if rank is None:
             return False
@@ -90,7 +90,7 @@ class Sieve:
         return True
 
     def due(self, rank: Rank) -> Iterator[Waiting]:
-        """Yield the waiting messages of this rank that are sent now. States wait while an event is overdue."""
+        """Yield the waiting messages of this rank that may be sent now. States wait while an event is overdue."""
         if rank is Rank.STATE and self._event_is_overdue:
             asked, self._event_asked = self._event_asked, False
             if asked:  # since the last time: else it has gone
@@ -108,7 +108,7 @@ class Sieve:
                 yield entry
 
     def empty(self) -> Iterator[Waiting]:
-        """Yield all waiting messages: there is room enough from now on."""
+        """Yield all waiting messages, because from now on there is room for all."""
         self._short.clear()
         while self._waiting:
             yield self._waiting.pop(next(iter(self._waiting)))
@@ -122,14 +122,14 @@ class Sieve:
         return rank is Rank.STATE or self._clock() - self._sent_at.get(topic, -inf) >= self.stream_s
 
     def _passes(self, rank: Rank, message: Message) -> bool:
-        """Return True if there is room, and no message of this rank waits for it."""
+        """True if there is room for the message, and no other message of its rank waits."""
         if rank in self._short or not self._takes(rank, _size(message)):
             self._short.add(rank)
             return False
         return True
 
     def _note(self, rank: Rank, topic: str) -> None:
-        """Note that a message is sent, so that its stream's next turn is later."""
+        """Note that a message was sent, which sets the time of its stream's next one."""
         if rank is not Rank.STREAM:
             return
         self._sent_at.pop(topic, None)
@@ -143,7 +143,7 @@ def _size(message: Message) -> int:
 
 
 def rank_of(subject: Subject, message: Message) -> Rank | None:
-    """Return the rank of a message; None: it never waits."""
+    """Return the rank in which a message waits; None if it never waits."""
     if subject.kind is Kind.STREAM or (subject.kind is Kind.EVENT and message.qos is QoS.LATEST):
         return Rank.STREAM
     return Rank.STATE if subject.kind is Kind.STATE else None

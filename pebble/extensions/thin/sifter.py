@@ -1,4 +1,4 @@
-"""Passes messages that leave a robot through a sieve, while the link to its remote side is thin."""
+"""Sends messages that leave a robot through a sieve, while the link to its remote side is thin."""
 
 import threading
 from collections.abc import Iterable
@@ -15,10 +15,10 @@ from pebble.transports import Message
 
 
 class Sifter:
-    """The sieve in a forwarder, for messages that leave the robot; thread-safe."""
+    """The sieve of a forwarder, for messages that leave the robot; thread-safe."""
 
     def __init__(self, forwarder: Forwarder, way: Forwarder | GroupGate, groups: StreamGroups | None) -> None:
-        """Store the arguments; ``way``: what passes messages on, the forwarder itself or a gate before it."""
+        """Store the arguments; ``way``: the part that forwards messages, the forwarder itself or a gate before it."""
         self._forwarder, self._way, self._sides = forwarder, way, forwarder.sides
         self._sieve: Sieve | None = None
         self._groups = groups

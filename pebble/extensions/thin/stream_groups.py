@@ -1,4 +1,4 @@
-"""Sends streams of a robot in groups, while something beside the remote broker takes them apart."""
+"""Sends streams of a robot in groups, while an expander beside the remote broker splits them."""
 
 import threading
 from collections.abc import Callable
@@ -23,7 +23,7 @@ _CROWDED = 4  # so much longer between two groups, while a queue stands
 class StreamGroups:
     """The newest message of each stream, sent together ``group_hz`` times a second. Any thread adds messages.
 
-    A group is deflated with an earlier one as the dictionary, which is published retained.
+    A group is deflated with an earlier group as its dictionary, which is published as a retained message.
     """
 
     def __init__(
@@ -49,13 +49,13 @@ class StreamGroups:
         self._is_announced = False
 
     def heard(self) -> None:
-        """Note that an expander is there."""
+        """Note that an expander has announced itself."""
         now = self._clock()
         self._since = now if now - self._heard_at > HEARD_S else self._since
         self._heard_at = now
 
     def takes(self, message: Message) -> bool:
-        """Keep a message until the next group, and return True; False: it is to be sent by itself."""
+        """Keep a message for the next group, and return True. False: send it by itself."""
         metric, payload = message.topic.removeprefix(self._below), message.payload
         if self._clock() - self._heard_at > HEARD_S or metric == message.topic or len(payload) > _MOST_BYTES:
             return False
@@ -72,7 +72,7 @@ class StreamGroups:
         return True
 
     def send(self, takes_room: Callable[[int], bool], *, crowded: bool) -> None:
-        """Send the waiting streams, if it is time and there is room; call this often."""
+        """Send the waiting streams, if it is time and there is room. Call this often."""
         now = self._clock()
         if not self._is_announced:
             self._publish_wire()
@@ -97,7 +97,7 @@ class StreamGroups:
         self._learn(text, frozenset(waiting), now)
 
     def _learn(self, text: bytes, metrics: frozenset[str], now: float) -> None:
-        """Make a group the dictionary of later ones, if it has streams that the present one lacks."""
+        """Make a group the dictionary of later groups, if it has streams that the present dictionary lacks."""
         if now - max(self._since, self._learned_at + _LEARN_AGAIN_S - _LEARN_S) < _LEARN_S or metrics <= self._known:
             return
         self._dict_id, self._dictionary = self._dict_id % LAST_DICT + 1, text

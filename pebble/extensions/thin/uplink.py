@@ -1,4 +1,4 @@
-"""Adapts the bridge to a link to the remote broker that may be thin, and publishes the link's level."""
+"""Adapts the bridge to a link that may be thin, and publishes the link's level."""
 
 import logging
 import threading
@@ -39,7 +39,7 @@ RENEW_S = 30.0  # between two connections that are renewed for it, at least: who
 
 
 class LinkReport:
-    """The retained state that tells others the level of the link: a change at once, one of its queue soon."""
+    """The retained state that tells others the level of the link: a new level at once, a change of its queue soon."""
 
     def __init__(self, meter: LinkMeter, address: Address, remote: Transport) -> None:
         self._meter, self._address, self._remote = meter, address, remote
@@ -48,18 +48,18 @@ class LinkReport:
 
     @property
     def is_outdated(self) -> bool:
-        """True if the level of the link, or whether it is crowded, has changed: others have to act otherwise."""
+        """True if the level of the link, or whether it is crowded, has changed, so that others must adapt."""
         return (self._meter.level, self._meter.crowded) != (self._level, self._crowded)
 
     def is_due(self, now: float) -> bool:
-        """True if the figures of the link have changed enough since they were published, or are old."""
+        """True if the link's figures have changed enough since they were published, or were published long ago."""
         change_s = abs(self._meter.queue_s - self._queue_s)
         state_s = _CROWDED_STATE_S if self._crowded else _STATE_S
         changed = now - self._at >= state_s and change_s >= max(_CHANGE_S, self._meter.round_trip_s / 2)
         return changed or now - self._at >= _STATES_S
 
     def publish(self, now: float) -> None:
-        """Publish a retained message: without a connection it is sent at the next one."""
+        """Publish the state as a retained message. Without a connection it is sent on the next one."""
         meter, earlier = self._meter, self._level
         self._level, self._crowded, self._queue_s, self._at = meter.level, meter.crowded, meter.queue_s, now
         trip_ms, queue_ms = round(1000 * meter.round_trip_s), round(1000 * meter.queue_s)
@@ -82,7 +82,7 @@ def make_uplink(
     notifier: Notifier,
     clock: Callable[[], float],
 ) -> Uplink:
-    """Return the uplink of a robot whose link may be thin, or which takes groups of commands."""
+    """Return the uplink of a robot whose link may be thin, or that takes groups of commands."""
     if config.services.mqtt_bridge.link.profile != "wide":
         return ThinUplink(config, addresses, remote, forwarder, notifier, clock)
     uplink = Uplink()
@@ -91,7 +91,7 @@ def make_uplink(
 
 
 class ThinUplink(Uplink):
-    """The link to the remote broker, where a config says that it may be thin."""
+    """The link to the remote broker, for a config that says that it may be thin."""
 
     channels: tuple[Channel, ...] = (LINK,)
 
@@ -173,16 +173,16 @@ class ThinUplink(Uplink):
         return self.level.heartbeat_s > 0
 
     def note_drive(self, payload: bytes) -> None:
-        """Let media wait while a person drives; the motor owner decides who that is."""
+        """Let media wait while a person drives. Whether a person does is decided by the motor owner."""
         with suppress(PayloadError):
             command: Drive = codec.decode(DRIVE, payload)
             if self._meter.level == "thin" and command.moves and command.source != SCRIPT:
                 self._hold.note_drive(self._clock())
 
     def _drop_late(self) -> None:
-        """Drop late commands: more than a thin link carries would fill the broker's queue, where a stop would wait.
+        """Drop late commands if there are so many that a stop would wait behind them in the broker's queue.
 
-        They are worth nothing when they come, and a new connection drops all that wait. From then on stops have a
+        They are useless by the time they come, and a new connection drops all that wait. From then on stops have a
         connection of their own.
         """
         late, now = self._late, self._clock()
@@ -193,7 +193,7 @@ class ThinUplink(Uplink):
             self._remote.renew_connection("only late commands come over a thin link: those that wait there are dropped")
 
     def _suit(self, now: float) -> None:
-        """Adapt to another level, or to a queue that begins or ends to stand."""
+        """Adapt to a change of level, or of whether a queue stands."""
         self._suit_transport()
         stream_hz = (self.level.stream_hz or 0.0) * (_CROWDED_STREAMS if self._meter.crowded else 1)
         self._sieve.stream_s = 1 / stream_hz if stream_hz else 0.0

@@ -1,4 +1,4 @@
-"""The work of the bridge besides forwarding: system actions, programs for pictures and sound, earlier names."""
+"""The bridge's tasks besides forwarding: system actions, programs for pictures and sound, and earlier names."""
 
 from pebble.extension import Extension
 

@@ -1,4 +1,4 @@
-"""System actions: reboot, service-restart and git-pull each run one command of the operating system."""
+"""System actions: reboot, service-restart and git-pull, each a command of the operating system."""
 
 import logging
 import os
@@ -29,7 +29,7 @@ _LOOK_S = 0.2
 
 
 class Row(Struct, frozen=True):
-    """One action: its channel, the section of services.mqtt_bridge with its command, and the time between two runs."""
+    """An action: its channel, its section of services.mqtt_bridge with the command, and the time between two runs."""
 
     channel: Channel
     section: str
@@ -44,9 +44,9 @@ ACTIONS: Final = (
 
 
 class Action:
-    """A command that runs once at a time, and no more often than its cooldown allows. Not thread-safe.
+    """A command that runs once at a time, and not again before its cooldown is over. Not thread-safe.
 
-    Operators read the log, and a command's words or output may hold a token: they stay in a file in ``folder``.
+    Operators read the log, and a command's words or output may hold a token: these go to a file in ``folder``.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Action:
         return self._process is not None and self._process.poll() is None
 
     def request(self) -> bool:
-        """Run the command; return False, with a log line, if the request is refused."""
+        """Run the command; return False, and log why, if the request is refused."""
         if not self.control.command:
             if not self._warned:
                 self._warned = True
@@ -111,7 +111,7 @@ class Action:
         return True
 
     def _follow(self, process: "subprocess.Popen[bytes]", output: int | None, where: str) -> None:
-        """Keep the file small while the command runs, and log its exit code."""
+        """Limit the output's file while the command runs, and log its exit code."""
         while (code := process.poll()) is None:
             time.sleep(_LOOK_S)
             if output is not None:
@@ -123,7 +123,7 @@ class Action:
 
 
 def shorten(file: int) -> None:
-    """Cut a file, to which a program appends, to its end if it is long."""
+    """Cut a file to its end if it is long, while a program may append to it."""
     size = os.fstat(file).st_size
     if size > _MOST:
         with suppress(OSError):  # a full disk

@@ -1,6 +1,6 @@
-"""Removes what brokers retain under the names that this robot had before: its identity in the config was changed.
+"""Removes retained messages under the robot's earlier names, before its identity in the config was changed.
 
-Nothing else ever would, and operators would see a robot that is off for ever.
+Otherwise they would stay, and operators would see a robot that is off for ever.
 """
 
 import json
@@ -37,7 +37,7 @@ _TOPICS = 1000  # that are removed of one name
 
 
 class EarlierNames:
-    """The names that were used with the same config file."""
+    """The robot's names with this config file until now."""
 
     def __init__(self, config: Config, sides: list[Transport], call_in: CallIn) -> None:
         self._base, self._sides, self._call_in = config.base, sides, call_in
@@ -51,7 +51,7 @@ class EarlierNames:
         self._begun = False
 
     def begin(self) -> None:
-        """Remember the robot's name, and look for what is left of earlier ones; once both sides are connected."""
+        """Remember the robot's name, and look for messages of earlier ones. Call this when both sides are connected."""
         if self._begun or self._file is None:
             return
         self._begun = True
@@ -88,7 +88,7 @@ class EarlierNames:
 
 
 class Renaming(Requests):
-    """The task that looks for earlier names once the bridge forwards; nobody requests it."""
+    """A task that looks for earlier names once the bridge forwards. It needs no request."""
 
     channels = ()
 
@@ -104,7 +104,7 @@ class Renaming(Requests):
         )
 
     def take(self, channel: Channel, value: Any) -> None:
-        """Take nothing: it has no channels."""
+        """Do nothing: this task has no channels."""
 
     def repeat(self) -> None:
         if self._forwarder.gate is Gate.OPEN:
@@ -112,9 +112,9 @@ class Renaming(Requests):
 
 
 class _Removal:
-    """The removal of one earlier name: watches for a robot of that name, and if there is none, cleans the brokers.
+    """The removal of one earlier name: watches for a living robot of that name; without one it cleans the brokers.
 
-    It removes the messages that brokers retain under the name, and checks that they have gone.
+    It removes the messages that brokers retain under the name, and checks that they are gone.
     """
 
     def __init__(self, name: str, sides: list[Transport], call_in: CallIn, done: Callable[[], None]) -> None:
@@ -145,12 +145,12 @@ class _Removal:
         self._call_in(_ARRIVE_S, again)
 
     def _check(self) -> None:
-        left = [topic for topics in self._found for topic in topics]
-        left += [one.filter for one in self._subscriptions if one.refused]
+        remaining = [topic for topics in self._found for topic in topics]
+        remaining += [subscription.filter for subscription in self._subscriptions if subscription.refused]
         self._end()
-        if left:
+        if remaining:
             text = "%s, its earlier name, stays at a broker: this account may not remove %s and %d more topics"
-            log.warning(text, self._name, min(left), len(left) - 1)
+            log.warning(text, self._name, min(remaining), len(remaining) - 1)
         elif self._removed:  # the next start looks again: a broker may publish a will later
             log.info("removed %d retained messages of its earlier name %s", self._removed, self._name)
         else:
@@ -159,12 +159,12 @@ class _Removal:
     def _ask(
         self, filter_: str, note: Callable[[set[str], Message], None], wait_s: float, then: Callable[[], None]
     ) -> None:
-        """Subscribe on all sides, and go on once what they have has arrived; nothing of this ends the bridge."""
+        """Subscribe on all sides; call ``then`` after their retained messages. No exception ends the bridge."""
         self._end()
         self._found = [set() for _ in self._sides]
         try:
-            for transport, found in zip(self._sides, self._found, strict=True):
-                received = partial(note, found)
+            for transport, topics in zip(self._sides, self._found, strict=True):
+                received = partial(note, topics)
                 self._subscriptions.append(transport.subscribe(filter_, received, echo=False, direct=True))
         except TransportError as error:
             log.warning("what is left of its earlier name %s stays: %s", self._name, error)

@@ -1,4 +1,4 @@
-"""Requests for media programs: a flag of the operators allows them, a request starts and stops them."""
+"""Requests for media programs: a flag set by operators permits them, a request starts and stops them."""
 
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, ClassVar, Final
@@ -14,7 +14,7 @@ from pebble.services.mqtt_bridge.own_requests import Requests
 
 
 class Row(Struct, frozen=True, eq=False):
-    """One medium: the flag that allows it, the channel that requests it, its encodings and its programs."""
+    """A medium: the flag that permits it, the channel that requests it, its encodings and its programs."""
 
     flag: Channel
     request: Channel
@@ -31,12 +31,12 @@ _NO: Final = ProgramRequest(on=False)
 
 
 class Media:
-    """The newest flag and request of each medium of a robot that has ``programs``; each change goes to the launcher.
+    """The newest flag and request of each medium of a robot that has ``programs``. Changes go to the launcher.
 
     ``running`` are the programs that an earlier bridge process had requested. They count as requested, because a
     request is never retained and the operator does not know that the bridge was restarted. Until the flag of a medium
-    is known, its programs are left as they are, except that a request may stop them.
-    ``send_one`` returns False if the launcher is busy; this never waits for it.
+    is known, its programs are left as they are, except that a request may stop them. ``send_one`` returns False if the
+    launcher is busy; this never waits for it.
     """
 
     def __init__(
@@ -55,14 +55,14 @@ class Media:
         self.send()
 
     def request(self, channel: Channel, request: MediaRequest) -> None:
-        """Note the newest request. Without a known encoding the request means the configured encoding."""
+        """Note the newest request. An unknown encoding stands for the configured one."""
         row = _ROWS[channel.suffix]
         encoding = request.encoding if request.encoding in row.encodings else None
         self._requested[row] = ProgramRequest(request.enabled, encoding or "")
         self.send()
 
     def requests(self) -> dict[str, ProgramRequest]:
-        """Return the requests by program, without those whose flag has to be known first."""
+        """Return the requests by program, without those whose flag is still unknown."""
         requests: dict[str, ProgramRequest] = {}
         for row, request in self._requested.items():
             if not request.on or row in self._allowed:
@@ -71,7 +71,7 @@ class Media:
         return {name: request for name, request in requests.items() if name in self._programs}
 
     def send(self) -> None:
-        """Send the requests that have changed, and again those that the launcher did not accept."""
+        """Send the requests that have changed, and again those that the launcher has not accepted."""
         for program, request in self.requests().items():
             if self._sent.get(program) != request and self._send_one(program, request):
                 self._sent[program] = request
@@ -82,7 +82,7 @@ def _first(row: Row, running: Mapping[str, ProgramRequest]) -> ProgramRequest:
 
 
 class MediaRequests(Requests):
-    """The requests for media programs of a robot, passed on to its launcher."""
+    """The requests for a robot's media programs, sent on to its launcher."""
 
     channels: ClassVar[tuple[Channel, ...]] = tuple(channel for row in MEDIA for channel in (row.flag, row.request))
 

@@ -1,4 +1,4 @@
-"""The aliases of a device that are in use: those that no other device claims."""
+"""Decides which aliases of a device are in use: those that no other device claims."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -9,7 +9,7 @@ from pebble.transports import Subscription
 
 
 class AliasUse:
-    """The aliases in use; ``begin`` starts the use of one and returns its subscription, if any; ``end`` ends it."""
+    """The aliases in use. ``begin`` starts the use of one and returns its subscription, if any; ``end`` ends it."""
 
     def __init__(
         self,
@@ -19,7 +19,7 @@ class AliasUse:
         end: Callable[[Alias], None],
         owners: Mapping[str, str],
     ) -> None:
-        """Store the arguments; ``owners``: the uid that the config names for a channel; no other device has it then."""
+        """Store the arguments; ``owners``: by channel, the uid that the config names; only that device may use it."""
         self._log, self._peers, self._begin, self._end, self._owners = log, peers, begin, end, owners
         self.permitted = False  # other devices have had time to object
         self._device: Device | None = None
@@ -30,17 +30,17 @@ class AliasUse:
         return alias.claim in self.used
 
     def announce(self, device: Device) -> None:
-        """Store a device whose manifest was just published; no alias is in use yet."""
+        """Store a device whose manifest was just published. None of its aliases is in use yet."""
         self._device, self.permitted = device, False
 
     def permit(self, device: Device) -> None:
-        """Use aliases from now on: other devices have had time to object."""
+        """Start using aliases, because other devices have had time to object."""
         if device is self._device:
             self.permitted = True
             self.update()
 
     def update(self) -> None:
-        """Use the aliases that no other device claims, and release the others: while two claim one, neither uses it."""
+        """Use the aliases that no other device claims, and release the others. If two claim one, neither uses it."""
         if self._device is None:
             return
         for route in self._device.routes.values():
@@ -48,7 +48,7 @@ class AliasUse:
                 self._update(self._device, route, route.alias)
 
     def withdraw(self) -> None:
-        """Release all aliases, because the device has gone."""
+        """Release all aliases, because the device is gone."""
         for claim in list(self.used):
             self._release(claim)
         self._device, self.permitted = None, False

@@ -26,7 +26,7 @@ Lookup = Callable[[str], c.Channel | None]
 class Claims:
     """The claims of one manifest: interface names by claim, and the reasons of refusals by interface name.
 
-    A claim is a channel with its direction, ``outgoing/outlets/o1/status``.
+    A claim is a channel with its direction, such as ``outgoing/outlets/o1/status``.
     """
 
     granted: Mapping[str, str]
@@ -34,7 +34,7 @@ class Claims:
 
 
 def claims(manifest: McuManifest, lookup: Lookup = c.channel_of) -> Claims:
-    """Return the claims of a manifest; every process that reads it comes to the same result.
+    """Return the claims of a manifest. Every process that reads the manifest comes to the same result.
 
     ``lookup`` finds the robot's channel under a suffix, renamed ones included.
     """
@@ -54,12 +54,12 @@ def claims(manifest: McuManifest, lookup: Lookup = c.channel_of) -> Claims:
 
 
 def outlet_feature(claim: str) -> set[str]:
-    """Return the feature for the robot's capabilities while this claim is in use: an outlet's topic, or none."""
+    """Return the feature for the robot's capabilities while this claim is in use, if it is an outlet's topic."""
     return {claim.partition("/")[2]} if c.channel_of(claim) in (c.OUTLET_STATUS, c.OUTLET_COMMAND) else set()
 
 
 def _why_not(claim: str, interface: Mapping[str, Any], lookup: Lookup) -> str:
-    """Return why an MCU must not have this channel: it would command or imitate the robot, or be unreadable."""
+    """Return why an MCU must not use this channel: it would command or imitate the robot, or be unreadable."""
     direction, family = claim.split("/")[:2]
     if family in _OWN_FAMILIES or c.is_reserved(family):
         return f"{direction}/{family} is the robot's own"

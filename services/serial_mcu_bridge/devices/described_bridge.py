@@ -1,4 +1,4 @@
-"""The owner of the serial line to a self-describing MCU (``pebble_serial_v1``), whose manifest defines its topics."""
+"""The bridge of a self-describing MCU (``pebble_serial_v1``), whose manifest defines its topics."""
 
 import logging
 import secrets
@@ -54,7 +54,7 @@ _UID_QUERY = Channel(
 
 
 class DescribedBridge(SerialService):
-    """The service of one MCU: it publishes its topics while it is connected, and clears them when it has gone."""
+    """The service of one MCU. It publishes the MCU's topics while it is connected, and clears them afterwards."""
 
     publishes = (MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, IMU_FAST, IMU)
     end = END
@@ -119,7 +119,7 @@ class DescribedBridge(SerialService):
         self._arm()
 
     def _arm(self) -> None:
-        """Ensure that the timer is early enough; one that is too early has no effect."""
+        """Set the timer if the next event is earlier; a timer that is too early does no harm."""
         due = min((due for due in (self._session.due, self._peers.due) if due is not None), default=None)
         if due is None or (self._timer is not None and self._timer.due <= due):
             return
@@ -284,7 +284,7 @@ class DescribedBridge(SerialService):
         self.transport.subscribe(self.addresses[MCU_DESCRIBE].topic, self._on_manifest, echo=False, direct=True)
 
     def _on_manifest(self, message: Message) -> None:
-        """Take a manifest, on the transport's thread."""
+        """Handle the manifest of any device, on the transport's thread."""
         uid = MCU_DESCRIBE.names(message.topic).get("uid")
         if uid is None:  # the filter's + also matches an empty level
             self.counters.add("refused")
@@ -327,7 +327,7 @@ class _ProvidedFeatures:
         self._reported: set[str] = set()
 
     def report(self) -> None:
-        """Report what has changed, also what the launcher was too busy for before."""
+        """Report changes, also those for which the launcher was too busy before."""
         for name in sorted(self._reported ^ self.names):
             if self._notifier.feature(name, name in self.names):
                 self._reported ^= {name}

@@ -51,11 +51,11 @@ class Device:
         interfaces = tuple(map(self._renamed, manifest.interfaces))
         self.payload: McuManifest = Manifest(manifest.hello, interfaces).payload()
         self.claims: Claims = claims(self.payload, self._robots_channel)
-        self.routes = {one.id: self._route(one) for one in interfaces}
+        self.routes = {interface.id: self._route(interface) for interface in interfaces}
 
     @property
     def has_motion(self) -> bool:
-        """True if the MCU has an inertial sensor, which sends continuously."""
+        """True if the MCU has an inertial sensor, which sends all the time."""
         return any(route.interface.profile == imu.MOTION for route in self.routes.values())
 
     @property
@@ -79,7 +79,7 @@ class Device:
         )
 
     def alias_body(self, route: Route, sample: McuSample) -> Payload | None:
-        """Return a sample as the payload of the alias; None if there is none yet. Stores motion for summaries."""
+        """Return a sample as the payload of its alias; None if there is none yet. Stores motion, for summaries."""
         body = "" if route.alias is None else route.alias.body
         if route.interface.profile == imu.MOTION and imu.fits(imu.MOTION, sample.value):
             motion = self._reports.motion(sample.t, sample.seq, sample.mcu_ms, sample.value)  # summaries repeat it
@@ -110,7 +110,7 @@ class Device:
         return Alias(claim, claimed, interface.profile if fits else "")
 
     def _renamed(self, interface: Interface) -> Interface:
-        """Return ``interface`` with the effective name of its channel, if the config sets one that is valid."""
+        """Return ``interface`` with the channel name that the config sets, if it sets a valid one."""
         if interface.direction is Direction.IN:
             return interface
         channel = c.channel_of(f"{c.OUTGOING}/{interface.channel}")
@@ -124,7 +124,7 @@ class Device:
 
 
 def _channel(metric: str, kind: InterfaceKind, payload: Any, *, retain: bool = False) -> c.Channel:
-    """Return a channel created at run time. Only a state is retained: a retained sample would be stale."""
+    """Return a channel made at run time. Only a state is retained: a retained sample would be stale."""
     of_contract, qos = _KINDS[kind]
     if kind is InterfaceKind.STATE and retain:
         of_contract = c.Kind.STATE

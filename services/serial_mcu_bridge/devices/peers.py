@@ -1,4 +1,4 @@
-"""The other self-describing MCUs of this robot and the channels that their manifests claim. Pure."""
+"""The robot's other self-describing MCUs, and the channels that their manifests claim. Pure."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ class _PeerDevice:
 
 
 class PeerDevices:
-    """Claims by device. A retained manifest counts too, until its confirmation times out."""
+    """Claims by device. A retained manifest counts, too, until its device had time to confirm it."""
 
     def __init__(self) -> None:
         self._of: dict[str, _PeerDevice] = {}
@@ -26,7 +26,7 @@ class PeerDevices:
             self._of[uid] = _PeerDevice(claims, now + CONFIRM_S if retained else None)
 
     def forget(self, uid: str) -> None:
-        """Remove a device that has withdrawn its manifest, or is this one."""
+        """Forget a device: it has withdrawn its manifest, or is this one."""
         self._of.pop(uid, None)
 
     def claimants(self, claim: str) -> list[str]:
@@ -35,12 +35,12 @@ class PeerDevices:
 
     @property
     def due(self) -> float | None:
-        """The time at which the next confirmation times out; None if none is pending."""
+        """Time at which the next confirmation times out; None if none is pending."""
         return min((peer.confirm_by for peer in self._of.values() if peer.confirm_by is not None), default=None)
 
     def left_over(self, now: float) -> list[str]:
-        """Remove the devices that were not confirmed in time, and return their uids."""
-        gone = [uid for uid, one in self._of.items() if one.confirm_by is not None and one.confirm_by <= now]
-        for uid in gone:
+        """Forget the devices that were not confirmed in time, and return their uids."""
+        late = [uid for uid, peer in self._of.items() if peer.confirm_by is not None and peer.confirm_by <= now]
+        for uid in late:
             del self._of[uid]
-        return gone
+        return late

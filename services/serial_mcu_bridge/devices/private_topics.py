@@ -1,7 +1,7 @@
-"""Topics that a self-describing MCU marks ``local_only``: serial bridges publish a list for each.
+"""Topics that a self-describing MCU marks ``local_only``: serial bridges publish a list for each MCU.
 
-The order of two topics is undefined: on Zenoh, and behind a full queue of a broker, a value may arrive before the list,
-and at a bridge that starts late it nearly always does. So nothing of an MCU passes before its list.
+A value may arrive before the list: the order of two topics is undefined on Zenoh, and behind a full queue of a broker;
+at a bridge that starts late it nearly always happens. So no value of an MCU passes before its list.
 """
 
 import threading
@@ -32,7 +32,7 @@ class LocalOnly(PrivateTopics):
         self._commands = f"{base}/{MCU_COMMAND.suffix.partition('{')[0]}"
 
     def stays(self, topic: str) -> bool:
-        """True if ``topic`` is on a list, or is for a command to an MCU without a list, or for a manifest request."""
+        """True if ``topic`` is on a list, is a command to an MCU without a list, or a request for a manifest."""
         if topic.startswith(self._commands):
             uid = topic.removeprefix(self._commands).partition("/")[0]
             if uid not in self._listed or topic.endswith(_QUESTION):
@@ -40,7 +40,7 @@ class LocalOnly(PrivateTopics):
         return bool(self._private) and any(topic in topics for topics in list(self._private.values()))
 
     def admit(self, message: Message) -> list[Message]:
-        """Return ``message`` if it may pass now, else store a value; for a list, return the values that waited."""
+        """Return ``message`` if it may pass now, otherwise keep it; for a list, return the values that waited."""
         with self._lock:
             if not message.payload:
                 self._waiting.pop(message.topic, None)  # removed: nothing to forward any more
@@ -51,7 +51,7 @@ class LocalOnly(PrivateTopics):
             return self._judge(message)
 
     def _learn(self, uid: str, payload: bytes) -> None:
-        """Store a list. A list that is removed, or cannot be read, lets no value pass; its topics stay private."""
+        """Store a list. A list that was removed or cannot be read lets no value pass; known topics stay private."""
         self._listed.discard(uid)
         try:
             listed: McuLocalOnly = codec.decode(MCU_LOCAL_ONLY, payload)
@@ -75,7 +75,7 @@ class LocalOnly(PrivateTopics):
         return []
 
     def _uid_of(self, message: Message) -> str | None:
-        """Return the uid of the MCU that sent a value; None for a message of another program, or a manifest."""
+        """Return the uid of the MCU whose value this is; None for a manifest, or another program's message."""
         if message.topic.startswith(self._values):
             uid = message.topic.removeprefix(self._values).partition("/")[0]
             return None if message.topic.endswith(_QUESTION) else uid
@@ -85,7 +85,7 @@ class LocalOnly(PrivateTopics):
 
 
 def _object(payload: bytes) -> dict[str, Any]:
-    """Return the JSON object in ``payload``; an empty dict for anything else."""
+    """Return the JSON object in ``payload``; an empty dict if there is none."""
     try:
         plain = codec.plain(MCU_DESCRIBE, payload)
     except PayloadError:

@@ -1,4 +1,4 @@
-"""Inertial sensors: the service of one with a line of text of its own, and what the lines of all of them become."""
+"""Inertial sensors: the service of one with its own line of text, and the payloads of all kinds."""
 
 from pebble.contract.serial_protocols import SerialProtocol
 from pebble.extension import Extension

@@ -1,4 +1,4 @@
-"""Owns the serial line to an inertial sensor with ``imu_mpu6050_v1``: publishes its samples on ``sensors/imu*``."""
+"""The bridge of an inertial sensor with ``imu_mpu6050_v1``: publishes its samples on ``sensors/imu*``."""
 
 import logging
 import time
@@ -18,7 +18,7 @@ _WATCH_S = 0.5
 
 
 class ImuBridge(SerialService):
-    """The service of a sensor, which is sent nothing. Drive commands tell when its samples have to change."""
+    """The service of a sensor, to which it sends nothing. Drive commands tell when samples should change."""
 
     publishes = (IMU_FAST, IMU)
     receive_only = True

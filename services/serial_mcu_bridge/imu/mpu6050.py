@@ -1,7 +1,7 @@
-"""The text protocol ``imu_mpu6050_v1`` of an Arduino with an inertial sensor: lines in, nothing out, no I/O.
+"""The text protocol ``imu_mpu6050_v1`` of an Arduino with an inertial sensor: parses lines, sends nothing, no I/O.
 
 ``I n= ms= ax= ay= az= gx= gy= gz= t= r= p=`` is a sample, ``S n= ms= r= p= t= an= gbx= gby= gbz= ok= err= cal=`` a
-summary. All keys must be there; anything else is a log line.
+summary. A line without all keys is a log line.
 """
 
 import logging

@@ -1,4 +1,4 @@
-"""Inertial sensors: from values to the payloads of ``sensors/imu*``, and a watchdog for missing samples. Pure."""
+"""Makes the payloads of ``sensors/imu*`` from an inertial sensor's values, and notices missing samples. Pure."""
 
 from collections.abc import Collection, Mapping
 from typing import Any, Final
@@ -29,25 +29,25 @@ Values = Mapping[str, Any]
 
 
 def measured(values: Values) -> dict[str, tuple[Any, ...]]:
-    """Return a sample's values by the sensor that gave them; noise alone makes each differ from the one before."""
+    """Return a sample's values by sensor. Because of noise, successive samples always differ."""
     axes = {"acceleration": ("ax", "ay", "az"), "rotation": ("gx", "gy", "gz")}
     return {name: tuple(values[axis] for axis in names) for name, names in axes.items()}
 
 
 def fits(profile: str, names: Collection[str]) -> bool:
-    """True if fields of these names include all fields of the profile."""
+    """True if these field names include all fields of the profile."""
     return _FIELDS[profile] <= set(names)
 
 
 class ImuReports:
-    """The payloads of one sensor; a summary repeats the newest sample."""
+    """A maker of the payloads of one sensor; a summary repeats the newest sample."""
 
     def __init__(self, *, device: str, protocol: str, instance: str) -> None:
         self._device, self._protocol, self._instance = device, protocol, instance
         self._newest: ImuFastValues | None = None
 
     def motion(self, t: int, seq: int, mcu_ms: int, values: Values) -> ImuFast:
-        """Return a sample; ``values`` by the profile's fields, in m/s², degrees per second, °C and degrees."""
+        """Return a sample as a payload; ``values`` by the profile's fields: m/s², degrees per second, °C, degrees."""
         self._newest = ImuFastValues(
             accel_mps2=_vector(values, "ax", "ay", "az"),
             gyro_dps=_vector(values, "gx", "gy", "gz"),
@@ -81,7 +81,7 @@ class ImuReports:
 
 
 class ImuWatchdog:
-    """A watchdog for the time without a sample while a device is connected; when it expires, the process must end.
+    """A watchdog for missing samples while a device is connected. When it expires, the process must end.
 
     The clock is passed in.
     """
@@ -96,14 +96,14 @@ class ImuWatchdog:
         return TIMEOUT_S if self._is_imu else 0.0
 
     def found_imu(self) -> None:
-        """Record that the device is an inertial sensor."""
+        """Note that the device is an inertial sensor."""
         self._is_imu = True
 
     def begin(self, now: float) -> None:
         self._since = now + FIRST_S
 
     def end(self) -> None:
-        """Stop waiting, because there is no device."""
+        """Stop watching, because there is no device."""
         self._since = None
 
     def sample(self, now: float) -> None:

@@ -1,1 +1,1 @@
-"""The serial line itself: the open port, what waits to be sent, and the stop that is sent first and last."""
+"""The serial line itself: the open port, lines that wait to be sent, and the stop that is sent first and last."""

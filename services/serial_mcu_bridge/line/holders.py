@@ -1,4 +1,4 @@
-"""Other holders of a serial device: both read what the board sends, so each misses some, and both send."""
+"""Finds other programs that use a serial device: each of two misses bytes that the other reads, and both send."""
 
 import os
 from contextlib import suppress

@@ -1,4 +1,4 @@
-"""The lines that wait to be sent: only the newest of each kind."""
+"""The lines that wait to be sent: the newest of each kind."""
 
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ class _Waiting(NamedTuple):
 
 
 class Outbox:
-    """Slots for waiting lines, one per kind; a newer line replaces an older one. A line may be a frame.
+    """Slots for waiting lines, one per kind: a newer line replaces an older one. A line may also be a frame.
 
     Pure: the clock is passed in. A drive line that could not be sent in time is replaced by the stop line.
     """
@@ -21,16 +21,16 @@ class Outbox:
         self.waiting: dict[str, _Waiting] = {}  # by kind
 
     def drive(self, line: bytes, now: float, valid_s: float, replaces: str = "") -> None:
-        """Add a drive line that is valid for ``valid_s``, at most for the timeout; ``replaces``: another kind too."""
+        """Add a drive line that is valid for ``valid_s``, at most the timeout; ``replaces``: another kind."""
         self.waiting.pop(replaces, None)
         self._place(_DRIVE, _Waiting(line, now + min(valid_s, self._drive_timeout)))
 
     def halt(self) -> None:
-        """Make the stop line the newest drive line. It never expires."""
+        """Put the stop line in the drive line's slot. It never expires."""
         self._place(_DRIVE, _Waiting(self._stop, float("inf")))
 
     def put(self, kind: str, line: bytes) -> None:
-        """Add any other line, for example ``put("lights", …)``; it never expires."""
+        """Add a line of another kind, such as ``put("lights", …)``. It never expires."""
         self._place(kind, _Waiting(line, float("inf")))
 
     def take(self, now: float) -> bytes | None:

@@ -1,4 +1,4 @@
-"""The output to an open serial device: the bytes being written, and after them the lines that wait."""
+"""The output to an open serial device: the bytes being written, then the lines that wait."""
 
 from pebble.errors import DeviceError
 from pebble.services.serial_mcu_bridge.line.outbox import Outbox
@@ -22,7 +22,7 @@ class Output:
         self._blocked_since: float | None = None
 
     def begin(self, port: Port) -> None:
-        """Forget the lines for an earlier opening; begin with a line end and the stop."""
+        """Start on a newly opened device with a line end and the stop; forget earlier lines."""
         port.discard_output()  # an earlier process may have left old commands in the kernel
         self.outbox.clear()
         self.sending, self._blocked_since = self._end + self.stop, None
@@ -32,7 +32,7 @@ class Output:
         return now >= self.sent_until and not port.queued()
 
     def write(self, port: Port, now: float, *, ready: bool) -> None:
-        """Write until the kernel accepts no more; lines from the outbox only to a ``ready`` device."""
+        """Write until the kernel accepts no more; lines from the outbox are written only to a ``ready`` device."""
         while self.sending or (ready and self.outbox.waiting and self._next_line(port, now)):
             sent = port.write(self.sending)
             if not sent:

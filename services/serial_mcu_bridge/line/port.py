@@ -17,10 +17,10 @@ _CHUNK = 4096
 
 
 class Port:
-    """An open tty in raw mode, 8N1, with old input discarded. Raises DeviceError when it cannot be opened or has gone.
+    """An open tty in raw mode, 8N1, with old input discarded. Raises DeviceError if it cannot be opened or is gone.
 
-    Exclusive by flock: TIOCEXCL would outlive a killed process on a pty, a flock never does. HUPCL stays set:
-    when our process ends, DTR drops, which resets (so stops) some boards.
+    Exclusive by flock: TIOCEXCL would outlive a killed process on a pty, a flock never does. HUPCL stays set: when our
+    process ends, DTR drops, which resets (so stops) some boards.
     """
 
     def __init__(self, path: str, baud: int) -> None:
@@ -56,7 +56,7 @@ class Port:
             raise DeviceError(f"{self.path} has gone: {error}") from error
 
     def queued(self) -> int:
-        """Return how many bytes the kernel holds that are not sent yet; always 0 on a pty."""
+        """Return how many unsent bytes the kernel holds; always 0 on a pty."""
         try:
             answer = fcntl.ioctl(self._fd, termios.TIOCOUTQ, b"\0\0\0\0")
         except (OSError, ValueError) as error:
@@ -64,12 +64,12 @@ class Port:
         return int.from_bytes(answer, sys.byteorder)
 
     def discard_output(self) -> None:
-        """Discard the bytes that the kernel holds and has not sent."""
+        """Discard the unsent bytes that the kernel holds."""
         with suppress(termios.error, ValueError):  # a port that has gone raises at the next read
             termios.tcflush(self.fileno(), termios.TCOFLUSH)
 
     def is_replaced(self) -> bool:
-        """True if the path is another device now: a replug often creates a new node for the symlink."""
+        """True if the path now leads to another device: a replug often makes a new node for the symlink."""
         try:
             return Path(self.path).stat().st_rdev != os.fstat(self.fileno()).st_rdev
         except OSError:
@@ -86,7 +86,7 @@ class Port:
 
 
 def _reason(error: Exception, path: str) -> str:
-    """Return the plain reason; pyserial nests the path and the error number in its text."""
+    """Return the plain reason of an error: pyserial wraps it in a text with path and number."""
     number = error.errno if isinstance(error, OSError) else None
     if number == errno.EAGAIN:  # from flock
         return ", ".join(["another program has it open", *holders(path)])

@@ -32,7 +32,7 @@ class LineState(Enum):
 
 
 class _Opening(NamedTuple):
-    """A device, and the parameters of its opening."""
+    """A device with the parameters for opening it."""
 
     path: str
     baud: int
@@ -44,14 +44,14 @@ class SerialLine:
     """One serial port and its reading thread. Any thread may call any method; only :meth:`close` blocks, up to 0.8 s.
 
     Every opening sends a line end, because the device may hold half an earlier line, and then the stop as the first
-    line. During ``boot_s`` input is discarded; then the stop is sent again, and after it the lines that were added
-    since the opening. Only the newest of each kind waits (:class:`Outbox`); described commands use up to 8 kinds
-    per interface.
+    line. During ``boot_s`` input is discarded; then the stop is sent again, followed by the lines that were added since
+    the opening. Only the newest of each kind waits (:class:`Outbox`); described commands use up to 8 kinds per
+    interface.
 
-    ``on_bytes(chunk)`` and ``on_state(state, problem)`` run on the reading thread and must return at once.
-    ``stop`` is the line that stops the motors, empty where there are none; ``drive_timeout_s`` the age at which a drive
-    line expires. ``end`` ends a text line, or a frame; empty where nothing is ever sent.
-    ``retry_s`` is the longest wait between two attempts to open the device.
+    ``on_bytes(chunk)`` and ``on_state(state, problem)`` run on the reading thread and must return at once. ``stop`` is
+    the line that stops the motors, empty if there are none; ``drive_timeout_s`` the age at which a drive line expires.
+    ``end`` ends a text line, or a frame; empty if nothing is ever sent. ``retry_s`` is the longest wait between two
+    attempts to open the device.
     """
 
     def __init__(
@@ -88,29 +88,28 @@ class SerialLine:
 
     @property
     def problem(self) -> str:
-        """The reason why there is no device; empty while there is one."""
+        """Reason why there is no device; empty while there is one."""
         return self._problem
 
     def open(self) -> None:
-        """Start the thread that opens the device. Returns at once."""
+        """Start the thread that opens the device, without waiting for it."""
         self._thread.start()
 
     def drive(self, line: bytes, valid_s: float = float("inf"), *, replaces: str = "") -> bool:
-        """Send a drive line now, or once earlier bytes are sent unless a newer one replaces it.
+        """Send a drive line now, or after earlier bytes unless a newer one replaces it; False if there is no device.
 
-        Return False if there is no device. A drive line that could not be sent for ``valid_s``, or for
-        ``drive_timeout_s``, becomes a stop. Other lines may follow in ``line``: they have the same fate; ``replaces``
-        is their kind.
+        If it could not be sent for ``valid_s``, or for ``drive_timeout_s``, a stop is sent instead. ``line`` may
+        contain other lines, which share its fate; ``replaces`` is their kind.
         """
         outbox = self.output.outbox
         return self._hand_over(lambda now: outbox.drive(line, now, valid_s, replaces), line if valid_s > 0 else b"")
 
     def halt(self) -> bool:
-        """Send the stop in place of any waiting drive line. False: no device; opening it begins with the stop."""
+        """Send the stop in place of a waiting drive line. False without a device: its opening begins with the stop."""
         return self._hand_over(lambda _now: self.output.outbox.halt(), self.output.stop)
 
     def send(self, kind: str, line: bytes) -> bool:
-        """Send a line that drives nothing, in place of a waiting one of the same ``kind``; False without a device."""
+        """Send a line that does not drive, in place of a waiting line of its ``kind``; False if there is no device."""
         return self._hand_over(lambda _now: self.output.outbox.put(kind, line), line)
 
     def close(self, timeout: float = 0.8) -> None:
@@ -136,7 +135,7 @@ class SerialLine:
     # -- any thread
 
     def _hand_over(self, place: Callable[[float], None], line: bytes) -> bool:
-        """Write ``line`` at once, on the caller's thread, or ``place`` it in the outbox if it has to wait."""
+        """Write ``line`` at once on the caller's thread; if it has to wait, call ``place`` to put it in the outbox."""
         now = time.monotonic()
         with self._lock:
             port, output = self._port, self.output
@@ -176,7 +175,7 @@ class SerialLine:
             self._set_state(LineState.CLOSED)
 
     def _serve_opening(self, port: Port) -> None:
-        """Serve the device from opening to closing. Raises DeviceError when it has gone."""
+        """Serve the device until it is closed. Raises DeviceError when it is gone."""
         try:
             self._attach(port)
             self._serve(port)
@@ -219,7 +218,7 @@ class SerialLine:
                     raise DeviceError(f"{port.path} is another device now")
 
     def _poll_timeout(self, until_ready: float) -> float:
-        """Return how long to wait for input before writing again, in seconds."""
+        """Return the seconds to wait for input before writing again."""
         if self._state is LineState.BOOTING:
             return max(_RETRY_WRITE_S, min(_READ_S, until_ready))
         return _RETRY_WRITE_S if self.output.sending or self.output.outbox.waiting else _READ_S
@@ -235,7 +234,7 @@ class SerialLine:
         self._set_state(LineState.READY)
 
     def _write_waiting(self, port: Port, now: float) -> None:
-        """Write waiting bytes; raise DeviceError for a device that has gone or accepts nothing."""
+        """Write waiting bytes. Raises DeviceError if the device is gone, or accepts nothing."""
         with self._lock:
             if self._failure is not None:
                 raise self._failure
@@ -245,7 +244,7 @@ class SerialLine:
                 self.output.check_stall(port, now)
 
     def _finish(self, port: Port) -> None:
-        """Wait up to 0.3 s until the last stop is sent; for a stuck device it replaces all earlier output."""
+        """Wait up to 0.3 s until the last stop is sent; in a stuck device it replaces all earlier output."""
         end = time.monotonic() + _DRAIN_S
         while time.monotonic() < end:
             with self._lock:
@@ -270,6 +269,6 @@ class SerialLine:
         end = time.monotonic() + seconds
         poller = select.poll()
         poller.register(self._wakeup, select.POLLIN)
-        while not self._closing and (left := end - time.monotonic()) > 0:
-            if poller.poll(1000 * left):
+        while not self._closing and (remaining_s := end - time.monotonic()) > 0:
+            if poller.poll(1000 * remaining_s):
                 self._wakeup.clear()

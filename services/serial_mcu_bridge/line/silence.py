@@ -1,4 +1,4 @@
-"""The silence of a board on a serial line, and its meaning. Pure."""
+"""Judges the silence of a board on a serial line. Pure."""
 
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 
@@ -8,10 +8,10 @@ _REGULAR = 5  # checks in a row; our motor boards report at least twice a second
 
 
 class Silence:
-    """A watch for silence; call :meth:`check` about once a second, and when the state of the line changes.
+    """A watch for silence. Call :meth:`check` about once a second, and when the state of the line changes.
 
-    A board that has sent something of its own accord in five checks in a row, while nothing was sent to it, reports at
-    rest: if it stops, it hangs, or its wires do. Others may be silent by design.
+    A board that has sent data unasked in five checks in a row, while nothing was sent to it, is known to report at
+    rest: if it becomes silent, it or its wires have failed. Other boards may be silent by design.
     """
 
     def __init__(self) -> None:
@@ -22,9 +22,9 @@ class Silence:
         self._in_row = 0
 
     def check(self, state: LineState, opened: int, received: int, now: float, *, idle: bool) -> tuple[str, int | None]:
-        """Return the state of the line, and how long ago its board was heard: 0, 1000 or 10000 ms, at least.
+        """Return the line's state, and how long the board has been silent: at least 0, 1000 or 10000 ms.
 
-        ``opened`` counts openings, ``received`` what of the board's protocol was received since the last one; ``idle``:
+        ``opened`` counts openings; ``received`` counts the protocol's messages since the last opening; ``idle``:
         nothing was sent to the board for a second.
         """
         if opened != self._opened:

@@ -1,4 +1,4 @@
-"""Counts of the starts of a board on a serial line, by its messages and by the line itself. Pure."""
+"""Counts how often a board on a serial line has started, by its messages and by the line itself. Pure."""
 
 from collections import deque
 
@@ -8,7 +8,7 @@ _CLOCK_BITS, _LEAST_MS = 32, 1000  # of a board's clock; samples that overtake o
 
 
 class Starts:
-    """Starts of a board after the first one. ``now`` is a monotonic clock's."""
+    """The starts of a board after its first one. ``now`` is a time of a monotonic clock."""
 
     def __init__(self) -> None:
         self._starts: deque[float] = deque(maxlen=1000)
@@ -21,7 +21,7 @@ class Starts:
             self._starts.append(now)
 
     def sent(self, opened: int, mcu_ms: int, now: float) -> None:
-        """Note the board's clock, which begins at 0 when it starts; ``opened`` counts openings of the line."""
+        """Note the board's clock, which is 0 when the board starts; ``opened`` counts openings of the line."""
         earlier, self._clock = self._clock, (opened, mcu_ms)
         if earlier is not None and earlier[0] == opened:
             back_ms = (earlier[1] - mcu_ms) % (1 << _CLOCK_BITS)
@@ -29,7 +29,7 @@ class Starts:
                 self.began(now)
 
     def within_a_minute(self, opened: int, now: float) -> int:
-        """Return the number of starts; each opening of the line but the first is one."""
+        """Return the number of starts in the last minute, including openings of the line except the first."""
         if opened != self._opened:
             if self._opened:
                 self.began(now)

@@ -1,4 +1,4 @@
-"""One frame of ``pebble_serial_v1``: COBS(body, CRC-16), ended by a zero. Bytes in and out, no I/O."""
+"""One frame of ``pebble_serial_v1``: COBS(body, CRC-16) and a zero. Bytes in and out, no I/O."""
 
 import binascii
 import struct
@@ -37,7 +37,7 @@ class Type(IntEnum):
 
 
 class FrameError(PayloadError):
-    """Bytes that are no valid frame. ``subject`` is the kind of error, for counters."""
+    """An error: bytes that are no valid frame. ``subject`` is the kind of error, for counters."""
 
     def __init__(self, subject: str, text: str) -> None:
         self.subject = subject
@@ -46,7 +46,7 @@ class FrameError(PayloadError):
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A frame. ``interface`` 0 is the protocol itself; ``timestamp`` is in ms of the sender's clock, of 32 bits."""
+    """A frame. ``interface`` 0 is the protocol itself; ``timestamp``: ms on the sender's 32-bit clock."""
 
     type: Type
     payload: bytes = b""
@@ -89,7 +89,7 @@ def decode(stuffed: bytes) -> Frame:
 
 
 def stuff(data: bytes) -> bytes:
-    """Return ``data`` in COBS, which contains no zero, so that a zero can end the frame (Cheshire and Baker 1997).
+    """Return ``data`` in COBS, which contains no zero: a zero can then end the frame (Cheshire and Baker 1997).
 
     The result is longer by at most one byte per 254, plus one.
     """
@@ -104,7 +104,7 @@ def stuff(data: bytes) -> bytes:
 
 
 def unstuff(stuffed: bytes) -> bytes:
-    """Return the data of :func:`stuff`. Raises PayloadError for bytes that :func:`stuff` cannot return."""
+    """Return the data that :func:`stuff` was given. Raises PayloadError for bytes that it cannot have returned."""
     data = bytearray()
     at, end = 0, len(stuffed)
     while at < end:
@@ -125,6 +125,6 @@ def _full_blocks(part: bytes) -> bytes:
 
 
 def _block(part: bytes) -> bytes:
-    """Return the last block of ``part``, shorter than a full one; a zero follows it, or the end."""
+    """Return the last block of ``part``, shorter than a full one; after it comes a zero, or the end."""
     rest = part[len(part) - len(part) % _BLOCK :]
     return bytes((len(rest) + 1,)) + rest

@@ -47,7 +47,7 @@ _U32 = 0xFFFFFFFF
 
 @dataclass(frozen=True, slots=True)
 class Send:
-    """Bytes to send. A newer event of the same ``kind`` replaces one that still waits."""
+    """An event: bytes to send. A newer one of the same ``kind`` replaces one that still waits."""
 
     kind: str
     data: bytes
@@ -55,7 +55,7 @@ class Send:
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """The manifest of the MCU from now on; ``remembered``: known from an earlier DESCRIBE, selected by a HELLO."""
+    """An event: the MCU's manifest is known; ``remembered``: from an earlier DESCRIBE, as a HELLO names it."""
 
     manifest: Manifest
     remembered: bool = False
@@ -63,14 +63,14 @@ class Described:
 
 @dataclass(frozen=True, slots=True)
 class Gone:
-    """The described device has gone, or describes itself differently."""
+    """An event: the described device is gone, or now describes itself differently."""
 
     why: str
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """The values of an interface. ``mcu_ms`` is the MCU's clock."""
+    """An event: values of an interface. ``mcu_ms`` is the MCU's clock."""
 
     interface: Interface
     sequence: int
@@ -80,7 +80,7 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The answer to the command of this name. ``accepted`` is None when none was received in time."""
+    """An event: the answer to a command. ``accepted`` is None if none was received in time."""
 
     command: str
     sequence: int
@@ -90,7 +90,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class RefusedInput:
-    """Received bytes that could not be used. ``subject`` is the kind of error, for counters."""
+    """An event: received bytes that could not be used. ``subject`` is the kind of error, for counters."""
 
     subject: str
     reason: str
@@ -107,14 +107,14 @@ class _Command:
 
 
 class Session:
-    """One MCU on one serial line. ``now`` is a monotonic clock's, ``wall_ms`` epoch milliseconds.
+    """The dialogue with one MCU on one serial line. ``now`` is a monotonic time, ``wall_ms`` epoch milliseconds.
 
     Call :meth:`opened` and :meth:`closed` when the serial line opens and closes, :meth:`feed` with received bytes, and
     :meth:`tick` at ``due``.
     """
 
     def __init__(self, base: str = "") -> None:
-        """Begin without a device; ``base`` is the beginning of the robot's topics."""
+        """Start without a device; all topics of the robot begin with ``base``."""
         self.manifest: Manifest | None = None
         self.frames = 0  # valid ones from a device
         self.mcu_ms: int | None = None  # what its clock showed when it sent something of its own accord
@@ -131,7 +131,7 @@ class Session:
 
     @property
     def due(self) -> float | None:
-        """The time at which :meth:`tick` has something to do; None for never."""
+        """Time at which :meth:`tick` has something to do; None for never."""
         times = [] if self._ask_at is None else [self._ask_at]
         if self._commands:
             times.append(next(iter(self._commands.values())).due)
@@ -140,7 +140,7 @@ class Session:
         return min(times, default=None)
 
     def opened(self, now: float) -> None:
-        """Begin a session with an unknown device."""
+        """Note that the line is open; the device is unknown."""
         self._splitter.reset()
         self._commands.clear()
         self._received_at = now
@@ -154,12 +154,12 @@ class Session:
     def feed(self, chunk: bytes, now: float) -> list[Event]:
         """Return the events of the frames that ``chunk`` completes. Never raises."""
         events = [event for stuffed in self._splitter.feed(chunk) if stuffed for event in self._receive(stuffed, now)]
-        more = self._splitter.discarded_lines - self._too_long
-        self._too_long += more
-        return events + [RefusedInput("too long", f"a frame of more than {FRAME_LIMIT} bytes")] * more
+        discarded = self._splitter.discarded_lines - self._too_long
+        self._too_long += discarded
+        return events + [RefusedInput("too long", f"a frame of more than {FRAME_LIMIT} bytes")] * discarded
 
     def tick(self, now: float, wall_ms: int) -> list[Event]:
-        """Request the manifest, send pings and end timeouts, each when it is due."""
+        """Return the events that are due: requests for the manifest, pings and timeouts."""
         events: list[Event] = []
         if self.manifest is not None and now - self._received_at >= SILENCE_S:
             events += self._forget(f"has been silent for {SILENCE_S:g} s")
@@ -272,7 +272,7 @@ class Session:
         yield Answer(command.name, frame.sequence, frame.type is Type.ACK, reason)
 
     def _doubt(self, now: float) -> None:
-        """Request the manifest again, at most every 10 s: the device may run other firmware now."""
+        """Request the manifest again, at most every 10 s, because the device may run other firmware now."""
         if self._ask_at is None and now - self._asked_at >= _DOUBT_S:
             self._ask_at = now
 

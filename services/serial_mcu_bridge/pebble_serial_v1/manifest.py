@@ -1,4 +1,4 @@
-"""Parses and checks the two messages in which an MCU describes itself: HELLO and DESCRIBE."""
+"""Parses and checks HELLO and DESCRIBE, the two messages in which an MCU describes itself."""
 
 import math
 import re
@@ -43,7 +43,7 @@ class InterfaceKind(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Interface:
-    """One thing that the MCU reports, or accepts as a command. ``channel`` is its alias, empty where it has none."""
+    """A value that the MCU reports, or accepts as a command. ``channel`` is its alias, empty if it has none."""
 
     id: int
     name: str
@@ -59,7 +59,7 @@ class Interface:
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """The identity of an MCU and of its manifest: the key by which a manifest is remembered."""
+    """The identity of an MCU and of its manifest, by which a manifest is remembered."""
 
     schema_version: int
     interface_count: int
@@ -79,7 +79,7 @@ class Manifest:
         return self.hello.device_uid
 
     def payload(self) -> McuManifest:
-        """Return the manifest as it is published on ``outgoing/mcu/{uid}/describe``, with the original's keys."""
+        """Return the manifest in its published form, ``outgoing/mcu/{uid}/describe``, with the original's keys."""
         hello = self.hello
         return McuManifest(
             protocol=PROTOCOL,
@@ -94,7 +94,7 @@ class Manifest:
 
 
 def parse_hello(payload: bytes) -> Hello:
-    """Return the HELLO. Raises PayloadError for anything that is not exactly one."""
+    """Return the HELLO in ``payload``. Raises PayloadError if it is anything else, or more."""
     reader = _Reader(payload)
     hello = _hello(reader)
     reader.end()
@@ -102,7 +102,7 @@ def parse_hello(payload: bytes) -> Hello:
 
 
 def parse_describe(payload: bytes, base: str = "") -> Manifest:
-    """Return the manifest. PayloadError names what is wrong: bytes missing or left over, invalid topic levels, …
+    """Return the manifest in ``payload``. PayloadError says what is wrong: bytes missing, invalid topic levels, …
 
     ``base`` is the beginning of the robot's topics: names that are too long below it are refused, too.
     """
@@ -125,7 +125,7 @@ def parse_describe(payload: bytes, base: str = "") -> Manifest:
 
 
 class _Reader:
-    """A reader that takes little-endian values off the front of a payload."""
+    """A reader that takes little-endian values from the front of a payload."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._at = data, 0
@@ -138,7 +138,7 @@ class _Reader:
         return values
 
     def string(self) -> str:
-        """Take a text: its length in one byte, and as many bytes of UTF-8."""
+        """Take a text: a byte with its length, then that many bytes of UTF-8."""
         (length,) = self.take(_LENGTH)
         raw = self._data[self._at : self._at + length]
         if len(raw) != length:
@@ -150,9 +150,9 @@ class _Reader:
             raise PayloadError(f"{raw[:40]!r} is not UTF-8") from None
 
     def end(self) -> None:
-        left = len(self._data) - self._at
-        if left:
-            raise PayloadError(f"{left} bytes too many")
+        unread = len(self._data) - self._at
+        if unread:
+            raise PayloadError(f"{unread} bytes too many")
 
 
 _LENGTH = struct.Struct("<B")

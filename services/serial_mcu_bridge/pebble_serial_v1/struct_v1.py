@@ -1,4 +1,4 @@
-"""The encoding ``struct_v1``: an interface's fields as packed little-endian numbers, and as JSON's, both ways."""
+"""The encoding ``struct_v1``: converts an interface's fields between packed little-endian numbers and JSON's."""
 
 import math
 import struct
@@ -52,7 +52,7 @@ _RANGES = {
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One number: its value is raw · ``scale`` + ``offset``, in ``unit``. A boolean has no scale."""
+    """A number whose value is raw · ``scale`` + ``offset``, in ``unit``. A boolean has no scale."""
 
     name: str
     type: FieldType
@@ -79,7 +79,7 @@ def unpack(fields: Sequence[Field], payload: bytes) -> dict[str, Any]:
 
 
 def pack(fields: Sequence[Field], values: Mapping[str, Any]) -> bytes:
-    """Return ``values`` as a payload. Raises PayloadError for a missing field and for what a field cannot hold."""
+    """Return ``values`` as a payload. Raises PayloadError for a missing value, or one that its field cannot hold."""
     raw = [_raw(field, values) for field in fields]
     try:
         return _layout(tuple(field.type for field in fields)).pack(*raw)
@@ -89,7 +89,7 @@ def pack(fields: Sequence[Field], values: Mapping[str, Any]) -> bytes:
 
 @lru_cache(maxsize=256)
 def _layout(types: tuple[FieldType, ...]) -> struct.Struct:
-    return struct.Struct("<" + "".join(_CODES[one] for one in types))
+    return struct.Struct("<" + "".join(_CODES[kind] for kind in types))
 
 
 def _value(field: Field, raw: Any) -> Any:
@@ -133,7 +133,7 @@ def _integer(field: Field, value: float) -> int:
 
 
 def _is_finite(value: float) -> bool:
-    """Return False for an integer that is too large for a float, too: no field can hold it."""
+    """True if the value is finite as a float; False also for an integer that is too large for one."""
     try:
         return math.isfinite(value)
     except OverflowError:
@@ -141,7 +141,7 @@ def _is_finite(value: float) -> bool:
 
 
 def shortest(value: float) -> float:
-    """Return the shortest decimal that is the same f32: 0.001, where the f32's own value is 0.00100000005."""
+    """Return the shortest decimal that is the same f32: 0.001 for an f32 that is exactly 0.00100000005."""
     wanted = struct.pack("<f", value)
     for digits in range(6, 9):
         short = float(f"{value:.{digits}g}")

@@ -7,9 +7,9 @@ LIMIT = 200  # characters
 
 @dataclass(frozen=True, slots=True)
 class DeviceLogLine:
-    """A line for the log: an answer, a boot message, a malformed report. ``level`` is one of logging's.
+    """A line for the log: an answer, a boot message, or a malformed report. ``level`` is one of logging's.
 
-    ``known``: it is in the protocol's own words; other text may be noise, or come from whatever else runs there.
+    ``known``: the text belongs to the protocol. Other text may be noise, or the output of another program on the board.
     """
 
     level: int
@@ -23,7 +23,7 @@ def is_known(report: object) -> bool:
 
 
 def printable(raw: bytes) -> str:
-    """Return at most 200 printable characters; invalid UTF-8 is escaped, so that the rest is not lost."""
+    """Return ``raw`` as at most 200 printable characters, with invalid UTF-8 escaped."""
     text = raw.strip()[: 4 * LIMIT].decode("utf-8", "backslashreplace")[:LIMIT]
     if text.isprintable():
         return text

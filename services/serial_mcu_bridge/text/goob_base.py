@@ -26,7 +26,7 @@ _LEVELS = {b"OK": logging.DEBUG, b"WARN": logging.WARNING, b"ERR": logging.ERROR
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """Three sensors as the ADC reads them (10 or 12 bits). On Goob they are the wheels' hall sensors."""
+    """Three sensors as the ADC reads them (10 or 12 bits). On Goob they are the hall sensors of the wheels."""
 
     a0: int
     a1: int
@@ -52,7 +52,7 @@ Report: TypeAlias = Touch | Charging | Level | DeviceLogLine
 
 
 def parse(line: bytes) -> list[Report]:
-    """Return all reports of one line: ``T t0=1 t1=2 t2=3 chg=1`` is a Touch and a Charging. Empty for a blank line.
+    """Return the reports of one line, none for a blank line: ``T t0=1 t1=2 t2=3 chg=1`` is a Touch and a Charging.
 
     Never raises. A ``T`` or ``C`` line without a valid field is reported as a warning.
     """
@@ -120,7 +120,7 @@ def _level(fields: dict[bytes, bytes]) -> list[Report]:
 
 
 def _shares(*parts: float) -> tuple[float, ...]:
-    """Return the parts, each limited to 0..1. Raises PayloadError for NaN and infinities."""
+    """Return the values, each limited to 0..1. Raises PayloadError for NaN and infinities."""
     if not all(map(isfinite, parts)):
         raise _not_finite(*parts)
     return tuple([max(0.0, min(1.0, part)) for part in parts])

@@ -1,4 +1,4 @@
-"""Samples of the wheels' hall sensors in a POSIX shared memory: where the original's `wheel-odometry` reads them."""
+"""Samples of the hall sensors of the wheels, in a POSIX shared memory that the original's `wheel-odometry` reads."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CHECK_NS = 1_000_000_000  # how soon it is made again, and how often that is tr
 class HallMemory:
     """A ring of ``slots`` samples called ``name``. It is made for the first sample, and stays when its writer ends.
 
-    A reader maps it once and reads on while its number grows: so one that exists is used again, and continued.
+    A reader maps it once, and reads on while its number grows: so an existing one is used again, and continued.
     """
 
     def __init__(self, name: str, slots: int = 2048) -> None:
@@ -38,7 +38,7 @@ class HallMemory:
         self._problem = ""
 
     def write(self, at_ns: int, values: tuple[int, int, int], charging: bool | None) -> None:
-        """Add a sample of the time ``at_ns`` on CLOCK_MONOTONIC. Without a memory it is lost, which is logged once."""
+        """Add a sample at ``at_ns`` on CLOCK_MONOTONIC. Without the memory it is lost, which is logged once."""
         if at_ns >= self._check_at_ns:
             self._check_at_ns = at_ns + _CHECK_NS
             self._keep()
@@ -59,7 +59,7 @@ class HallMemory:
             os.close(descriptor)
 
     def _keep(self) -> None:
-        """Open the memory, also after it was removed, as Python's own SharedMemory does when a reader ends."""
+        """Open the memory if it is not open, or was removed, as Python's SharedMemory does when a reader ends."""
         if self._opened is not None and self._in_place(self._opened[0]):
             return
         self.close()
@@ -74,27 +74,27 @@ class HallMemory:
 
     def _in_place(self, descriptor: int) -> bool:
         try:
-            found = self._path.lstat()
+            status = self._path.lstat()
         except OSError:
             return False
-        return os.path.samestat(found, os.fstat(descriptor))
+        return os.path.samestat(status, os.fstat(descriptor))
 
     def _open(self) -> tuple[int, mmap.mmap, memoryview]:
-        """Create the memory, or open an existing one. It appears whole, as a reader keeps what it maps too early."""
-        flags, made = os.O_RDWR | os.O_CLOEXEC, False
+        """Create the memory, or open an existing one; it appears only when complete, for readers map it once."""
+        flags, is_new = os.O_RDWR | os.O_CLOEXEC, False
         try:
             descriptor = os.open(self._path, flags | os.O_NOFOLLOW)
         except FileNotFoundError:
-            descriptor, made = os.open(self._path.parent, flags | os.O_TMPFILE, _MODE), True
+            descriptor, is_new = os.open(self._path.parent, flags | os.O_TMPFILE, _MODE), True
         try:
             memory = self._mapped(descriptor)
             form = (_MAGIC, _VERSION, self._slots, 0)
-            *found, newest = _HEADER.unpack_from(memory)
-            if tuple(found) == form:  # its readers go on
+            *header, newest = _HEADER.unpack_from(memory)
+            if tuple(header) == form:  # its readers go on
                 self._number = max(self._number, newest)
             else:
                 _HEADER.pack_into(memory, 0, *form, self._number)
-            if made:  # with a descriptor, so that Python follows the link
+            if is_new:  # with a descriptor, so that Python follows the link
                 os.link(f"/proc/self/fd/{descriptor}", self._path, src_dir_fd=descriptor)
         except BaseException:
             os.close(descriptor)
@@ -102,16 +102,16 @@ class HallMemory:
         return descriptor, memory, memoryview(memory).cast("Q")
 
     def _mapped(self, descriptor: int) -> mmap.mmap:
-        """Return the memory behind ``descriptor``, if it is ours alone. Raises OSError."""
+        """Return the mapped memory behind ``descriptor``, if only this user can use it. Raises OSError."""
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise OSError("is written by another process") from None
-        found = os.fstat(descriptor)
-        if found.st_uid != os.geteuid():
+        status = os.fstat(descriptor)
+        if status.st_uid != os.geteuid():
             raise PermissionError(errno.EPERM, "belongs to another user")
-        if found.st_size not in (0, self._size):
-            raise OSError(f"has {found.st_size} bytes, and {self._slots} slots need {self._size}: remove it")
-        if not found.st_size:
+        if status.st_size not in (0, self._size):
+            raise OSError(f"has {status.st_size} bytes, and {self._slots} slots need {self._size}: remove it")
+        if not status.st_size:
             os.posix_fallocate(descriptor, 0, self._size)  # so that no write into it can be fatal
         return mmap.mmap(descriptor, self._size)

@@ -1,4 +1,4 @@
-"""Owns the serial line to a motor MCU: sends drive and lights commands, publishes sensor reports."""
+"""The bridge of a motor MCU: sends drive and lights commands, publishes sensor reports."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _LIGHTS = "lights"  # a steady colour and a fade replace one another
 
 
 class MotorProtocol(Protocol):
-    """A text protocol that drives motors; a module can be one, as goob_base is."""
+    """The functions of a text protocol that drives motors; a module can be one, as goob_base is."""
 
     def parse(self, line: bytes) -> list[Report]: ...
     def mix(self, x: float, z: float) -> tuple[float, float]: ...

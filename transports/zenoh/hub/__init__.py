@@ -69,7 +69,7 @@ class ZenohHub:
         return 0 if self._store is None else self._store.refused
 
     def open(self) -> ZenohHub:
-        """Start. Raises TransportError if the run directory has a hub already, or cannot be used."""
+        """Start the hub. Raises TransportError if the run directory has a hub already, or cannot be used."""
         self._lock = self._take_lock()
         try:
             self._start()
@@ -80,10 +80,10 @@ class ZenohHub:
         return self
 
     def look(self) -> None:
-        """Listen again, with all that is stored, if a certificate or rule changed; call often.
+        """Open the session again, with all stored records, if a certificate or rule has changed. Call this often.
 
-        Zenoh reads certificates and rules when a session begins. Raises TransportError if it cannot listen there again,
-        or if its files were removed: this hub then ends, and its launcher starts another one.
+        Zenoh reads certificates and rules when a session begins. Raises TransportError if it cannot listen again, or if
+        its files were removed: this hub then ends, and its launcher starts another one.
         """
         if self._lock is None or self._worker is None:
             return
@@ -100,7 +100,7 @@ class ZenohHub:
 
     @property
     def _newest(self) -> tuple[object, object]:
-        """The certificates and rules as now in their files."""
+        """The certificates and rules that are now in the files."""
         return None if self._certificates is None else self._certificates.get(), self._admission.newest()
 
     def close(self) -> None:
@@ -110,8 +110,8 @@ class ZenohHub:
             self._worker.close()
         if self._lock is not None:
             if self._lock.in_place:  # else they may be another hub's
-                for left in (HUB_SOCKET, HUB_SOCKET + ".lock"):
-                    (self._settings.run_dir / left).unlink(missing_ok=True)
+                for name in (HUB_SOCKET, HUB_SOCKET + ".lock"):
+                    (self._settings.run_dir / name).unlink(missing_ok=True)
             self._lock.release()
         self._session = self._worker = self._lock = None
 
@@ -143,9 +143,9 @@ class ZenohHub:
         worker.serve(self._session)
 
     def _is_free(self, endpoint: str) -> bool:
-        """Return True unless a process has taken the endpoint, which is named in the log or in a TransportError.
+        """True unless another process uses the endpoint. That is logged, or raised as TransportError.
 
-        A robot's hub runs without such an endpoint, as any user can take a port; other hubs end.
+        A robot's hub runs without such an endpoint, because any user can take a port; other hubs end.
         """
         kind = socket.SOCK_DGRAM if endpoint.startswith("quic/") else socket.SOCK_STREAM
         host, _, port = endpoint.partition("/")[2].partition("#")[0].partition("?")[0].rpartition(":")

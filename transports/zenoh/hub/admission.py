@@ -1,6 +1,6 @@
-"""Rules of a hub for wills and retained messages of its clients.
+"""Rules of a hub about its clients' wills and retained messages.
 
-A command that was left as a will would be published as a fresh one, any time later.
+They matter because a command that was left as a will would be published as a new one, at any later time.
 """
 
 import logging
@@ -19,10 +19,10 @@ _LOGGED = 200  # characters of a topic or a client's id
 
 
 class Admission:
-    """Admission of clients of this machine; a subclass may admit accounts of other machines.
+    """Rules for clients of this machine; a subclass may admit accounts of other machines.
 
-    ``wills``: filters, and whether a will on such a topic is taken; the last one that matches decides. ``unretained``:
-    filters of topics on which nothing is retained.
+    ``wills``: filters, each with whether a will on such a topic is accepted; the last one that matches decides.
+    ``unretained``: filters of topics on which nothing is retained.
     """
 
     def __init__(self, wills: Sequence[tuple[str, bool]], unretained: Sequence[str] = ()) -> None:
@@ -32,23 +32,23 @@ class Admission:
         self._logged: set[str] = set()
 
     def newest(self) -> object:
-        """Return the source of the rules for other machines: another object once it has changed."""
+        """Return the source of the rules for other machines; a different object means that it has changed."""
         return None
 
     def rules(self) -> Mapping[str, Any]:
-        """Return Zenoh's configuration of what connections from other machines may do from now on."""
+        """Return Zenoh's configuration of the rights of connections from other machines."""
         return {}
 
     def hello(self, account: str, hello: Hello) -> Hello | None:
-        """Return ``hello`` as it may be stored; None if it is not answered."""
+        """Return ``hello`` in the form to store; None if it gets no answer."""
         return None if account else hello
 
     def owns(self, account: str, session: str) -> bool:
-        """True if a session of this name is the account's."""
+        """True if the session of this name belongs to the account."""
         return not account and bool(session)
 
     def admitted(self, record: Record) -> Record | None:
-        """Return ``record`` as it may be stored, without a refused will, which is counted; None if it may not be."""
+        """Return ``record`` to be stored, without a refused will, which is counted; None if it must not be stored."""
         if isinstance(record, Retained):
             refused = bool(self._unretained) and _matches_any(self._unretained, key_to_topic(record.key))
             return None if refused else record
@@ -58,8 +58,8 @@ class Admission:
         return StoredWill(record.name, None)
 
     def takes(self, topic: str) -> bool:
-        """True if a will on this topic is taken."""
-        return next((taken for filter_, taken in self._wills if matches(filter_, topic)), True)
+        """True if a will on this topic is accepted."""
+        return next((is_taken for filter_, is_taken in self._wills if matches(filter_, topic)), True)
 
     def refuse_will(self, will: Will, why: str) -> None:
         """Count a refused will, and log the first refusal of its client."""

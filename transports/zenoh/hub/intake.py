@@ -1,4 +1,4 @@
-"""The queue before a hub's thread: tasks and queries of Zenoh's threads, within bounds."""
+"""The bounded queue before a hub's thread, for tasks and queries from Zenoh's threads."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _OnQuery = Callable[[zenoh.Query], None]
 
 
 class Intake:
-    """Tasks and queries in the order of their arrival, taken in turn, so that neither kind keeps the other waiting."""
+    """Tasks and queries in the order of arrival, taken alternately, so that neither kind delays the other."""
 
     def __init__(self) -> None:
         self.dropped = 0  # tasks
@@ -36,13 +36,13 @@ class Intake:
         self._ended = self._was_task = False
 
     def put(self, task: Task) -> None:
-        """Queue a task of the hub, or that a client has come or gone."""
+        """Queue a task of the hub itself, or the arrival or departure of a client."""
         with self._lock:
             self._tasks.append((task, 0))
             self._changed.notify()
 
     def receive(self, task: Task, size: int) -> None:
-        """Queue a task for a received message of ``size`` bytes. Wait for room; drop it if too many others wait."""
+        """Queue the task for a received message of ``size`` bytes. Wait for room; drop it if too many others wait."""
         size += OVERHEAD
         with self._lock:
             if self._outside or not self._has_room(size):
@@ -58,14 +58,14 @@ class Intake:
             self._room.notify()
 
     def greet(self, work: _OnQuery, query: zenoh.Query) -> None:
-        """Queue a hello or goodbye, which is a task."""
+        """Queue a hello or goodbye, which counts as a task."""
         if (size := _size(query)) <= ASKED_BYTES:
             self.receive(lambda: work(query), size)
         else:
             query.drop()  # type: ignore[no-untyped-call]
 
     def ask(self, work: _OnQuery, query: zenoh.Query) -> None:
-        """Queue a query. It gets no answer if too many wait, or once its client does not wait any more."""
+        """Queue a query. It gets no answer if too many wait, or once its client no longer waits."""
         came = monotonic()
 
         def answer() -> None:
@@ -83,13 +83,13 @@ class Intake:
             query.drop()  # type: ignore[no-untyped-call]
 
     def end(self) -> None:
-        """Have :meth:`take` return None once nothing is left."""
+        """Make :meth:`take` return None once the queue is empty."""
         with self._lock:
             self._ended = True
             self._changed.notify()
 
     def take(self, timeout: float | None) -> Task | None:
-        """Return the next task; after ``timeout`` seconds, one that does nothing; None at the end."""
+        """Return the next task; after ``timeout`` seconds, a task that does nothing; None at the end."""
         with self._lock:
             if not (self._tasks or self._queries or self._ended) and not self._changed.wait(timeout):
                 return _nothing
@@ -105,7 +105,7 @@ class Intake:
             return task
 
     def _has_room(self, size: int) -> bool:
-        """True if ``size`` bytes fit; a task larger than all the room fits if no other task waits."""
+        """True if ``size`` bytes fit. A task larger than the whole room fits if no other waits."""
         return not self._bytes or self._bytes + size <= QUEUE_BYTES
 
     def _note_dropped(self) -> None:
@@ -119,4 +119,4 @@ def _size(query: zenoh.Query) -> int:
 
 
 def _nothing() -> None:
-    """Do nothing: time has passed."""
+    """Do nothing: this stands for a wait that has ended without a task."""

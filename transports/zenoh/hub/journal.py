@@ -1,7 +1,7 @@
 """A database that keeps a hub's records across restarts, and tolerates a disk that fails for a while.
 
-What is put survives the death of this process; it reaches the disk within about a second (``SYNC_S``), so a power cut
-costs at most that.
+Records survive the death of this process at once. They reach the disk within about a second (``SYNC_S``), which is the
+most that a power cut costs.
 """
 
 import logging
@@ -21,10 +21,10 @@ _NEVER = float("inf")
 
 
 class Journal:
-    """A file of records: ``load()`` and ``rewrite()`` with the current records, then ``put()``, finally ``close()``.
+    """A file of records: call ``load()``, ``rewrite()`` with the current records, then ``put()``, finally ``close()``.
 
-    A disk that is full, missing or cannot be written is no error of the caller: one line in the log says so, and
-    ``rewrite_at`` when to try again. Until then nothing, or only a part, is stored.
+    A disk that is full, missing or read-only is no error for the caller: one line is logged, and ``rewrite_at`` is the
+    time to try again. Until then nothing, or only a part, is stored.
     """
 
     def __init__(self, path: Path, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -56,7 +56,7 @@ class Journal:
         return []
 
     def rewrite(self, records: Iterable[tuple[str, bytes]]) -> None:
-        """Store these records, by their names, instead of all that was loaded: all or nothing."""
+        """Replace everything in the file by these records, given by their names: all of them, or none."""
         self._release()
         try:
             database = self._opened()
@@ -76,7 +76,7 @@ class Journal:
             self._syncer.start()
 
     def put(self, name: str, record: bytes | None) -> None:
-        """Store a record in place of the record with this name; None removes that record."""
+        """Store a record under this name instead of the earlier one; None removes it."""
         if self._database is None:
             return
         try:
@@ -101,7 +101,7 @@ class Journal:
         return records
 
     def _opened(self) -> sqlite3.Connection:
-        """Return the open database, for this user alone. Raises OSError and sqlite3.Error."""
+        """Return the open database, readable for this user alone. Raises OSError and sqlite3.Error."""
         if self._database is None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             os.close(os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))

@@ -16,7 +16,7 @@ class Retained(msgspec.Struct, frozen=True, array_like=True, tag="kept"):
 
     @property
     def id(self) -> str:
-        """The name of the record that it replaces."""
+        """Name of the record; it replaces an earlier record of the same name."""
         return f"kept {self.key}"
 
     @property
@@ -32,7 +32,7 @@ class StoredWill(msgspec.Struct, frozen=True, array_like=True, tag="will"):
 
     @property
     def id(self) -> str:
-        """The name of the record that it replaces."""
+        """Name of the record; it replaces an earlier record of the same name."""
         return f"will {self.name}"
 
     @property

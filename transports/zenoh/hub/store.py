@@ -29,7 +29,7 @@ class HubStore:
         self._bytes = 0
 
     def apply(self, record: Record) -> bool:
-        """Store a record; False if it changes nothing or there is no room."""
+        """Store a record; False if it changes nothing, or there is no room."""
         return self._store_retained(record) if isinstance(record, Retained) else self._store_will(record)
 
     def get(self, key: str) -> Retained | None:
@@ -45,17 +45,17 @@ class HubStore:
         return self._wills.get(name)
 
     def records(self) -> Iterator[Record]:
-        """Yield the records that make an equal store."""
+        """Yield records that rebuild this store."""
         yield from self._retained.values()
         for name, will in self._wills.items():
             yield StoredWill(name, will)
 
     def lacks(self, hello: Hello) -> list[str]:
-        """Return the keys this client should send: those missing here, and those it wrote itself that differ now.
+        """Return the keys that this client should send: those missing here, and its own values that differ now.
 
         A later value, or removal, by another client stays.
         """
-        return [key for key, own in hello.own.items() if self._differs(key, own, hello.name)]
+        return [key for key, digest in hello.own.items() if self._differs(key, digest, hello.name)]
 
     def _differs(self, key: str, own: int | None, name: str) -> bool:
         retained = self._retained.get(key)
@@ -90,7 +90,7 @@ class HubStore:
         return before != after
 
     def _resize(self, grown: int) -> bool:
-        """Account for ``grown`` bytes more, or less; False if there is no room for them."""
+        """Account for ``grown`` more bytes (negative: fewer); False if there is no room for them."""
         if grown > 0 and self._bytes + grown > MAX_BYTES:
             return False
         self._bytes += grown

@@ -1,4 +1,4 @@
-"""Queries of subscribers that wait in the hub for retained messages which are known to be on their way."""
+"""Subscribers' queries that wait in the hub for retained messages which are known to be on their way."""
 
 from collections import deque
 
@@ -9,7 +9,7 @@ PATIENCE_S = 0.5  # so long each waits
 
 
 class WaitingQueries:
-    """Queries, each with the numbers of retained messages of clients that its answer must include; not thread-safe."""
+    """Queries, each with the number of retained messages per client that its answer must include. Not thread-safe."""
 
     def __init__(self) -> None:
         self._received: dict[str, int] = {}  # how many retained messages have arrived, by client
@@ -18,11 +18,11 @@ class WaitingQueries:
         self._looks = False  # True if some of them may have waited for long enough
 
     def count_from(self, client: str, count: int) -> None:
-        """Note that all ``count`` messages that this client has retained until now are here."""
+        """Note that all ``count`` retained messages that this client has sent until now are here."""
         self._received[client] = count
 
     def received(self, client: str, count: int) -> None:
-        """Note a message, the ``count``-th that this client has retained; 0: the client does not count messages."""
+        """Note the ``count``-th retained message of this client; 0: the client does not count its messages."""
         if count and client in self._received:
             self._received[client] = max(count, self._received[client])
             self._looks = self._looks or client in self._awaited
@@ -34,7 +34,7 @@ class WaitingQueries:
         self._received.clear()
 
     def add(self, needs: dict[str, int], query: zenoh.Query, now: float) -> bool:
-        """Add a query that waits; False if the query must be answered now."""
+        """Let a query wait; False if it must be answered now."""
         if len(self._waiting) >= QUERIES or self._has_arrived(needs):
             return False
         self._waiting.append((now + PATIENCE_S, needs, query))
@@ -42,13 +42,13 @@ class WaitingQueries:
         return True
 
     def due(self) -> float:
-        """Return when to :meth:`take`; infinite if nothing waits."""
+        """Return the time at which to call :meth:`take`; infinite if nothing waits."""
         if not self._waiting:
             return float("inf")
         return float("-inf") if self._looks else self._waiting[0][0]
 
     def take(self, now: float) -> list[zenoh.Query]:
-        """Remove and return the queries that have waited for long enough, or have nothing more to wait for."""
+        """Remove and return the queries to answer now: nothing is missing for them, or they have waited long enough."""
         due = []
         while self._waiting and now >= self._waiting[0][0]:
             due.append(self._waiting.popleft())

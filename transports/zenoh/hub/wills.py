@@ -1,4 +1,4 @@
-"""Times at which a hub publishes the wills of clients that are gone. Pure."""
+"""The times at which a hub publishes the wills of lost clients. Pure."""
 
 from collections.abc import Iterable
 
@@ -7,29 +7,29 @@ RETURN_S = 2.5  # after a restart clients have this long to reconnect before the
 
 
 class WillTimes:
-    """The times at which wills are due, by the names of their clients' sessions."""
+    """The times at which wills are due, by the session names of their clients."""
 
     def __init__(self) -> None:
         self._due: dict[str, float] = {}
 
     def on_hello(self, name: str, now: float, *, alive: bool, has_will: bool) -> None:
-        """Note a client's will. If the client's token never comes, the client has died meanwhile."""
+        """Note a client's will. If the client's token does not follow, the client has died since."""
         if alive:
             self._due.pop(name, None)
         elif has_will:
             self._due[name] = now + RETURN_S
 
     def on_gone(self, name: str, now: float) -> None:
-        """Note that the token of a client that has left a will is gone."""
+        """Note that the token of a client has gone, which has left a will here."""
         self._due[name] = now + GONE_S
 
     def on_restart(self, names: Iterable[str], now: float) -> None:
-        """Note the wills from before a restart, whose clients may come back."""
+        """Note the wills that were stored before a restart: their clients may come back."""
         for name in names:
             self._due.setdefault(name, now + RETURN_S)
 
     def forget(self, name: str) -> None:
-        """Forget the will of a client that is present, or has no will any more."""
+        """Forget the will of a client that is present, or no longer has a will."""
         self._due.pop(name, None)
 
     @property
@@ -38,7 +38,7 @@ class WillTimes:
 
     def take_due(self, now: float) -> list[str]:
         """Remove and return the clients whose wills are due."""
-        taken = [name for name, due in self._due.items() if now >= due]
-        for name in taken:
+        due_names = [name for name, due in self._due.items() if now >= due]
+        for name in due_names:
             del self._due[name]
-        return taken
+        return due_names

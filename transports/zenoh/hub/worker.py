@@ -33,7 +33,7 @@ _NEVER = float("inf")
 
 
 class HubWorker:
-    """One thread and one queue for all messages and queries of the hub, so that the order of arrival decides (T8)."""
+    """The thread and queue for all messages and queries of a hub, so that their order of arrival decides (T8)."""
 
     def __init__(
         self, name: str, store: HubStore, admission: Admission, journal: Journal | None, counters: Counters
@@ -50,7 +50,7 @@ class HubWorker:
             self._recall(journal)
 
     def serve(self, session: zenoh.Session) -> None:
-        """Serve the clients of ``session`` instead of those of the one before, which is closed."""
+        """Serve the clients of ``session``, in place of the former session, which is closed."""
         if self._session is not None:
             self.post(self._await_return)
         self._session = session
@@ -81,7 +81,7 @@ class HubWorker:
         return direct(lambda event: self.post(lambda: work(event)))
 
     def post(self, task: Task) -> None:
-        """Do ``task`` on the hub's thread."""
+        """Run ``task`` on the hub's thread."""
         self._intake.put(task)
 
     def _run(self) -> None:
@@ -168,7 +168,7 @@ class HubWorker:
             query.reply(wire.asked(wire.HELLO, account), wire.encode(lacking))
 
     def _end_predecessor(self, hello: wire.Hello) -> None:
-        """Publish the pending will of a restarted client's former session now, unless it has published there since."""
+        """Publish a restarted client's former will now, unless the client has published on its topic since."""
         if hello.will is None:
             return
         for name in self._store.wills() - {hello.name}:
@@ -230,13 +230,13 @@ class HubWorker:
     # -- store and journal
 
     def apply(self, record: Record) -> None:
-        """Store the part of ``record`` that is admitted."""
+        """Store the admitted part of ``record``."""
         admitted = self._admission.admitted(record)
         if admitted is not None and self._store.apply(admitted) and self._journal is not None:
             self._journal.put(admitted.id, None if admitted.is_removal else wire.encode(admitted))
 
     def _recall(self, journal: Journal) -> None:
-        """Store the records of an earlier hub, as far as they are admitted now."""
+        """Store the records of an earlier hub, as far as the present rules admit them."""
         decode = msgspec.msgpack.Decoder(Record).decode
         for data in journal.load():
             try:
@@ -251,7 +251,7 @@ class HubWorker:
         journal.rewrite((record.id, wire.encode(record)) for record in self._store.records())
 
     def _await_return(self) -> None:
-        """Give clients of a session that was closed as long to come back as after a restart."""
+        """Give the clients of a closed session time to come back, as after a restart."""
         self.alive_clients.clear()
         self._waiting.forget_all()
         self._await_wills()

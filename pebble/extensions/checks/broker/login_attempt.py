@@ -80,7 +80,7 @@ def _expiry(sock: object) -> float | None:
 
 @contextmanager
 def reached(settings: MqttSettings, below: str, restart: Callable[[], bool] | None = None) -> Iterator[BrokerTrial]:
-    """Yield a trial at the broker's first address that accepts the login, and clean up after it.
+    """Yield a trial at the broker's first address that accepts the login; clean up afterwards.
 
     Raises TransportError if there is no such address.
     """

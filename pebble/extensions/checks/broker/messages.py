@@ -58,9 +58,9 @@ def rights(trial: BrokerTrial) -> CheckResult:
     elif why := _why_unread(trial, reader):
         return failed(why, fix)
     trial.qos = int(has_qos_1 and granted == b"\x01")
-    kept = _kept(trial)
-    trial.retains = kept is not None
-    if kept is not None and not kept.retain:
+    retained_message = _kept(trial)
+    trial.retains = retained_message is not None
+    if retained_message is not None and not retained_message.retain:
         return failed("what it retains comes without the retain flag: a command of yesterday looks new", OTHER)
     lacks = [
         *([] if trial.qos else ["it has no QoS 1: events and answers may be lost on the way"]),
@@ -73,7 +73,7 @@ def rights(trial: BrokerTrial) -> CheckResult:
 
 
 def _why_unread(trial: BrokerTrial, reader: Peer) -> str:
-    """Publish again without QoS 1; return why that message is not delivered either, or an empty text if it is."""
+    """Publish once more, without QoS 1; return why that message is not delivered, either, or "" if it is."""
     writer = trial.peer()
     writer.publish("x")
     if not trial.wait(lambda: reader.received or writer.closed):
@@ -83,7 +83,7 @@ def _why_unread(trial: BrokerTrial, reader: Peer) -> str:
 
 
 def _kept(trial: BrokerTrial) -> Received | None:
-    """Return the message that a later subscriber gets if it was published as retained; None if there is none."""
+    """Return the retained message as a later subscriber gets it; None if there is none."""
     writer, late = trial.peer(), trial.peer()
     writer.publish("retained", qos=trial.qos, retain=True)
     writer.ping()
@@ -95,7 +95,7 @@ def _kept(trial: BrokerTrial) -> Received | None:
 
 
 def _is_forbidden(trial: BrokerTrial) -> bool | None:
-    """True if the broker refuses to take a message; None if it cannot tell, as only MQTT 5 has such an answer."""
+    """True if the broker refuses a message; None if it cannot say so, as only MQTT 5 can."""
     try:
         writer = trial.peer(protocol="5")
     except RefusedError:
@@ -227,7 +227,7 @@ def as_published(trial: BrokerTrial) -> CheckResult:
 
 
 def _lacks_of_flags(trial: BrokerTrial, peer: Peer, *, modern: bool) -> str:
-    """Return which of noLocal and retain-as-published does not work; empty if both do."""
+    """Return which of noLocal and retain-as-published does not work; "" if both do."""
     other, granted = trial.peer(), peer.subscribe("#", qos=trial.qos, options=modern)
     peer.publish("own", qos=trial.qos)
     other.publish("other", b"1", qos=trial.qos, retain=trial.retains)

@@ -34,7 +34,7 @@ NAME = "pebble-doctor-of-a-broker"  # as long as the names of a robot's programs
 
 
 class RefusedError(TransportError):
-    """The broker refuses this client. ``code``: that of its CONNACK, if it sent one."""
+    """An error: the broker refuses this client. ``code``: that of its CONNACK, if it sent one."""
 
     def __init__(self, text: str, code: int | None = None) -> None:
         super().__init__(text)
@@ -186,7 +186,7 @@ class BrokerTrial:
     """Peers at one broker, and the retained messages that they left there.
 
     ``address``: the host's address that accepted the login. Each probe has topics below ``{below}/{random digits}``;
-    :meth:`close` removes the retained ones.
+    :meth:`close` removes their retained messages.
     """
 
     def __init__(
@@ -255,7 +255,7 @@ class BrokerTrial:
             time.sleep(_STEP_S)
 
     def wait_quiet(self, *peers: Peer) -> None:
-        """Serve all peers until nothing more arrives at these."""
+        """Serve all peers until no more messages arrive."""
         quiet_s, end = _QUIET_S + 4 * self.round_trip_s, time.monotonic() + self.answer_s
 
         def seen() -> int:

@@ -1,4 +1,4 @@
-"""The probes of a broker as a table: each with what robots lose where the broker fails it."""
+"""The table of probes of a broker, each with what robots lack if the broker fails it."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ PROBES = (
 
 
 def judge(trial: BrokerTrial) -> Iterator[tuple[Probe, CheckResult]]:
-    """Run the probes in their order; if the account lacks the rights, only the first."""
+    """Run the probes in order, and yield their results; if the account lacks the rights, only the first."""
     for probe, result in run(PROBES, trial):
         yield probe, result
         if probe.name == _RIGHTS and result.state is State.FAILED:
@@ -85,7 +85,7 @@ def judge(trial: BrokerTrial) -> Iterator[tuple[Probe, CheckResult]]:
 
 
 def assessment(states: Mapping[str, State]) -> list[str]:
-    """Return what the results mean for robots, operators and a mirror, a sentence each."""
+    """Return what the results mean for robots, operators and a mirror, a sentence for each."""
     broken = [name for name, state in states.items() if state is State.FAILED]
     if broken:
         return [f"robots cannot use it with this account: {', '.join(broken)}"]

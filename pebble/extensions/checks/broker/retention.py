@@ -1,4 +1,4 @@
-"""Probes of a broker: what it retains, for which subscriptions, and in which order it delivers it."""
+"""Probes of a broker's retained messages: which it keeps, which subscriptions get them, and in which order."""
 
 from __future__ import annotations
 
@@ -66,12 +66,12 @@ def order(trial: BrokerTrial) -> CheckResult:
     trial.wait_quiet(*readers)
     received = [[int(payload) if payload.isdigit() else -1 for payload in reader.payloads()] for reader in readers]
     newest = next(numbers) - 1
-    wrong = [reader for reader, seen in zip(readers, received, strict=True) if seen[-1:] != [newest]]
+    wrong = [reader for reader, values in zip(readers, received, strict=True) if values[-1:] != [newest]]
     if any(not reader.received or not reader.received[-1].retain for reader in wrong):
         return failed("the last value that comes to a new subscription is not the newest", OTHER)
     if wrong:
         return warn("a retained value comes after a newer live one")
-    if any(after < before for seen in received for before, after in pairwise(seen)):
+    if any(after < before for values in received for before, after in pairwise(values)):
         return warn("an older value may come between, to who subscribes while others publish; the newest is last")
     return ok("no older value comes after a newer one")
 

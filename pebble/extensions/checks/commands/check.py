@@ -87,7 +87,7 @@ def _check(path: Path, *, as_json: bool, first: bool) -> bool:
 
 
 def _check_certificates(config: Config) -> None:
-    """Raise ConfigError for files of TLS that a connection in use would refuse."""
+    """Raise ConfigError for TLS files that a connection in use would refuse."""
     problems = []
     for path, section in connections(config):
         place = ".".join(map(str, path))
@@ -181,7 +181,7 @@ def facts(config: Config, added: Iterable[Facts]) -> list[tuple[str, str]]:
 
 
 def _off(config: Config) -> Iterator[str]:
-    """Yield the services that have settings, but are not enabled."""
+    """Yield the services that have settings in the config but are not enabled."""
     bridge = config.services.serial_mcu_bridge
     for name, line in {"": bridge, **bridge.instances}.items():
         if not line.enabled and line.serial.port is not None:
@@ -214,7 +214,7 @@ def _lines(config: Config, service: str) -> list[TopicLine]:
 
 
 def _is_of(channel: Channel, service: str) -> bool:
-    """True if the channel belongs to the service: the config path that renames it begins with the service's name."""
+    """True if the channel belongs to the service, whose name begins the config path that renames the channel."""
     path = channel.override or ""
     if service in _MEDIA:
         return path == f"services.mqtt_bridge.media.{_MEDIA[service]}.topic"
@@ -247,7 +247,7 @@ def _uplink(config: Config) -> str:
 
 
 def _scripts(config: Config) -> list[tuple[str, str]]:
-    """Return a warning about scripts if others share the broker: no bridge stands between it and the motors."""
+    """Return a warning about scripts if other clients share the broker, where no bridge protects the motors."""
     bridge, shared = config.services.mqtt_bridge, config.transport.mqtt_mirror
     if config.transport.kind == "mqtt":
         elsewhere = bridge.remote is not None and bridge.remote.kind != "mqtt"

@@ -1,4 +1,4 @@
-"""The printed results of checks: each with the fix of a failure, or all as JSON."""
+"""The output of checks: each result with the fix of a failure, or all as JSON."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _BAD = ("warn", "failed")
 
 
 class Printer:
-    """A printer of results, as they come or, with JSON, at the end; it counts failures and warnings."""
+    """A printer of results, one by one or, as JSON, at the end. It counts failures and warnings."""
 
     def __init__(self, config: str = "CONFIG", *, as_json: bool) -> None:
         """Store ``config``, the path that the fixes name as the robot's config file."""
@@ -66,8 +66,8 @@ class Printer:
         if self._as_json:
             typer.echo(json.dumps({"ok": not bad, **more, "checks": self.rows}, ensure_ascii=False))
         else:
-            left = f", skipped: {counts['skipped']}" if counts["skipped"] else ""
-            typer.echo(f"checks: {len(self.rows)}, warnings: {counts['warn']}, failures: {counts['failed']}{left}")
+            skipped = f", skipped: {counts['skipped']}" if counts["skipped"] else ""
+            typer.echo(f"checks: {len(self.rows)}, warnings: {counts['warn']}, failures: {counts['failed']}{skipped}")
         return int(bad > 0)
 
 

@@ -51,7 +51,7 @@ def conform(
                 printer.take(result, check.why)
             unasked = [] if may_move else [check.name for check in MOVING if check.binds(observer)]
     skips = printer.names("skipped")
-    left = [*([", ".join(skips)] if skips else []), *([f"{len(unasked)} with --may-move"] if unasked else [])]
-    if left and not as_json:
-        typer.echo(f"NOT JUDGED: {'; '.join(left)}")
+    unjudged = [*([", ".join(skips)] if skips else []), *([f"{len(unasked)} with --may-move"] if unasked else [])]
+    if unjudged and not as_json:
+        typer.echo(f"NOT JUDGED: {'; '.join(unjudged)}")
     return printer.end(robot=observer.base, not_judged=[*skips, *unasked])

@@ -141,13 +141,13 @@ def _report(file: Path, config: Path | None, places: Places) -> int:
         raise typer.BadParameter(f"{file} exists: name another file, or remove it")
     if config is not None and not config.exists():
         raise typer.BadParameter(f"{config} does not exist: name a robot's config file")
-    made = make(places, None if config is None else config.absolute())
-    write_new(file, made.packed())
-    typer.echo(f"{file}: {', '.join(made.parts)}")
-    for name, why in made.missing.items():
+    report = make(places, None if config is None else config.absolute())
+    write_new(file, report.packed())
+    typer.echo(f"{file}: {', '.join(report.parts)}")
+    for name, why in report.missing.items():
         typer.echo(f"missing: {name}: {why}")
-    if made.unread:
-        typer.echo(f"pebble: warning: passwords in {len(made.unread)} files are not known: use sudo", err=True)
+    if report.unread:
+        typer.echo(f"pebble: warning: passwords in {len(report.unread)} files are not known: use sudo", err=True)
     return 0
 
 

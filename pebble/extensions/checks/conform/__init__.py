@@ -1,1 +1,1 @@
-"""Conformance of a robot to the contract, judged from outside: by what it publishes and how it answers."""
+"""Judges a robot's conformance to the contract from outside, by its messages and its answers."""

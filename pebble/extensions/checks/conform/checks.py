@@ -1,4 +1,4 @@
-"""The duties of a robot towards its watchers and those who stop it, as a table. No check here turns a wheel."""
+"""The table of a robot's duties towards those who watch or stop it. No check here turns a wheel."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ controls = _offered("control", lambda view: view.controlled)
 
 
 def free(robot: Observer) -> str:
-    """Return who still drives or has stopped the robot; empty if it is free.
+    """Return who still drives the robot or has stopped it; empty if it is free.
 
-    Waits first for the end of what the previous check began.
+    First it waits for the end of the previous check's effects.
     """
     robot.wait(lambda: not why_not_free(robot.view), ANSWER_S)
     return why_not_free(robot.view)
@@ -105,7 +105,7 @@ def clock(robot: Observer) -> CheckResult:
 
 
 def _none_of(wrong: Collection[str], fix: str, fine: str, what: str = "") -> CheckResult:
-    """Return a failure that names the first wrong items after the words ``what``; a pass if there are none."""
+    """Return a failure that names the first ``wrong`` items after the words ``what``; a pass if there are none."""
     return failed(f"{what}{some_of(sorted(wrong))}", fix) if wrong else ok(fine)
 
 
@@ -137,16 +137,16 @@ def sizes(robot: Observer) -> CheckResult:
 
 
 def retained(robot: Observer) -> CheckResult:
-    there = {record.metric for record in robot.retained()}
+    metrics = {record.metric for record in robot.retained()}
     live = {record.metric: record.channel for record in robot.records if record.channel and record.payload}
     must = {metric for metric, channel in live.items() if channel.default_retain and channel not in _REPEATED}
-    if lacks := must - there:
+    if lacks := must - metrics:
         fix = "publish it with the retain flag: who connects later lacks it"
         return failed(f"not retained: {some_of(sorted(lacks))}", fix)
     of_manifests = {metric for metric, channel in live.items() if channel is c.MCU_VALUE}  # which decide it
-    stale = {metric for metric in there & live.keys() if not live[metric].default_retain} - of_manifests
+    stale = {metric for metric in metrics & live.keys() if not live[metric].default_retain} - of_manifests
     fix = "publish it without the retain flag: it is news only once"
-    return _none_of(stale, fix, f"{len(there)} states", "retained: ")
+    return _none_of(stale, fix, f"{len(metrics)} states", "retained: ")
 
 
 def stale_commands(robot: Observer) -> CheckResult:
@@ -251,7 +251,7 @@ def freed(robot: Observer) -> bool:
 
 
 def while_stopped(test: Callable[[Observer, str], CheckResult]) -> Callable[[Observer], CheckResult]:
-    """Return a check that runs a test while a new stop holds the robot, and resets it afterwards."""
+    """Return a check that runs ``test`` while a new stop holds the robot, and then resets the stop."""
 
     def run(robot: Observer) -> CheckResult:
         name = secrets.token_hex(8)

@@ -1,4 +1,4 @@
-"""The duties of a robot towards several drivers, as a table: control, and accounts where they are checked."""
+"""The table of a robot's duties towards several drivers: control, and accounts where they are checked."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ UNSEEN = "its broker does not show this account that it delivers such a message"
 
 
 class Driver:
-    """A driving client for the trial: it requests control, and drives with the key that it was given."""
+    """A client that drives in a trial: it requests control, and signs commands with the key that it gets."""
 
     def __init__(self, robot: Observer, by: str = BY) -> None:
         self._robot, self._by, self.id = robot, by, secrets.token_hex(4)
@@ -38,22 +38,22 @@ class Driver:
         self._robot.send(c.CONTROL, self.request(want, for_ms))
 
     def leaves(self) -> bool:
-        """Release control; return False if the robot does not take it back."""
+        """Release control; return False if the robot still shows it."""
         self.asks("release")
         return self._robot.answers(lambda: not self.holds)
 
     def takes(self) -> float:
-        """Take control from its present holder; return when (monotonic)."""
+        """Take control from its present holder; return the time (monotonic)."""
         return self._robot.send(c.CONTROL_TAKE, self.request())
 
     def send(self, z: object = 0, *, key: str | None = None, wrapped: bool = False, **fields: object) -> float:
-        """Send one command; return when (monotonic). ``key`` replaces its own key; "" sends none."""
+        """Send one command; return the time (monotonic). ``key`` replaces its own key; "" sends none."""
         of = self.key if key is None else key
         command = {"x": 0, "z": z, **({"key": of} if of else {}), **fields}
         return self._robot.send(c.DRIVE, msgspec.json.encode({"value": command} if wrapped else command))
 
     def drive(self, seconds: float = DRIVES_S, *, z: object = SPEED, **fields: Any) -> tuple[float, float]:
-        """Send commands for ``seconds``, at the link's pace; return when the first and the last were sent."""
+        """Send commands for ``seconds``, at the link's pace; return the times of the first and the last."""
         began = last = time.monotonic()
         pace = self._robot.view.pace
         while time.monotonic() < began + seconds:

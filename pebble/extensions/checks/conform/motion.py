@@ -75,16 +75,16 @@ def _shown(robot: Observer) -> list[tuple[float, list[float]]]:
 
 
 def _travelled(robot: Observer) -> list[tuple[float, list[float]]]:
-    """Return the speeds of its odometry as those of a left and a right wheel (m/s), each with its time."""
-    found = []
+    """Return the odometry's speeds as those of a left and a right wheel (m/s), each with its time."""
+    speeds = []
     for record in robot.of(c.WHEEL_ODOMETRY):
         value: dict[str, Any] = record.value.value if record.value else {}
         ahead: Any = value.get("linear_speed_mps")
         turn: Any = value.get("angular_speed_radps")
         if _are_wheels([ahead, turn]):
             metres, swing = round(float(ahead), 2), _HALF_TRACK_M * round(float(turn), 2)
-            found.append((record.at, [metres - swing, metres + swing]))
-    return found
+            speeds.append((record.at, [metres - swing, metres + swing]))
+    return speeds
 
 
 def _moves(robot: Observer, since: float) -> list[float] | None:
@@ -138,7 +138,7 @@ def _rest(robot: Observer, began: float, last: float, limit_s: float, what: str 
 
 
 def rested(robot: Observer, began: float, last: float, limit_s: float, what: str = "the last command") -> CheckResult:
-    """Check that a robot driven from ``began`` to ``last`` rested no more than ``limit_s`` after ``last``."""
+    """Check that a robot driven from ``began`` to ``last`` was at rest within ``limit_s`` after ``last``."""
     until = moves_until(robot, began)
     if until is None:
         return _NOT_SHOWN

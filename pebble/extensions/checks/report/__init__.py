@@ -1,1 +1,1 @@
-"""The report: one file, without secrets, by which somebody elsewhere can find a fault."""
+"""The report: one file without secrets, by which a fault can be found from elsewhere."""

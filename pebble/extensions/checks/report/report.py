@@ -72,15 +72,15 @@ class Report:
 def make(places: Places, file: Path | None = None) -> Report:
     """Collect all parts, with this machine's secrets masked. A part that fails is named in the index."""
     here = _here(places, file or places.config)
-    known = secrets_of(places, here.config, [here.file])
-    report = Report(unread=known.unread)
+    secrets = secrets_of(places, here.config, [here.file])
+    report = Report(unread=secrets.unread)
     for name, part in PARTS.items():
         try:
-            report.parts[name] = known.hidden(without_secrets(part(here)))[:_LONGEST_PART]
+            report.parts[name] = secrets.hidden(without_secrets(part(here)))[:_LONGEST_PART]
         except Exception as error:  # noqa: BLE001 - what is broken is why there is a report: the rest is in it
             kind = "" if isinstance(error, PebbleError) else f"{type(error).__name__}: "
-            report.missing[name] = known.hidden(without_secrets(kind + " ".join(str(error).split())))
-    report.parts = {"index.txt": known.hidden(_index(report, known)), **report.parts}
+            report.missing[name] = secrets.hidden(without_secrets(kind + " ".join(str(error).split())))
+    report.parts = {"index.txt": secrets.hidden(_index(report, secrets)), **report.parts}
     return report
 
 
@@ -108,9 +108,9 @@ def _index(report: Report, known: Secrets) -> str:
 def _config(here: Here) -> str:
     """Return the config file and the config with its defaults, with secrets masked."""
     written = masked(plain(decode(read_text(here.file), here.file.name), Notes()))
-    whole: dict[str, Any] = {"file": str(here.file), "written": written}
-    whole |= {"problems": here.problem.splitlines()} if here.config is None else {"resolved": resolved(here.config)}
-    return json.dumps(whole, indent=1, ensure_ascii=False)
+    config: dict[str, Any] = {"file": str(here.file), "written": written}
+    config |= {"problems": here.problem.splitlines()} if here.config is None else {"resolved": resolved(here.config)}
+    return json.dumps(config, indent=1, ensure_ascii=False)
 
 
 def _doctor(here: Here) -> str:
@@ -120,9 +120,9 @@ def _doctor(here: Here) -> str:
 
 
 def _status(here: Here) -> str:
-    """Return what the robot publishes and retains on its own transport.
+    """Return the messages that the robot publishes and retains on its own transport.
 
-    It is read as the robot's user, as root may not.
+    They are read as the robot's user, because root may not.
     """
     if here.config is None:
         raise PebbleError("the config cannot be read")
@@ -152,7 +152,7 @@ def _versions(here: Here) -> str:
 
 
 def _files(*patterns: str) -> Part:
-    """Return the part that consists of all files that match, below the root."""
+    """Return a part with all files that match, below the root."""
 
     def part(here: Here) -> str:
         files = sorted({file for pattern in patterns for file in here.places.root.glob(pattern)})
@@ -173,7 +173,7 @@ def _described(path: Path) -> str:
 
 
 def _programs(*commands: tuple[str, ...]) -> Part:
-    """Return the part that consists of the output of these commands."""
+    """Return a part with the output of these commands."""
     return lambda _here: "".join(output_of(*command, seconds=_PROGRAM_S) for command in commands)
 
 

@@ -75,13 +75,13 @@ def secrets_of(places: Places, config: Config | None, more: Collection[Path] = (
                     values += [(value, str(file)) for value in values_in(file.name, read_plain(file))]
         except (OSError, PebbleError):
             unread.add(str(file))
-    known = frozenset(value for value, _ in values if len(value) >= _SHORTEST)
+    maskable = frozenset(value for value, _ in values if len(value) >= _SHORTEST)
     short = {where for value, where in values if len(value) < _SHORTEST}
-    return Secrets(known, tuple(sorted(unread)), tuple(sorted(short)))
+    return Secrets(maskable, tuple(sorted(unread)), tuple(sorted(short)))
 
 
 def values_in(name: str, raw: bytes) -> Iterator[str]:
-    """Return the secrets in a file, found by the file's name and by its keys."""
+    """Yield the secrets in a file, found by the file's name and by its keys."""
     text = raw.decode(errors="replace")
     yield from _logins(text)
     keys = _keys(text)
@@ -115,6 +115,6 @@ def _walk(places: Iterable[Path], unread: set[str]) -> Iterator[Path]:
 
 
 def _forms(value: str) -> Iterator[str]:
-    """Return the forms in which a secret may be written: plain, in JSON, in a URL, in base64."""
+    """Yield the forms in which a secret may be written: plain, in JSON, in a URL, in base64."""
     yield from (value, json.dumps(value)[1:-1], quote(value, safe=""))
     yield base64.b64encode(value.encode()).rstrip(b"=").decode()

@@ -1,4 +1,4 @@
-"""The checks of a running robot, as a table: what each needs to reach, and what runs it."""
+"""The table of checks of a running robot, with the connections that each needs."""
 
 from __future__ import annotations
 
@@ -100,23 +100,25 @@ def heartbeats(robot: RobotUnderTest) -> CheckResult:
     if not section.enabled:
         return skipped("services.mqtt_bridge.heartbeat is off")
 
-    seen = side.view.liveness
+    liveness = side.view.liveness
 
     def longest() -> float:
-        interval_s = max(section.interval_seconds, LEVELS[seen.link].heartbeat_s)
-        return max(silent_after(interval_s, seen.link, seen.average_latency_s or 0.0), _LONGEST_GAP * interval_s)
+        interval_s = max(section.interval_seconds, LEVELS[liveness.link].heartbeat_s)
+        return max(
+            silent_after(interval_s, liveness.link, liveness.average_latency_s or 0.0), _LONGEST_GAP * interval_s
+        )
 
     if not robot.wait(lambda: side.heartbeats, robot.patience_s):
         return failed("none arrives", "pebble doctor CONFIG")
     if not robot.wait(lambda: _gap(side) <= longest(), 3 * _IN_A_ROW * longest()):
         return failed(f"gaps of {_gap(side):.1f} s, where {longest():.1f} s is the longest", "pebble doctor CONFIG")
-    late = seen.average_latency_s
+    late = liveness.average_latency_s
     shown = "" if late is None else f", {1000 * late:.0f} ms on the way"
     return ok(f"{_IN_A_ROW} in a row, the longest gap {_gap(side):.2f} s{shown}")
 
 
 def _gap(side: RobotSide) -> float:
-    """Return the longest gap between the newest heartbeats; inf until there are enough."""
+    """Return the longest gap between the newest heartbeats; inf if there are too few."""
     newest = side.heartbeats[-_IN_A_ROW:]
     gaps = [after - before for before, after in pairwise(newest)]
     return max(gaps) if len(newest) == _IN_A_ROW else math.inf
@@ -157,7 +159,8 @@ def boards(robot: RobotUnderTest) -> CheckResult:
     drives = robot.view.driveable
     if drives is not None and drives.state == "no":
         return failed(f"its motors are not reached: {drives.why}", _LOG)
-    unheard = [name for name in lines if not isinstance(age := _mcu(robot, name).get("heard_ms"), int) or age >= 10_000]
+    ages_ms = {name: _mcu(robot, name).get("heard_ms") for name in lines}
+    unheard = [name for name, age_ms in ages_ms.items() if not isinstance(age_ms, int) or age_ms >= 10_000]
     if unheard:
         return skipped(f"{', '.join(unheard)} sends nothing at rest, as some boards do")
     if drives is not None and drives.state == "unknown":
@@ -187,19 +190,19 @@ def battery(robot: RobotUnderTest) -> CheckResult:
 
 def leftovers(robot: RobotUnderTest) -> CheckResult:
     """Find retained messages of other robot ids on this machine, such as those from before a robot was renamed."""
-    here = [side for side in robot.sides if side.is_here(robot.config)]
-    if not here:
+    local_sides = [side for side in robot.sides if side.is_here(robot.config)]
+    if not local_sides:
         return skipped("other ids at a broker elsewhere are other robots")
     others: set[str] = set()
-    for side in here:
+    for side in local_sides:
         topics, live = side.others()
         others |= topics.keys()
-        if gone := sorted(topics.keys() - live):
-            names = some_of([id_of(base) for base in gone], _SHOWN)
+        if absent := sorted(topics.keys() - live):
+            names = some_of([id_of(base) for base in absent], _SHOWN)
             remote = "" if side.own else " --remote"
-            topic = shlex.quote(min(topics[gone[0]]))  # anybody may have chosen it
+            topic = shlex.quote(min(topics[absent[0]]))  # anybody may have chosen it
             fix = f"if they are gone: pebble topic pub {topic} '' --retain --force -c CONFIG{remote}, and so on"
-            return failed(f"{len(gone)} that send no heartbeat: {names}", fix)
+            return failed(f"{len(absent)} that send no heartbeat: {names}", fix)
     return ok(f"none; {len(others)} other robots are there" if others else "none")
 
 

@@ -57,7 +57,7 @@ def unit_of(properties: Mapping[str, str]) -> CheckResult:
 
 
 def slot(robot: RobotUnderTest) -> CheckResult:
-    """Check that the slot which runs is the active one, and complete."""
+    """Check that the running slot is the active one, and complete."""
     places = robot.places
     if not places.slots.is_dir() or not (places.slots / "active").is_symlink():
         return skipped("it is not installed in slots")
@@ -85,15 +85,15 @@ def clock(_robot: RobotUnderTest) -> CheckResult:
 
 
 def disk(robot: RobotUnderTest) -> CheckResult:
-    """Check that there is room to go on saving stops, people and the audit."""
+    """Check that the disk has room for stops, people and the audit."""
     folder = Path(os.path.normpath(robot.config.state_dir()))  # a config may name it by ../..
     existing = next(place for place in (folder, *folder.parents) if place.exists())
     room = os.statvfs(existing)
-    free, whole = room.f_bavail * room.f_frsize, room.f_blocks * room.f_frsize
-    text = f"{free / 1e9:.1f} of {whole / 1e9:.1f} GB are free at {folder}"
+    free, size = room.f_bavail * room.f_frsize, room.f_blocks * room.f_frsize
+    text = f"{free / 1e9:.1f} of {size / 1e9:.1f} GB are free at {folder}"
     if room.f_flag & os.ST_RDONLY:
         return failed(f"{folder} is read-only: no stop survives a power cut", "sudo mount -o remount,rw /")
-    if free < max(_LEAST_FREE, _LEAST_SHARE * whole):
+    if free < max(_LEAST_FREE, _LEAST_SHARE * size):
         return failed(text, f"du -xh --max-depth=1 {folder.parent} | sort -h; journalctl --vacuum-size=50M")
     if room.f_files and not room.f_favail:
         return failed(f"{folder}: no file can be made any more", f"du -x --inodes {folder.parent} | sort -n | tail")
@@ -142,7 +142,7 @@ def _status(host: str, port: int, context: ssl.SSLContext | None) -> int:
 
 
 def _trusting(certificate: Path | None) -> tuple[ssl.SSLContext | None, float | None]:
-    """Return a TLS context that trusts this certificate only, under any name, and the days until it ends."""
+    """Return a TLS context that trusts only this certificate, under any name, and the days until it expires."""
     if certificate is None:
         return None, None
     context = ssl.create_default_context(cafile=str(certificate))

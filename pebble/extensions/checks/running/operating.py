@@ -1,4 +1,4 @@
-"""Checks that operate a robot: watch, listen, stop, drive. Afterwards it is free again."""
+"""Checks that operate a robot: request media, stop and drive it. Afterwards it is free again."""
 
 import time
 from dataclasses import replace
@@ -108,7 +108,7 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
     """Check that the robot ignores a retained command.
 
     The command is a reset that no motor owner could accept: an owner that reads it publishes why it refuses it. A live
-    reset of another kind follows, which must be answered: it shows that the silence before meant something.
+    reset of another kind follows, which must be answered: this shows that the silence before was no accident.
     """
     operators = robot.commanding_side
     if robot.own_side.heartbeats:

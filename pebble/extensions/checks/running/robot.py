@@ -1,4 +1,4 @@
-"""The robot under test, seen from its own transport and from its operators' broker."""
+"""A running robot under test, seen from its own transport and from its operators' broker."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class RobotSide(Observer):
         super().__init__(target, transport, names, [self._addresses[channel].topic for channel in watched])
 
     def is_here(self, config: Config) -> bool:
-        """True if this side is on this machine, so that other robots' retained messages are leftovers."""
+        """True if this side is on this machine: other robots' retained messages are then leftovers."""
         if self.own:
             return config.transport.kind != "mqtt" or is_loopback(config.local_mqtt.host)
         return is_loopback(config.services.mqtt_bridge.remote_mqtt.host)
@@ -78,13 +78,13 @@ class RobotSide(Observer):
 
     @property
     def heartbeats(self) -> list[float]:
-        """Return when live heartbeats arrived (monotonic)."""
+        """Return the times at which live heartbeats arrived (monotonic)."""
         return [record.at for record in self.of(c.ONLINE) if record.value is not None]
 
 
 @dataclass(kw_only=True)
 class RobotUnderTest:
-    """A robot and its two sides. ``why_own`` and ``why_operators`` say why a side could not be reached."""
+    """A robot and its two sides. ``why_own`` and ``why_operators``: why a side could not be reached."""
 
     config: Config
     places: Places
@@ -102,7 +102,7 @@ class RobotUnderTest:
 
     @property
     def commanding_side(self) -> RobotSide:
-        """Return the side to send commands from: the operators' if it is reached, else its own."""
+        """Return the side from which to send commands: the operators' if it is reached, else its own."""
         return self.operators or self.own_side
 
     @property
@@ -130,7 +130,7 @@ class RobotUnderTest:
 
 
 def user_of(folder: Path) -> pwd.struct_passwd | None:
-    """Return the user as whom root must reach the robot of this folder; None: no other user.
+    """Return the user as whom root must reach the robot with this folder; None: no other user.
 
     As that user, root leaves no files of its own.
     """
@@ -151,7 +151,7 @@ def become_user_of(folder: Path) -> None:
 def reached(
     config: Config, places: Places, by: str, *, patience_s: float = PATIENCE_S, rests_s: float = RESTS_S
 ) -> Iterator[RobotUnderTest]:
-    """Connect to both sides of a robot as far as they can be reached; disconnect at the end of the block."""
+    """Yield a robot, connected on each side that can be reached; disconnect at the end of the block."""
     robot = RobotUnderTest(config=config, places=places, by=by, patience_s=patience_s, rests_s=rests_s)
     with ExitStack() as stack:
 

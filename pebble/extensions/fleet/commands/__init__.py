@@ -1,1 +1,1 @@
-"""``pebble fleet``, and what else concerns more than one robot: hubs, gateways, the audit."""
+"""``pebble fleet``: commands for more than one robot."""

@@ -72,7 +72,7 @@ class _Program(Protocol):
 
 
 class _Together:
-    """Programs that end together: all of them end at a signal, or when one of them fails."""
+    """Programs that end together, at a signal or when one of them fails."""
 
     def __init__(self, programs: list[_Program]) -> None:
         self._programs, self._failed = programs, False

@@ -127,10 +127,10 @@ def add(
         pebble fleet add page-1 --role page
         pebble fleet add goob-lan --role neighbour --base pebble/robots/goob
     """
-    given = tuple(dict.fromkeys(split_names(roles)))
-    bases = tuple(base or ((f"pebble/robots/{name}",) if given == (ProgramRole.ROBOT,) else ()))
+    role_names = tuple(dict.fromkeys(split_names(roles)))
+    bases = tuple(base or ((f"pebble/robots/{name}",) if role_names == (ProgramRole.ROBOT,) else ()))
     database = "" if people is None else str(people.absolute())
-    account = Account(roles=given, bases=bases, plain=plain, people=database)
+    account = Account(roles=role_names, bases=bases, plain=plain, people=database)
     with _changing(folder_) as (place, fleet):
         if why := folder.refused(fleet, name, account):
             raise FleetError(why)
@@ -138,7 +138,7 @@ def add(
             raise FleetError(f"{place} has {folder.MAX_ACCOUNTS} accounts already: remove one, or make another fleet")
         after = fleet.with_account(name, account)
         secret = new_password()
-        is_neighbour = given == (ProgramRole.NEIGHBOUR,)  # which is at a hub, and nowhere else
+        is_neighbour = role_names == (ProgramRole.NEIGHBOUR,)  # which is at a hub, and nowhere else
         if is_neighbour:
             require_packages("pebble fleet")
             after = replace(after, hubs="here" if fleet.hubs == "none" else fleet.hubs)
@@ -182,14 +182,14 @@ def remove(name: _Name, folder_: _Folder = None) -> int:
     with _changing(folder_) as (place, fleet):
         account = _account(place, fleet, name)
         after = fleet.without(name)
-        left = list(_remove_from_pages(fleet, name)) if not set(account.roles) & set(ProgramRole) else []
-        left += applying.copies(Path(_shown(place)), after)
+        unfinished = list(_remove_from_pages(fleet, name)) if not set(account.roles) & set(ProgramRole) else []
+        unfinished += applying.copies(Path(_shown(place)), after)
         try:
             how = applying.apply(place, after)
             typer.echo(f"{name} is removed and disconnected ({how})")
         except FleetError as error:
-            left += [*str(error).splitlines(), f"{name} may still get in there: give this command again"]
-    return _left(left)
+            unfinished += [*str(error).splitlines(), f"{name} may still get in there: give this command again"]
+    return _left(unfinished)
 
 
 def zenoh(
@@ -239,9 +239,9 @@ def certificate(
         if is_hub and not hosts:
             raise FleetError(f"{name} is a hub: name where others reach it, `pebble fleet certificate {name} HOST`")
         of_brokers = certificates.hosts_of(host for server in fleet.brokers for host in applying.names_of(server))
-        asked = set(certificates.hosts_of(hosts)) if hosts else set[str]()
-        if taken := asked & {*fleet.accounts, *(() if is_hub else of_brokers)} - {name}:
-            raise FleetError(f"{name} cannot be {min(taken)}: that is a broker of this fleet, or another account")
+        host_names = set(certificates.hosts_of(hosts)) if hosts else set[str]()
+        if conflicts := host_names & {*fleet.accounts, *(() if is_hub else of_brokers)} - {name}:
+            raise FleetError(f"{name} cannot be {min(conflicts)}: that is a broker of this fleet, or another account")
         files = certificates.of_account(place, name, hosts or ())
         _print_certificate(place, fleet, name, files)
     return 0
@@ -271,15 +271,15 @@ def apply_(folder_: _Folder = None) -> int:
         pebble fleet apply
     """
     with _changing(folder_, any_rules=True) as (place, fleet):
-        left = list[str]()
+        unfinished = list[str]()
         if fleet.rules == "plugin":
-            fleet, left = plugin.convert(place, fleet)
+            fleet, unfinished = plugin.convert(place, fleet)
         if applying.obeys_plugin(place):
-            left += applying.conf_differences(place, fleet)
+            unfinished += applying.conf_differences(place, fleet)
         else:
             typer.echo(f"{_shown(place)} knows {len(fleet.accounts)} accounts ({applying.apply(place, fleet)})")
-        left += applying.copies(Path(_shown(place)), fleet)
-    return _left(left)
+        unfinished += applying.copies(Path(_shown(place)), fleet)
+    return _left(unfinished)
 
 
 def check_(folder_: _Folder = None) -> int:
@@ -335,7 +335,7 @@ def _init_again(place: Path, host: str | None, level: str | None, plain: bool | 
 
 @contextmanager
 def _changing(folder_: Path | None, *, any_rules: bool = False) -> Iterator[tuple[Path, Fleet]]:
-    """Lock a fleet for a change. Raises PebbleError.
+    """Yield a fleet and its folder, locked for a change. Raises PebbleError.
 
     ``any_rules``: also a fleet that still uses mosquitto's plugin.
     """
@@ -416,7 +416,7 @@ def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, 
 
 
 def _left(lines: Iterable[str]) -> int:
-    """Print the places where a change does not count yet; return the command's exit code."""
+    """Print the places where a change does not apply yet; return the command's exit code."""
     code = 0
     for line in lines:
         typer.echo(f"pebble: {shown(line)}", err=True)

@@ -148,7 +148,7 @@ def _running(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def _accounts(fleet: Fleet, robots: list[str], boards: list[str]) -> Fleet:
-    """Give each robot an account as a neighbour of the others, and each board one at the broker. Raises FleetError."""
+    """Return the fleet with accounts for robots, as neighbours, and for boards at the broker. Raises FleetError."""
     bases = {name: f"pebble/robots/{name}" for name in (*robots, *boards)}
     for name, times in Counter((*robots, *boards)).items():
         if times > 1:
@@ -180,21 +180,22 @@ def _write_robot(place: Path, fleet: Fleet, name: str, others: list[str]) -> Non
     piece = pieces.of_certificate(fleet, _neighbour(name))
     section = piece["services"]["neighbours"]
     section |= {"shares": list(_SHARED), "listens": {other: list(_SHARED) for other in others}}
-    its = _folder_of(place, name)
+    robot_folder = _folder_of(place, name)
     _write(
-        its / f"{name}.json", {"robot": piece["robot"], "transport": {"kind": "zenoh"}, "services": piece["services"]}
+        robot_folder / f"{name}.json",
+        {"robot": piece["robot"], "transport": {"kind": "zenoh"}, "services": piece["services"]},
     )
     for suffix, mode in ((".pem", 0o644), (".key", 0o600)):
         file = place / certificates.ACCOUNTS / f"{_neighbour(name)}{suffix}"
-        write(its / file.name, read_plain(file), mode, FleetError)
+        write(robot_folder / file.name, read_plain(file), mode, FleetError)
 
 
 def _folder_of(place: Path, name: str) -> Path:
-    """Return the folder that is to be copied to a robot."""
-    its = place / ROBOTS / name
-    its.mkdir(parents=True, exist_ok=True)
-    write(its / certificates.CA_CERT, read_plain(place / certificates.CA_CERT), 0o644, FleetError)
-    return its
+    """Return the folder to be copied to a robot."""
+    robot_folder = place / ROBOTS / name
+    robot_folder.mkdir(parents=True, exist_ok=True)
+    write(robot_folder / certificates.CA_CERT, read_plain(place / certificates.CA_CERT), 0o644, FleetError)
+    return robot_folder
 
 
 def _neighbour(name: str) -> str:

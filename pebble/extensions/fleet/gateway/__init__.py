@@ -1,1 +1,1 @@
-"""The gateway: a program that forwards between the robots of a Zenoh hub and their operators' MQTT broker."""
+"""The gateway: forwards between the robots of a Zenoh hub and their operators' MQTT broker."""

@@ -1,6 +1,6 @@
-"""A robot that the gateway forwards for: a forwarder and its subscriptions.
+"""A robot for which the gateway forwards: a forwarder and its subscriptions.
 
-Both are new whenever the gateway begins with the robot, so that retained messages count as at the start of a bridge.
+Both are made whenever the gateway begins with the robot, so that retained messages count as at the start of a bridge.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -59,9 +59,9 @@ class NamedSubjects(Subjects):
 
 
 class Beginning:
-    """A record of since when commands may have waited behind a new robot's retained messages at the broker.
+    """The time since which commands may have waited behind a new robot's retained messages at the broker.
 
-    They share a connection that is almost never idle, so pings cannot tell their age.
+    All share a connection that is almost never idle, so pings cannot tell their age.
     """
 
     LONG_S, REST_S = 0.5, 0.25  # what moves may wait so long; so long after it what had waited is still being read
@@ -95,9 +95,9 @@ class Beginning:
 
 
 def begin(robots: Sequence["CarriedRobot"], hub: Transport, broker: Transport) -> None:
-    """Start to forward for ``robots``, beginning with what the hub retains.
+    """Start forwarding for ``robots``, beginning with the hub's retained messages.
 
-    Waits, for a bounded time, for both sides: once for all robots, as a round trip takes longer than everything else.
+    Waits, for a limited time, for both sides: once for all robots, as a round trip takes longer than everything else.
     """
     _subscribe(robots, Side.LOCAL, hub, f"{OUTGOING}/#", f"{INCOMING}/flags/#")
     for robot in robots:
@@ -151,12 +151,12 @@ class CarriedRobot:
         )
 
     def subscribing(self, side: Side, *below: str) -> dict[str, Handler]:
-        """Return the subscriptions to make on ``side``; retained messages arrive from now on."""
+        """Return the subscriptions to make on ``side``, whose retained messages arrive from now on."""
         self.forwarder.sides[side].subscribing()
         return {f"{self.base}/{metrics}": partial(self.receive, side) for metrics in below}
 
     def subscribed(self, side: Side, subscriptions: Iterable[Subscription]) -> None:
-        """Record that the subscriptions are active and that all retained messages have arrived."""
+        """Note that the subscriptions are active, and that all retained messages have arrived."""
         self._subscriptions += subscriptions
         self.forwarder.subscribed(side)
         self._synchronize_at = self._clock() + INITIAL_SYNC_S
@@ -167,7 +167,7 @@ class CarriedRobot:
             subscription.close()
 
     def tick(self, now: float) -> None:
-        """Forward what both sides retain, and look for cycles, when either is due."""
+        """Forward the retained messages of both sides, and look for cycles, when either is due."""
         if now >= self._synchronize_at:
             self._synchronize_at = float("inf")
             for side in Side:
@@ -195,7 +195,7 @@ class CarriedRobot:
     # -- media
 
     def _is_wanted(self, channel: Channel | None) -> bool:
-        """True if the channel may pass: a medium must be allowed, and not ended by the operator at the broker."""
+        """True if the channel may pass: a medium must be permitted, and not ended by the operator at the broker."""
         if channel not in self._requested:
             return True
         return self._allowed.get(channel, False) and self._requested[channel] is not False

@@ -46,7 +46,7 @@ class SecondGatewayError(PebbleError):
 
 
 def will(name: str) -> Message:
-    """Return the message by which other gateways learn that this one has gone."""
+    """Return the will, by which other gateways learn that this one is gone."""
     return Message(ONLINE.topic(Identity("pebble", GATEWAYS, name).base), b"", QoS.DELIVERED, True)
 
 
@@ -58,8 +58,8 @@ def is_stop(topic: str) -> bool:
 class Gateway:
     """A forwarder for all robots whose base topics match ``robots``. Its transports are not yet open.
 
-    ``broker`` carries what is forwarded, as it was published; ``presence``, with the :func:`will`, and ``stops`` are
-    further connections to the same broker.
+    ``broker`` carries forwarded messages, as they were published; ``presence``, with the :func:`will`, and ``stops``
+    are more connections to the same broker.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class Gateway:
         self._presence.subscribe(ONLINE.filter(f"+/{GATEWAYS}/+"), self._on_gateway, direct=True)
 
     def close(self) -> None:
-        """Stop forwarding, then publish that this gateway has gone."""
+        """Stop forwarding, then publish that this gateway is gone."""
         self._end(self.carries)
         for transport in (self._broker, self._presence, self._stops, self._hub):
             transport.close()
@@ -230,7 +230,7 @@ class Gateway:
             self._quiet_log.warning("many", "the hub has more than %d robots: give it accounts", MAX_ROBOTS)
 
     def _differs(self, base: str, heartbeat: bytes) -> bool:
-        """True if an earlier heartbeat of that robot was different.
+        """True if the robot's last heartbeat was a different one.
 
         Needed where a transport cannot tell live messages from retained ones.
         """

@@ -1,4 +1,4 @@
-"""Other gateways at the same broker, known by their `online`, so that no robot is carried twice. Pure."""
+"""Other gateways at the same broker, by their `online` messages, so that no robot is carried twice. Pure."""
 
 from dataclasses import dataclass
 
@@ -17,8 +17,8 @@ class _Other:
 class OtherGateways:
     """The newest heartbeat of each other gateway.
 
-    ``run`` identifies this one: if two carry the same robot, the greater ``run`` continues. Two that begin at the same
-    moment both carry it until they hear each other.
+    ``run`` identifies this gateway: if two carry the same robot, the greater ``run`` continues. Two that begin at the
+    same moment both carry it until they hear each other.
     """
 
     def __init__(self, run: str) -> None:
@@ -26,15 +26,15 @@ class OtherGateways:
         self._others: dict[str, _Other] = {}
 
     def forget(self) -> None:
-        """Forget all gateways, as the connection on which they were heard was lost."""
+        """Forget all gateways, because the connection on which they were heard is lost."""
         self._others.clear()
 
     def left(self, name: str) -> None:
-        """Record that a gateway has gone: its will was published, or it left in order."""
+        """Note that a gateway is gone: it left in order, or its will was published."""
         self._others.pop(name, None)
 
     def heard(self, name: str, run: str, robots: tuple[str, ...], now: float) -> None:
-        """Record a live heartbeat of any gateway."""
+        """Note a live heartbeat of any gateway."""
         if run == self.run:
             return
         others = self._others
@@ -43,7 +43,7 @@ class OtherGateways:
         others[name] = _Other(now, run, frozenset(robots))
 
     def carrier(self, robot: str, now: float, *, carried: bool) -> str:
-        """Return the other gateway that carries ``robot``; empty if none. ``carried``: this one carries it too."""
+        """Return the other gateway that carries ``robot``; empty if none does. ``carried``: this one carries it too."""
         for name, other in list(self._others.items()):
             if now - other.at <= FRESH_S and robot in other.robots and (not carried or other.run > self.run):
                 return name

@@ -82,7 +82,7 @@ def flash(
 
 
 def _target(robot: str, firmware: str | None) -> tuple[Firmware, Config | None]:
-    """Return the firmware, and the config if there is one; robots with Wi-Fi need one."""
+    """Return the firmware, and the config if one was given; robots with Wi-Fi need one."""
     if robot in FIRMWARE:
         kind = firmware_named(firmware or robot)
         shipped = Path(str(files("pebble")), "configs", f"{robot}.json")

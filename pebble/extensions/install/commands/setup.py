@@ -53,11 +53,11 @@ def back_up(file: Path, places: Places) -> int:
 
     if file.exists():
         raise typer.BadParameter(f"{file} exists: name another file, or remove it")
-    made = backups.make(places)
-    write_new(file, backups.packed(made))
-    back = backups.read(file)  # as the disk has it
-    typer.echo(f"{file}: {back.about.id}, {len(back.files)} files, {back.bytes / 1e6:.1f} MB")
-    for place, why in made.left_out.items():
+    backup = backups.make(places)
+    write_new(file, backups.packed(backup))
+    written = backups.read(file)  # as the disk has it
+    typer.echo(f"{file}: {written.about.id}, {len(written.files)} files, {written.bytes / 1e6:.1f} MB")
+    for place, why in backup.left_out.items():
         typer.echo(f"not in it: {place}: {why}")
-    typer.echo(f"pebble: warning: {back.about.note}", err=True)
+    typer.echo(f"pebble: warning: {written.about.note}", err=True)
     return 0

@@ -1,4 +1,4 @@
-"""The boards that firmware exists for, and which robot is built on which."""
+"""The boards for which firmware exists, and the board of each robot."""
 
 from binascii import crc_hqx
 from collections.abc import Callable
@@ -57,7 +57,7 @@ ESP8266 = Board(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Firmware:
-    """The firmware of one robot: one folder of firmware/ and the board it runs on."""
+    """The firmware of one robot: its folder of firmware/, and its board."""
 
     name: str
     board: Board
@@ -101,7 +101,7 @@ FIRMWARE = {
 
 
 def firmware_named(name: str) -> Firmware:
-    """Return the firmware of this name. Raises PebbleError, which lists the known names."""
+    """Return the firmware of this name. Raises PebbleError that lists the known names."""
     if name not in FIRMWARE:
         raise PebbleError(f"unknown firmware {name}; known: {', '.join(sorted(FIRMWARE))}")
     return FIRMWARE[name]

@@ -27,8 +27,8 @@ def check_image(path: Path, board: Board) -> None:
 def _esp(header: bytes, board: Board) -> str:
     if len(header) < 16 or header[0] != _ESP_MAGIC:
         return "not an image for an Espressif chip"
-    found = struct.unpack_from("<H", header, 12)[0]
-    if board.chip_id is not None and found != board.chip_id:
+    chip_id = struct.unpack_from("<H", header, 12)[0]
+    if board.chip_id is not None and chip_id != board.chip_id:
         return f"an image for another chip than {board.chip}"
     return ""
 

@@ -1,4 +1,4 @@
-"""Scripts that run on a board's MicroPython, and the interpretation of their output."""
+"""Scripts that run on a board's MicroPython, and readers of their output."""
 
 import re
 from dataclasses import dataclass
@@ -58,11 +58,11 @@ class BoardInfo:
 
 
 def check_answer(answer: str, board: Board) -> BoardInfo:
-    """Parse the output of :data:`IDENTIFY`. Raises PebbleError if it is not from ``board``."""
-    found = _ANSWER.search(answer)
-    if found is None:
+    """Return the report in the output of :data:`IDENTIFY`. Raises PebbleError if it is not from ``board``."""
+    match = _ANSWER.search(answer)
+    if match is None:
         raise PebbleError(f"unexpected answer from the board: {answer.strip()[-200:]!r}")
-    name, *numbers, mpy_text, binary, rom, machine = found.groups()
+    name, *numbers, mpy_text, binary, rom, machine = match.groups()
     version, mpy = ".".join(numbers), int(mpy_text)
     if name != "micropython":
         raise PebbleError(f"the board runs {name}; install MicroPython with --micropython FILE")

@@ -19,7 +19,7 @@ _RESET_PULSE_S = 0.1
 
 
 def described() -> list[str]:
-    """Return one line per serial port: its path, the USB device's own name, and its ids."""
+    """Return a line per serial port: its path, the USB device's own name, and its ids."""
     lines = []
     for port in sorted(list_ports.comports()):
         name = " ".join(filter(None, (port.manufacturer, port.product))) or port.description
@@ -31,21 +31,21 @@ def described() -> list[str]:
 
 def hint() -> str:
     """Return the list of ports for an error message."""
-    found = described()
-    if not found:
+    ports = described()
+    if not ports:
         return "no board is plugged in (some USB cables carry power only: try another)"
-    return "available ports:\n" + "\n".join(f"  {line}" for line in found)
+    return "available ports:\n" + "\n".join(f"  {line}" for line in ports)
 
 
 def check(port: str) -> None:
     """Raise DeviceError, with the available ports, unless ``port`` can be opened."""
     path = Path(port)
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError as error:
         why = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be used: {error.strerror}"
         raise DeviceError(f"--port {port}: {why}; {hint()}") from None
-    if not stat.S_ISCHR(found.st_mode):
+    if not stat.S_ISCHR(status.st_mode):
         raise DeviceError(f"--port {port}: is not a serial port; {hint()}")
     if not os.access(path, os.R_OK | os.W_OK):
         raise DeviceError(f"--port {port}: permission denied: sudo usermod -aG dialout $USER, then log in again")
@@ -64,8 +64,8 @@ def break_in(port: str, ask: Callable[[str], None], *, pulse: bool, timeout_s: f
     """Stop the program on the board, so that MicroPython's prompt answers.
 
     Our firmware accepts Ctrl-C only in the first second after a reset: later, no byte on the line may stop it, and its
-    watchdog would reset the board during the copy. So the board is reset: by the line's RTS where it is wired
-    (``pulse``), else by the user, whom ``ask`` prompts. Raises DeviceError when no prompt appears.
+    watchdog would reset the board during the copy. So the board is reset: by the line's RTS if that is wired
+    (``pulse``), else by the user, whom ``ask`` prompts. Raises DeviceError if no prompt appears.
     """
     begin, asked = time.monotonic(), False
     if pulse:

@@ -1,4 +1,4 @@
-"""private_config.json: a board's identity, Wi-Fi and broker, made from the robot's config and read by the firmware."""
+"""Makes private_config.json, a board's identity, Wi-Fi and broker, from the robot's config. The firmware reads it."""
 
 import ipaddress
 import json
@@ -20,7 +20,7 @@ _NO_BROKER = (".example", ".invalid", ".test")  # RFC 2606
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PrivateFiles:
-    """The files that belong to one board only."""
+    """The files that belong only to one board."""
 
     settings: dict[str, Any] = field(default_factory=dict)
     ca: bytes | None = field(default=None, repr=False)  # an authority's certificate, DER
@@ -30,12 +30,12 @@ class PrivateFiles:
         return json.dumps(self.settings)
 
     def shown(self) -> str:
-        """Return the same with passwords as ***, for messages."""
+        """Return the content with *** in place of passwords, for messages."""
         return json.dumps(_hidden(self.settings))
 
 
 def private_files(config: Config, firmware: Firmware, *, ssid: str, wifi_password: str) -> PrivateFiles:
-    """Make the files from the robot's config. Raises PebbleError for settings that the board cannot use."""
+    """Return the files made from the robot's config. Raises PebbleError for settings that the board cannot use."""
     if not 1 <= len(ssid.encode()) <= _WIFI_NAME:
         raise PebbleError(f"--wifi: a network name has 1 to {_WIFI_NAME} bytes")
     if wifi_password and len(wifi_password.encode()) not in _WIFI_PASSWORD:
@@ -103,7 +103,7 @@ def _tls(broker: Mqtt, firmware: Firmware) -> tuple[Any, bytes | None]:
 
 
 def _der(path: Path) -> bytes:
-    """Read the certificate of an authority as DER. Raises ConfigError for a file with several."""
+    """Return the certificate of an authority as DER. Raises ConfigError for a file with several."""
     try:
         content = path.read_bytes()
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Collects the files of firmware/ that a robot needs, and the command that compiles each."""
+"""Finds the files of firmware/ that a robot needs, and the command that compiles each."""
 
 import ast
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ def main_file(firmware: Firmware, root: Path | None = None) -> Path:
 
 
 def modules(firmware: Firmware, root: Path | None = None) -> list[Path]:
-    """Return all modules that main.py imports, directly or not, relative to firmware/; nothing else is copied.
+    """Return all modules that main.py imports, also indirectly, relative to firmware/; only these are copied.
 
     Raises PebbleError if there is no main.py.
     """
@@ -28,14 +28,14 @@ def modules(firmware: Firmware, root: Path | None = None) -> list[Path]:
     main = main_file(firmware, root)
     if not main.is_file():
         raise PebbleError(f"{firmware.name} has no firmware yet: {main} does not exist")
-    found: set[Path] = set()
+    imported: set[Path] = set()
     waiting = [main]
     while waiting:
         for path in _imported(waiting.pop(), root):
-            if path not in found:
-                found.add(path)
+            if path not in imported:
+                imported.add(path)
                 waiting.append(root / path)
-    return sorted(found)
+    return sorted(imported)
 
 
 def _imported(file: Path, root: Path) -> Iterator[Path]:

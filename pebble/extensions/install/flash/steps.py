@@ -24,7 +24,7 @@ _WRITE_S = 600.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlashOptions:
-    """The firmware to install, the port, and its sources."""
+    """The firmware to install, the port, and the sources."""
 
     firmware: Firmware
     port: str
@@ -63,7 +63,7 @@ def show_steps(options: FlashOptions, tools: Tools, report: Report) -> None:
 
 
 class Steps:
-    """The steps for these options; compiled code and files to copy are in the folder ``work``."""
+    """The steps for these options. The folder ``work`` holds compiled code and files to copy."""
 
     def __init__(self, options: FlashOptions, tools: Tools, work: Path, report: Report) -> None:
         self._options, self._tools, self._work, self._report = options, tools, work, report
@@ -178,7 +178,7 @@ class Steps:
         return steps
 
     def _copy_code(self, folders: list[str]) -> Step:
-        """Copy the code into the ROM file system, where it takes little RAM; without one, as files."""
+        """Return the step that copies the code: into the ROM file system, where it takes little RAM, or as files."""
         image = self._work / "code.romfs"
         build = Command("mpremote", ("romfs", "--output", str(image), "build", str(self._code)))
         deploy = self._remote("romfs", "deploy", str(image))

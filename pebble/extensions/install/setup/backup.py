@@ -1,4 +1,4 @@
-"""Packs what a new machine needs to be this robot into one tar file, and reads it again.
+"""Packs into one tar file what a new machine needs to be this robot, and reads it again.
 
 The first member is ``backup.json``, an :class:`About`; the others are files at their paths below the root, without the
 leading slash. Recordings are not in it.
@@ -51,11 +51,11 @@ _BROKER_FILES = re.compile(
 
 
 class BackupError(PebbleError):
-    """A backup cannot be made or read. Example: ``goob.tar: is no backup of Pebble``."""
+    """An error: a backup cannot be made or read. Example: ``goob.tar: is no backup of Pebble``."""
 
 
 class About(msgspec.Struct, frozen=True, kw_only=True):
-    """The content of ``backup.json``. ``id``: of the robot; ``version``: of the Pebble that made it."""
+    """The content of ``backup.json``. ``id``: the robot's; ``version``: of the Pebble that made it."""
 
     format: int
     version: str
@@ -65,7 +65,7 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class Saved:
-    """One file, and its permissions."""
+    """A file with its permissions."""
 
     content: bytes
     mode: int
@@ -88,7 +88,7 @@ class Backup:
 
 
 def make(places: Places) -> Backup:
-    """Read all files of the installed robot into a backup. Raises BackupError. The database may be in use."""
+    """Return a backup of all files of the installed robot. Raises BackupError. The database may be in use."""
     if not places.config.is_file():
         raise BackupError(f"there is no {places.config}: no robot is installed there, so there is nothing to back up")
     config = load(places.config, {**os.environ, "STATE_DIRECTORY": str(places.state)})
@@ -108,12 +108,12 @@ def make(places: Places) -> Backup:
 
 
 def _files(places: Places, config: Config) -> Iterator[Path]:
-    """Yield the files that cannot be made again. A file that another one names may be anywhere."""
+    """Yield the files that cannot be made again. A file that is named in another may be anywhere."""
     without = [_here(places, folder) for _, folder in _left_out(config)]
     for folder in (places.etc, places.state, _here(places, config.state_dir())):
         yield from _below(folder, without)
-    own = (config.folder / name for name in config.extensions if name.endswith(".py"))
-    named = [places.broker, people_of(config), *values_of(config, Path), *own]
+    owner_extensions = (config.folder / name for name in config.extensions if name.endswith(".py"))
+    named = [places.broker, people_of(config), *values_of(config, Path), *owner_extensions]
     if places.broker.is_file():
         named += map(Path, _BROKER_FILES.findall(places.broker.read_text(encoding="utf-8", errors="replace")))
     for path in named:
@@ -146,7 +146,7 @@ def _below(place: Path, without: Iterable[Path]) -> Iterator[Path]:
 
 
 def _add(backup: Backup, root: Path, file: Path) -> None:
-    """Add a file, in its state at one moment."""
+    """Add a file as it is at one moment."""
     name = str(file.relative_to(root))
     if name.endswith(_NOT):
         return
@@ -170,14 +170,14 @@ def _database(file: Path) -> bytes:
     """Return a consistent copy of a database, by SQLite's backup. Raises BackupError if it is damaged."""
     try:
         with (
-            closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as there,
-            closing(sqlite3.connect(":memory:")) as here,
+            closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as original,
+            closing(sqlite3.connect(":memory:")) as copy,
         ):
-            there.backup(here)
-            ((result,),) = here.execute("PRAGMA quick_check(1)").fetchall()
+            original.backup(copy)
+            ((result,),) = copy.execute("PRAGMA quick_check(1)").fetchall()
             if result != "ok":
                 raise BackupError(f"{file}: is damaged: {result}")
-            return here.serialize()
+            return copy.serialize()
     except sqlite3.Error as error:
         raise BackupError(f"{file}: is no whole database: {error}") from None
 
@@ -199,7 +199,7 @@ def packed(backup: Backup) -> bytes:
 
 
 def read(file: Path) -> Backup:
-    """Read a complete backup and check it. Raises BackupError with one line."""
+    """Return the backup in a file, complete and checked. Raises BackupError with one line."""
     try:
         return unpacked(read_plain(file, _MOST + _LARGEST), str(file))
     except OSError as error:
@@ -207,7 +207,7 @@ def read(file: Path) -> Backup:
 
 
 def unpacked(raw: bytes, name: str) -> Backup:
-    """Read a backup from the content of the file called ``name``."""
+    """Return the backup in ``raw``, the content of the file called ``name``."""
     try:
         with tarfile.open(fileobj=io.BytesIO(raw), mode="r:") as tar:
             members = iter(tar)

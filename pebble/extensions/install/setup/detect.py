@@ -1,4 +1,4 @@
-"""The devices of this machine: boards, to which nothing is sent, cameras, and the parts that a robot lacks."""
+"""Finds the devices of this machine: boards, to which it sends nothing, cameras, and parts that a robot lacks."""
 
 import re
 import shutil
@@ -83,7 +83,7 @@ def _received(port: str, baud: int, seconds: float) -> bytes:
 
 
 def _understood(received: bytes) -> tuple[str | None, str] | None:
-    """Return the protocol and what was received, in words; None if nothing makes sense at this speed."""
+    """Return the protocol, and what was received in words; None if nothing makes sense at this speed."""
     if b"\0" in received:
         return ("pebble_serial_v1", "frames") if any(map(_is_frame, received.split(b"\0"))) else None
     lines = [line.strip() for line in received.split(b"\n") if line.strip()]
@@ -91,10 +91,10 @@ def _understood(received: bytes) -> tuple[str | None, str] | None:
     if not readable or len(readable) < _ENOUGH * len(lines):
         return None
     kinds = {line.split()[0] for line in readable}
-    known = sorted(kind for kind in kinds if kind in _KINDS)
-    if not known:
+    known_kinds = sorted(kind for kind in kinds if kind in _KINDS)
+    if not known_kinds:
         return None, f"{len(readable)} lines"
-    return _KINDS[known[0]], f"`{'`, `'.join(kind.decode() for kind in known)}` lines"
+    return _KINDS[known_kinds[0]], f"`{'`, `'.join(kind.decode() for kind in known_kinds)}` lines"
 
 
 def _is_frame(stuffed: bytes) -> bool:
@@ -125,9 +125,10 @@ def lacks(places: Places) -> Iterator[str]:
     """Yield each part that the robot will lack, with the command that adds it."""
     if not any((places.root / path).exists() for path in _POLKIT):
         yield NO_POLKIT
-    found = clock(time.time(), synchronised())
-    if found.state is State.FAILED:
-        yield f"The clock {found.text.partition(':')[0]}, so certificates would be refused: {found.fix}, then {_RENEW}"
+    result = clock(time.time(), synchronised())
+    if result.state is State.FAILED:
+        problem = result.text.partition(":")[0]
+        yield f"The clock {problem}, so certificates would be refused: {result.fix}, then {_RENEW}"
     if not _has_network():
         yield OFFLINE
 
@@ -140,11 +141,11 @@ def no_broker(places: Places) -> str:
         if file == places.broker:
             continue
         try:
-            found = _GLOBAL.search(file.read_text(encoding="utf-8", errors="replace"))
+            match = _GLOBAL.search(file.read_text(encoding="utf-8", errors="replace"))
         except OSError:
             continue
-        if found is not None:
-            line = found[0].strip().split()[0]
+        if match is not None:
+            line = match[0].strip().split()[0]
             return f"{places.named(file)} has its own `{line}`: remove it, or answer with the name of that broker"
     if places.root != Path("/") or places.broker.exists() or _runs("mosquitto"):
         return ""

@@ -36,7 +36,7 @@ def make(new: Path, fleet: Fleet, passwords: dict[str, str]) -> None:
 
 
 def link(place: Path) -> None:
-    """Link mosquitto's places to the folder, by relative links, which are also valid below another root."""
+    """Make links from mosquitto's places to the folder; relative ones, which are also valid below another root."""
     for name, target in LINKS.items():
         if not (place / name).is_symlink():
             (place / name).symlink_to(target)
@@ -47,8 +47,10 @@ def knows(place: Path, wanted: Fleet, passwords: dict[str, str]) -> bool:
     with as_owner(place):
         fleet = folder.load(place)
         stored = applying.passwords_of(place)
-    known = all(fleet.accounts.get(name) == account for name, account in wanted.accounts.items())
-    return known and all(name in stored and stored[name].is_of(password) for name, password in passwords.items())
+    accounts_agree = all(fleet.accounts.get(name) == account for name, account in wanted.accounts.items())
+    return accounts_agree and all(
+        name in stored and stored[name].is_of(password) for name, password in passwords.items()
+    )
 
 
 def change(place: Path, wanted: Fleet, passwords: dict[str, str]) -> None:

@@ -35,7 +35,7 @@ def say(text: str, indent: int = 0) -> None:
 
 
 def asked(job: Job) -> Job:
-    """Return the job with the answers from the terminal; a wrong answer is asked for again."""
+    """Return the job with the answers from the terminal. A wrong answer is asked for again."""
     first = [] if job.config is not None else [_ask_name]
     for number, ask in enumerate([*first, _ask_board, _ask_camera, _ask_broker, _ask_page], start=1):
         job = _answered(job, number, ask)
@@ -75,8 +75,8 @@ def _ask_board(job: Job, number: str) -> _Given:
     typer.echo("\n   Listening to serial ports…")
     boards = {board.port: board for board in detect.boards(detect.SERIAL_PORTS)}
     choices = [*((board.port, board.text) for board in boards.values()), (NONE, "no board now")]
-    known = next((board.port for board in boards.values() if board.baud), NONE)
-    port = _choose(f"{number} Which board drives the motors?", choices, job.answers.port or known)
+    heard_port = next((board.port for board in boards.values() if board.baud), NONE)
+    port = _choose(f"{number} Which board drives the motors?", choices, job.answers.port or heard_port)
     if port == NONE:
         return {"port": NONE}
     board = boards.get(port)
@@ -103,8 +103,8 @@ def _ask_broker(job: Job, number: str) -> _Given:
     if answers.is_far:
         default = answers.broker_user or str(answers.id)
         given["broker_user"] = str(typer.prompt("   The robot's account there", default=default))
-        known = answers.broker_ca or ""
-        ca = str(typer.prompt("   File with its authority, ca.pem (empty: a public one)", default=known))
+        present = answers.broker_ca or ""
+        ca = str(typer.prompt("   File with its authority, ca.pem (empty: a public one)", default=present))
         given["broker_ca"] = str(Path(ca).absolute()) if ca else None
     return given
 
@@ -122,7 +122,7 @@ def _ask_page(job: Job, number: str) -> _Given:
 
 
 def _with_passwords(job: Job) -> Job:
-    """Return the job with the passwords that are still needed, asked for."""
+    """Return the job with the passwords that it still needs, after asking for them."""
     answers, secrets = job.answers, job.secrets
     if needs_login(answers):
         text, default = f"   Password of {answers.account} at the broker", None

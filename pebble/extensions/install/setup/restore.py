@@ -1,6 +1,6 @@
 """Puts the files of a backup in their places on a machine that is no robot yet; nothing is overwritten.
 
-Whoever made the file may have changed it, so it says nothing about what root runs, reads, deletes or lets in.
+The backup may have been changed, so root does not trust it to say what to run, read, delete or let in.
 """
 
 import os
@@ -86,24 +86,24 @@ def _content(file: Path) -> bytes:
 
 
 def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
-    """Return the backup's files without foreign ones and without mosquitto's, which setup makes itself."""
+    """Return the backup's files without foreign files, and without mosquitto's, which setup makes itself."""
     folder = f"{places.broker_folder.relative_to(places.root)}/"
-    made = [f"{folder}{name}" for name in own_broker.LINKS]
+    links = [f"{folder}{name}" for name in own_broker.LINKS]
     broker = str(places.broker.relative_to(places.root))
-    kept = {
+    allowed = {
         name: saved
         for name, saved in files.items()
-        if name not in made and (name.startswith(folder) or not name.startswith("etc/mosquitto/"))
+        if name not in links and (name.startswith(folder) or not name.startswith("etc/mosquitto/"))
     }
     if broker in files:
-        kept[broker] = Saved(own_broker.conf_text(places, own_broker.fleet_of("robot", "", places.people)), 0o644)
-    if any(name.startswith(folder) for name in kept) and f"{folder}{FLEET}" not in kept:
+        allowed[broker] = Saved(own_broker.conf_text(places, own_broker.fleet_of("robot", "", places.people)), 0o644)
+    if any(name.startswith(folder) for name in allowed) and f"{folder}{FLEET}" not in allowed:
         raise SetupError(f"the backup has files of a broker, and no {folder}{FLEET}: it was changed")
-    return kept
+    return allowed
 
 
 def _beyond(value: Any, *keys: str) -> Iterator[str]:
-    """Yield the programs in a config except setup's, and the files beyond the robot's, each with its key."""
+    """Yield the programs in a config that setup does not write, and files outside of the robot's, each with its key."""
     key = keys[-1] if keys else ""
     is_run = key in _RUNS or key.endswith(("_command", "_env"))
     if (value and value not in COMMANDS) if is_run else (isinstance(value, str) and _is_beyond(value)):
@@ -117,7 +117,7 @@ def _beyond(value: Any, *keys: str) -> Iterator[str]:
 
 
 def _is_beyond(text: str) -> bool:
-    """True if a text may be the path of a file that is not the robot's."""
+    """True if a text may be the path of a file that does not belong to the robot."""
     if not text.startswith(("/", "~", "file:")) and ".." not in text.split("/"):
         return False
     path = os.path.normpath(text if text[0] in "/~" else f"/etc/pebble/{text}")

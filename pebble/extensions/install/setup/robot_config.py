@@ -26,7 +26,7 @@ COMMANDS = (
 
 
 def answers_of(config: Config, places: Places) -> Answers:
-    """Return the answers for which setup would write this config."""
+    """Return the answers from which setup would write this config."""
     services, devices = config.services, config.section(AvDaemon)
     line, video, remote = services.serial_mcu_bridge, devices.video, services.mqtt_bridge.remote_mqtt
     has_board = line.enabled and line.serial.port is not None
@@ -55,14 +55,14 @@ def changed(current: dict[str, Any], before: dict[str, Any], after: dict[str, An
     """Return the present config with the changes that the answers ask for; other hand-written keys stay."""
     result = dict(current)
     for key in {**before, **after}:
-        here, old, new = (config.get(key) for config in (current, before, after))
+        present, old, new = (config.get(key) for config in (current, before, after))
         if old == new:
             continue
-        if isinstance(here, dict) and (isinstance(old, dict) or isinstance(new, dict)):
-            result[key] = changed(here, old or {}, new or {})
+        if isinstance(present, dict) and (isinstance(old, dict) or isinstance(new, dict)):
+            result[key] = changed(present, old or {}, new or {})
         elif key in after:
             result[key] = new
-        elif here == old:
+        elif present == old:
             result.pop(key, None)
     return result
 

@@ -26,9 +26,9 @@ _SUDO = "sudo pebble setup"
 
 
 def set_up(system: System, answers_file: Path | None, backup_file: Path | None) -> int:
-    """Set up the machine from a backup, from a file of answers, or from a person's answers.
+    """Set up the machine from a backup, from a file of answers, or from a person's answers; return the exit code.
 
-    Returns the exit code. Raises SetupError, and AnswersError before anything is written.
+    Raises SetupError, and AnswersError before anything is written.
     """
     places = system.places
     system.owner(ROBOTS)
@@ -74,7 +74,7 @@ def _agree(lines: Sequence[str]) -> None:
 
 
 def _failures(job: Job, *, is_started: bool) -> Iterator[str]:
-    """Yield the problems that keep the robot from being driven, by its own test if it was started."""
+    """Yield the problems that keep the robot from being driven; if it was started, by its own test."""
     places = job.places
     if not job.system.has_systemd:
         yield f"systemd does not run here, so nothing starts the robot: pebble up {places.config}"

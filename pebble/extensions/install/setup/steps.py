@@ -1,4 +1,4 @@
-"""The steps that set up a robot, in their order. Each is checked first, and done only if it is necessary."""
+"""The steps that set up a robot, in order. Each is checked first, and done only if it is necessary."""
 
 import json
 import os
@@ -67,7 +67,7 @@ def load_config(places: Places) -> Config | None:
 
 @dataclass(frozen=True)
 class Job:
-    """The data on which all steps depend. ``config``: the existing one."""
+    """The data of all steps. ``config``: the existing one."""
 
     system: System
     config: Config | None
@@ -126,17 +126,17 @@ class Job:
 
     def _passwords(self) -> Iterator[Step]:
         file, page = self.places.etc / BROKER_PASSWORD, self.places.etc / PAGE_PASSWORD
-        given = self.secrets.broker_password
-        if given is not None and self.answers.broker != HERE:
-            yield self._file("password of the robot at its broker", file, f"{given}\n".encode())
+        typed = self.secrets.broker_password
+        if typed is not None and self.answers.broker != HERE:
+            yield self._file("password of the robot at its broker", file, f"{typed}\n".encode())
         if self.answers.broker == HERE:
-            known = self.config is None or self.has_login
-            yield self._new_password("password of the robot at its own broker", file, known=known)
+            keeps_password = self.config is None or self.has_login
+            yield self._new_password("password of the robot at its own broker", file, known=keeps_password)
             if self.answers.page:
                 yield self._new_password("password of the page at the robot's broker", page)
 
     def _new_password(self, what: str, file: Path, *, known: bool = True) -> Step:
-        """Return the step that writes a new password. ``known``: one in the file is of this broker, so it stays."""
+        """Return the step that writes a new password. ``known``: the one in the file is of this broker, so it stays."""
         write = partial(self.system.write, file)
         return Step(what, lambda: known and file.exists(), lambda: write(f"{new_password()}\n".encode()))
 
@@ -175,18 +175,18 @@ class Job:
         )._replace(restarts=(BROKER_SERVICE,))
 
     def _other_broker(self) -> Iterator[Step]:
-        own = self.places.broker
-        if own.exists():
-            yield Step("the robot's own broker ends", lambda: False, own.unlink, (BROKER_SERVICE,))
+        broker_conf = self.places.broker
+        if broker_conf.exists():
+            yield Step("the robot's own broker ends", lambda: False, broker_conf.unlink, (BROKER_SERVICE,))
         if self.answers.broker_ca in (None, self.earlier.broker_ca):
             return
-        given = Path(str(self.answers.broker_ca))
+        ca_file = Path(str(self.answers.broker_ca))
         try:
-            content = certificates.only_certificates(read_plain(given))
+            content = certificates.only_certificates(read_plain(ca_file))
         except OSError as error:
-            raise SetupError(f"broker_ca: {given}: {error.strerror}") from None
+            raise SetupError(f"broker_ca: {ca_file}: {error.strerror}") from None
         if not content:
-            raise SetupError(f"broker_ca: {given} holds no certificate")
+            raise SetupError(f"broker_ca: {ca_file} holds no certificate")
         yield self._file("authority of the broker", self.places.etc / BROKER_CA, content)
 
     def _certificate(self) -> Iterator[Step]:
@@ -233,13 +233,13 @@ class Job:
     # -- doing them
 
     def left(self) -> list[Step]:
-        """Return the steps that still have to be done. Raises PebbleError."""
+        """Return the steps that are still to be done. Raises PebbleError."""
         return [step for step in self.steps() if not step.is_done()]
 
     def do(self, steps: list[Step]) -> bool:
-        """Do the steps, then restart the services that read the written files.
+        """Do the steps, then restart the services that read the written files; return True if the robot was started.
 
-        Returns True if the robot was started. Raises SetupError at the first failure.
+        Raises SetupError at the first failure.
         """
         unfinished = self.places.unfinished
         services = {service for step in steps for service in step.restarts}

@@ -23,7 +23,7 @@ _PACKAGES = {"pebble": "./pebble-robot_….deb", "mosquitto": "mosquitto"}
 
 
 class SetupError(PebbleError):
-    """A machine that cannot be set up as asked. Example: ``only root can do this: sudo pebble setup``."""
+    """An error: a machine cannot be set up as asked. Example: ``only root can do this: sudo pebble setup``."""
 
 
 def run_command(command: Sequence[str]) -> None:

@@ -1,1 +1,1 @@
-"""Signed releases, by which a newer version can be installed safely."""
+"""Signed releases, which make it safe to install a newer version."""

@@ -31,7 +31,7 @@ _WHEEL = re.compile(r"pebble_robot-[0-9A-Za-z.+]+-py3-none-any\.whl")
 
 
 class ReleaseError(PebbleError):
-    """A release that is refused; the message says why."""
+    """An error: a release is refused. The message says why."""
 
 
 class Release(msgspec.Struct, frozen=True):
@@ -102,8 +102,8 @@ def _check_files(folder: Path, release: Release) -> None:
     for name, digest in release.files.items():
         if hashlib.sha256(_read(folder / name)).hexdigest() != digest:
             raise ReleaseError(f"{name} is not what {MANIFEST} names: fetch it again")
-    if more := {path.name for path in folder.iterdir()} - {MANIFEST, SIGNATURE, *release.files}:
-        raise ReleaseError(f"{folder} has more than {MANIFEST} names: {', '.join(sorted(more))}")
+    if unlisted := {path.name for path in folder.iterdir()} - {MANIFEST, SIGNATURE, *release.files}:
+        raise ReleaseError(f"{folder} has more than {MANIFEST} names: {', '.join(sorted(unlisted))}")
 
 
 def _read(path: Path) -> bytes:
@@ -119,7 +119,7 @@ def _read(path: Path) -> bytes:
 
 
 def _bytes(text: str) -> bytes:
-    """Decode base64, in its one canonical form."""
+    """Return decoded base64, which must be in its one canonical form."""
     data = base64.b64decode(text, validate=True)
     if base64.b64encode(data).decode() != text:
         raise binascii.Error("another form of the same bytes")
@@ -150,11 +150,11 @@ def main(arguments: Sequence[str], *, test_key: bool = False) -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--trusted", type=Path, required=True, help="folder of the release whose keys count")
     parser.add_argument("--above", type=Path, required=True, help="file with the highest sequence so far")
-    asked = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     try:
-        keys = msgspec.json.decode(_read(asked.trusted / MANIFEST), type=Release).keys
-        above = int(_read(asked.above)) if asked.above.exists() else 0
-        release = verify(asked.folder, keys, above=above, test_key=test_key)
+        keys = msgspec.json.decode(_read(options.trusted / MANIFEST), type=Release).keys
+        above = int(_read(options.above)) if options.above.exists() else 0
+        release = verify(options.folder, keys, above=above, test_key=test_key)
     except (PebbleError, ValueError) as error:
         sys.stderr.write(f"pebble: refused: {error}\n")
         return 1

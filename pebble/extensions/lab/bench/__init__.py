@@ -1,1 +1,1 @@
-"""Comparative runs: this way against that way, in one run on one machine."""
+"""Comparisons of variants, all measured in one run on one machine."""

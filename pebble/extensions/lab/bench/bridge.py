@@ -38,7 +38,7 @@ STARTUP_S = 1.0  # for start-up work to finish
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The course of the comparison: ``seconds`` in each round and under each load, in turns of a second."""
+    """The course of the comparison: ``seconds`` per round and load, in turns of a second."""
 
     seconds: float = 12.5
     rounds: int = 20
@@ -70,7 +70,7 @@ def run(settings: Settings, console: Console) -> Shown:
 
 @contextmanager
 def running(variants: Sequence[str], *, reports: bool) -> Iterator[dict[str, DrivenRobot]]:
-    """Start fresh robots, which are ready; with ``reports`` they forward those of their MCUs."""
+    """Start fresh robots and yield them once they are ready; with ``reports`` they forward their MCUs' reports."""
     with ExitStack() as stack:
         driven = {kind: stack.enter_context(driven_robot(kind, reports=reports)) for kind in variants}
         for robot in driven.values():
@@ -80,7 +80,7 @@ def running(variants: Sequence[str], *, reports: bool) -> Iterator[dict[str, Dri
 
 
 def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cell]:
-    """Measure fresh robots that forward reports, and fresh ones that do not, each in turns of a second."""
+    """Yield the results of fresh robots with and without reports of their MCUs, each measured in turns of a second."""
     passes = max(1, round(settings.seconds))
     for load in in_turn((UNLOADED, COMMANDS), number):
         reports, turns = load == UNLOADED, list[tuple[str, Turn]]()
@@ -121,12 +121,12 @@ def latency_table(results: Results, cells: Sequence[Cell]) -> Table:
          *(f"p{percent} to {base}" for base in (STAND_IN, FLOOR) for percent in (50, 99))],
         left=3, caption=f"{STAND_IN}: plain paho in place of the original. {RATIOS}",
     )  # fmt: skip
-    for (way, load), some in grouped(cells, lambda cell: (cell.measure, str(cell.params["load"]))).items():
+    for (way, load), group in grouped(cells, lambda cell: (cell.measure, str(cell.params["load"]))).items():
         grid.add_section()
-        for ours in some:
+        for ours in group:
             bases = [results.find(name, way, load=load) for name in (STAND_IN, FLOOR)]
             cpu = f"{ours.middle('cpu_percent'):.1f}" if way == DOWN else ""
-            place = (way, load) if ours is some[0] else ("", "")
+            place = (way, load) if ours is group[0] else ("", "")
             counts = (str(len(ours.samples)), str(ours.lost))
             grid.add_row(
                 *place,
@@ -143,9 +143,9 @@ def cpu_table(results: Results, cells: Sequence[Cell]) -> Table:
     """Return the CPU time for each forwarded message."""
     grid = plain_table("CPU for each forwarded message, µs: median (minimum to maximum) of the rounds",
                         ["load", "process", "variant", "", f"to {STAND_IN}"], left=3, caption=RATIOS)  # fmt: skip
-    for (load, process), some in grouped(cells, lambda cell: tuple(cell.params.values())).items():
-        for ours in some:
+    for (load, process), group in grouped(cells, lambda cell: tuple(cell.params.values())).items():
+        for ours in group:
             base = results.find(STAND_IN, CPU, load=load, process=process)
-            place = (str(load), str(process)) if ours is some[0] else ("", "")
+            place = (str(load), str(process)) if ours is group[0] else ("", "")
             grid.add_row(*place, ours.variant, spread(ours), compared(ours, base))
     return grid

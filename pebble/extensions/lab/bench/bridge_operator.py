@@ -1,4 +1,4 @@
-"""An operator who drives at a steady rate over MQTT, and which commands and reports of the MCU arrived."""
+"""An operator that drives at a steady rate over MQTT, and a record of the commands and MCU reports that arrived."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Turn(NamedTuple):
 
 
 class Arrived(NamedTuple):
-    """The arrivals of several turns."""
+    """The messages of several turns that arrived."""
 
     commands: Mapping[Wheels, int]  # when each reached the MCU
     reports: Sequence[tuple[int, int | None]]  # of the MCU: when each was sent, and received; None: it was not
@@ -52,17 +52,17 @@ class Arrived(NamedTuple):
 
 
 def wheels(number: int) -> Wheels:
-    """Return the wheel speeds of command ``number`` (0 … 639,999): each pair is unique."""
+    """Return the wheel speeds of command ``number`` (0 … 639,999), a different pair for each number."""
     return round(0.1 + (number % _STEPS) / 1000, 3), round(0.1 + (number // _STEPS % _STEPS) / 1000, 3)
 
 
 def arrivals(entries: Sequence[Entry]) -> dict[Wheels, int]:
-    """Return when each command first reached the MCU."""
+    """Return the time at which each command first reached the MCU."""
     return {line.drive: line.ns for line in reversed(entries) if line.drive is not None}
 
 
 def matched(entries: Sequence[Entry], received: Sequence[tuple[int, Touch]]) -> list[tuple[int, int | None]]:
-    """Pair the time each report was sent with the time it was received; None if it was not.
+    """Return, for each report, the time when it was sent and the time when it was received (None: it was not).
 
     A report is identified by its values: while the wheels turn, the sensors never report the same values for long.
     Values that were sent more than once do not count.
@@ -76,10 +76,10 @@ def matched(entries: Sequence[Entry], received: Sequence[tuple[int, Touch]]) -> 
 
 
 class DrivenRobot(StockClient):
-    """A robot, and its operator on one MQTT connection to the remote broker, with the TCP options of our own clients.
+    """A robot and its operator, on one MQTT connection to the remote broker with the TCP options of our own clients.
 
-    TCP_NODELAY: see :class:`StockClient`. TCP_QUICKACK: otherwise a stock broker delays a report by up to 40 ms while
-    its answer to a command is not acknowledged. Without them the comparison would measure that.
+    TCP_NODELAY: see :class:`StockClient`. TCP_QUICKACK: otherwise a stock broker delays a report by up to 40 ms, until
+    its answer to a command is acknowledged. Without them the comparison would measure these delays.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -96,8 +96,10 @@ class DrivenRobot(StockClient):
     def wait_until_ready(self) -> None:
         """Wait until the robot is ready. Raises PebbleError if it does not become so."""
         robot = self.robot
-        with closing(RobotSubscriber(robot.remote_port, BASE)) as seen:
-            robot.expect(lambda: None not in (seen.ready_ns, seen.first_heartbeat_ns), "it is not ready", _UP_S)
+        with closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
+            robot.expect(
+                lambda: None not in (subscriber.ready_ns, subscriber.first_heartbeat_ns), "it is not ready", _UP_S
+            )
         running = robot.processes()
         self._parts = {part: [running[name]] for part, name in SERVICES.items() if name in running}
         if len(self._parts) < len(SERVICES):
@@ -120,7 +122,7 @@ class DrivenRobot(StockClient):
         return Turn(began, ended, sent, used)
 
     def arrived(self, turns: Sequence[Turn]) -> Arrived:
-        """Wait until the last commands and reports have arrived or count as lost."""
+        """Wait until the last commands and reports have arrived or count as lost; return those that arrived."""
         time.sleep(max(0.0, turns[-1].ended / 1e9 + _ARRIVE_S - time.monotonic()))
         since = turns[0].began
         entries = self.robot.lines(since)
@@ -143,28 +145,28 @@ class StandIn(Robot):
     """A robot as a user would build it without us."""
 
     def launch(self) -> None:
-        rest = (*self.broker_ports[::-1], self.base, self.port, *(["--reports"] if self.reports else []))
+        arguments = (*self.broker_ports[::-1], self.base, self.port, *(["--reports"] if self.reports else []))
         for part in ("bridge", "serial"):
-            self.start(f"the {self.name}'s {part}", [*self.command(), part, *map(str, rest)])
+            self.start(f"the {self.name}'s {part}", [*self.command(), part, *map(str, arguments)])
 
     def command(self) -> list[str]:
         return python("pebble.extensions.lab.bench.stand_in")
 
     def processes(self) -> dict[str, int]:
-        """Return the two programs, by the names of the services that they stand for, and the robot's broker."""
+        """Return the two programs, under the names of the services that they replace, and the robot's broker."""
         running = [*self._started, *([self.local_broker] if self.local_broker else [])]
         return {name: program.pid for name, program in zip((*SERVICES.values(), "mosquitto"), running, strict=False)}
 
 
 class CFloor(StandIn):
-    """The same two programs in C, which is the floor for robots of two programs and a broker."""
+    """The two programs in C: the lower limit for robots of two programs and a broker."""
 
     def command(self) -> list[str]:
         return [str(compiled(self.folder / "floor"))]
 
 
 def compiled(program: Path) -> Path:
-    """Return the programs of floor.c, compiled. Raises PebbleError if gcc or libmosquitto is missing."""
+    """Compile floor.c, and return the path of the programs. Raises PebbleError if gcc or libmosquitto is missing."""
     source = Path(__file__).with_name("floor.c")
     try:
         subprocess.run(["gcc", "-O2", source, "-lmosquitto", "-o", program], check=True, capture_output=True)
@@ -175,7 +177,7 @@ def compiled(program: Path) -> Path:
 
 @contextmanager
 def driven_robot(kind: str, *, reports: bool = True) -> Iterator[DrivenRobot]:
-    """Launch a robot and connect its operator; with ``reports`` it forwards those of its MCU. Raises PebbleError."""
+    """Yield a new robot with its operator; with ``reports`` it forwards its MCU's reports. Raises PebbleError."""
     with one_robot(kind, {STAND_IN: StandIn, FLOOR: CFloor}.get(kind, Robot), reports=reports) as robot:
         robot.launch()
         with closing(DrivenRobot(robot)) as driven:

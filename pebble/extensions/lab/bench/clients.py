@@ -1,4 +1,4 @@
-"""Operators from stock paho clients: some drive robots, one watches a robot start and stream."""
+"""Operators made of stock paho clients: they drive robots, or watch a robot start and stream."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def drive_of(left: float, right: float) -> Drive:
 
 
 class StockClient:
-    """One paho client on loopback with its own network thread, on which ``receive`` runs.
+    """A paho client on loopback with its own network thread, on which ``receive`` runs.
 
     ``subscriptions`` are topics with a QoS or with options. ``at_once`` sets TCP_NODELAY, as Pebble's own clients do.
-    Without it, a client that receives as much as it sends delays a command in a hundred by 40 ms, until the broker's
+    Without it, a client that receives as much as it sends delays one command in a hundred by 40 ms, until the broker's
     delayed ACK.
     """
 
@@ -59,18 +59,18 @@ class StockClient:
             self.paho.on_socket_open = _send_at_once
 
     def open(self, port: int) -> Self:
-        """Connect and start the network thread; return before anything was subscribed."""
+        """Connect and start the network thread; return before any subscription is acknowledged."""
         self.paho.connect("127.0.0.1", port)
         self.paho.loop_start()
         return self
 
     def wait(self) -> None:
-        """Wait for the broker to acknowledge the subscriptions, or the connection without any. Raises PebbleError."""
+        """Wait until subscriptions, or else the connection, are acknowledged. Raises PebbleError."""
         if not self._ready.wait(_ANSWER_S):
             raise PebbleError(f"the broker acknowledged nothing within {_ANSWER_S:.0f} s")
 
     def subscribe(self, filter_: str, qos: int) -> None:
-        """Add a subscription, acknowledged by the broker when this returns. Raises PebbleError."""
+        """Add a subscription; return when the broker has acknowledged it. Raises PebbleError."""
         self._ready.clear()
         self.paho.subscribe(filter_, qos)
         self.wait()
@@ -87,11 +87,11 @@ class StockClient:
         self.paho.publish(message.topic, message.payload, message.qos, message.retain)
 
     def driver(self, base: str, wait: Callable[[float], object] = time.sleep) -> ScriptedOperator:
-        """Return an operator that knows nothing of its robot, as the original page: without control."""
+        """Return an operator that, like the original page, knows nothing of its robot and drives without control."""
         return ScriptedOperator(RobotView(base), self.publish, by="bench", wait=wait)
 
     def request_media(self, base: str, *encodings: str) -> None:
-        """Allow and request a robot's pictures and sound."""
+        """Permit and request a robot's pictures and sound."""
         for (flag, request), encoding in zip(_MEDIA_CHANNELS, encodings, strict=True):
             self.send(flag, base, True)
             self.send(request, base, {"enabled": True, "encoding": encoding})
@@ -109,7 +109,7 @@ def _send_at_once(_client: Client, _data: Any, sock: Any) -> None:
 
 @contextmanager
 def driving(port: int, *bases: str) -> Iterator[None]:
-    """Drive these robots during the ``with`` block, whether or not they receive it."""
+    """Drive these robots during the ``with`` block, whether or not they receive the commands."""
     ended = threading.Event()
     with closing(StockClient().open(port)) as client:
         drivers = [client.driver(base, ended.wait) for base in bases]
@@ -126,7 +126,7 @@ def driving(port: int, *bases: str) -> Iterator[None]:
 
 
 class RobotSubscriber(StockClient):
-    """A record of when and how much one robot publishes: CLOCK_MONOTONIC, in ns; None: not yet."""
+    """A record of when and how much one robot publishes. Times are CLOCK_MONOTONIC, in ns; None: not yet."""
 
     def __init__(self, port: int, base: str) -> None:
         self._base = base
@@ -152,7 +152,7 @@ class RobotSubscriber(StockClient):
 
 @contextmanager
 def ready_robot(kind: str) -> Iterator[tuple[Robot, RobotSubscriber]]:
-    """Start a robot with a camera and a microphone, whose services are ready. Raises PebbleError with its log."""
+    """Yield a robot with camera and microphone whose services are ready. Raises PebbleError with its log."""
     with one_robot(kind, services=MEDIA) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
         subscriber.wait()
         robot.launch()
@@ -170,6 +170,6 @@ def encoding_of(raw: bytes) -> str:
 
 
 def all_ready(status: Mapping[str, Any]) -> bool:
-    """True if all services are ready; those on demand are ``stopped`` until requested, as all are before."""
+    """True if all services are ready; on-demand services are ``stopped`` until requested, which counts as ready."""
     states = {service["state"] for service in status.get("services", {}).values()}
     return "ready" in states and states <= {"ready", "stopped"}

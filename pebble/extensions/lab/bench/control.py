@@ -36,7 +36,7 @@ _ANSWER_S = 30.0  # in addition to the slice itself
 
 
 class Variant(NamedTuple):
-    """A way from one service to another."""
+    """A transport between two services."""
 
     kind: str  # a transport, or the stand-in
     settings: Mapping[str, Any] = {}
@@ -55,7 +55,7 @@ VARIANTS: Final = {
 
 
 class Case(NamedTuple):
-    """Messages of a size at a rate, beside a load."""
+    """A message size and rate, with a load beside it."""
 
     size: int  # bytes
     rate: int  # Hz
@@ -89,7 +89,7 @@ def run(settings: Settings, console: Console) -> Shown:
 
 
 def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cell]:
-    """Measure one round; in every other pass backwards."""
+    """Yield the results of one round; every other pass goes backwards."""
     with Participants(settings.variants) as participants:
         for pass_ in range(settings.passes):
             for case in in_turn(settings.cases, number + pass_):
@@ -127,7 +127,7 @@ def table(results: Results) -> Table:
 
 
 class Participants(Processes):
-    """The processes of each variant, which are ready when the ``with`` block begins: a broker or hub, and two ends."""
+    """The processes of each variant: a broker or hub, and two ends. They are ready when the ``with`` block begins."""
 
     def __init__(self, variants: Sequence[str]) -> None:
         super().__init__()
@@ -141,9 +141,9 @@ class Participants(Processes):
             folder.mkdir()
             if kind == "zenoh":
                 where: Any = ZenohSettings(run_dir=folder / "z", **settings)  # short: paths of Unix sockets
-                own = _json(ZenohSettings(run_dir=where.run_dir))
+                hub_settings = _json(ZenohSettings(run_dir=where.run_dir))
                 hub = self.add(
-                    Program("hub", python("pebble.extensions.lab.rig.hub", own), folder / "hub.log"), BROKERS
+                    Program("hub", python("pebble.extensions.lab.rig.hub", hub_settings), folder / "hub.log"), BROKERS
                 )
                 hub.wait_until((where.run_dir / "hub.sock").exists, _READY_S)
                 stream: tuple[str, object] = ("zenoh-shm", where.run_dir)
@@ -161,7 +161,7 @@ class Participants(Processes):
             worker.answer(_READY_S)
 
     def run(self, variant: str, case: Case, seconds: float) -> tuple[Slice, float]:
-        """Run one slice; return its results, and the pictures per second meanwhile.
+        """Run one slice; return its results, and the pictures per second during it.
 
         Raises PebbleError if a process ended, or no pictures flow.
         """

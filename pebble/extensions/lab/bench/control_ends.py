@@ -1,9 +1,9 @@
 """The two ends of the control comparison, which use a transport as services do.
 
-Both handle a message on the transport's thread that brings it, as an idle service does with a drive command, and as
-stock paho does.
+Both handle a message on the transport's thread that receives it, like an idle service with a drive command, and like
+stock paho.
 
-``python -m pebble.extensions.lab.bench.control_ends echo|sender stand-in|mqtt|zenoh SETTINGS`` (JSON, of the
+``python -m pebble.extensions.lab.bench.control_ends echo|sender stand-in|mqtt|zenoh SETTINGS`` (JSON, for the
 transport). A sender receives slices as JSON and answers each.
 """
 
@@ -71,7 +71,7 @@ class Slice(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Connection(NamedTuple):
-    """The three calls that each side of the benchmark makes on a connection."""
+    """The three functions of a connection that the benchmark uses."""
 
     subscribe: Callable[[str, Handler], object]  # to a topic
     publish: Callable[[str, bytes], object]
@@ -79,7 +79,7 @@ class Connection(NamedTuple):
 
 
 def opened(transport: Transport) -> Connection:
-    """Open any of Pebble's transports, used through the same calls as in pebble.service.Service. Raises PebbleError."""
+    """Open any of Pebble's transports; return the functions that pebble.service.Service uses. Raises PebbleError."""
     transport.open(_CONNECT_S)
     if transport.state is not State.CONNECTED:
         problem = transport.problem
@@ -107,7 +107,7 @@ def stock(port: int) -> Connection:
 
 
 def echo(connection: Connection) -> None:
-    """Return every message from now on at once, with its time."""
+    """Return every message to its sender at once, with the time of its arrival."""
 
     def on_message(payload: bytes) -> None:
         reply = bytearray(payload)
@@ -118,7 +118,7 @@ def echo(connection: Connection) -> None:
 
 
 class Sender:
-    """A sender of slices that collects the replies; the transport's thread fills entries that the slice has made."""
+    """A sender of slices. It makes an entry for each message, which the transport's thread fills from the reply."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection

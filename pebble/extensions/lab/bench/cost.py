@@ -39,7 +39,7 @@ _FIRST = 5  # pictures and sound packets until a stream counts as flowing
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Robots of each variant, one in each round, and seconds of each phase."""
+    """The number of robots of each variant, one per round, and the seconds of each phase."""
 
     seconds: float = 1.5
     rounds: int = 8
@@ -65,7 +65,7 @@ def run(settings: Settings, console: Console) -> Shown:
 
 
 def measure(variant: str, seconds: float) -> Iterator[Cell]:
-    """Measure all phases of a fresh robot. Raises PebbleError with its log if a phase does not start."""
+    """Yield the results of all phases of a fresh robot. Raises PebbleError with its log if a phase does not start."""
     with ready_robot(variant) as (robot, subscriber):
         yield from _phase(robot, IDLE, seconds)
         with driving(robot.remote_port, BASE):
@@ -83,7 +83,7 @@ def _flow(robot: Robot, subscriber: RobotSubscriber, forms: Sequence[str]) -> bo
 
 
 def _phase(robot: Robot, phase: str, seconds: float) -> Iterator[Cell]:
-    """Measure the robot's processes for some seconds; memory is read afterwards."""
+    """Yield the usage of the robot's processes during some seconds; memory is read afterwards."""
     time.sleep(_STARTUP_S)
     processes, began = robot.processes(), time.monotonic()
     before = {name: cpu_s([pid]) for name, pid in processes.items()}
@@ -98,14 +98,14 @@ def _phase(robot: Robot, phase: str, seconds: float) -> Iterator[Cell]:
 
 
 def cells_of(variant: str, phase: str, used: Mapping[str, Mapping[str, float]]) -> Iterator[Cell]:
-    """Yield what was ``used``, by measure and process, and by the whole robot."""
+    """Yield the ``used`` resources by measure and process, and for the whole robot."""
     for name, values in used.items():
         for process, value in (*values.items(), (ALL, sum(values.values()))):
             yield round_cell(variant, name, _UNITS[name], [value], {"phase": phase, "process": process})
 
 
 def table(results: Results) -> Table:
-    """Return what each process needs, by phase, and the ratios; the whole robot last, in bold."""
+    """Return the usage of each process by phase, and the ratios; the whole robot last, in bold."""
     heads = [f"{variant} {unit}" for variant in KINDS for unit in ("MB", "%", "thr.")]
     ratios = [f"{measure_}, zenoh / mqtt" for measure_ in (MEMORY, CPU)]
     grid = plain_table("Memory (PSS), CPU (of one core), threads; medians", ["phase", "process", *heads, *ratios],

@@ -1,4 +1,4 @@
-"""The floor of a robot's start and memory: one process with a local transport and an MQTT connection to operators.
+"""The lower limit of a robot's start and memory: one process with a local transport and a connection to operators.
 
 It runs as a plain file, and imports nothing of Pebble: ``floor.py LOCAL REMOTE_PORT ONLINE STATUS``. LOCAL is the port
 of a local broker, or the path of a Unix socket on which Zenoh listens; ONLINE and STATUS are topics.
@@ -19,7 +19,7 @@ _HEARTBEAT_S = 0.25
 
 
 def connected(port: int) -> Client:
-    """Return a client that a broker has accepted."""
+    """Return a client once a broker has accepted it."""
     client, accepted = Client(CallbackAPIVersion.VERSION2), threading.Event()
     client.on_connect = lambda *_: accepted.set()
     client.connect("127.0.0.1", port)

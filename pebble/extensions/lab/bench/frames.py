@@ -48,7 +48,7 @@ _ANSWER_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The cases, and how long each is measured: ``seconds`` of each case in each round."""
+    """The cases, and the ``seconds`` for which each is measured per round."""
 
     variants: Sequence[str] = VARIANTS
     size: Sequence[str] = ("640x480", "1920x1080")
@@ -62,7 +62,7 @@ QUICK: Final = Settings(size=("640x480",), readers=(1,), rounds=2)
 
 
 def run(settings: Settings, console: Console) -> Shown:
-    """Measure all variants that this machine has. Raises PebbleError."""
+    """Measure all variants that can run on this machine. Raises PebbleError."""
     reasons = {variant: why for variant in settings.variants if (why := missing(variant)) is not None}
     variants = [variant for variant in settings.variants if variant not in reasons]
     if not variants:
@@ -84,7 +84,7 @@ def run(settings: Settings, console: Console) -> Shown:
 
 
 def missing(variant: str) -> str | None:
-    """Return why this variant cannot run on this machine, with what installs it; None if it can."""
+    """Return why this variant cannot run on this machine, and what to install; None if it can."""
     if variant == "mqtt" and mosquitto_path() is None:
         return "mosquitto is not installed: apt-get install -y --no-install-recommends mosquitto"
     if variant == "gstreamer-shm":
@@ -96,9 +96,9 @@ def missing(variant: str) -> str | None:
 
 
 def measure(variant: str, condition: Params, seconds: float) -> Cell:
-    """Run one writer and its readers, each as a process. Raises PebbleError if one of them fails.
+    """Return the results of one writer and its readers, each a process. Raises PebbleError if one of them fails.
 
-    CPU is in % of one core, memory (PSS) in MB; those of the readers are their mean.
+    CPU is in % of one core, memory (PSS) in MB; for the readers they are means.
     """
     is_gstreamer = variant == "gstreamer-shm"
     program = [SYSTEM_PYTHON, _PLAIN_WORKER] if is_gstreamer else python("pebble.extensions.lab.bench.frames_worker")
@@ -156,6 +156,6 @@ def table(results: Results) -> Table:
 
 
 def _beside(cell: Cell, *names: str) -> str:
-    """Return figures side by side."""
-    known = [cell.middle(name) for name in names if name in cell.figures]
-    return " / ".join(f"{value:.0f}" if value >= 20 else f"{value:.1f}" for value in known)
+    """Return a cell's figures in one line."""
+    values = [cell.middle(name) for name in names if name in cell.figures]
+    return " / ".join(f"{value:.0f}" if value >= 20 else f"{value:.1f}" for value in values)

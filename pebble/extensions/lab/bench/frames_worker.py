@@ -41,7 +41,7 @@ Fill = Callable[[np.ndarray], None]  # writes the pixels of a frame (uint8, 1-D)
 
 
 def write(writer: Writer, size: int) -> None:
-    """Write a frame of ``size`` bytes 30 times a second until standard input closes; answer with their times."""
+    """Write a frame of ``size`` bytes 30 times a second until standard input closes; report the frames' times."""
     picture = np.random.default_rng(1).integers(0, 256, size, dtype=np.uint8)
     stamps: list[int] = []  # of the frames, also of those that could not be sent
 
@@ -65,7 +65,7 @@ def write(writer: Writer, size: int) -> None:
 
 
 def read(reader: Reader) -> None:
-    """Read until standard input closes; answer with the time of every frame and of its arrival."""
+    """Read frames until standard input closes; report the time of each frame and of its arrival."""
     arrived: list[tuple[int, int]] = []
     torn = 0
     ended = worker_end.serve_on_thread(lambda _line: {"arrived": arrived, "torn": torn})
@@ -88,7 +88,7 @@ def read(reader: Reader) -> None:
 
 
 class ZenohWriter:
-    """Frames are created in the shared segment, as services do."""
+    """A writer that creates frames in the shared segment, as services do."""
 
     def __init__(self, folder: Path, size: int) -> None:
         self._info, self._frame = FrameInfo(format="bgr24"), np.zeros(size, np.uint8)
@@ -109,7 +109,7 @@ class ZenohWriter:
 
 
 class ZenohReader:
-    """Frames are views into the segment."""
+    """A reader whose frames are views of the segment."""
 
     def __init__(self, folder: Path) -> None:
         self._reader = FrameReader(folder, _STREAM, views=True).open()
@@ -122,7 +122,7 @@ class ZenohReader:
 
 
 def _refuse(problem: str) -> None:
-    """Raise TransportError: results of frames that took another way would be labelled wrongly."""
+    """Raise TransportError: a frame that took another way would be counted for the wrong variant."""
     if problem:
         raise TransportError(problem)
 
@@ -131,7 +131,7 @@ def _refuse(problem: str) -> None:
 
 
 class MqttWriter:
-    """The next frame is not begun before the last one is sent."""
+    """A writer that begins a frame only after the last one was sent."""
 
     def __init__(self, port: int, size: int) -> None:
         self._client, self._frame, self._leaving = _mqtt(port), bytearray(size), None
@@ -147,7 +147,7 @@ class MqttWriter:
 
 
 class MqttReader:
-    """Runs paho's network loop in the reading thread, which avoids a handover between threads."""
+    """A reader that runs paho's network loop in its own thread, which saves a switch of threads."""
 
     def __init__(self, port: int) -> None:
         self._arrived: deque[bytes] = deque(maxlen=1)
@@ -159,10 +159,10 @@ class MqttReader:
     def read(self, timeout: float) -> np.ndarray | None:
         end = time.monotonic() + timeout
         while not self._arrived:
-            left = end - time.monotonic()
-            if left <= 0:
+            remaining_s = end - time.monotonic()
+            if remaining_s <= 0:
                 return None
-            self._client.loop(left)
+            self._client.loop(remaining_s)
         return np.frombuffer(self._arrived.popleft(), np.uint8)
 
 
@@ -181,7 +181,7 @@ def _mqtt(port: int) -> Any:
 
 
 class GstWriter:
-    """appsrc into shmsink. As in the original Pebble, pictures are created in the shared segment: no copy is made."""
+    """A writer: appsrc into shmsink. As in the original, pictures are created in the shared segment without a copy."""
 
     def __init__(self, socket: str, caps: str, size: int) -> None:
         self._size = size
@@ -213,7 +213,7 @@ class GstWriter:
 
 
 class GstReader:
-    """shmsrc into appsink, which holds only the newest buffer; the reader maps it and copies it once."""
+    """A reader: shmsrc into appsink, which holds only the newest buffer; the reader maps it and copies it once."""
 
     def __init__(self, socket: str, caps: str) -> None:
         self._pipeline = Gst.parse_launch(

@@ -1,4 +1,4 @@
-"""Draws the pictures of comparisons: distributions, and lines. matplotlib is imported only to draw."""
+"""Draws the charts of comparisons: distributions, and lines. matplotlib is imported only to draw."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _SETTINGS: dict[Any, Any] = {
 
 
 def curves(name: str, caption: str, cells: Sequence[Cell]) -> list[Picture]:
-    """Return the distributions, a panel for each condition: the share of all messages that arrived within a time."""
-    known = [cell for cell in cells if len(cell.samples) >= _LEAST]
+    """Return charts of distributions, a panel for each condition: the share of messages that arrived within a time."""
+    shown_cells = [cell for cell in cells if len(cell.samples) >= _LEAST]
     caption = f"{caption}. Share of all messages, lost ones included, within the time"
-    return [Picture(name, caption, partial(_curves, known, caption))] if known else []
+    return [Picture(name, caption, partial(_curves, shown_cells, caption))] if shown_cells else []
 
 
 def _curves(cells: Sequence[Cell], title: str) -> Figure:
@@ -41,8 +41,8 @@ def _curves(cells: Sequence[Cell], title: str) -> Figure:
     by_place, style_of = grouped(cells, Cell.conditions), styles([cell.variant for cell in cells])
     figure, every = panels(len(by_place), 3, (3.9, 2.7), title)
     ends = around([percentile(cell.samples, percent) for cell in cells for percent in (0.1, 99.8)])
-    for axes, (place, some) in zip(every, by_place.items(), strict=True):
-        for cell in some:
+    for axes, (place, group) in zip(every, by_place.items(), strict=True):
+        for cell in group:
             times, style = sorted(cell.samples), style_of[cell.variant]
             step = 100 / (len(times) + (cell.lost or 0))
             shares = [step * count for count in range(1, len(times) + 1)]
@@ -56,23 +56,23 @@ def _curves(cells: Sequence[Cell], title: str) -> Figure:
 
 
 def lines(name: str, caption: str, cells: Sequence[Cell], *, over: str) -> list[Picture]:
-    """Return lines through the medians as the parameter ``over`` grows; one panel for each measure."""
-    known = [cell for cell in cells if cell.samples]
-    return [Picture(name, caption, partial(_lines, known, caption, over))] if known else []
+    """Return charts of the medians as lines over the parameter ``over``; one panel for each measure."""
+    shown_cells = [cell for cell in cells if cell.samples]
+    return [Picture(name, caption, partial(_lines, shown_cells, caption, over))] if shown_cells else []
 
 
 def _lines(cells: Sequence[Cell], title: str, over: str) -> Figure:
     by_measure, style_of = grouped(cells, lambda cell: cell.measure), styles([cell.variant for cell in cells])
     figure, every = panels(len(by_measure), 3, (3.9, 3.0), title)
-    for axes, (measure, some) in zip(every, by_measure.items(), strict=True):
-        for variant, points in grouped(some, lambda cell: cell.variant).items():
+    for axes, (measure, group) in zip(every, by_measure.items(), strict=True):
+        for variant, points in grouped(group, lambda cell: cell.variant).items():
             along = sorted((float(str(cell.params[over])), cell.percentile(50)) for cell in points)
             axes.plot(*zip(*along, strict=True), **style_of[variant])
             axes.annotate(f"  {digits(along[-1][1])}", along[-1], fontsize=8, va="center", annotation_clip=False)
-        at = [float(str(cell.params[over])) for cell in some]
+        at = [float(str(cell.params[over])) for cell in group]
         log_axis(axes, "x", over, 0.8 * min(at), 2.5 * max(at))
-        top = 1.15 * max(cell.percentile(50) for cell in some) or 1.0
-        axes.set(ylim=(0, top), ylabel=f"{measure}, {_unit(some[0])}")
+        top = 1.15 * max(cell.percentile(50) for cell in group) or 1.0
+        axes.set(ylim=(0, top), ylabel=f"{measure}, {_unit(group[0])}")
     legend(figure, style_of)
     return figure
 
@@ -145,7 +145,7 @@ def log_axis(axes: Axes, which: str, label: str, low: float, high: float) -> Non
 
 
 def around(values: Sequence[float]) -> tuple[float, float]:
-    """Return the ends of a logarithmic axis with some margin around all positive values."""
+    """Return the ends of a logarithmic axis that holds all positive values with some margin."""
     positive = [value for value in values if 0 < value < math.inf] or [1.0]
     return 0.75 * min(positive), 1.4 * max(positive)
 

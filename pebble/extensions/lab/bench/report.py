@@ -1,4 +1,4 @@
-"""Runs the comparisons of a report, each as its own command line, and writes the report: README.md and its pictures."""
+"""Runs the comparisons of a report, each by its command, and writes the report: README.md and its charts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _END_S = 20.0  # for a comparison to end its processes
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A comparison of the report, and the seconds that it takes, in full and quickly."""
+    """A comparison of the report, with the seconds that it takes in full and in a quick run."""
 
     name: str
     title: str
@@ -91,9 +91,9 @@ HEADLINES: Final = (
 
 
 def run(names: Sequence[str], folder: Path, *, quick: bool, console: Console) -> int:
-    """Measure and write; return 0 if every comparison succeeded. A failed one does not stop the others.
+    """Measure and write a report; return 0 if every comparison succeeded. If one fails, the others still run.
 
-    Without names all that this user may run. Raises PebbleError if the folder cannot be written.
+    Without names it runs all that this user may run. Raises PebbleError if the folder cannot be written.
     """
     path, sections, failed = _checked(folder), _chosen(names), 0
     console.print(f"{len(sections)} comparisons: about {_span(sum(section.expected_s(quick) for section in sections))}")
@@ -114,7 +114,7 @@ def run(names: Sequence[str], folder: Path, *, quick: bool, console: Console) ->
 
 
 def _checked(folder: Path) -> Path:
-    """Return the page's path. Raises PebbleError, before an hour of measuring, if it cannot or must not be written."""
+    """Return the report's path. PebbleError, before an hour of measuring, if it cannot or must not be written."""
     if find_spec("matplotlib") is None:
         raise PebbleError("a report needs matplotlib, which is not installed: pip install 'pebble-robot[bench]'")
     check_folder(folder)
@@ -132,7 +132,7 @@ def _chosen(names: Sequence[str]) -> list[Section]:
 
 
 def run_one(section: Section, folder: Path, quick: bool) -> str:
-    """Run a comparison's command line; return why it failed. The process ends with this one."""
+    """Run a comparison's command; return why it failed, or "". The command ends with this process."""
     results, output = (folder / f"{section.name}.{ending}" for ending in ("json", "txt"))
     for path in (results, output, *folder.glob(f"{section.name}*.png")):  # of an earlier run: they would hide a failure
         path.unlink(missing_ok=True)
@@ -146,7 +146,9 @@ def run_one(section: Section, folder: Path, quick: bool) -> str:
         end_all([program], _END_S)
     if code is None:
         return "hung and was ended"
-    return f"ended with code {code}" if code else "" if results.exists() else "measured nothing"
+    if code:
+        return f"ended with code {code}"
+    return "" if results.exists() else "measured nothing"
 
 
 def _span(seconds: float) -> str:
@@ -183,7 +185,7 @@ def _about(section: Section, results: Results | None) -> Iterator[str]:
 
 
 def _headlines(measured: Mapping[str, Results]) -> Iterator[str]:
-    """Yield MQTT against Zenoh, with the stand-in of the original beside it."""
+    """Yield the rows that compare MQTT with Zenoh, and the stand-in of the original beside them."""
     rows = []
     for headline in HEADLINES:
         results = measured.get(headline.bench)

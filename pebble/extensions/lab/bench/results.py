@@ -1,4 +1,4 @@
-"""The results of one run of a comparison: every sample, and the options, machine and versions that it depends on."""
+"""The results of one run of a comparison: every sample, with the options, the machine and the versions."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ K = TypeVar("K", bound=Hashable)
 
 
 class Cell(msgspec.Struct, kw_only=True):
-    """A table of the samples of one variant under one set of conditions.
+    """The samples of one variant under one set of conditions.
 
     Cells with equal ``params`` and ``measure`` ran in turn: their rounds with the same number form pairs.
     """
@@ -55,14 +55,14 @@ class Cell(msgspec.Struct, kw_only=True):
 
     @property
     def lost(self) -> int | None:
-        """The number of messages that were sent and never arrived; None if they are not counted."""
+        """Number of messages that were sent and never arrived; None if they are not counted."""
         return self.total("sent") - len(self.samples) if "sent" in self.figures else None
 
     def total(self, name: str) -> int:
         return round(sum(self.figures.get(name, ())))
 
     def middle(self, name: str) -> float:
-        """Return the median of a figure over the rounds; NaN without it."""
+        """Return the median of a figure over the rounds; NaN if there is none."""
         return median(self.figures.get(name) or [math.nan])
 
     def percentile(self, percent: float) -> float:
@@ -73,7 +73,7 @@ class Cell(msgspec.Struct, kw_only=True):
         return [percentile(samples, 50) for samples in self.rounds if samples]
 
     def with_lost(self) -> list[list[float]]:
-        """Return the rounds with lost messages as infinitely late ones."""
+        """Return the rounds with lost messages included as infinitely late."""
         if self.lost is None:
             return self.rounds
         return [
@@ -89,7 +89,7 @@ class Cell(msgspec.Struct, kw_only=True):
 def round_cell(
     variant: str, measure: str, unit: str, samples: Iterable[float], params: Params | None = None, **figures: float
 ) -> Cell:
-    """Return a result with the samples of one round."""
+    """Return a cell with the samples of one round."""
     return Cell(
         variant=variant, measure=measure, unit=unit, rounds=[list(samples)], params=dict(params or {}),
         figures={name: [value] for name, value in figures.items()},
@@ -112,13 +112,15 @@ class Results(msgspec.Struct, kw_only=True):
 
     def save(self, path: Path) -> None:
         """Write the file. Raises PebbleError if it cannot be written."""
-        shorter = [[[round(sample, _DIGITS) for sample in samples] for samples in cell.rounds] for cell in self.cells]
-        cells = [msgspec.structs.replace(cell, rounds=rounds) for cell, rounds in zip(self.cells, shorter, strict=True)]
+        cells = []
+        for cell in self.cells:
+            rounds = [[round(sample, _DIGITS) for sample in samples] for samples in cell.rounds]
+            cells.append(msgspec.structs.replace(cell, rounds=rounds))
         with named(path):
             path.write_bytes(msgspec.json.encode(msgspec.structs.replace(self, cells=cells)) + b"\n")
 
     def find(self, variant: str, measure: str, **params: Value) -> Cell | None:
-        """Return the first cell of these, which may have more ``params``."""
+        """Return the first cell with these ``params``, which may have more; None if there is none."""
         same = (cell for cell in self.cells if (cell.variant, cell.measure) == (variant, measure))
         return next((cell for cell in same if params.items() <= cell.params.items()), None)
 
@@ -133,14 +135,14 @@ def load(path: Path) -> Results:
 
 
 def begin(bench: str, settings: DataclassInstance) -> Results:
-    """Return the empty results of a run that begins now, on this machine."""
+    """Return empty results for a run that begins now on this machine."""
     began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     return Results(bench=bench, options=asdict(settings), machine=machine(), began=began)
 
 
 @contextmanager
 def named(path: Path) -> Iterator[None]:
-    """Raise PebbleError with the path for an OSError."""
+    """Raise PebbleError that names the path, in place of an OSError."""
     try:
         yield
     except OSError as error:
@@ -155,7 +157,7 @@ def check_folder(folder: Path) -> None:
 
 
 def machine() -> dict[str, Value]:
-    """Describe the machine and the versions that results depend on; no names of hosts or users."""
+    """Return the properties of the machine, and the versions, that matter; no names of hosts or users."""
     from pebble.extensions.operator.places import mosquitto_path  # not for the processes that only measure
 
     model = re.search(r"^(?:model name|Model).*?: *(.*?) *$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
@@ -174,7 +176,7 @@ def machine() -> dict[str, Value]:
 
 
 def grouped(things: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
-    """Group by key, in the order of their first appearance."""
+    """Return the things by their key, in the order in which keys first appear."""
     groups: dict[K, list[T]] = {}
     for thing in things:
         groups.setdefault(key(thing), []).append(thing)

@@ -1,4 +1,4 @@
-"""A comparison of variants in rounds: the confidence interval of a ratio comes from the rounds.
+"""Compares variants in rounds, from which the confidence interval of a ratio comes.
 
 Samples of one round are not independent: they share processes, a memory layout and a moment of the machine. So each
 round counts as one observation, and the variation is estimated by resampling the rounds (decision 0010).
@@ -36,14 +36,14 @@ T = TypeVar("T")
 
 
 def in_turn(things: Sequence[T], number: int) -> Sequence[T]:
-    """Return the things in the order of this round: every other one goes backwards."""
+    """Return the things in the order for this round: every other round goes backwards."""
     return things[::-1] if number % 2 else things
 
 
 def measure_rounds(
     results: Results, rounds: int, measure: Callable[[int, Progress], Iterable[Cell]], console: Console
 ) -> None:
-    """Measure all rounds and join their cells; a round that fails is left out for all variants, and noted.
+    """Measure all rounds and add their cells to ``results``; a failed round is left out for all variants, and noted.
 
     Raises PebbleError if the first ones fail, since all would.
     """
@@ -69,21 +69,21 @@ def measure_rounds(
 
 
 def add_round(results: Results, measured: Iterable[Cell]) -> None:
-    """Join the cells of a round to those of earlier ones; several of the same case are one.
+    """Add the cells of a round to those of earlier rounds; equal cases are joined.
 
     Their figures that are whole numbers are counts, which add up; others are averaged.
     """
-    known = {_key(cell): cell for cell in results.cells}
+    by_key = {_key(cell): cell for cell in results.cells}
     for key, parts in grouped(list(measured), _key).items():
-        cell = known.get(key)
+        cell = by_key.get(key)
         if cell is None:
             cell = msgspec.structs.replace(parts[0], rounds=[], figures={})
             results.cells.append(cell)
         cell.rounds.append([sample for part in parts for sample in part.samples])
         for name in parts[0].figures:
             values = [value for part in parts for value in part.figures[name]]
-            whole = all(isinstance(value, int) for value in values)
-            cell.figures.setdefault(name, []).append(sum(values) if whole else fmean(values))
+            are_counts = all(isinstance(value, int) for value in values)
+            cell.figures.setdefault(name, []).append(sum(values) if are_counts else fmean(values))
 
 
 def _key(cell: Cell) -> tuple[str, str, frozenset[object]]:
@@ -95,7 +95,7 @@ def _key(cell: Cell) -> tuple[str, str, frozenset[object]]:
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A ratio and its interval of 99 %, which few rounds do not support; NaN: nothing was measured."""
+    """A ratio with its 99 % interval, which needs more than a few rounds; NaN: nothing was measured."""
 
     ratio: float = math.nan
     low: float = math.nan
@@ -113,7 +113,7 @@ def ratio(ours: Cell, theirs: Cell, percent: float = 50) -> Interval:
 
 
 def paired(ours: Samples, theirs: Samples, percent: float = 50) -> Interval:
-    """Return the median, over rounds, of the ratio of their percentiles; rounds where both are infinite do not count.
+    """Return the median over the rounds of the ratio of their percentiles; rounds with two infinite ones are left out.
 
     The ends of the interval are those of the medians of many samples of as many rounds, drawn with replacement, and
     wider by Student's t.

@@ -51,7 +51,7 @@ Publish = Callable[[str, bytes], object]
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Numbers of boards, and seconds of measuring each."""
+    """The numbers of boards, and the seconds of measuring for each number."""
 
     boards: Sequence[int] = (10, 100, 1000)
     seconds: float = 20.0
@@ -81,19 +81,19 @@ def table(results: Results) -> Table:
     """Return CPU, memory and latency for each number of boards."""
     heads = ["boards", "CPU %", "broker %", "boards' %", "PSS MB", "p50 ms", "p99 ms", "n", "lost"]
     grid = plain_table("Page server with one viewer: CPU of one core, memory, latency of a value", heads)
-    for found in (cell for cell in results.cells if cell.measure == LATENCY):
-        boards = found.params["boards"]
-        used = [results.find(PAGE, CPU, process=name, boards=boards) for name in PROCESSES]
+    for delay in (cell for cell in results.cells if cell.measure == LATENCY):
+        boards = delay.params["boards"]
+        cpu = [results.find(PAGE, CPU, process=name, boards=boards) for name in PROCESSES]
         memory = results.find(PAGE, MEMORY, boards=boards)
         grid.add_row(
-            str(boards), *(digits(cell.percentile(50)) if cell else "" for cell in (*used, memory)),
-            digits(found.percentile(50)), digits(found.percentile(99)), str(len(found.samples)), str(found.lost),
+            str(boards), *(digits(cell.percentile(50)) if cell else "" for cell in (*cpu, memory)),
+            digits(delay.percentile(50)), digits(delay.percentile(99)), str(len(delay.samples)), str(delay.lost),
         )  # fmt: skip
     return grid
 
 
 def measure(boards: int, seconds: float) -> Iterator[Cell]:
-    """Publish values for some seconds, and measure a page server with one viewer meanwhile. Raises PebbleError."""
+    """Publish values for some seconds; yield the usage of a page server with one viewer. Raises PebbleError."""
     with Processes() as processes:
         broker = processes.broker()
         broker.wait()
@@ -125,7 +125,7 @@ def measure(boards: int, seconds: float) -> Iterator[Cell]:
 
 
 class Viewer:
-    """A viewer of the operator page without a browser, which answers pings. Times are CLOCK_MONOTONIC, ns."""
+    """A viewer of the operator page without a browser; it answers pings. Times are CLOCK_MONOTONIC, ns."""
 
     def __init__(self, url: str) -> None:
         from websockets.sync.client import connect  # optional
@@ -148,11 +148,11 @@ class Viewer:
 
     @property
     def online(self) -> int:
-        """Count the robots that the page shows as online."""
+        """Number of robots that the page shows as online."""
         return len(self._online)
 
     def wait_until(self, condition: Callable[[], bool], what: str) -> None:
-        """Wait until the page meets ``condition``. Raises PebbleError, which names ``what``, if it never does."""
+        """Wait until the page meets ``condition``. Raises PebbleError that names ``what`` if it does not in time."""
         end = time.monotonic() + _UP_S
         while not condition():
             if time.monotonic() > end:
@@ -178,7 +178,7 @@ class Viewer:
 
 
 def connected(port: int, name: str) -> Publish:
-    """Connect a board to a broker, which it asks for nothing. Raises PebbleError."""
+    """Connect a board to a broker, without subscriptions; return its publish function. Raises PebbleError."""
     sock = socket.create_connection((HOST, port))
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     will = Message(ONLINE.topic(_base(name)), b'{"t": 0, "online": false}', QoS.DELIVERED, retain=True)
@@ -211,7 +211,7 @@ def _epoch_ms() -> int:
 
 
 def main(port: int, count: int) -> None:
-    """Run boards until standard input closes; their heartbeats are evenly spread."""
+    """Run boards, whose heartbeats are spread evenly, until standard input closes."""
     ended, boards = serve_on_thread(lambda _line: None), list[tuple[str, Publish]]()
     for number in range(count):
         identity = Identity("pebble", "robots", f"board-{number:04d}")

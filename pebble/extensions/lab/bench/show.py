@@ -30,7 +30,7 @@ _WIDEST: Final = 200  # characters of a table
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture: its file name without ending, its caption, and the function that draws it."""
+    """A chart: its file name without ending, its caption, and the function that draws it."""
 
     name: str
     caption: str
@@ -39,7 +39,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """Results with their tables and pictures."""
+    """Results with their tables and charts."""
 
     results: Results
     tables: Sequence[Table]
@@ -47,7 +47,7 @@ class Shown:
 
 
 def finish(shown: Shown, folder: Path, console: Console) -> int:
-    """Print and write everything; return 0 if all was measured. Raises PebbleError if a file cannot be written."""
+    """Print and write everything; return 0 if results are complete. PebbleError if a file cannot be written."""
     results = shown.results
     results.save(file := folder / f"{results.bench}.json")  # before anything that may fail
     for table in shown.tables:
@@ -104,7 +104,7 @@ def spread(cell: Cell | None) -> str:
 
 
 def compared(ours: Cell | None, base: Cell | None, percent: float = 50) -> str:
-    """Return the ratio to the baseline as text; empty for the baseline itself, and without one."""
+    """Return the ratio to the baseline as text; empty for the baseline itself, or if there is none."""
     return "" if ours is None or base is None or ours is base else str(ratio(ours, base, percent))
 
 

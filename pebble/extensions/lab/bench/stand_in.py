@@ -50,18 +50,18 @@ def bridge(remote_port: int, local_port: int, base: str) -> None:
 
 
 def serial_bridge(local_port: int, base: str, device: str, *, reports: bool) -> None:
-    """Write a line for each drive command, and with ``reports`` publish each one of the touch sensors."""
+    """Write a line for each drive command; with ``reports`` publish the touch sensors' reports."""
     port = serial.Serial(device, _BAUD, timeout=_READ_S)
 
     def drive(message: MQTTMessage) -> None:
-        wanted = json.loads(message.payload)
-        left, right = (max(-1.0, min(1.0, wanted["z"] + side * wanted["x"])) for side in (1, -1))
+        command = json.loads(message.payload)
+        left, right = (max(-1.0, min(1.0, command["z"] + side * command["x"])) for side in (1, -1))
         port.write(b"M %.3f %.3f\n" % (left, right))
 
     local = StockClient(drive, [(DRIVE.topic(base), 1)], at_once=False).open(local_port)
-    rest = b""
+    unfinished = b""
     while True:  # without pyserial's own readline, which reads byte by byte
-        *lines, rest = (rest + port.read(max(1, min(port.in_waiting, _PIECE)))).split(b"\n")
+        *lines, unfinished = (unfinished + port.read(max(1, min(port.in_waiting, _PIECE)))).split(b"\n")
         for line in lines if reports else ():
             fields = dict(token.split("=", 1) for token in line.decode().split() if "=" in token)
             if all(name in fields for name in _TOUCH):

@@ -44,7 +44,7 @@ _EVERYTHING = f"{BASE}/#"
 
 
 class Floor(Robot):
-    """One process in place of the launcher and its services."""
+    """One process that takes the place of the launcher and its services."""
 
     def launch(self) -> None:
         program = [sys.executable, "-P", str(Path(__file__).with_name("floor.py"))]
@@ -67,7 +67,7 @@ VARIANTS: Final = [f"{kind} {part}".rstrip() for part in PARTS for kind in KINDS
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Launches of each variant, one in each round, and late subscribers of each launch."""
+    """The number of launches per variant, one in each round, and of late subscribers per launch."""
 
     rounds: int = 10
     joins: int = 5
@@ -115,7 +115,7 @@ def floor_table(results: Results) -> Table:
 
 
 def launch(variant: str, joins: int) -> Iterator[Cell]:
-    """Launch a fresh robot. Seconds count from just before the launcher is started. Raises PebbleError with its log."""
+    """Launch a fresh robot; yield its times in seconds from just before that. Raises PebbleError with its log."""
     kind, _, part = variant.partition(" ")
     make, services = PARTS[part]
     with (
@@ -159,20 +159,20 @@ def _late(robot: Robot, joins: int) -> Iterator[Cell]:
 
 
 def _retained_topics(transport: Transport) -> set[str]:
-    """Return the topics with a retained message. Waits for a pause, since no message is marked as the last."""
-    found: list[Message] = []
+    """Return the topics with a retained message. It waits for a pause, since no message is marked as the last."""
+    messages: list[Message] = []
     with transport:
-        transport.subscribe(_EVERYTHING, found.append, direct=True)
+        transport.subscribe(_EVERYTHING, messages.append, direct=True)
         topics, before = set[str](), -1
         while before < len(topics):
             before = len(topics)
             time.sleep(_QUIET_S)
-            topics = {message.topic for message in found if message.retain}
+            topics = {message.topic for message in messages if message.retain}
     return topics
 
 
 def _late_ms(topics: Set[str], transport: Transport) -> float:
-    """Return the ms from opening a connection until messages of all topics have arrived. Raises PebbleError."""
+    """Return the ms from opening a connection until messages on all topics have arrived. Raises PebbleError."""
     missing, complete, ended_ns = set(topics), threading.Event(), 0
 
     def receive(message: Message) -> None:

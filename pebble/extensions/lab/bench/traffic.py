@@ -60,7 +60,7 @@ _FIGURES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The times in which the robots stand idle, and are used."""
+    """The seconds for which the robots are idle, and in use."""
 
     idle_s: float = 40.0
     session_s: float = 80.0
@@ -88,15 +88,15 @@ def run(settings: Settings, console: Console) -> Shown:
 
 
 def analysed(settings: Settings) -> Analysed:
-    """Return the analysis of a recording that is made now, by robot. Raises PebbleError."""
+    """Make a recording; return its analysis, by robot. Raises PebbleError."""
     from pebble.extensions.recordings.traffic.analysis import analyse
     from pebble.extensions.recordings.traffic.sources import sources
 
     with tempfile.TemporaryDirectory(prefix="pebble-traffic-") as scratch:
         recordings = Path(scratch) / "recordings"
         record(recordings, settings.idle_s, settings.session_s)
-        found = sources([recordings], Path(scratch))
-        return {robot.robot.rpartition("/")[2]: robot for robot in analyse(found, Path(scratch)).robots}
+        indexed = sources([recordings], Path(scratch))
+        return {robot.robot.rpartition("/")[2]: robot for robot in analyse(indexed, Path(scratch)).robots}
 
 
 def record(folder: Path, idle_s: float, session_s: float) -> None:
@@ -117,7 +117,7 @@ def record(folder: Path, idle_s: float, session_s: float) -> None:
 
 
 def _use(testbed: Testbed, seconds: float) -> None:
-    """Drive all robots while pictures and sound arrive of those that have them. Raises PebbleError."""
+    """Drive all robots, while pictures and sound arrive from those that have them. Raises PebbleError."""
     viewer = create("mqtt", "pebble-bench-viewer", MqttSettings(host="127.0.0.1", port=testbed.broker_port))
     robots = testbed.robots.values()
     with viewer, ExitStack() as stack:
@@ -157,12 +157,12 @@ def cells_of(robots: Analysed) -> Iterator[Cell]:
 
 
 def media_table(robots: Analysed) -> Table:
-    """Return Table 4.1 beside the paper's."""
+    """Return Table 4.1 beside the paper's values."""
     heads = [f"{family} {value}" for family in (VIDEO, AUDIO) for value in ("median", "p95")]
     table = plain_table("Table 4.1: media, kbit/s of active seconds", ["robot", "", *heads], left=2)
     for name, paper in TABLE_4_1.items():
-        here = [robots[name].of(family) if name in robots else None for family in (VIDEO, AUDIO)]
-        shown = [("–", "–") if row is None else (f"{row.median_kbps:.2f}", f"{row.p95_kbps:.2f}") for row in here]
+        measured = [robots[name].of(family) if name in robots else None for family in (VIDEO, AUDIO)]
+        shown = [("–", "–") if row is None else (f"{row.median_kbps:.2f}", f"{row.p95_kbps:.2f}") for row in measured]
         table.add_row(name, "paper", *(f"{value:.2f}" for value in paper))
         table.add_row("", "here", *chain(*shown))
     return table

@@ -1,4 +1,4 @@
-"""Resource usage of processes and the clocks of this machine, read from the kernel."""
+"""The resource usage of processes, and this machine's clocks, read from the kernel."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _AT_ONCE_NS = 20_000
 
 
 def cpu_s(pids: Iterable[int]) -> float:
-    """Return the CPU seconds of these processes so far, all threads, user and system; 0 for processes that have ended.
+    """Return the CPU seconds of these processes so far, all threads, user and system; 0 for ended processes.
 
     In nanoseconds: /proc counts in ticks of 10 ms, too coarse for slices of less than a second.
     """
@@ -23,7 +23,7 @@ def cpu_s(pids: Iterable[int]) -> float:
 
 
 def pss_mb(pid: int) -> float:
-    """Return the proportional set size: shared pages are divided among their users; 0 if the process has ended."""
+    """Return the proportional set size, in which shared pages are divided among their users; 0 if it has ended."""
     with suppress(FileNotFoundError, ProcessLookupError):
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
         return sum(int(line.split()[1]) for line in lines if line.startswith("Pss:")) / 1024
@@ -38,7 +38,7 @@ def threads(pid: int) -> int:
 
 
 def wall_clock_ahead_ns() -> int:
-    """Return how far the wall clock is ahead of CLOCK_MONOTONIC: its stamps minus this are stamps of that."""
+    """Return how far the wall clock is ahead of CLOCK_MONOTONIC, to convert its time stamps."""
     while True:
         before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
         if after - before < _AT_ONCE_NS:  # else this thread stood still in between

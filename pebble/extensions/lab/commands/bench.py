@@ -148,7 +148,7 @@ def report(
 
 
 def _chosen(option: str, text: str, known: Collection[str]) -> tuple[str, ...]:
-    """Return names that are separated by commas. Raises PebbleError for an unknown one."""
+    """Return the names in a text that separates them by commas. Raises PebbleError for an unknown one."""
     names = split_names(text)
     if unknown := [name for name in names if name not in known]:
         raise PebbleError(f"--{option}: unknown {', '.join(unknown)}: there are {', '.join(known)}")
@@ -158,9 +158,9 @@ def _chosen(option: str, text: str, known: Collection[str]) -> tuple[str, ...]:
 
 
 def _run(name: str, quick: bool, output: Path, **options: Any) -> int:
-    """Measure, print and write; returns 0 if everything has results of enough rounds. Raises PebbleError.
+    """Measure, print and write; return 0 if every result has enough rounds. Raises PebbleError.
 
-    Of the ``options``, text is some names of those that the full run has.
+    An option that is text names some of the values of the full run.
     """
     from rich.console import Console
 

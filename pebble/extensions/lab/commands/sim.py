@@ -139,7 +139,7 @@ def demo(
 
 
 def _check_options(context: typer.Context, kind: str) -> None:
-    """Raise BadParameter for a given option that this ``kind`` of simulation does not take."""
+    """Raise BadParameter for an option that this ``kind`` of simulation does not have."""
     for parameter in context.command.params:
         source = context.get_parameter_source(str(parameter.name))
         if source is not None and source.name == "COMMANDLINE" and kind not in _OF.get(str(parameter.name), (kind,)):
@@ -147,7 +147,7 @@ def _check_options(context: typer.Context, kind: str) -> None:
 
 
 def _check_words(kind: str, words: list[str]) -> None:
-    """Raise BadParameter for an option that there is not, and for more words than this kind takes."""
+    """Raise BadParameter for an unknown option, and for more words than this kind takes."""
     for word in words:
         if word.startswith("-"):
             raise typer.BadParameter(f"there is no option {word}")

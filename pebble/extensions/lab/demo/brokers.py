@@ -21,12 +21,12 @@ class BrokerKind(StrEnum):
 
     @property
     def program(self) -> str | None:
-        """The module that runs as the broker; None: the broker is mosquitto."""
+        """Module that runs as the broker; None: the broker is mosquitto."""
         return "pebble.extensions.lab.demo.brokers" if self is BrokerKind.EMBEDDED else None
 
 
 def best_kind() -> BrokerKind:
-    """Return the best kind installed on this machine. Raises PebbleError with both remedies if there is none."""
+    """Return the best kind of broker on this machine. If there is none, raise PebbleError with both remedies."""
     if mosquitto_path() is not None:
         return BrokerKind.MOSQUITTO
     if find_spec("amqtt") is not None:
@@ -37,7 +37,7 @@ def best_kind() -> BrokerKind:
 
 
 class _Subscriptions(dict[str, Any]):
-    """Subscriptions that may grow while amqtt 0.12.1 iterates over them: else that ends the service of a client."""
+    """Subscriptions that may grow while amqtt 0.12.1 iterates over them, which would end its service of a client."""
 
     def __iter__(self) -> Iterator[str]:
         return iter(list(self.keys()))

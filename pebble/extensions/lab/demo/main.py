@@ -55,7 +55,7 @@ def run(
     console: Console | None = None,
     for_phones: bool = False,
 ) -> int:
-    """Run the demo until Ctrl-C, or for ``seconds`` of driving; 0 if every robot moved and stopped as commanded.
+    """Run the demo until Ctrl-C, or for ``seconds`` of driving; return 0 if every robot moved and stopped as commanded.
 
     With ``seconds`` at least one whole round of the script must have been driven. ``broker`` selects a kind instead of
     the best one available. ``for_phones``: other machines reach the page, see Phone. Every process ends with the demo;
@@ -78,7 +78,7 @@ def run(
 
 
 class Demo:
-    """The robots, their operator page, and the programs that drive and watch them."""
+    """The robots, their operator page, and the programs that drive and watch the robots."""
 
     def __init__(self, testbed: Testbed, console: Console, ending: threading.Event, seconds: float | None) -> None:
         self._testbed, self._console, self._ending, self._seconds = testbed, console, ending, seconds
@@ -129,7 +129,7 @@ class Demo:
             self._console.print("Every robot moved and stopped as commanded.", style="green")
 
     def _start_page(self, opened: Phone | None) -> None:
-        """Start the operator page, and a recorder for its Recordings."""
+        """Start the operator page, and a recorder for its tab Recordings."""
         console, testbed = self._console, self._testbed
         recordings = testbed.folder / "recordings"
         recordings.mkdir()
@@ -142,14 +142,14 @@ class Demo:
             opened.show(self._page_url, console)
 
     def _index(self) -> None:
-        """Ask now and then for what Recordings open with, so that the server has indexed it when a visitor does."""
+        """Request the data that Recordings shows first, now and then, so that the server has it ready for visitors."""
         while not self._ending.wait(_INDEX_S):
-            asked = f"archive/timeline?day={datetime.now(UTC):%Y-%m-%d}&robot={_GOOB.base}"
-            with suppress(OSError), urlopen(self._page_url + asked, timeout=_INDEX_S):  # noqa: S310 - its own page
+            path = f"archive/timeline?day={datetime.now(UTC):%Y-%m-%d}&robot={_GOOB.base}"
+            with suppress(OSError), urlopen(self._page_url + path, timeout=_INDEX_S):  # noqa: S310 - its own page
                 pass
 
     def _invite(self) -> None:
-        """Print the broker's address, and what can be pasted into another terminal in this folder."""
+        """Print the broker's address, and commands to paste into another terminal in this folder."""
         port, pebble, url = self._testbed.broker_port, _pebble(), self._broker_url
         drive = f'mosquitto_pub -h {HOST} -p {port} -t {DRIVE.topic(_GOOB.base)} -m \'{{"x": 0, "z": 0.3}}\''
         lines = {
@@ -164,7 +164,7 @@ class Demo:
             print_line(self._console, f"  # {what}\n  {line}")
 
     def _wait_until_ready(self, view: View) -> list[str]:
-        """Return the names of robots that cannot be driven when the time is over."""
+        """Wait until all robots can be driven; return the names of those that cannot in time."""
         end = time.monotonic() + _DISCOVERY_S
         while (missing := self._operator.not_ready(ROBOTS)) and time.monotonic() < end:
             view.update()
@@ -173,7 +173,7 @@ class Demo:
         return missing
 
     def _drive(self, view: View) -> None:
-        """Drive for the given time, and until the first round is complete; without a time once, then wait."""
+        """Drive for the given time, but at least one round. Without a time drive one round, then wait."""
         for_visitors = self._seconds is None
         self._operator.begin(f"the robots are yours: {self._page_url}" if for_visitors else "")
         if not for_visitors:  # a robot has one encoding for everybody: people choose theirs in the page
@@ -193,7 +193,7 @@ class Demo:
             self._outcomes.add(outcome_of(driven, self._testbed.robots[driven.robot].entries()))
 
     def _wrong(self, robot: SimulatedRobot) -> list[str]:
-        """Return what a robot did wrong, and with a time to drive also what it lacks, unless a person took it."""
+        """Return what a robot did wrong, and with a time also what it did not do, unless a person took it."""
         wrong = self._outcomes.problems(robot.name)
         if self._seconds is None:
             return wrong
@@ -205,21 +205,21 @@ class Demo:
 
 
 def _pebble() -> str:
-    """Return the program of the environment that this one runs in, as short as it can be written here."""
+    """Return the shortest text that runs this environment's program in this folder."""
     program = Path(sys.executable).with_name("pebble")
     if not program.exists():
         return f"{shlex.quote(sys.executable)} -m pebble"
-    here = Path.cwd()
-    return shlex.quote(str(program.relative_to(here) if program.is_relative_to(here) else program))
+    folder = Path.cwd()
+    return shlex.quote(str(program.relative_to(folder) if program.is_relative_to(folder) else program))
 
 
 def print_line(console: Console, line: str) -> None:
-    """Print what is to be copied, neither wrapped nor coloured."""
+    """Print a line to be copied, neither wrapped nor coloured."""
     console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def usual_or_free(testbed: Testbed, ending: threading.Event, **settings: Any) -> PageServer:
-    """Start the page at its usual port, or at a free one if another program has that."""
+    """Start the page at its usual port, or at a free port if another program uses that."""
     with suppress(PebbleError):
         usual = testbed.start_page(DEFAULT_PORT, **settings)
         usual.wait(ending)
@@ -231,7 +231,7 @@ def usual_or_free(testbed: Testbed, ending: threading.Event, **settings: Any) ->
 
 @contextmanager
 def ending_on_signals() -> Iterator[threading.Event]:
-    """Give an event that Ctrl-C, a closed terminal and SIGTERM set, so that every process is ended in order."""
+    """Yield an event that Ctrl-C, a closed terminal and SIGTERM set, so that processes are ended in order."""
     ending = threading.Event()
 
     def ask(_signal: int, _frame: FrameType | None) -> None:

@@ -22,7 +22,7 @@ _ENCODINGS: dict[Medium, tuple[str, ...]] = {"video": ALL_VIDEO, "audio": ALL_SO
 
 
 class CountedMedia(MediaReceiver):
-    """One robot's pictures and sounds, ``counted`` by encoding. The transport's threads write, another one reads."""
+    """One robot's pictures and sounds, ``counted`` by encoding. The transport's threads write, another reads."""
 
     def __init__(self, transport: Transport, base: str) -> None:
         super().__init__(transport, base)
@@ -40,7 +40,7 @@ class CountedMedia(MediaReceiver):
 
 
 class MediaViewer:
-    """The demo's viewer, on a thread and a connection of its own; ``received``: by the robots' names."""
+    """The demo's viewer, with a thread and a connection of its own; ``received``: by the robots' names."""
 
     def __init__(self, port: int) -> None:
         self.received: dict[str, CountedMedia] = {}
@@ -78,7 +78,7 @@ class MediaViewer:
             media.close()
 
     def _wait(self) -> bool:
-        """Wait for a turn; True if the demo ends."""
+        """Wait for the time of one turn; True if the demo ends."""
         for _ in range(round(TURN_S / _STEP_S)):
             for media in self.received.values():
                 media.poll()

@@ -1,7 +1,7 @@
-"""A scripted operator drives the robots of a broker: steps, an emergency stop, and a script that it overrules.
+"""A scripted operator of a broker's robots: it drives steps, an emergency stop, and a script that it overrules.
 
-It yields to people: a robot that another person drives, or has stopped, is left alone until the step after.
-Times are seconds of time.monotonic().
+It yields to people: a robot that another person drives, or has stopped, is left alone until the next step. Times are
+seconds of time.monotonic().
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ _MOST_WAITING = 1000  # events and completed steps; beyond them the oldest is dr
 
 
 def wheels_of(drive: Drive) -> Wheels:
-    """Return how fast a command turns the wheels; none of the demo's asks for more than full speed."""
+    """Return the wheel speeds of a command, which in the demo never exceeds full speed."""
     return drive.z + drive.x, drive.z - drive.x
 
 
 class Step(NamedTuple):
-    """A command that is repeated for ``drive_s``; then comes a stop, or nothing more, for ``rest_s``."""
+    """A command that is repeated for ``drive_s``; then, for ``rest_s``, a stop or no command."""
 
     name: str
     drive: Drive
@@ -88,14 +88,14 @@ STEPS = (*(step.name for step in SCRIPT), EMERGENCY_STOP, AFTER_RESET)  # of eve
 
 
 class EndedEarlyError(Exception):
-    """The demo ends, or a person has taken the robot."""
+    """An error: the demo ends, or a person has taken the robot."""
 
 
 class Operator:
-    """The demo's driver, on a thread and a connection of its own.
+    """The demo's driver, with a thread and a connection of its own.
 
-    ``activity`` and ``events`` (seconds and a line) are for display, ``visitors`` knows the robots that people have,
-    and ``completed`` collects what was commanded. The emergency stop and the script belong to the first round.
+    ``activity`` and ``events`` (seconds and a line) are for display. ``visitors`` knows the robots that people have.
+    ``completed`` collects the commands that were driven. The emergency stop and the script belong to the first round.
     """
 
     def __init__(self, port: int) -> None:
@@ -114,7 +114,7 @@ class Operator:
         self._thread = threading.Thread()
 
     def connect(self) -> None:
-        """Connect and subscribe; return at once."""
+        """Connect and subscribe, without waiting."""
         self._transport.open(timeout=0.0)
         self._transport.subscribe(
             ALL_OUTGOING, lambda message: self.discovery.receive(message, time.monotonic(), time.time())
@@ -134,13 +134,13 @@ class Operator:
 
     @property
     def activity(self) -> str:
-        """The present step, and the robots that it leaves alone."""
+        """The present step, with the robots that it leaves alone."""
         robots, now = self.discovery.all_robots(), time.monotonic()
         others = [f"{robot.name} {why}" for robot in robots if (why := self.visitors.taken(robot, now))]
         return "; ".join([self._doing, *others])
 
     def begin(self, yours: str = "") -> None:
-        """Start driving all robots discovered so far, round after round; with ``yours`` only once, and then show it."""
+        """Start driving all robots discovered so far, round after round. With ``yours`` drive once, then show it."""
         self._thread = threading.Thread(target=self._run, args=(yours,), name="operator", daemon=True)
         self._thread.start()
 
@@ -202,7 +202,7 @@ class Operator:
             raise EndedEarlyError
 
     def _until(self, condition: Callable[[], bool], timeout: float, steady_s: float = 0.0) -> None:
-        """Wait until the condition has held for ``steady_s``, at most for ``timeout``."""
+        """Wait, at most ``timeout``, until the condition has held for ``steady_s``."""
         since = time.monotonic()
         end = since + timeout
         while (now := time.monotonic()) < end:
@@ -212,13 +212,13 @@ class Operator:
             self._wait(_POLL_S)
 
     def _drive(self, drive: Drive) -> float:
-        """Send one command to all robots that are free; return when."""
+        """Send a command to all robots that are free; return the time."""
         for driver in self._free_drivers():
             driver.command(drive)
         return time.monotonic()
 
     def _hold(self, drive: Drive, seconds: float) -> float:
-        """Send a command again and again, as a held stick does; return when it was last sent."""
+        """Repeat a command, as a held stick does; return the time when it was last sent."""
         self._take_control()
         sent = time.monotonic()
         for _ in paced(seconds, wait=self._wait):
@@ -279,7 +279,7 @@ class Operator:
         self._complete(step.name, step.drive, began, released, time.monotonic())
 
     def _stop_all(self, robots: Sequence[RobotView]) -> None:
-        """Drive all, stop them, drive in vain, reset, drive again; a stop by a person is the person's to reset."""
+        """Drive all, stop them, try to drive, reset, drive again. A person's stop is left to the person."""
         began = time.monotonic()
         self._begin(EMERGENCY_STOP, robots)
         self._end_trails()
@@ -308,18 +308,18 @@ class Operator:
         self._complete(AFTER_RESET, _FORWARD, reset_at, released, time.monotonic())
 
     def _show_trails(self, robots: Sequence[RobotView]) -> None:
-        """Have each robot that has the script for it publish its own position, unless it runs another script.
+        """Start the script that publishes a robot's position on each robot that has it, unless it runs another script.
 
         A robot that is stopped, or was driven a moment ago, refuses to start a script.
         """
         now = time.monotonic()
-        for robot in [one for one in robots if one.base in self._drawing]:
+        for robot in [candidate for candidate in robots if candidate.base in self._drawing]:
             runs = robot.autonomy is not None and robot.autonomy.running
             if not runs and not robot.stopped_by and self.visitors.rests(robot, now):
                 self._command(robot, AutonomyCommand(action="start", file=TRAIL))
 
     def _end_trails(self) -> None:
-        """End these scripts before an emergency stop does, which would be shown as a failure."""
+        """End these scripts, because an emergency stop would end them as a failure."""
         for robot in self._robots:
             if robot.autonomy is not None and robot.autonomy.running and robot.autonomy.file == TRAIL:
                 self._command(robot, AutonomyCommand(action="stop"))
@@ -340,20 +340,20 @@ class Operator:
 
     def _follow(self, robot: RobotView) -> None:
         """Start the script, drive for a moment, and wait until it has arrived."""
-        seen: deque[TagData] = deque(maxlen=1)
+        tags: deque[TagData] = deque(maxlen=1)
 
         def receive(message: Message) -> None:
             with suppress(PayloadError):
-                seen.append(codec.decode(c.APRILTAG_DATA, message.payload))
+                tags.append(codec.decode(c.APRILTAG_DATA, message.payload))
 
         def scripted() -> bool:
-            """True if the robot reports that no person goes before its script."""
+            """True if the robot reports that no person drives in place of its script."""
             status = robot.autonomy
             return status is not None and status.running and status.overridden is not True
 
         def distance_m() -> float:
             """Return the robot's distance from the tag; infinite if the robot does not see the tag."""
-            return math.inf if not seen or seen[0].distance_m is None else seen[0].distance_m
+            return math.inf if not tags or tags[0].distance_m is None else tags[0].distance_m
 
         self.show(f"STARTS: {FOLLOW}, {robot.name} plays {CLIP} and drives to tag {TAG_ID} by itself")
         config = {"tag_id": TAG_ID, "tag_size_m": TAG_SIZE_M, "target_distance_m": DISTANCE_M}
@@ -363,7 +363,7 @@ class Operator:
             stack.callback(self._command, robot, AutonomyCommand(action="stop"))
             self._command(robot, AutonomyCommand(action="start", file=FOLLOW, config=config))
             self._publish(c.SOUNDBOARD_COMMAND.topic(robot.base), sound)
-            self._until(lambda: bool(seen) and scripted(), _START_S)
+            self._until(lambda: bool(tags) and scripted(), _START_S)
             self._wait(_APPROACH_S)
             self.show(f"TAKES OVER: drives {robot.name}, {FOLLOW} is overruled")
             took_over = time.monotonic()

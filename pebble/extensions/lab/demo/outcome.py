@@ -1,4 +1,4 @@
-"""A judgement of the trace of a robot's motors: did it move when driven, and stand when released? Pure."""
+"""Judges a robot by the trace of its motors: did it move when driven, and stand when released? Pure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Wheels = tuple[float, float]  # left and right, -1..1
 
 
 class Driven(NamedTuple):
-    """A robot that was driven, and then let go or stopped. Times are seconds of time.monotonic()."""
+    """A robot's commanded motion: when it was driven, released or stopped. Times are seconds of time.monotonic()."""
 
     robot: str  # its id
     step: str
@@ -25,7 +25,7 @@ class Driven(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """A robot's motion in one step; ``wrong`` is empty if it was the commanded one."""
+    """The motion of a robot in one step; ``wrong`` is empty if it was as commanded."""
 
     robot: str
     step: str
@@ -34,7 +34,7 @@ class Outcome(NamedTuple):
 
 
 def outcome_of(driven: Driven, entries: Sequence[Entry]) -> Outcome:
-    """Judge a step by the changes of the motors in ``entries``, which are in the order of time."""
+    """Return the outcome of a step, by the motors' changes in ``entries``, which are in the order of time."""
     motors = [(entry.ns / 1e9, entry.motors) for entry in entries if entry.motors is not None]
     motors = [(at, wheels) for at, wheels in motors if at < driven.ended]
     moved = any(driven.began <= at < driven.released and _same_way(wheels, driven.wheels) for at, wheels in motors)
@@ -54,7 +54,7 @@ def _same_way(wheels: Wheels, commanded: Wheels) -> bool:
 
 
 def _off_at(motors: Sequence[tuple[float, Wheels]]) -> float:
-    """Return when the motors were switched off for the last time; infinite if they run at the end."""
+    """Return the time at which the motors were last switched off; infinite if they run at the end."""
     running = [index for index, (_, wheels) in enumerate(motors) if any(wheels)]
     if not running:
         return -math.inf
@@ -63,7 +63,7 @@ def _off_at(motors: Sequence[tuple[float, Wheels]]) -> float:
 
 
 class Outcomes:
-    """The worst outcome of each robot and step, however long the demo runs."""
+    """The worst outcome of each robot and step; its size does not grow with time."""
 
     def __init__(self) -> None:
         self._worst: dict[tuple[str, str], Outcome] = {}

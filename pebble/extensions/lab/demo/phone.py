@@ -25,13 +25,13 @@ _BLOCKS: Final = {(False, False): " ", (True, False): "▀", (False, True): "▄
 
 
 def require_terminal() -> None:
-    """Raise PebbleError where what is printed may end in a file."""
+    """Raise PebbleError if the output is no terminal: a password must not end in a file."""
     if not sys.stdout.isatty():
         raise PebbleError("--phone prints a password, to a terminal only: start the demo in one, without a pipe")
 
 
 class Phone:
-    """The person and the certificate, below ``folder``; ``settings`` are fields of WebSettings."""
+    """The certificate and the person for the page, below ``folder``; ``settings`` are fields of WebSettings."""
 
     def __init__(self, folder: Path) -> None:
         self._tls, people = folder / "tls", folder / "people.sqlite"
@@ -50,7 +50,7 @@ class Phone:
         }
 
     def show(self, url: str, console: Console) -> None:
-        """Print the QR code, the person and the password."""
+        """Print the QR code, the person's name and the password."""
         show_qr(url, console)
         lines = [
             "All of this machine's network can open the page, but not the broker: for a phone in the same Wi-Fi.",
@@ -63,7 +63,7 @@ class Phone:
 
 
 def show_qr(text: str, console: Console) -> None:
-    """Print a QR code, black on white in terminals of any colour: most phones read no other."""
+    """Print a QR code, black on white in any terminal: most phones read no other."""
     for line in qr_lines(text):
         console.print(Text(line, style="#000000 on #ffffff", no_wrap=True, overflow="ignore", end="\n"), crop=False)
 
@@ -76,4 +76,4 @@ def qr_lines(text: str) -> Iterator[str]:
     if len(dark) % 2:
         dark = np.pad(dark, ((0, 1), (0, 0)))
     for upper, lower in zip(dark[::2], dark[1::2], strict=True):
-        yield "".join(_BLOCKS[bool(one), bool(other)] for one, other in zip(upper, lower, strict=True))
+        yield "".join(_BLOCKS[bool(above), bool(below)] for above, below in zip(upper, lower, strict=True))

@@ -1,4 +1,4 @@
-"""Output of the demo: a line at each step, and what was measured."""
+"""The output of the demo: a line at each step, and the measurements."""
 
 import math
 import threading
@@ -16,7 +16,7 @@ from pebble.extensions.lab.rig.robot import SimulatedRobot
 
 
 class View:
-    """The robots while they run; call ``update`` at any rate.
+    """A view of the running robots; call ``update`` at any rate.
 
     ``ending`` is set when the terminal was closed: under make, SIGHUP reaches only make.
     """
@@ -31,7 +31,7 @@ class View:
         self._step = ""  # that was printed last
 
     def update(self) -> None:
-        """Print a line for each robot when it is discovered, and for each step and event when it begins."""
+        """Print a line for each newly discovered robot, and for each step and event that begins."""
         with self._until_closed():
             while self._operator.events:
                 at, line = self._operator.events.popleft()
@@ -39,10 +39,10 @@ class View:
                 self._step = line.removeprefix("operator ")  # it is one of the steps
             now = time.monotonic()
             for robot in self._robots:
-                seen = self._operator.discovery.robots.get(robot.base)
-                if seen is not None and seen.capabilities and robot.name not in self._known:
+                discovered = self._operator.discovery.robots.get(robot.base)
+                if discovered is not None and discovered.capabilities and robot.name not in self._known:
                     self._known.add(robot.name)
-                    self._print(now, f"{robot.name} is online: {robot.runs_on}, {seen.transport} inside")
+                    self._print(now, f"{robot.name} is online: {robot.runs_on}, {discovered.transport} inside")
             if self._operator.activity != self._step:
                 self._step = self._operator.activity
                 self._print(now, f"operator: {self._step}")
@@ -54,7 +54,7 @@ class View:
 
     @contextmanager
     def _until_closed(self) -> Iterator[None]:
-        """End the demo in order if its terminal is closed before, or while, something is written to it."""
+        """End the demo in order if its terminal is closed before the ``with`` block has written to it."""
         self._notice_closed_terminal()
         try:
             yield
@@ -70,7 +70,7 @@ class View:
 
 
 def show_outcomes(console: Console, robots: Sequence[str], outcomes: Outcomes) -> None:
-    """Print a table with a row for each step and a column for each robot; if there were several rounds, the worst."""
+    """Print a table with a row per step and a column per robot, with the worst of several rounds."""
     table = Table("step", *robots, title="Measured by the MCUs: time until the motors were off", title_justify="left")
     for step in outcomes.steps():
         table.add_row(step, *(_cell(outcomes.of(name, step)) for name in robots))

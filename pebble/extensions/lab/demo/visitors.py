@@ -1,4 +1,4 @@
-"""Robots that people have taken from the demo's operator: driven by any program, or stopped. Pure."""
+"""Robots that people have taken from the demo's operator, by driving or stopping them. Pure."""
 
 import math
 from collections import defaultdict, deque
@@ -13,13 +13,13 @@ _SENT = 1000  # drive commands of the operator that are on their way back: 50 s 
 
 
 class Visitors:
-    """A table of what people do; a robot that a person had is free again in the step after.
+    """A table of the robots that people have. Each is free again in the step after.
 
     Times are seconds of one monotonic clock.
     """
 
     def __init__(self, name: str) -> None:
-        """Begin with no visitors. ``name``: that of the demo's operator, whose own stops do not count as a person's."""
+        """Make an empty table. ``name``: the demo's operator, whose own stops do not count as a person's."""
         self.left_alone: set[str] = set()  # names of robots that were found to be taken
         self.own_ids: set[str] = set()  # under which the operator itself has control
         self._name = name
@@ -33,7 +33,7 @@ class Visitors:
         self._sent[topic].append(payload)
 
     def receive_drive(self, message: Message, now: float) -> None:
-        """Take any drive command of any robot: the operator's own, or one that was pasted into a terminal."""
+        """Note a drive command to any robot, by the operator or by a person."""
         address, sent = parse_topic(message.topic), self._sent.get(message.topic)
         if sent and message.payload in sent:
             sent.remove(message.payload)
@@ -42,11 +42,11 @@ class Visitors:
             self._moved[address.identity.base] = now
 
     def begin_step(self, now: float) -> None:
-        """Forget what people had before."""
+        """Free all robots that people had in the last step."""
         self._step_began = now
 
     def taken(self, robot: RobotView, now: float) -> str:
-        """Return why a person has the robot now; empty: it is free."""
+        """Return why the robot counts as a person's now; empty if it is free."""
         state = robot.control.state if robot.controlled else None
         if state is not None and state.id and state.id not in self.own_ids:
             self._driven[robot.base] = now, robot.control.who
@@ -57,11 +57,11 @@ class Visitors:
         return f"is driven by {who}" if now - at < DRIVES_S else ""
 
     def rests(self, robot: RobotView, now: float) -> bool:
-        """True if no person has moved the robot for a moment, even if a person has control."""
+        """True if no person has moved the robot for a moment, even if one has control."""
         return now - self._moved.get(robot.base, -math.inf) >= DRIVES_S
 
     def free(self, robot: RobotView, now: float) -> bool:
-        """True if no person has had the robot in the present step; else note the robot as left alone."""
+        """True if no person has had the robot in the present step; else note it as left alone."""
         taken = self.taken(robot, now)
         if self._driven.get(robot.base, (-math.inf, ""))[0] < self._step_began and not taken:
             return True

@@ -1,4 +1,4 @@
-"""The operator page of a testbed: ``python -m pebble.extensions.lab.rig.page FIELDS``, those of WebSettings as JSON.
+"""The operator page of a testbed: ``python -m pebble.extensions.lab.rig.page FIELDS``, JSON with fields of WebSettings.
 
 It prints ``{"url": …}`` once the page can be opened.
 """
@@ -16,7 +16,7 @@ from pebble.runtime.parent import set_up_logging
 
 
 class Ready(msgspec.Struct):
-    """The output once the page can be opened."""
+    """The line that is printed once the page can be opened."""
 
     url: str
 

@@ -1,4 +1,4 @@
-"""Child processes, each with a log file and a deadline to end; the kernel ends them when this process dies."""
+"""Child processes, each with a log file and a time limit for its end; the kernel ends them when this process dies."""
 
 import json
 import os
@@ -41,7 +41,7 @@ def unchanged(command: Sequence[str]) -> Sequence[str]:
 
 
 class Program:
-    """One child process in its own session: Ctrl-C in a terminal reaches only this process, which ends them in order.
+    """A child process in a session of its own: Ctrl-C in a terminal reaches only this process, which ends it in order.
 
     Start programs from the main thread: the kernel ends them when the thread that started them ends.
     """
@@ -49,7 +49,7 @@ class Program:
     has_input: ClassVar = False  # it ends with its standard input, not with the thread that starts it
 
     def __init__(self, name: str, command: Sequence[str], log: Path, each: Each | None = None) -> None:
-        """Start the program. ``each`` gets its lines on a thread of its own.
+        """Start the program. ``each`` gets its lines of output, on another thread.
 
         Without ``each`` standard output is in the log, as errors are.
         """
@@ -68,7 +68,7 @@ class Program:
 
     @property
     def code(self) -> int | None:
-        """The exit code of the program, once it has ended."""
+        """Exit code of the program, once it has ended."""
         return self._process.poll()
 
     @property
@@ -79,7 +79,7 @@ class Program:
         return self.log.read_text(errors="replace").strip()[-_TAIL:]
 
     def freeze(self) -> None:
-        """Send SIGSTOP: its connections stay, and it answers nothing. A process that has ended stays so."""
+        """Send SIGSTOP: its connections stay, and it answers nothing."""
         self._process.send_signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
@@ -90,7 +90,7 @@ class Program:
         self._process.wait()
 
     def wait_until(self, condition: Callable[[], bool], timeout: float, ending: threading.Event | None = None) -> None:
-        """Wait for ``condition``, or until ``ending``. Raises PebbleError on timeout or if the program ends first."""
+        """Wait for ``condition`` or ``ending``. Raises PebbleError on timeout, or if the program ends first."""
         end, ending = time.monotonic() + timeout, ending or threading.Event()
         while not condition() and not ending.wait(_STEP_S):
             if self.ended:
@@ -109,7 +109,7 @@ class Program:
 
 
 class Worker(Program):
-    """A program that reads lines, answers in JSON lines, and ends with its input, so also when this process ends.
+    """A program that reads lines, answers in JSON lines, and ends when its input does, also when this process dies.
 
     Its other end is worker_end.
     """
@@ -123,7 +123,7 @@ class Worker(Program):
     def answer(self, timeout: float) -> dict[str, Any]:
         """Return the next answer.
 
-        Raises PebbleError with its log if it ends, or does not answer within ``timeout`` s.
+        Raises PebbleError with its log if it has ended, or does not answer within ``timeout`` s.
         """
         why = f"did not answer within {timeout:.0f} s"
         with suppress(queue.Empty):
@@ -133,7 +133,7 @@ class Worker(Program):
         raise PebbleError(f"{self.name} {why}\n{self.tail()}".rstrip())
 
     def send(self, line: str) -> None:
-        """Write a line to standard input. Ignored if the process has ended: :meth:`answer` reports that."""
+        """Write a line to standard input. If the process has ended, nothing happens: :meth:`answer` reports that."""
         if self._process.stdin is not None:
             with suppress(BrokenPipeError):
                 self._process.stdin.write(line.encode() + b"\n")
@@ -154,7 +154,7 @@ class Worker(Program):
 
 
 def mosquitto_command(port: int, stem: Path, extra: Sequence[str] = (), host: str = HOST) -> list[str]:
-    """Return the command of a mosquitto on ``port``; writes its configuration to ``stem`` plus ``.conf``."""
+    """Write a mosquitto's configuration to ``stem`` plus ``.conf``; return the command that runs it on ``port``."""
     path = mosquitto_path()
     if path is None:
         raise PebbleError("mosquitto is not installed: apt install mosquitto")
@@ -171,8 +171,8 @@ def free_port() -> int:
 
     In a new network namespace every port is unused.
 
-    It is none that the system gives to outgoing connections: a client that tries again and again while its server is
-    away gets that server's port some day, is connected to itself, and the server cannot start.
+    The port is outside of the system's range for outgoing connections. Otherwise a client that tries again and again
+    while its server is away would some day get that server's port, and be connected to itself.
     """
     while True:
         port = random.SystemRandom().randrange(*_PORTS)
@@ -182,7 +182,7 @@ def free_port() -> int:
 
 
 class Broker(Program):
-    """A broker, from its construction on."""
+    """A broker, which runs from its construction on."""
 
     def __init__(
         self,
@@ -205,7 +205,7 @@ class Broker(Program):
         super().__init__(name, wrap(command), folder / f"{name}.log")
 
     def wait(self, ending: threading.Event | None = None) -> None:
-        """Wait until the broker answers, or ``ending``. Raises PebbleError on timeout, or if the broker has ended."""
+        """Wait until the broker answers, or ``ending``. Raises PebbleError on timeout, or if it has ended."""
         self.wait_until(lambda: self._answers() and not self.ended, _BROKER_START_S, ending)
 
     def _answers(self) -> bool:
@@ -217,9 +217,9 @@ P = TypeVar("P", bound=Program)
 
 
 class Processes:
-    """The processes of a run, and their folder.
+    """The processes of a run, with their folder.
 
-    The ``with`` block ends all of them, those of a kind at the same time; then it deletes the folder.
+    The end of the ``with`` block ends all of them, those of a kind at the same time; then it deletes the folder.
     """
 
     ends_s: ClassVar[tuple[float, ...]] = (_END_S, 6.0, 2.0, 2.0)  # what is left of each kind after that is killed
@@ -239,7 +239,7 @@ class Processes:
         return self
 
     def start(self) -> None:
-        """Start what a subclass consists of, as the ``with`` block begins."""
+        """Start the processes of a subclass. Called when the ``with`` block begins."""
 
     def __exit__(self, *_: object) -> None:
         for kind, within_s in enumerate(self.ends_s):
@@ -252,11 +252,11 @@ class Processes:
         return program
 
     def end(self, program: Program) -> None:
-        """End one of them before the others."""
+        """End one process before the others."""
         end_all([program], self.ends_s[self._kinds.pop(program)])
 
     def unexpected_exits(self) -> list[str]:
-        """Return the processes that should still run and do not, brokers first."""
+        """Return the processes that have ended although they should run, brokers first."""
         programs = sorted(self._kinds, key=lambda program: -self._kinds[program])
         return [f"{program.name} ended unexpectedly: see {program.log}" for program in programs if program.ended]
 
@@ -264,12 +264,12 @@ class Processes:
         return self.command(name, wrap(python(module, *arguments)))
 
     def command(self, name: str, command: Sequence[str]) -> Worker:
-        """Return a worker that is not a module."""
+        """Return a worker that runs any command, not a module."""
         self.workers.append(self.add(Worker(name, command, self.folder / f"{name}.log"), OPERATORS))
         return self.workers[-1]
 
     def broker(self, name: str = "broker", folder: Path | None = None, **more: Any) -> Broker:
-        """Return a broker that is starting: wait for it."""
+        """Start a broker and return it; wait for it before using it."""
         return self.add(Broker(name, folder or self.folder, **more), BROKERS)
 
 
@@ -295,9 +295,9 @@ def children(pid: int) -> list[int]:
 
     Not every kernel has /proc/PID/task/TID/children.
     """
-    found = []
+    pids = []
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
             if int((process / "stat").read_text().rpartition(")")[2].split()[1]) == pid:
-                found.append(int(process.name))
-    return sorted(found)
+                pids.append(int(process.name))
+    return sorted(pids)

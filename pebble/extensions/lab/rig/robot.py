@@ -44,9 +44,9 @@ Config = Mapping[str, Any]
 
 
 class SimulatedRobot:
-    """A robot on this machine, whose processes are among ``running``, and end with them.
+    """A robot on this machine. Its processes are among ``running``, and end with them.
 
-    ``entries()`` are what its MCU measured, independent of telemetry.
+    ``entries()`` are measured at its MCU, independently of telemetry.
     """
 
     runs_on: str
@@ -75,16 +75,16 @@ class SimulatedRobot:
         return self._add(f"{self.name}'s {name}", command, MCUS, f"{name}.log")
 
     def _start_board(self, kind: str, port: Path, trace: Path, *options: object, name: str = "MCU") -> Program:
-        """Return an MCU on a pty."""
+        """Start an MCU on a pty, and return its program."""
         return self._start_mcu(kind, "--link", port, "--trace", trace, *options, name=name)
 
 
 class Robot(SimulatedRobot):
-    """One with the launcher and its services; ``kind`` is its local transport.
+    """A simulated robot with the launcher and its services; ``kind`` is its local transport.
 
-    It connects to a broker for operators at ``remote``, host and port. ``services``: fields of its services' configs
-    besides these connections; one that is named is enabled. ``reports``: whether every report of its MCU is recorded
-    and forwarded, 50 a second. ``wrap`` extends the commands of all processes that use the network.
+    It connects to a broker for operators at ``remote``, host and port. ``services``: more fields of its services'
+    configs; a service that is named there is enabled. ``reports``: every report of its MCU is recorded and forwarded,
+    50 a second. ``wrap`` extends the commands of all processes that use the network.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Robot(SimulatedRobot):
         self._own: Config = {"robot": {"id": name}, "transport": {"kind": kind}}
 
     def prepare(self, ending: threading.Event | None = None) -> None:
-        """Start what the robot needs and write its config, or wait no longer once ``ending`` is set.
+        """Start the processes that the robot needs, and write its config; stop waiting once ``ending`` is set.
 
         Raises PebbleError if a process does not start.
         """
@@ -165,15 +165,15 @@ class Robot(SimulatedRobot):
     def processes(self) -> dict[str, int]:
         """Return the process ids of the launcher, its children (a hub among them) and the local broker, by name."""
         names = {name[:15]: name for name in self._programs()}  # as long as they are in the kernel
-        found = {"launcher": self.launcher.pid}
+        pids = {"launcher": self.launcher.pid}
         for pid in children(self.launcher.pid):
             with suppress(OSError):  # it has just ended
                 comm = Path(f"/proc/{pid}/comm").read_text().strip()
-                found[names.get(comm, comm)] = pid
-        return found if self.local_broker is None else found | {"mosquitto": self.local_broker.pid}
+                pids[names.get(comm, comm)] = pid
+        return pids if self.local_broker is None else pids | {"mosquitto": self.local_broker.pid}
 
     def complete(self) -> bool:
-        """True if all its programs run, including those started on demand."""
+        """True if all programs of the robot run, including on-demand ones."""
         return self._programs() <= self.processes().keys()
 
     def _programs(self) -> set[str]:
@@ -199,7 +199,7 @@ MEDIA: dict[str, Config] = {
 
 @contextmanager
 def one_robot(kind: str, make: type[Robot] = Robot, **options: Any) -> Iterator[Robot]:
-    """Give a robot of its own with a remote broker of its own, ready to be launched. Raises PebbleError."""
+    """Yield a robot with a remote broker of its own, ready to be launched. Raises PebbleError."""
     with Processes() as processes:
         broker = processes.broker("remote")
         robot = make(processes, kind, (HOST, broker.port), **options)

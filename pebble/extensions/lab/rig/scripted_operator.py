@@ -1,4 +1,4 @@
-"""An operator that is a program: it drives one robot, stops it, and leaves it to a person who wants it."""
+"""A program as operator: it drives one robot, stops it, and yields it to a person who wants it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ VALID_MS = 750  # of each command: no robot obeys one for longer
 def paced(
     seconds: float = math.inf, rate_hz: float = RATE_HZ, wait: Callable[[float], object] = time.sleep
 ) -> Iterator[int]:
-    """Count from 0 at a steady rate, until ``wait`` returns something true; what is late does not delay the rest."""
+    """Yield 0, 1, 2 … at a steady rate, until ``wait`` returns true. A late step does not delay the following ones."""
     due = time.monotonic()
     for number in itertools.count() if math.isinf(seconds) else range(round(seconds * rate_hz)):
         yield number
@@ -35,12 +35,10 @@ def paced(
 
 
 class ScriptedOperator:
-    """The operator of one robot over a link that carries everything; one thread calls it.
+    """The operator of one robot, over a link that carries everything; one thread calls it.
 
-    ``robot`` gets the robot's messages elsewhere.
-
-    ``publish`` sends a message at once. ``wait`` waits so many seconds; what it raises, or something true that it
-    returns, ends what is being done. ``device`` is shown to people who want control.
+    ``robot`` gets the robot's messages elsewhere. ``publish`` sends a message at once. ``wait`` waits so many seconds;
+    an exception from it, or true, ends what is being done. ``device`` is shown to people who want control.
     """
 
     def __init__(
@@ -62,7 +60,7 @@ class ScriptedOperator:
     # -- driving
 
     def drive(self, x: float = 0.0, z: float = 0.0, seconds: float = math.inf) -> None:
-        """Drive for ``seconds``, then let go, also if the wait is interrupted."""
+        """Drive for ``seconds``, then release, also if the wait is interrupted."""
         try:
             for _ in paced(seconds, wait=self._wait):
                 self.command(Drive(x=x, z=z))
@@ -70,9 +68,9 @@ class ScriptedOperator:
             self.command(Drive())
 
     def command(self, drive: Drive) -> float:
-        """Send one drive command, with the control key if there is one; nothing while a person has control.
+        """Send a drive command, with the control key if there is one; none while a person has control.
 
-        A person who asks for control gets it. Return the time.monotonic() of sending; infinite: nothing was sent.
+        A person who asks for control gets it. Return the time.monotonic() of sending; infinite if nothing was sent.
         """
         if self.control.asked_by:
             self.control.release()
@@ -87,17 +85,17 @@ class ScriptedOperator:
         return now
 
     def ask_control(self) -> None:
-        """Ask for control, if the robot gives it; it is never taken from a person."""
+        """Ask for control, if the robot has that; never take it from a person."""
         if self.robot.controlled and not self.control.wanted:
             self.control.ask(time.monotonic())
 
     @property
     def has_control(self) -> bool:
-        """True if the operator has the control that it asked for, or did not ask for any."""
+        """True if the operator has the control that it asked for, or has not asked."""
         return self.control.held or not self.control.wanted
 
     def release(self) -> None:
-        """Leave control to people."""
+        """Release control."""
         self.control.release()
         self.tick()
 
@@ -108,12 +106,12 @@ class ScriptedOperator:
     # -- the emergency stop
 
     def stop(self, why: str = "") -> None:
-        """Begin an emergency stop, which each further call of ``tick`` repeats until it is confirmed."""
+        """Begin an emergency stop, which ``tick`` repeats until it is confirmed."""
         self._stop = StopSender(new_name(), by=self._by, why=why, now=time.monotonic(), robots=[self.robot.base])
         self.tick()
 
     def receive(self, message: Message) -> None:
-        """Take a message of any robot, on any thread, by which a stop is confirmed; retained ones, too."""
+        """Handle a message of any robot, retained ones too, on any thread; some confirm a stop."""
         self._received.put(message)
 
     @property
@@ -122,7 +120,7 @@ class ScriptedOperator:
         return self._stop is not None and self._stop.confirmed
 
     def reset(self) -> None:
-        """End the operator's own emergency stop; a stop of a person is left for a person to reset."""
+        """End the operator's own emergency stop. A person's stop is left for a person to reset."""
         stop = self.robot.stopped_by
         if stop is None or stop.by == self._by:
             self._publish_all(Reset(self.robot.estop, self._by).messages())

@@ -39,11 +39,11 @@ _START = {
 
 
 class LinuxRobot(Robot):
-    """Goob or Fred: the real launcher and services; camera, microphone, MCUs and loudspeaker are simulated.
+    """Goob or Fred: the real launcher and services, with simulated camera, microphone, MCUs and loudspeaker.
 
     Both are in the room that comes with Pebble: their motor MCUs are part of it, and their cameras see it. A simulated
-    loudspeaker records what Goob ``played``. ``instances`` are the configs of its self-describing MCUs, to which
-    others may be added before it is brought up.
+    loudspeaker records the sound that Goob ``played``. ``instances`` are the configs of its self-describing MCUs, to
+    which others may be added before it is brought up.
     """
 
     runs_on = "Linux, SAMD21"
@@ -51,9 +51,9 @@ class LinuxRobot(Robot):
     running: Testbed
 
     def __init__(self, running: Testbed, name: str) -> None:
-        own = _config(name)
+        config = _config(name)
         remote, folder = (HOST, running.broker_port), running.folder / name
-        super().__init__(running, own["transport"]["kind"], remote, name=name, folder=folder)
+        super().__init__(running, config["transport"]["kind"], remote, name=name, folder=folder)
         self.has_scripts = name == "goob"
         self.local_port = running.local_broker.port
         self.port, self._trace = port_path(running.world, name), trace_path(running.world, name)
@@ -61,7 +61,7 @@ class LinuxRobot(Robot):
         self.played = folder / "played"
         self._imu = folder / "imu"  # a serial port
         self.instances: dict[str, Config] = {}
-        self._own = own | {"services": own["services"] | {"av_daemon": {}}}
+        self._own = config | {"services": config["services"] | {"av_daemon": {}}}
         raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
         camera = {"video": {"device": f"{running.room_file}#{name}"}}
         self._services = {
@@ -112,7 +112,7 @@ def _loudspeaker(record: Path) -> list[str]:
 
 
 class McuRobot(SimulatedRobot):
-    """MiniLAMP or BenJr: the firmware's own files against simulated pins, with its own connection to the broker."""
+    """MiniLAMP or BenJr: the real firmware files on simulated pins, with its own connection to the broker."""
 
     def __init__(self, running: Testbed, name: str) -> None:
         super().__init__(running, name, running.folder / name)
@@ -126,7 +126,7 @@ class McuRobot(SimulatedRobot):
 
 
 class PageServer(Program):
-    """A server of the operator page for one broker; ``settings`` are further fields of WebSettings."""
+    """A server of the operator page for one broker; ``settings`` are more fields of WebSettings."""
 
     def __init__(self, folder: Path, broker_port: int, **settings: Any) -> None:
         """Start the server. Raises PebbleError without the packages that it needs."""
@@ -148,7 +148,7 @@ class Testbed(Processes):
     """Two brokers, two Linux robots with an MCU each, and two robots that are an MCU; or only those of ``names``.
 
     ``keep``: the folder with the logs stays after the demo. ``world``: the folder of Goob's and Fred's room.
-    ``broker_port`` is that of the operators' broker, on loopback.
+    ``broker_port``: the operators' broker, on loopback.
     """
 
     ends_s = (1.0, 2.5, 1.0, 1.0)  # with the operator's disconnect: every process ends within five seconds
@@ -177,23 +177,23 @@ class Testbed(Processes):
             self.robots[name] = McuRobot(self, name) if name in _BOARDS else LinuxRobot(self, name)
 
     def start_page(self, port: int = 0, **settings: Any) -> PageServer:
-        """Return the operator page's server, which is starting, instead of an earlier one; ``port`` 0 is a free one."""
+        """Start the operator page in place of an earlier one; return its server. ``port`` 0: a free port."""
         for earlier in [program for program in self._kinds if isinstance(program, PageServer)]:
             self.end(earlier)
         self.server = self.add(PageServer(self.folder, self.broker_port, port=port, **settings), OPERATORS)
         return self.server
 
     def start_recorder(self, into: Path, *options: object) -> Program:
-        """Start ``pebble record`` for everything at the operators' broker and return it; it may not be ready yet.
+        """Start ``pebble record`` for everything at the operators' broker; return it, perhaps not yet ready.
 
-        ``options`` are further arguments of the command.
+        ``options`` are more arguments of the command.
         """
         url = f"mqtt://{HOST}:{self.broker_port}"
         command = python("pebble.cli", "record", "--url", url, "--into", into, *options)
         return self.add(Program("pebble record", command, self.folder / "record.log"), OPERATORS)
 
     def start_robots(self) -> None:
-        """Start the robots. Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""
+        """Start the robots. Raises PebbleError if a simulated MCU fails; any other failure shows at the operator."""
         for robot in self.robots.values():
             robot.bring_up(self._ending)
 

@@ -21,16 +21,16 @@ def answer(what: bytes | dict[str, Any]) -> None:
 
 
 def serve(handle: Handle) -> None:
-    """Pass each line to ``handle`` and write what it answers, if anything, until standard input closes."""
+    """Pass each line to ``handle`` and write its answer, if any, until standard input closes."""
     for line in sys.stdin:
         if (reply := handle(line.strip())) is not None:
             answer(reply)
 
 
 def serve_on_thread(handle: Handle, end: Callable[[], object] = lambda: None) -> threading.Event:
-    """Return the same on a thread of its own.
+    """Serve lines as :func:`serve`, on another thread.
 
-    The event is set, and ``end`` is called, when standard input has closed.
+    The returned event is set, and ``end`` is called, when standard input has closed.
     """
     ended = threading.Event()
 

@@ -22,7 +22,7 @@ _DEADLINES_S = 2.0  # simulated part of a longer pause: all deadlines of the fir
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """The timing of a board: ``turn_s`` is the period of its firmware's loop, ``tick_s`` of calls of ``tick``."""
+    """The timing of a board: ``turn_s`` is the period of its firmware's loop, ``tick_s`` that of calls of ``tick``."""
 
     turn_s: float
     tick_s: float
@@ -37,10 +37,10 @@ KINDS: Final = {
 
 
 class SimulatedMcu:
-    """One board. Pass host data to ``receive``, call ``tick`` often, and send what both return to the host.
+    """A board. Pass the host's data to ``receive``, call ``tick`` often, and send what both return to the host.
 
-    ``now`` is a monotonic time in seconds from one clock for all calls. ``motion`` is where the robot stands, and on
-    what ground. ``on_motors(now, (left, right))`` is called at each change of the motors, + = forward.
+    ``now`` is a monotonic time in seconds from one clock for all calls. ``motion`` tells the robot's place and its
+    ground. ``on_motors(now, (left, right))`` is called at each change of the motors, + = forward.
     """
 
     def __init__(
@@ -65,12 +65,12 @@ class SimulatedMcu:
 
     @property
     def robot(self) -> Any:
-        """The robot object of the firmware, since the last boot."""
+        """Robot object that the firmware made at the last boot."""
         return self._runner.robot
 
     @property
     def resets(self) -> int:
-        """The number of times that the board has restarted by itself."""
+        """Number of times that the board has restarted by itself."""
         return self.board.resets
 
     def boot(self, now: float) -> None:
@@ -80,7 +80,7 @@ class SimulatedMcu:
         self._start()
 
     def receive(self, data: bytes, now: float) -> bytes:
-        """Process ``data``, which may end in the middle of a line. Returns the board's output."""
+        """Process ``data``, which may end in the middle of a line; return the board's output."""
         output = self._advance(now, self.profile.tick_s)
         self.board.type(data)
         output += self._turn(now)
@@ -91,7 +91,7 @@ class SimulatedMcu:
         return output
 
     def tick(self, now: float) -> bytes:
-        """Advance to ``now``. Returns the board's output until then."""
+        """Advance to ``now``; return the board's output until then."""
         first, self._boot_output = self._boot_output, b""
         return first + self._advance(now, self.profile.turn_s) + self._turn(now)
 
@@ -101,7 +101,7 @@ class SimulatedMcu:
     # -- time
 
     def _advance(self, now: float, turn_s: float) -> bytes:
-        """Run the loop every ``turn_s`` up to just before ``now``. Returns the board's output."""
+        """Run the loop every ``turn_s`` until just before ``now``; return the board's output."""
         output = b""
         behind = now - self._clock.now()
         if behind <= turn_s:
@@ -114,7 +114,7 @@ class SimulatedMcu:
         return output
 
     def _turn(self, now: float) -> bytes:
-        """Run one turn of the firmware's loop at ``now``, unless the firmware is still blocked then."""
+        """Run one turn of the firmware's loop at ``now``, unless the firmware still blocks then."""
         if self._clock.now() > now:
             return b""
         self._clock.until(now)
@@ -123,6 +123,6 @@ class SimulatedMcu:
         return self.board.take_output()
 
     def _start(self) -> None:
-        """Run the first turn; its output belongs to the boot and is no answer to a command."""
+        """Run the first turn. Its output belongs to the boot, and answers no command."""
         self._runner.step()
         self._boot_output = self.board.take_output()

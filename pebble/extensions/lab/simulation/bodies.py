@@ -1,4 +1,4 @@
-"""The robots around simulated boards: motors, wheels, battery, sensors, lights and I2C devices."""
+"""The bodies of robots around simulated boards: motors, wheels, battery, sensors, lights and I2C devices."""
 
 import math
 from collections.abc import Callable
@@ -52,10 +52,10 @@ class BoardState:
 
 
 class Body:
-    """A robot around its board, from pins to pose. Make it before loading the firmware, which needs its devices.
+    """A robot's body, from the board's pins to the pose. Make it before loading the firmware, which needs its devices.
 
-    ``end_turn`` must be called after every turn of the firmware's loop. It calls ``on_motors(now, (left, right))``
-    when the motors have changed: −1..1, + = forward of the robot, however the motors are mounted.
+    ``end_turn`` must be called after every turn of the firmware's loop. It calls ``on_motors(now, (left, right))`` when
+    the motors have changed: −1..1, + = forward of the robot, however the motors are mounted.
     """
 
     kind: str
@@ -74,7 +74,7 @@ class Body:
         board.pins.before_change = self.before_output_change
 
     def before_output_change(self) -> None:
-        """Advance to now, just before an output of the board changes; several may change in one turn."""
+        """Advance to the present time before an output of the board changes; several may change in one turn."""
         now = self.board.clock.now()
         if self._stale and now == self._changed_at:
             return
@@ -104,7 +104,7 @@ class Body:
             self.battery.advance(self.motion, seconds / slices)
 
     def _read_outputs(self) -> None:
-        """Update the motors if outputs have changed."""
+        """Set the motors by the board's outputs, if these have changed."""
         if self._stale:
             self._stale = False
             self._motors = self.forward(*self.outputs())
@@ -127,11 +127,11 @@ class Body:
         )
 
     def outputs(self) -> Pair:
-        """Return the inputs of the left and right motor driver, −1..1; + is the driver's own forward."""
+        """Return the inputs of the left and the right motor driver, −1..1; + is forward for the driver."""
         return 0.0, 0.0
 
     def forward(self, left: float, right: float) -> Pair:
-        """Convert ``outputs`` to speeds of the robot: + = forward."""
+        """Convert ``outputs`` to speeds of the robot's sides: + = forward."""
         return left, right
 
     def light(self) -> Light:
@@ -201,7 +201,7 @@ class Fred(TwoWheeled):
 
 
 class Minilamp(TwoWheeled):
-    """Two wheels, one cell; what its grousers do is not simulated."""
+    """Two wheels and a battery of one cell; the grousers' effect is not simulated."""
 
     kind = "minilamp"
     cells = 1
@@ -246,9 +246,10 @@ BODIES: Final[dict[str, type[Body]]] = {kind.kind: kind for kind in (Goob, Fred,
 
 
 def body_of(kind: str, board: Board, motion: RobotMotion | None = None) -> Body:
-    """Make the body of a robot around ``board``, before its firmware is loaded; ConfigError for an unknown kind.
+    """Return the body of a robot around ``board``, whose firmware is not yet loaded.
 
-    ``motion``: where it stands, and on what; otherwise at the origin of an empty floor.
+    ``motion``: the robot's place and ground; by default the origin of an empty floor. Raises ConfigError for an unknown
+    kind.
     """
     if kind not in BODIES:
         raise ConfigError(f"unknown simulated robot {kind!r}; known: {', '.join(BODIES)}")

@@ -1,6 +1,6 @@
 """Many simulated robots with Wi-Fi in one process and thread, each with its own board, firmware and connection.
 
-A robot has a turn at once when one of its sockets is ready, otherwise periodically.
+A robot runs a turn at once when one of its sockets is ready, otherwise periodically.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _LONGEST_S = 0.05
 
 
 class Fleet:
-    """A fleet: ``add`` robots, then ``run`` them; leaving the context stops all motors and closes all connections."""
+    """A fleet: ``add`` robots, then ``run`` them. Leaving the context stops all motors and closes all connections."""
 
     def __init__(self, broker: MqttSettings) -> None:
         self.broker = broker
@@ -42,7 +42,7 @@ class Fleet:
             self._epoll.register(sock, select.EPOLLIN)
 
     def add(self, kind: str, identity: Identity, *, moving_s: float = _MOVING_S, **options: Any) -> WirelessRobot:
-        """Add a robot; its first turn is when the fleet runs."""
+        """Add a robot. Its first turn comes when the fleet runs."""
         robot = WirelessRobot(kind, identity, self.broker, self._servers, moving_s=moving_s, **options)
         self.robots.append(robot)
         self._due.append(0.0)
@@ -70,7 +70,7 @@ class Fleet:
         self.close()
 
     def _turn(self) -> None:
-        """Wait for a ready socket or for the next robot that is due, and step those robots."""
+        """Wait for a ready socket or for the next robot that is due; run a turn of those robots."""
         wait = min(self._due, default=0.0) - time.monotonic()
         for descriptor, _ in self._epoll.poll(min(_LONGEST_S, max(0.0, wait))):
             if descriptor in self._servers_of:
@@ -95,7 +95,7 @@ class Fleet:
 
 
 class ConnectionReporter:
-    """A reporter, in one line, of robots that cannot connect, and again when that changes. Call ``poll`` often."""
+    """A reporter of robots that cannot connect: one line, and another when that changes. Call ``poll`` often."""
 
     def __init__(self, robots: Sequence[WirelessRobot], report: Callable[[str], None]) -> None:
         self._robots, self._report = robots, report

@@ -1,7 +1,7 @@
 """Simulated I2C devices: the MPU-6050, with its registers and sensors, and the WEMOS D1 mini motor shield v1.0.0.
 
-The MPU's registers, scales and reset values are those of InvenSense RM-MPU-6000A-00 4.2; its noise is that of the
-data sheet.
+The MPU's registers, scales and reset values are those of InvenSense RM-MPU-6000A-00 4.2; its noise is from the data
+sheet.
 """
 
 import math
@@ -52,14 +52,14 @@ class Mpu6050:
     def read(self, count: int) -> bytes:
         if not self._registers[_PWR_MGMT_1] & _SLEEP:
             self._registers[_ACCEL_XOUT_H : _ACCEL_XOUT_H + 14] = self._sample()
-        got = bytes(self._registers[(self._pointer + offset) % 128] for offset in range(count))
+        values = bytes(self._registers[(self._pointer + offset) % 128] for offset in range(count))
         self._pointer = (self._pointer + count) % 128
-        return got
+        return values
 
     # -- the sensors
 
     def _sample(self) -> bytes:
-        """Return acceleration, temperature and angular rate, as in the 14 data registers."""
+        """Return acceleration, temperature and angular rate as the 14 data registers hold them."""
         accel, gyro = self._true_values()
         per_g = _ACCEL_LSB_PER_G / (1 << (self._registers[_ACCEL_CONFIG] >> 3 & 3))
         per_dps = _GYRO_LSB_PER_DPS / (1 << (self._registers[_GYRO_CONFIG] >> 3 & 3))
@@ -71,7 +71,7 @@ class Mpu6050:
         )
 
     def _true_values(self) -> tuple[Vector, Vector]:
-        """Return specific force in g (at rest: 1 g upwards), and angular rate in degrees per second."""
+        """Return specific force in g (1 g upwards at rest), and angular rate in degrees per second."""
         roll, pitch = (math.radians(angle) for angle in self.tilt_deg)
         ahead, aside, turn_dps = self._motion_values()
         accel = (
@@ -83,7 +83,7 @@ class Mpu6050:
         return accel, (bias_x, bias_y, bias_z + turn_dps)
 
     def _motion_values(self) -> tuple[float, float, float]:
-        """Return what the motion adds: acceleration ahead and to the left in g, and angular rate to the left."""
+        """Return the motion's part: acceleration ahead and to the left in g, and angular rate to the left."""
         if self._motion is None:
             return 0.0, 0.0, 0.0
         now = self._now()
@@ -107,7 +107,7 @@ _SIGN: Final = {1: -1.0, 2: 1.0}  # counter-clockwise, clockwise; brake, stop an
 class MotorShield:
     """The motor shield. ``speeds`` of motors A and B are −1..1, + = clockwise; they persist when the MCU resets.
 
-    The motors are off until the PWM frequency is set. ``before_change`` is called just before a message is executed.
+    The motors are off until the PWM frequency is set. ``before_change`` is called just before a message takes effect.
     """
 
     def __init__(self) -> None:

@@ -19,7 +19,7 @@ _REPORT_PERIOD_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A line of a report: one JSON object, ten times a second. ``ns`` is time.monotonic_ns()."""
+    """A line of a report: a JSON object, ten times a second. ``ns`` is time.monotonic_ns()."""
 
     ns: int
     plugged: bool
@@ -51,7 +51,7 @@ def run(
 
 
 def write_line(what: object) -> bool:
-    """Write a line of JSON to standard output; False if its reader has closed it."""
+    """Write a line of JSON to standard output; False if nothing reads it any more."""
     try:
         os.write(sys.stdout.fileno(), msgspec.json.encode(what) + b"\n")
     except BrokenPipeError:
@@ -60,7 +60,7 @@ def write_line(what: object) -> bool:
 
 
 def actions(mcu: PtyMcu) -> dict[str, Callable[[], None]]:
-    """Return the commands that standard input may have."""
+    """Return the commands that standard input accepts."""
     return {
         "unplug": mcu.unplug,
         "replug": mcu.replug,
@@ -71,11 +71,11 @@ def actions(mcu: PtyMcu) -> dict[str, Callable[[], None]]:
 
 
 def _run_commands(mcu: PtyMcu, end: EndSignal) -> None:
-    known = actions(mcu)
+    commands = actions(mcu)
     for line in sys.stdin:
-        action = known.get(line.strip())
+        action = commands.get(line.strip())
         if action is None:
-            sys.stderr.write(f"unknown command {line.strip()}; known: {', '.join(known)}\n")
+            sys.stderr.write(f"unknown command {line.strip()}; known: {', '.join(commands)}\n")
         else:
             action()
     end.set()

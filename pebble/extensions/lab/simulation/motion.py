@@ -1,4 +1,4 @@
-"""The physics of a robot on two driven wheels: motion and pose, hall sensors, and battery."""
+"""The physics of a robot on two driven wheels: motion and pose, hall sensors, battery."""
 
 import math
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Wheels:
-    """The wheels as they are, which may differ from those that a program believes in."""
+    """The true measures of the wheels, which may differ from those that a program assumes."""
 
     left_diameter_mm: float = WHEEL_DIAMETER_MM
     right_diameter_mm: float = WHEEL_DIAMETER_MM
@@ -28,19 +28,19 @@ class Wheels:
 
 
 class Ground(Protocol):
-    """The ground below a robot."""
+    """The ground under a robot."""
 
     def move(self, start: Pose, end: Pose) -> Pose:
-        """Return where a robot is that drives from ``start`` to ``end``: less far, if something is in its way."""
+        """Return the pose that a robot reaches on its way from ``start`` to ``end``: something may stop it."""
 
     def place(self, pose: Pose) -> None:
-        """Note that the robot has been lifted, and put down there."""
+        """Note that the robot was lifted and put down at ``pose``."""
 
 
 class RobotMotion:
     """Two wheels that follow their commanded speeds with a lag, and the resulting pose.
 
-    Where ``ground`` stops the robot, its wheels slip; without one nothing is in the way.
+    Where ``ground`` stops the robot, its wheels slip. Without ``ground`` nothing is in the way.
     """
 
     def __init__(self, pose: Pose | None = None, ground: Ground | None = None, wheels: Wheels | None = None) -> None:
@@ -76,7 +76,7 @@ class RobotMotion:
 
 
 def _follow(speed: float, wanted: float, seconds: float) -> tuple[float, float]:
-    """Speed and distance of a wheel that approaches the speed ``wanted`` exponentially."""
+    """Return speed and distance of a wheel that approaches the speed ``wanted`` exponentially."""
     left_over = (speed - wanted) * math.exp(-seconds / _LAG_S)
     way = wanted * seconds + (speed - wanted - left_over) * _LAG_S
     reached = wanted + left_over
@@ -93,7 +93,7 @@ _SAG_V = 0.075  # under full load
 
 
 def hall(motion: RobotMotion) -> tuple[float, float, float]:
-    """Return the Hall sensors, 0..1 of the ADC's range: left wheel, right wheel, left wheel a quarter wave later."""
+    """Return the Hall sensors' readings, 0..1 of the ADC's range: left, right, left a quarter wave later."""
     left = _MAGNETS * motion.left_mm / motion.wheels.left_diameter_mm  # half the magnets are waves of a turn, in rad
     right = _MAGNETS * motion.right_mm / motion.wheels.right_diameter_mm
     return _part(math.sin(left)), _part(math.sin(right)), _part(math.sin(left - math.pi / 2))
@@ -104,7 +104,7 @@ def _part(level: float) -> float:
 
 
 class Battery:
-    """``cells`` in series. Its voltage falls with time and motion, sags under load and rises on the charger."""
+    """A battery of ``cells`` in series: falls with time and motion, sags under load, rises on the charger."""
 
     def __init__(self, cells: int) -> None:
         self.charging = False

@@ -30,9 +30,9 @@ def run(
     report: bool = False,
     files: Path | None = None,
 ) -> int:
-    """Run one robot until a signal, or until the reader of the report closes the pipe. Raises PebbleError.
+    """Run a robot until a signal, or until the reader of its report closes the pipe. Raises PebbleError.
 
-    ``name``: what people call it. ``security``: of its config; None: open.
+    ``name``: the robot's name for people. ``security``: the level in its config; None: open.
     """
     end, record = EndSignal(), Trace(trace)
 
@@ -56,9 +56,9 @@ def run(
 
 
 def run_fleet(broker: MqttSettings, robots: int) -> int:
-    """Run a fleet until a signal, and print its status. Raises PebbleError.
+    """Run a fleet until a signal, and print its status; return 0 if all robots are online at the end.
 
-    Returns 0 if all robots are online at the end.
+    Raises PebbleError.
     """
     end, due = EndSignal(), time.monotonic() + _STATUS_S
 

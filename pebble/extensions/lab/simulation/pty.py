@@ -26,7 +26,7 @@ _TRACED_LINE = 4096  # bytes; far longer than any line that the MCU accepts
 
 
 class _Recorder:
-    """A recorder that adds to a trace what passes the port, in lines."""
+    """A recorder of the lines that pass the port, in a trace."""
 
     def __init__(self, trace: Trace, *, is_text: bool, output: bool) -> None:
         self._trace = trace
@@ -41,7 +41,7 @@ class _Recorder:
             self._add(ns, "line", self._received.feed(data))
 
     def sent(self, ns: int, data: bytes, *, whole: bool) -> None:
-        """Note what was sent. ``whole``: nothing was lost after it."""
+        """Note data that was sent; ``whole``: nothing before it was lost."""
         if self._sent is not None:
             self._add(ns, "said", self._sent.feed(data))
             if not whole:
@@ -54,12 +54,12 @@ class _Recorder:
 
 
 class PtyMcu:
-    """A SimulatedMcu, its pty, the thread that runs them, and ``symlink``, the stable path of the port.
+    """A SimulatedMcu with its pty, the thread that runs both, and ``symlink``, the stable path of the port.
 
     The symlink's folder must exist; only a symlink is replaced. Unplugging closes the pty but leaves the MCU powered:
     its motors stop by failsafe, as on a robot whose MCU is powered by the battery. Each replug makes a new pty behind
-    the same symlink. ``motion`` is where the robot stands, used by this object alone. The file ``trace`` also has when
-    the MCU was late, and with ``trace_output`` the trace has the MCU's own lines that the host received.
+    the same symlink. ``motion`` is the robot's motion, used by this object alone. The file ``trace`` also tells when
+    the MCU was late; with ``trace_output`` it has the MCU's own lines that the host received.
     """
 
     def __init__(
@@ -212,7 +212,7 @@ class PtyMcu:
         self._transmit(self._mcu.receive(data, arrived / 1e9))
 
     def _transmit(self, data: bytes) -> None:
-        """Write to the host; as with a USB device, data that no host receives is lost."""
+        """Write to the host. As with a USB device, data that no host receives is lost."""
         if not data:
             return
         sent, began = 0, time.monotonic_ns()

@@ -1,4 +1,4 @@
-"""A record of a simulated MCU's input, motor changes and output, with their times."""
+"""A record of a simulated MCU's input and output and of its motors' changes, with times."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ Event = Literal["plugged", "opened", "line", "closed", "unplugged", "motors", "s
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line from the host or (``said``) to it, a change of the port or of the motors.
+    """One line from the host or (``said``) to it, or a change of the port or of the motors.
 
     ``ns`` is time.monotonic_ns() when the line's last byte was received, just before it was written, or when the
     outputs changed. The line of ``motors`` is ``<left> <right>`` with three decimals, -1..1, + = forward of the robot,
-    however its motors are mounted. That of ``late`` are the seconds for which a busy machine kept the MCU from its port
-    until now: what it receives next came at any time since.
+    however its motors are mounted. The line of ``late`` is the number of seconds for which a busy machine kept the MCU
+    from its port until now: what it receives next came at any time since.
     """
 
     ns: int
@@ -34,12 +34,12 @@ class Entry:
 
     @property
     def motors(self) -> tuple[float, float] | None:
-        """The new speeds of the motors: left and right, -1..1."""
+        """New speeds of the motors, left and right, -1..1; None for other entries."""
         return _pair(self.line.split(" ")) if self.event == "motors" else None
 
     @property
     def late_s(self) -> float:
-        """The time for which the MCU did not read its port until now; 0 for any other entry."""
+        """Seconds for which the MCU did not read its port until now; 0 for other entries."""
         return float(self.line) if self.event == "late" else 0.0
 
 
@@ -58,7 +58,7 @@ def motors_entry(ns: int, motors: tuple[float, float]) -> Entry:
 
 
 class Trace:
-    """Entries in the order of arrival; with ``path`` also a file with one JSON object per line, unbuffered."""
+    """Entries in the order of their arrival; with ``path`` also a file, with one JSON object per line, unbuffered."""
 
     def __init__(self, path: Path | None = None) -> None:
         self._entries: deque[Entry] = deque(maxlen=_RETAINED)
@@ -70,11 +70,11 @@ class Trace:
             self._file.write(msgspec.json.encode(entry) + b"\n")
 
     def entries(self) -> list[Entry]:
-        """Return a copy, oldest first."""
+        """Return a copy of the entries, oldest first."""
         return list(self._entries.copy())
 
     def lines(self) -> list[str]:
-        """Return only the lines, oldest first."""
+        """Return the lines of the entries, oldest first."""
         return [entry.line for entry in self.entries() if entry.event == "line"]
 
     def close(self) -> None:
@@ -89,7 +89,7 @@ def read_trace(path: Path) -> list[Entry]:
 
 
 def complete_lines(path: Path, start: int = 0) -> tuple[list[bytes], int]:
-    """Return the complete lines of a file from byte ``start`` on, and where the incomplete one begins."""
+    """Return the complete lines of a file from byte ``start`` on, and the place where an incomplete line begins."""
     with path.open("rb") as file:
         file.seek(start)
         raw = file.read()

@@ -32,8 +32,8 @@ class WirelessRobot:
     """One robot; ``step`` is a turn of its loop. ``on_motors(seconds, (left, right))`` is called when motors change.
 
     ``pause_s`` is the longest time until its next turn while its sockets are idle. ``files`` is the folder of its
-    board's files, which survive the program; None: they are in memory. ``name``: what people call it; empty: nothing
-    else than its id. ``security``: of its config.
+    board's files, which survive the program; None: they are in memory. ``name``: the robot's name for people; empty:
+    its id. ``security``: the level in its config.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class WirelessRobot:
 
     @property
     def problem(self) -> str:
-        """The reason why the robot is not online; "" if unknown."""
+        """Reason why the robot is not online; "" if unknown."""
         reason = str(self.firmware.session.connection.reason)
         return reason if "refused by the broker" in reason else self.network.problem or reason
 
@@ -112,7 +112,7 @@ class WirelessRobot:
         return {"robot": robot, "wifi": wifi, "mqtt": self._mqtt(), **security}
 
     def _mqtt(self) -> dict[str, Any]:
-        """Return the section ``mqtt`` of a private_config.json."""
+        """Return the section ``mqtt`` of the board's private_config.json."""
         broker, tls = self.broker, self.broker.tls
         login = {"username": broker.username, "password": broker.password} if broker.username is not None else {}
         ca: Any = {"ca": _CA_FILE} if tls is not None and tls.ca_cert is not None else tls is not None

@@ -1,4 +1,4 @@
-"""One frame: its bytes, the metadata beside them, and the picture decoded from them."""
+"""A frame: its bytes, their metadata, and the picture decoded from them."""
 
 from importlib import import_module
 from typing import Any
@@ -14,7 +14,7 @@ _LARGEST = 1 << 14  # pixels per side
 
 
 class FrameInfo(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """The metadata of a frame: MessagePack in its attachment. New fields go to the end and have defaults."""
+    """Metadata of a frame, sent as MessagePack in its attachment. New fields go to the end and have defaults."""
 
     sequence: int = 0  # set by the writer: 1, 2, 3 … since it was opened
     writer: int = 0  # set by the writer: a random number, new each time it is opened
@@ -43,7 +43,7 @@ def decode(attachment: bytes) -> FrameInfo | None:
 class Frame:
     """The bytes of one frame and its metadata.
 
-    Without views the bytes are the caller's own copy. With views they are read-only and still belong to the writer:
+    Without views the bytes are a copy for the caller. With views they are read-only and still belong to the writer:
     process them soon, and check `valid` afterwards. Arrays taken from a frame stay readable after its release.
     """
 
@@ -63,14 +63,15 @@ class Frame:
         return self._data
 
     def picture(self, width: int | None = None) -> Bytes:
-        """Decode to (height, width, 3), BGR, scaled to ``width`` pixels if given. Raises PayloadError if no picture.
+        """Return the picture of the frame: (height, width, 3), BGR, scaled to ``width`` pixels if given.
 
-        A `bgr24` frame in its own size is not copied: with views the result is a view, too.
+        A `bgr24` frame in its original size is not copied: with views the result is a view, too. Raises PayloadError if
+        the frame is no picture.
         """
         return picture(self.data, self.info, width)
 
     def valid(self) -> bool:
-        """True if the memory still holds this frame; else what was read may be wrong and must be discarded."""
+        """True if the memory still holds this frame. If not, discard what was read: it may be wrong."""
         if self._data is None:
             return False
         return self._buffer is None or bool(self._buffer.is_valid())
@@ -81,14 +82,14 @@ class Frame:
 
 
 def picture(data: Bytes, info: FrameInfo, width: int | None = None) -> Bytes:
-    """Decode ``data`` to (height, width, 3), BGR. Raises PayloadError if it is no picture."""
+    """Return the picture in ``data``: (height, width, 3), BGR. Raises PayloadError if it is no picture."""
     if info.format == "mjpeg":
-        found = _jpeg(data, info, width)
+        pixels = _jpeg(data, info, width)
     elif info.format in PICTURE_FORMATS:
-        found = _raw(data, info)
+        pixels = _raw(data, info)
     else:
         raise PayloadError(f'a frame of format "{info.format}" is no picture')
-    return found if width is None or width == found.shape[1] else _resized(found, width)
+    return pixels if width is None or width == pixels.shape[1] else _resized(pixels, width)
 
 
 def _raw(data: Bytes, info: FrameInfo) -> Bytes:
@@ -106,7 +107,7 @@ def _raw(data: Bytes, info: FrameInfo) -> Bytes:
 
 
 def _opencv(what: str) -> Any:
-    """Return the module cv2: tens of MB, only for readers that need it. Raises PayloadError where it is missing."""
+    """Return the module cv2: tens of MB, only for readers that need it. Raises PayloadError if it is missing."""
     try:
         return import_module("cv2")
     except ModuleNotFoundError:
@@ -114,7 +115,7 @@ def _opencv(what: str) -> Any:
 
 
 def _rows(data: Bytes, info: FrameInfo, rows: int, row_bytes: int) -> Bytes:
-    """Return the rows of pixels without the padding of the stride."""
+    """Return the rows of pixels without the padding at their ends."""
     stride = info.stride or row_bytes
     fits = 0 < info.width <= _LARGEST and 0 < info.height <= _LARGEST and stride >= row_bytes
     if not fits or data.size < stride * (rows - 1) + row_bytes:
@@ -126,17 +127,17 @@ def _rows(data: Bytes, info: FrameInfo, rows: int, row_bytes: int) -> Bytes:
 
 
 def _jpeg(data: Bytes, info: FrameInfo, width: int | None) -> Bytes:
-    """Decode at 1/2, 1/4 or 1/8 size if that is enough for ``width``: a fraction of the work."""
+    """Return the decoded JPEG, at 1/2, 1/4 or 1/8 size if that is enough for ``width``: much less work."""
     cv2 = _opencv(f"a frame of format {info.format}")
     scale = _scale(info.width, width)
     flags = {1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}
     try:
-        found = cv2.imdecode(data, flags.get(scale, cv2.IMREAD_REDUCED_COLOR_8))
+        pixels = cv2.imdecode(data, flags.get(scale, cv2.IMREAD_REDUCED_COLOR_8))
     except cv2.error:  # an empty or undecodable buffer
-        found = None
-    if found is None:
+        pixels = None
+    if pixels is None:
         raise PayloadError(f"{data.size} bytes are no JPEG")
-    return np.asarray(found)
+    return np.asarray(pixels)
 
 
 def _scale(has: int, wanted: int | None) -> int:

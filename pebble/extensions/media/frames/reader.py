@@ -34,11 +34,11 @@ _T = TypeVar("_T")
 
 
 class FrameReader:
-    """One reader of a stream. It may open before the writer, and survives any number of writers.
+    """A reader of one stream. It may open before the writer, and continues with every new writer.
 
     ``views``: frames are views of the writer's memory instead of copies. ``sharing``: False for sound, which comes as
-    bytes anyway; to be ready for shared memory takes Zenoh 8 MB (1.10.2). ``depth``: how many frames wait at most, for
-    sound; it must be below the writer's number of slots. One thread reads; any may close.
+    bytes anyway, because readiness for shared memory takes Zenoh 8 MB (1.10.2). ``depth``: the most frames that wait,
+    for sound; it must be below the writer's number of slots. One thread reads; any may close.
 
     Counters: received; missed (gaps in the numbers: lost, or overtaken by a newer one); skipped (replaced by a newer
     one before it was read); of those that were read shared (through shared memory), copied (as bytes) and torn
@@ -68,7 +68,7 @@ class FrameReader:
     # -- opening and closing
 
     def open(self) -> Self:
-        """Open. Raises TransportError in a folder that cannot contain a socket, or is not this user's."""
+        """Open the reader. Raises TransportError if the folder is another user's, or its path too long for a socket."""
         prepare_run_dir(self._names.folder)
         with self._changing:
             self._latest.reopen()
@@ -130,18 +130,18 @@ class FrameReader:
 
     @property
     def shared(self) -> bool:
-        """True if frames come through shared memory; else `problem` explains why, unless it is the reader's choice."""
+        """True if frames come through shared memory. If not, `problem` explains why, unless ``sharing`` is False."""
         return self._sharing and not self.problem
 
     @property
     def writers(self) -> int:
-        """The number of writers of the stream now: 0 or 1, and 2 for a moment when one replaces another."""
+        """Number of writers of the stream now: 0 or 1, or 2 for a moment when one replaces another."""
         return len(self.running)
 
     def read(self, timeout: float | None = None) -> Frame | None:
-        """Return the newest frame not yet returned (with ``depth``: the oldest of those waiting).
+        """Return the newest frame that was not returned before; with ``depth``, the oldest of those that wait.
 
-        None after ``timeout`` seconds without one, and when the reader is closed.
+        None if there is none within ``timeout`` seconds, or if the reader is closed.
         """
         end = None if timeout is None else time.monotonic() + timeout
         while not self._latest.closed:
@@ -197,7 +197,7 @@ class FrameReader:
             self.counters.add("skipped", skipped)
 
     def _missed(self, info: FrameInfo) -> int:
-        """Return how many frames were lost before this one; -1: it is not newer."""
+        """Return how many frames were lost before this frame; -1 if this frame is an old one."""
         writer, number = self._newest
         if info.writer == self._replaced or (info.writer == writer and info.sequence <= number):
             return -1  # of a writer that was replaced; or sent as bytes, overtaken by a shared one: counted as missed
@@ -230,16 +230,16 @@ class FrameReader:
         mapped = memory.mappings()
         if any(file.endswith(segment) for _, _, file in mapped):
             return ""  # as before: only the connection was lost
-        if (left := sum(end - start for start, end, _ in mapped)) > MAPPED_LIMIT:
+        if (total := sum(end - start for start, end, _ in mapped)) > MAPPED_LIMIT:
             return (
-                f"writers of {self._names.stream} were restarted so often that {left >> 20} MiB of their memory are "
+                f"writers of {self._names.stream} were restarted so often that {total >> 20} MiB of their memory are "
                 "lost until this process is restarted: from now on it gets frames as bytes"
             )
         needed = size + METADATA
         return "" if shared_memory.lockable(needed) else self._memlock_problem(needed)
 
     def _reopen_soon(self, problem: str) -> None:
-        """Have the next `read` reopen the session, without sharing if there is a problem: not on this thread."""
+        """Let the next `read` reopen the session, without sharing after a ``problem``: this thread cannot."""
         self.problem = problem
         self._sharing_ended.set()
         self._latest.wake()
@@ -261,7 +261,7 @@ _Arrival = tuple[FrameInfo, zenoh.ZBytes]
 
 
 class _LatestFrames(Generic[_T]):
-    """A queue of the newest few items, in order, from any thread to one."""
+    """A bounded queue of the newest items, in order, from any thread to one thread."""
 
     def __init__(self, depth: int) -> None:
         self._depth = depth
@@ -274,7 +274,7 @@ class _LatestFrames(Generic[_T]):
         self._wakeup = Wakeup()
 
     def put(self, item: _T) -> int:
-        """Append; return how many older items were dropped."""
+        """Add an item; return how many older items were dropped for it."""
         items, thrown = self._items, 0
         items.append(item)
         while len(items) > self._depth:
@@ -286,7 +286,7 @@ class _LatestFrames(Generic[_T]):
         return thrown
 
     def take(self, end: float | None) -> _T | None:
-        """Return the oldest item; None at ``end`` (monotonic seconds) or when woken."""
+        """Return the oldest item; None at the time ``end`` (monotonic seconds) or when woken."""
         items, wakeup = self._items, self._wakeup
         while True:
             try:

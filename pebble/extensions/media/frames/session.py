@@ -1,4 +1,4 @@
-"""The Zenoh network of one stream of frames: a writer that listens on its own socket, and readers connected to it.
+"""The Zenoh network of one stream of frames: a writer that listens on a socket, and readers connected to it.
 
 It is the same on robots of every transport, and has no hub: docs/decisions/0007.
 """
@@ -22,7 +22,7 @@ _stream_name = re.compile(r"[a-z][a-z0-9-]{0,31}").fullmatch
 
 
 class SharingError(TransportError):
-    """Zenoh could not create its segments; the session would open without shared memory."""
+    """An error: Zenoh could not create its segments, and would open the session without shared memory."""
 
 
 class StreamNames:
@@ -42,11 +42,11 @@ class StreamNames:
         return self.readers.replace("*", name)
 
     def writer(self, writer_id: int, size: int, segment: str) -> str:
-        """Return the token of a running writer: it includes how many bytes it shares, and in which segment."""
+        """Return the token that a running writer publishes: its id, the bytes that it shares, and its segment."""
         return f"{self.writers.removesuffix('*/*/*')}{writer_id:x}/{size}/{segment or '-'}"
 
     def writer_of(self, token: str) -> tuple[int, int, str]:
-        """Return a writer's id by its token, how many bytes it shares, and in which segment. Raises ValueError."""
+        """Return a writer's id, the bytes that it shares and its segment, from its token. Raises ValueError."""
         *_, writer_id, size, segment = token.split("/")
         return int(writer_id, 16), int(size), segment
 
@@ -59,7 +59,7 @@ class StreamNames:
 
 
 def open_writing(names: StreamNames, *, shared: bool) -> zenoh.Session:
-    """Open the writer's session. Raises TransportError if it cannot listen, for example because another writer does."""
+    """Open the writer's session. Raises TransportError if it cannot listen, for example beside another writer."""
     check_socket_path(names.socket)
     return _open(names.folder, [names.socket], [], shared=shared)
 

@@ -1,4 +1,4 @@
-"""The shared memory of a frame writer, and the limit on locked memory that readers and writers are subject to."""
+"""The shared memory of a frame writer, and the system's limit on the memory that a process may lock."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class SharedPool:
 
     def segment(self) -> str:
         """Return the name of its file in /dev/shm; "" if Zenoh does not report it."""
-        found = _segment(repr(self._provider.alloc(1, policy=self._policy)))
-        return f"{found[1]}.zenoh" if found else ""
+        match = _segment(repr(self._provider.alloc(1, policy=self._policy)))
+        return f"{match[1]}.zenoh" if match else ""
 
     def allocate(self, size: int) -> Chunk | None:
         """Return memory for a frame of ``size`` bytes; None if no slot is free."""
@@ -59,7 +59,7 @@ class SharedPool:
         return None
 
     def _starving(self) -> bool:
-        """True if no slot was free for STARVED_S; then the time starts again."""
+        """True, once, if no slot was free for STARVED_S; then the time starts again."""
         now = time.monotonic()
         if self._starved_since is None:
             self._starved_since = now
@@ -79,7 +79,7 @@ class Chunk:
         self._view: Bytes | None = None
 
     def view(self) -> Bytes:
-        """Return the memory as an array; it keeps the provider alive, so that the memory stays mapped after sending."""
+        """Return the memory as an array. It keeps the provider alive, so that the memory stays mapped after sending."""
         if self._view is None:
             self._view = views.array(self._buffer, self._size, writable=True, owner=self._provider)
             if self._view is None:
@@ -97,9 +97,9 @@ class Chunk:
 
 
 def lockable(size: int) -> bool:
-    """True if this process may lock ``size`` bytes in addition to those it has locked already.
+    """True if this process may lock ``size`` more bytes.
 
-    Zenoh locks what it shares; a reader that may not lock loses every shared frame without an error.
+    Zenoh locks the memory that it shares; a reader that may not lock loses every shared frame without an error.
     """
     if not hasattr(_libc, "mlock2"):
         return resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
@@ -113,7 +113,7 @@ def lockable(size: int) -> bool:
 
 
 def memlock_problem(size: int, what: str) -> str:
-    """Return the text for a false ``lockable(size)``: ``what`` cannot share memory, and which limit to raise."""
+    """Return the reason, for logs, why ``what`` cannot share memory, and the limit to raise: not ``lockable(size)``."""
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     return (
         f"{what} cannot use shared memory, frames are sent as bytes: this process may lock {limit >> 10} KiB "

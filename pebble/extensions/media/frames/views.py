@@ -1,8 +1,8 @@
 """Makes numpy views of Zenoh's shared memory, which its Python API cannot do yet (zenoh-python #33, #730).
 
-A `ZShm` or `ZShmMut` is a Rust struct inside a Python object, and one of its words is the address of its bytes. Where
-that word lies is known for certain versions, and is found again in every process by a self-test that needs no network.
-If anything differs from what is known, `why_unavailable` explains it, and frames are copied instead.
+A `ZShm` or `ZShmMut` is a Rust struct inside a Python object, and one of its words is the address of its bytes. The
+place of that word is known for certain versions; a self-test in every process finds it again, without a network. If
+anything differs, `why_unavailable` explains it, and frames are copied instead.
 """
 
 import ctypes
@@ -37,7 +37,7 @@ class UnexpectedLayoutError(Exception):
 
 
 class SelfTest:
-    """The result of the self-test of this process."""
+    """Result of the self-test of this process."""
 
     def __init__(self) -> None:
         self._once = threading.Lock()
@@ -98,7 +98,7 @@ def _read_word(buffer: Buffer, offset: int) -> int:
 
 
 def _calibrate() -> int:
-    """Return where the address of its bytes is in a buffer object. Raises UnexpectedLayoutError if uncertain."""
+    """Return the offset, in a buffer object, of the address of its bytes. Raises UnexpectedLayoutError if unsure."""
     if sys.implementation.name != "cpython":
         raise UnexpectedLayoutError(f"id() is not an address in {sys.implementation.name}")
     if (version := zenoh_version()) not in KNOWN_VERSIONS:
@@ -114,12 +114,12 @@ def _calibrate() -> int:
 
 def zenoh_version() -> str:
     """Return Zenoh's version, from the name of its folder: `importlib.metadata` takes several MB of memory."""
-    found = sorted(Path(zenoh.__file__).parent.parent.glob("eclipse_zenoh-*.dist-info"))
-    return found[-1].name.removeprefix("eclipse_zenoh-").removesuffix(".dist-info") if found else ""
+    folders = sorted(Path(zenoh.__file__).parent.parent.glob("eclipse_zenoh-*.dist-info"))
+    return folders[-1].name.removeprefix("eclipse_zenoh-").removesuffix(".dist-info") if folders else ""
 
 
 def _offsets(buffer: Buffer) -> set[int]:
-    """Return the offsets at which the address that Zenoh prints is found."""
+    """Return the offsets in the object at which the address stands that Zenoh prints."""
     address = _printed(buffer)
     words = range(_HEAD, type(buffer).__basicsize__ - _WORD + 1, _WORD)
     return {offset for offset in words if _read_word(buffer, offset) == address}
@@ -143,7 +143,7 @@ def _only(found: list[set[int]]) -> int:
 
 
 def _check(buffer: Buffer, size: int, offset: int) -> None:
-    """Check that buffer and view show each other's writes, before and after the buffer is sent."""
+    """Check that writes to the buffer appear in the view and the other way round, before and after it is sent."""
     address = _printed(buffer)
     _expect(offset + _WORD <= zenoh.shm.ZShm.__basicsize__, "a received buffer is too small for its address")
     _expect(_read_word(buffer, offset) == address, "the address of a buffer has moved")

@@ -41,12 +41,12 @@ _DROP, _BLOCK_FIRST = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOC
 class FrameWriter:
     """The writer of a stream. One thread at a time may write; `wanted`, `readers` and `close` work on any thread.
 
-    ``capacity`` is the size of the largest frame in bytes, ``slots`` how many of them the shared memory holds: two in
-    use by the writer and on their way, and one for every reader that holds a frame while it works. A frame without a
-    free slot is sent as bytes, so that a slow, stopped or dead reader costs the others nothing but time.
+    ``capacity`` is the size of the largest frame in bytes. ``slots`` is the number of frames that the shared memory
+    holds: two that are written or on their way, and one for each reader that holds a frame while it works. If no slot
+    is free, a frame is sent as bytes, so that a slow, stopped or dead reader costs the others only time.
 
-    Counters: written; of these shared and fallbacks (no room); unwanted (no readers); reclaimed (how often slots had
-    to be reclaimed from readers that died or stopped).
+    Counters: written; of these shared and fallbacks (no room); unwanted (no readers); reclaimed (how often slots had to
+    be reclaimed from readers that died or stopped).
     """
 
     def __init__(self, folder: Path, stream: str, *, capacity: int, slots: int = 6) -> None:
@@ -73,7 +73,7 @@ class FrameWriter:
     # -- opening and closing
 
     def open(self) -> Self:
-        """Open. Raises TransportError if it cannot listen in that folder, for example because another writer does."""
+        """Open the writer. Raises TransportError if it cannot listen there, for example beside another."""
         prepare_run_dir(self._names.folder)
         self._sweep()
         self.problem = self._why_not_shared()
@@ -103,12 +103,12 @@ class FrameWriter:
 
     @property
     def in_place(self) -> bool:
-        """True unless its shared memory was removed, as at a user's logout: readers that start now get nothing."""
+        """True unless the shared memory was removed, as at a user's logout: readers that start now get nothing then."""
         return self._memory is None or self._memory.exists()
 
     @property
     def may_share(self) -> bool:
-        """True if there was no room in shared memory when this writer was opened, and there is now."""
+        """True if shared memory has room now, and had none when this writer was opened."""
         return time.monotonic() >= self._retry_at and self._has_room()
 
     def _has_room(self) -> bool:
@@ -150,7 +150,7 @@ class FrameWriter:
             return None
 
     def close(self) -> None:
-        """Close. Readers stay open, and find the next writer by themselves."""
+        """Close the writer. Readers stay open, and find the next writer by themselves."""
         with self._closing:
             if self._session is None or self._pid != os.getpid():  # a forked session cannot even be closed
                 return
@@ -172,7 +172,7 @@ class FrameWriter:
 
     @property
     def shared(self) -> bool:
-        """True if frames are sent through shared memory; else `problem` explains why, unless they are small."""
+        """True if frames are sent through shared memory. If not, `problem` explains why, unless frames are small."""
         return self._pool is not None
 
     @property
@@ -181,7 +181,7 @@ class FrameWriter:
 
     @property
     def readers(self) -> int:
-        """The number of readers. A stopped one counts until its connection is closed, two seconds later."""
+        """Number of readers. A stopped reader counts until its connection is closed, two seconds later."""
         return len(self._readers)
 
     def _on_reader(self, sample: zenoh.Sample) -> None:
@@ -204,7 +204,7 @@ class FrameWriter:
         return self._put(slot.take(), info, shared=True)
 
     def slot(self, size: int) -> Slot | None:
-        """Return shared memory to build a frame in, without a copy; None if `write` is to be used.
+        """Return shared memory in which to build a frame without a copy; None if there is none: use `write`.
 
         It contains data of earlier frames: fill it completely.
         """
@@ -261,11 +261,11 @@ class Slot:
 
     @property
     def array(self) -> Bytes:
-        """One-dimensional, writable, not zeroed. Raises TransportError when the slot was sent or dropped."""
+        """One-dimensional, writable array, not zeroed. Raises TransportError when the slot was sent or dropped."""
         return self._take(keep=True).view()
 
     def send(self, info: FrameInfo) -> bool:
-        """Send the frame; False if there are no readers any more."""
+        """Send the frame; False if there are no readers left."""
         buffer = self._take().take()
         return self._writer._is_wanted() and self._writer._put(buffer, info, shared=True)
 
@@ -282,7 +282,7 @@ class Slot:
 
 
 def _flat(data: Data) -> Bytes:
-    """Return the same bytes as a one-dimensional array; a copy only if they are not contiguous."""
+    """Return the bytes of ``data`` as a one-dimensional array; they are copied only if they are not contiguous."""
     if isinstance(data, np.ndarray):
         return np.ascontiguousarray(data).reshape(-1).view(np.uint8)
     return np.frombuffer(data, np.uint8)

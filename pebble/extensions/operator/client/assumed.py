@@ -1,4 +1,4 @@
-"""Capabilities assumed for a silent board: two of the original's boards obey drive commands and never say so. Pure."""
+"""The capabilities assumed for a silent board, such as the original's that drive without saying so. Pure."""
 
 from collections.abc import Collection
 from typing import Any, Final, Literal
@@ -22,7 +22,7 @@ _LIST = msgspec.json.encode({"subscribes": [DRIVE.suffix]})
 
 
 def assumed(base: str, axes: Collection[str], name: str = "") -> dict[str, Any]:
-    """Return the capabilities that are assumed: a name, and driving if there are any ``axes``."""
+    """Return the assumed capabilities: a name, and driving if there are any ``axes``."""
     value = announced(base, _LIST) if axes else {}
     if axes:
         value["drive"]["axes"] = list(axes)

@@ -64,7 +64,7 @@ class Arrived:
 
 
 class Broker:
-    """A connection whose handlers and watchers run on the event loop.
+    """A connection to the broker whose handlers and watchers run on the event loop.
 
     Subscribing waits for the broker, so it happens on another thread.
     """
@@ -128,11 +128,10 @@ class Broker:
         qos: QoS = QoS.DELIVERED,
         by: str = "",
     ) -> bool:
-        """Publish now, ahead of streams; return False without a connection or for an invalid topic.
+        """Publish now, before streams; return False without a connection, or for an invalid topic.
 
         ``remember`` False: do not publish it again if the broker loses it, since others may have published a newer
-        value. ``by``: the person on whose behalf it is sent; robots that take only commands with a sender's name read
-        it.
+        value. ``by``: the person for whom it is sent; robots that take only commands with a sender's name read it.
         """
         try:
             signed = self.names.signed(topic, payload, by)
@@ -183,6 +182,6 @@ class Broker:
             watcher()
 
     def _call(self, function: Callable[..., None], *arguments: object) -> None:
-        """Schedule a call on the event loop from another thread; does nothing if the loop has ended."""
+        """Call ``function`` on the event loop, from another thread; do nothing if the loop has ended."""
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(function, *arguments)

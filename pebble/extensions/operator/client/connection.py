@@ -72,7 +72,7 @@ def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
 
 @contextmanager
 def listening(target: Target, sender: Transport) -> Iterator[Transport]:
-    """Open a second connection to the same place as ``sender``, without waiting for it, so that it delays no command.
+    """Open another connection to the same place as ``sender``, without waiting for it, so that it delays no command.
 
     It is ``sender`` itself where each client needs its own id, and within a robot's Zenoh network.
     """
@@ -87,7 +87,7 @@ def listening(target: Target, sender: Transport) -> Iterator[Transport]:
 
 
 def in_small_segments(settings: Any) -> Any:
-    """Return the settings with small TCP segments, for a network that may lose large packets."""
+    """Return the settings changed to small TCP segments, for a network that may lose large packets."""
     return replace(settings, max_segment=SMALL_SEGMENT) if isinstance(settings, MqttSettings) else settings
 
 
@@ -121,7 +121,7 @@ def _account(settings: Any) -> str | None:
 
 
 def put_names(transport: Transport, names: Names, is_named: Callable[[str], bool]) -> None:
-    """Put this client's account into the topics of commands to robots that require it."""
+    """Let the transport put this client's account into command topics, for robots that require it."""
     if names.account is not None:
         transport.policy.forms = NamedTopics(names.account, is_named).forms
 
@@ -160,7 +160,7 @@ class Listener:
         self.subscribe(transport, filters)
 
     def subscribe(self, transport: Transport, filters: Iterable[str]) -> None:
-        """Subscribe to further topics; on a slow network this takes seconds."""
+        """Subscribe to more topics; on a slow network this takes seconds."""
         for filter_ in filters:
             transport.subscribe(filter_, self._take, qos=QoS.DELIVERED)
 
@@ -179,7 +179,7 @@ class Listener:
 
 
 def subscribed_stop(transport: Transport, base: str) -> RobotEstop:
-    """Return a robot's emergency stop after its retained states were read.
+    """Return a robot's emergency stop after reading its retained states.
 
     Some brokers send retained messages a moment after the subscription.
     """

@@ -1,8 +1,8 @@
 """Control of a robot: its holder, as the motor owners publish it, and a client that requests it. Pure.
 
-The robot keeps the state: a client repeats its wish every second, more rarely over a thin link, and the published state
-is the answer. If a robot has several motor owners, the first by name decides, so that two clients never share a robot;
-a client that has control of another owner only releases it.
+The robot keeps the state. A client repeats its request every second, more rarely over a thin link, and the published
+state is the answer. If a robot has several motor owners, the first by name decides, so that two clients never share a
+robot; a client that has control of another owner only releases it.
 """
 
 import secrets
@@ -34,7 +34,7 @@ _NAME, _DEVICE = 40, 20  # characters, as robots cut them
 
 
 class RobotControl:
-    """The control of one robot, from the states of its motor owners. ``estop`` knows which owners it lists."""
+    """The control of one robot, from the states of its motor owners. ``estop`` knows which owners are listed."""
 
     def __init__(self, estop: RobotEstop) -> None:
         self.base = estop.base
@@ -50,7 +50,7 @@ class RobotControl:
 
     @property
     def state(self) -> ControlState | None:
-        """Return the state that decides; None if nothing is known."""
+        """Return the deciding owner's state; None if none is known."""
         return next(iter(self.states), None)
 
     @property
@@ -82,7 +82,7 @@ class RobotControl:
 class ControlClient:
     """A tab or process that requests control. Call :meth:`update` after each state, and :meth:`tick` often.
 
-    ``held``: the robot has confirmed that this client has control. ``failed``: why it gave up, for people.
+    ``held``: the robot has confirmed that this client has control. ``failed``: why it has given up, for people.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class ControlClient:
     # -- what is wanted
 
     def ask(self, now: float, *, over: bool = False) -> None:
-        """Request control from now on: ask its holder for it or, with ``over``, take it."""
+        """Start requesting control: ask its holder or, with ``over``, take it."""
         if not self.wanted:
             self.failed, self._out = "", []  # a release that was not sent yet is none
         self.wanted, self._take = True, over
@@ -117,7 +117,7 @@ class ControlClient:
         self.decided = ""
 
     def keep(self) -> None:
-        """Refuse the client that asks now."""
+        """Keep control although another client asks for it now."""
         state = self.robot.state
         self.passed_over = state.asks_id if state is not None else ""
 
@@ -159,12 +159,12 @@ class ControlClient:
 
     @property
     def done(self) -> bool:
-        """True if this client neither wants control nor has anything left to publish."""
+        """True if this client no longer wants control, and has nothing left to publish."""
         return not self.wanted and not self._out
 
     @property
     def key(self) -> str:
-        """Return the keys for a drive command, of all motor owners that this client has control of."""
+        """Return the keys for a drive command, one of each motor owner that has given control to this client."""
         keys = [state.key for state in self.robot.states if state.id == self.id]
         return " ".join(keys[:_KEYS]) if self.held else ""
 
@@ -187,7 +187,7 @@ class ControlClient:
         return any(state.id == self.id for state in self.robot.states)
 
     def _hopeless(self, now: float) -> str:
-        """Return why to give up the request; empty to go on."""
+        """Return why to give up the request; empty to continue."""
         if now - self._answered_at > self._pace_of().answer_s:
             return f"{self.robot.base.rpartition('/')[2]} {UNANSWERED}"
         return f"{self.robot.who} drives on" if now - self._asked_at > ASKS_S else ""

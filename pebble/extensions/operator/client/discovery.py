@@ -21,7 +21,7 @@ class Discovery:
         return list(self.robots.values())  # a copy: robots may be added meanwhile
 
     def awaits_heartbeat(self, waited_s: float) -> bool:
-        """True if a robot may exist although no heartbeat of it was received for ``waited_s``."""
+        """True if a robot may exist although none of its heartbeats was received for ``waited_s``."""
         robots = [robot.liveness for robot in self.all_robots()]
         awaited = [silent_after(link=liveness.link) for liveness in robots if liveness.received_at is None]
         return waited_s < max(awaited, default=0.0 if robots else silent_after())

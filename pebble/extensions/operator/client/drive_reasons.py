@@ -18,7 +18,7 @@ SLOW_S, SLOW_SPEED = 0.3, 0.4  # from this round trip on, the speed is limited
 
 
 class Code(StrEnum):
-    """A reason. Those that only a page has, such as being in the background, are not among them."""
+    """A reason. Reasons that only a page has, such as being in the background, are not among them."""
 
     BROKER = "broker"
     SILENT = "silent"
@@ -124,7 +124,7 @@ def words(
     problem: str = "",
     script: str = "",
 ) -> str:
-    """Return the sentence of a state for people; "" for none. ``driven``: the driver's name."""
+    """Return the sentence for people about a state; "" if it has none. ``driven``: the driver's name."""
     by = stopped.by if stopped is not None and stopped.by else "unknown"
     values = {"name": name, "by": person(by), "who": person(driven), "script": script or "A script", "problem": problem}
     return WORDS.get(code or "", "").format_map(defaultdict(str, values))
@@ -133,7 +133,7 @@ def words(
 def person(by: str, *, login: bool = True) -> str:
     """Return the sender ``by`` in words for people.
 
-    ``local`` is somebody without a login, perhaps with a device. ``login``: this server requires logins.
+    ``local`` is a user without a login, perhaps with a device. ``login``: this server requires logins.
     """
     if by.partition(" ")[0] != "local":
         return by

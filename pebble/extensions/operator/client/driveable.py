@@ -1,4 +1,4 @@
-"""The part of a robot's status about driving: whether its motors obey, and what waits while it is driven. Pure."""
+"""The part of a robot's status about driving: whether its motors obey, and which programs wait meanwhile. Pure."""
 
 from typing import Any, NamedTuple
 
@@ -10,7 +10,7 @@ _WHY = 300  # characters
 
 
 class Driveable(NamedTuple):
-    """The robot's answer. ``state``: ``yes``, ``no`` or ``unknown``; ``why``: its text, possibly not printable."""
+    """The robot's judgement. ``state``: ``yes``, ``no`` or ``unknown``; ``why``: a text, perhaps not printable."""
 
     state: str
     why: str = ""
@@ -25,9 +25,9 @@ class Driveable(NamedTuple):
 
 
 def driveable_of(status: bytes) -> Driveable | None:
-    """Return the answer in the value of an ``outgoing/status``.
+    """Return the judgement in the value of an ``outgoing/status``.
 
-    None if the status has no answer, as that of an older robot or of one without motors.
+    None if there is none, as in the status of an older robot, or one without motors.
     """
     section = _value(status).get("driveable")
     if not isinstance(section, dict) or section.get("state") not in ("yes", "no", "unknown"):
@@ -37,7 +37,7 @@ def driveable_of(status: bytes) -> Driveable | None:
 
 
 def is_held(status: bytes, program: str) -> bool:
-    """True if ``program`` is requested, and waits while a person drives over a thin link."""
+    """True if ``program`` is requested, but waits while a person drives over a thin link."""
     section: Any = _value(status)
     for level in ("services", program, "state"):
         section = section.get(level) if isinstance(section, dict) else None

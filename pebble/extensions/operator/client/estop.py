@@ -38,7 +38,7 @@ def new_name() -> str:
 
 
 class Progress(Enum):
-    """The progress of one robot's stop, as pages are told."""
+    """The progress of one robot's stop, in the words of the pages."""
 
     WAITING = "sent"
     CONFIRMED = "confirmed"
@@ -58,7 +58,7 @@ class Order(NamedTuple):
 
 
 class RobotStop:
-    """The stop of one robot: when to send it, and whether it is confirmed."""
+    """The stop of one robot: the time of its next message, and whether it is confirmed."""
 
     def __init__(self, base: str, order: Order, now: float) -> None:
         self.estop = RobotEstop(base)
@@ -90,7 +90,7 @@ class RobotStop:
 
     @property
     def is_gone(self) -> bool:
-        """True if only messages that its broker retains are left of the robot, which say that it is offline."""
+        """True if the robot is offline, and left only retained messages at its broker."""
         return self._is_offline and not self.live
 
     @property
@@ -141,10 +141,10 @@ class RobotStop:
         if message.topic == self._status_topic:
             self.driveable = driveable_of(message.payload)
             return
-        known = self.estop.has_capabilities
+        had_capabilities = self.estop.has_capabilities
         if not self.estop.receive(message):
             return
-        if self.estop.has_capabilities and not known:
+        if self.estop.has_capabilities and not had_capabilities:
             self.next, self._names_due = now, self.estop.named  # its topics may be others
         self._boots.update(
             {owner: self.estop.states[owner].boot for owner in self.estop.owners if self._lists_it(owner)}
@@ -182,7 +182,7 @@ class RobotStop:
         ]
 
     def give_up(self) -> None:
-        """Stop sending."""
+        """Stop sending to this robot."""
         self._given_up = True
 
     def _lacks(self, owner: str) -> str:
@@ -197,7 +197,7 @@ class RobotStop:
         return state is not None and self._order.name in state.recent
 
     def _has_taken_it(self, owner: str) -> bool:
-        """True if the owner has listed this stop since its start; later stops may be the present ones."""
+        """True if the owner has listed this stop since the stop's start; its present stop may be a later one."""
         state = self.estop.states.get(owner)
         return state is not None and self._boots.get(owner) == state.boot
 
@@ -206,10 +206,10 @@ class StopSender:
     """One emergency stop, of named robots or of all, until it is confirmed, ended, or 60 s old.
 
     Publish what ``tick`` returns, pass every message of the robots' ``outgoing/#`` to ``receive``, and call ``tick``
-    again after it and at ``due``. Times are seconds of one monotonic clock. A ``hold`` lasts until ``end``.
+    again afterwards and at ``due``. Times are seconds of one monotonic clock. A ``hold`` lasts until ``end``.
 
-    A stop of all goes to every robot as soon as anything arrives from it. ``robots`` has those to which it is also
-    repeated without that, and which confirm it; where there are too many, the others count as ``omitted``.
+    A stop of all is sent to every robot as soon as any message of it arrives. ``robots`` are those to which it is also
+    repeated without that, and which confirm it; if there are too many, the others count as ``omitted``.
     """
 
     def __init__(
@@ -244,7 +244,7 @@ class StopSender:
 
     @property
     def collecting(self) -> bool:
-        """True if further robots are stopped when they publish anything."""
+        """True if more robots will be stopped when they publish something."""
         return (
             not self.order.named and not self._ended and (self.order.hold or self._now < self._began + self._collect_s)
         )
@@ -258,7 +258,7 @@ class StopSender:
 
     @property
     def confirmed(self) -> bool:
-        """True if at least one robot is stopped, and every other one, except components that do not drive."""
+        """True if at least one robot is stopped, and every other one too, except components that do not drive."""
         progress = {robot.progress for robot in self.robots.values()}
         return Progress.CONFIRMED in progress and progress <= {Progress.CONFIRMED, Progress.SPARED} and not self.omitted
 
@@ -311,7 +311,7 @@ class StopSender:
 
     @property
     def _collect_s(self) -> float:
-        """Return for how many seconds newly heard robots are stopped: longer if some are reached only then."""
+        """Return for how many seconds newly heard robots are stopped: longer if some are reached only later."""
         return GIVE_UP_S if self.omitted else COLLECT_S
 
     def _receive_first(self, base: str, message: Message, now: float) -> None:

@@ -1,4 +1,4 @@
-"""The reset of an emergency stop: exactly of the states that were read. Pure."""
+"""The reset of an emergency stop, for exactly the states that were read. Pure."""
 
 from pebble.contract import ESTOP_RESET, codec
 from pebble.contract.payloads import EstopReset
@@ -12,7 +12,7 @@ class Reset:
     """A reset of exactly the stops that a person was shown; it never ends a later stop."""
 
     def __init__(self, robot: RobotEstop, by: str) -> None:
-        """Store the states that are to be reset: those that ``robot`` has received until now."""
+        """Store the states to reset: those that ``robot`` has received until now."""
         self.robot = robot
         self.shown = robot.latched
         self._by = stop_of({"by": by})[1]
@@ -34,10 +34,7 @@ class Reset:
         return all(self._free(owner) for owner in self.shown)
 
     def refusals(self) -> dict[str, str]:
-        """Return why owners are still stopped, in words.
-
-        Call it when no answer is missing, or after a timeout.
-        """
+        """Return why owners are still stopped, in words. Call this when no answer is missing, or after a timeout."""
         return {owner: self._refusal(owner) for owner in self.shown if not self._free(owner)}
 
     def _free(self, owner: str) -> bool | None:

@@ -1,4 +1,4 @@
-"""The form of a script: its settings, and which values they accept. Pure.
+"""The form of a script: its settings, and the values that they accept. Pure.
 
 Used by the manager that starts scripts, by scripts, and by operators' programs (paper A.8.11).
 """
@@ -27,7 +27,7 @@ Value = str | int | float | bool | None
 
 
 class SettingError(ValueError):
-    """A value that a setting does not accept. The text is for the sender of the value."""
+    """An error: a setting does not accept a value. The text is for the sender of the value."""
 
 
 class Setting(Struct, frozen=True, kw_only=True):
@@ -112,7 +112,8 @@ def arguments(settings: Sequence[Setting], values: Mapping[str, Value]) -> list[
         if value is None or not setting.arg:
             continue
         if setting.type == "bool" and setting.mode != "value":
-            words += [setting.arg] if value else [setting.arg_false] if setting.arg_false else []
+            flag = setting.arg if value else setting.arg_false
+            words += [flag] if flag else []
         else:
             words += [setting.arg, _word(value)]
     return words
@@ -138,15 +139,15 @@ def _bool(key: str, raw: Any) -> bool:
 
 
 def _numeric(setting: Setting, raw: Any) -> int | float:
-    whole = setting.type == "int"
+    is_integer = setting.type == "int"
     if isinstance(raw, bool) or not isinstance(raw, int | float | str):
-        raise SettingError(f"{setting.key} must be a {'whole ' if whole else ''}number")
+        raise SettingError(f"{setting.key} must be a {'whole ' if is_integer else ''}number")
     if isinstance(raw, str):
-        if not (_integer if whole else _number)(raw):
-            raise SettingError(f"{setting.key} must be a {'whole ' if whole else ''}number")
-        return int(raw) if whole else _finite(setting.key, raw)
+        if not (_integer if is_integer else _number)(raw):
+            raise SettingError(f"{setting.key} must be a {'whole ' if is_integer else ''}number")
+        return int(raw) if is_integer else _finite(setting.key, raw)
     number = _finite(setting.key, raw)
-    if not whole:
+    if not is_integer:
         return number
     if not number.is_integer() or abs(number) >= 1e15:
         raise SettingError(f"{setting.key} must be a whole number")
@@ -178,7 +179,7 @@ def _option(setting: Setting, raw: Any) -> str:
 
 
 def _text(key: str, raw: Any) -> str:
-    """Return a word for the command line that cannot be taken for an option."""
+    """Return a word for the command line that does not look like an option."""
     if isinstance(raw, bool) or not isinstance(raw, str | int | float):
         raise SettingError(f"{key} must be text")
     text = str(raw)
@@ -192,7 +193,7 @@ def _text(key: str, raw: Any) -> str:
 
 
 def shown(raw: object) -> str:
-    """Return a command's text, made fit for a status and a log."""
+    """Return a command's text in a form fit for a status and a log."""
     return "".join(letter if letter.isprintable() else "?" for letter in str(raw)[:_SHOWN])
 
 

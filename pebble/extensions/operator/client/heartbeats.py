@@ -1,4 +1,4 @@
-"""A connection that receives heartbeats only, so that robots are found whatever else the broker delivers or loses."""
+"""A connection that receives only heartbeats, so that robots are found whatever else the broker delivers or loses."""
 
 import os
 import threading
@@ -15,9 +15,9 @@ _WAITING = 10_000  # heartbeats, of which the oldest goes: it comes again
 
 
 class Heartbeats:
-    """A connection subscribed to heartbeats only: with MQTT 5 to live ones, else also to retained ones.
+    """A connection subscribed only to heartbeats: with MQTT 5 to live ones, otherwise also to retained ones.
 
-    The connection is made on a thread of its own, for which nothing waits.
+    It is made on another thread, and no caller waits for it.
     """
 
     def __init__(self, settings: MqttSettings) -> None:

@@ -62,7 +62,7 @@ class MediaReceiver:
             send(self._transport, self.requests["video"].keyframe(self.encoding.get("video"), now))
 
     def summary(self, medium: Medium, now: float) -> str:
-        """Return a line to show: ``h264 10/s 212 kbit/s, 45 ms``; empty while nothing arrives."""
+        """Return a line for display: ``h264 10/s 212 kbit/s, 45 ms``; empty while nothing arrives."""
         meter = self.pictures if medium == "video" else self.sounds
         rate, age_s = meter.rate(now), meter.age_s(now)
         if not rate or medium not in self.encoding:

@@ -1,6 +1,6 @@
 """Accounts in the topics of commands, for robots that accept only such commands. Pure.
 
-A robot's capabilities say whether it does (``named``). With :meth:`NamedTopics.forms` as a transport's forms, each
+A robot's capabilities tell whether it does (``named``). With :meth:`NamedTopics.forms` as a transport's forms, each
 command is published on the topic that its robot reads at present.
 """
 
@@ -19,7 +19,7 @@ _decoder = msgspec.json.Decoder()
 
 
 class NoNameError(TransportError):
-    """A command without a name. Example: ``goob takes commands only with a name: log in at its broker, …``."""
+    """An error: a command has no name. Example: ``goob takes commands only with a name: log in at its broker, …``."""
 
     def __init__(self, name: str, account: str) -> None:
         super().__init__(why_not(name, account))

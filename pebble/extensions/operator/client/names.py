@@ -1,4 +1,4 @@
-"""Resolution of what a user types (``drive-values``, ``outgoing/online``, a whole topic) to topics and channels."""
+"""Finds topics and channels by what a user types (``drive-values``, ``outgoing/online``, a whole topic)."""
 
 import difflib
 from collections.abc import Iterator
@@ -14,11 +14,11 @@ _USUAL = "pebble/robots/"  # before the id alone
 
 
 class NamingError(PebbleError):
-    """A name without a topic. Example: ``there is no topic "drive-value": did you mean "drive-values"?``."""
+    """An error: no topic has this name. Example: ``there is no topic "drive-value": did you mean "drive-values"?``."""
 
 
 class Names:
-    """The names of one robot's topics, including those its config renames, or of every robot's."""
+    """The names of topics of one robot, including those that its config renames, or of every robot."""
 
     def __init__(self, base: str = ANY_ROBOT, addresses: Addresses | None = None, account: str | None = None) -> None:
         """Store the robot. ``account``: the user name at the broker, "" for none; None within a robot."""
@@ -53,7 +53,7 @@ class Names:
     def _find(self, name: str, directions: tuple[str, str]) -> Channel | None:
         """Return the channel of a short name; None for a whole topic.
 
-        If both directions have the name, the first one that is asked for counts.
+        If both directions have the name, the first of ``directions`` counts.
         """
         if name.startswith((f"{INCOMING}/", f"{OUTGOING}/")):
             channel = channel_of(name)
@@ -88,7 +88,7 @@ def base_of(robot: str) -> str:
 
 
 def id_of(base: str) -> str:
-    """Return the shortest name that :func:`base_of` takes for this robot."""
+    """Return the shortest name that :func:`base_of` accepts for this robot."""
     name = base.removeprefix(_USUAL)
     return base if "/" in name else name
 

@@ -22,7 +22,7 @@ _USELESS_MS, _LONGEST_S = 500, 2.0
 
 
 class Pace(NamedTuple):
-    """The rate towards one robot.
+    """The rate of messages to one robot.
 
     ``stamped``: moving commands carry ``t`` and ``key``, requests for control ``t``.
     """
@@ -38,7 +38,7 @@ class Pace(NamedTuple):
     def dated(self, drive: Drive, now: float, key: str) -> Drive:
         """Return a moving command with its time, and with the validity for this link.
 
-        ``key``: used if the robot has given none.
+        ``key`` is used if the robot has given none.
         """
         if not self.stamped:
             return drive
@@ -49,7 +49,7 @@ WIDE = Pace()
 
 
 def pace_of(link: LinkState | None) -> Pace:
-    """Return the pace that a robot's link state asks for; without one, everything is sent."""
+    """Return the pace for a robot's link state; without a state, everything is sent."""
     if link is None or link.level == "wide":
         return WIDE
     level = LEVELS[link.level]
@@ -76,5 +76,5 @@ def way_s(link: LinkState) -> float:
 
 
 def ms(now: float) -> int:
-    """Return the sender's time for ``t``: milliseconds of a clock that goes on while the machine is suspended."""
+    """Return the sender's time for ``t``: milliseconds of a clock that also counts while the machine is suspended."""
     return round(1000 * now)

@@ -1,4 +1,4 @@
-"""The packages of the operator page, which some commands need too."""
+"""The packages that the operator page needs, and some commands, too."""
 
 from importlib.util import find_spec
 

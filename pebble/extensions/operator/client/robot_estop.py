@@ -66,7 +66,7 @@ class RobotEstop:
 
     @property
     def lacks(self) -> bool:
-        """True if the robot's capabilities, or a state of an owner that they list, are missing."""
+        """True if the robot's capabilities are missing, or a state of an owner that they list."""
         return not self.has_capabilities or bool(self.missing)
 
     @property
@@ -84,7 +84,7 @@ class RobotEstop:
     def old(self) -> bool:
         """True if the robot is known to have no emergency stop.
 
-        A robot that cannot receive its own topics is not old.
+        False for a robot that cannot receive its own topics.
         """
         return self.has_capabilities and not self.announces
 
@@ -99,7 +99,7 @@ class RobotEstop:
         transport.ask(self.missing)
 
     def receive(self, message: Message) -> bool:
-        """Update from a message of this robot; return False if it is about something else, or malformed."""
+        """Update from a message of this robot; return False if it is malformed, or not about the stop."""
         if message.topic == self._capabilities_topic:
             return self._receive_capabilities(message.payload)
         if message.topic.startswith(self._prefix):
@@ -158,10 +158,7 @@ def _section(value: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _owners(listed: object) -> tuple[str, ...]:
-    """Return the listed owners without repetitions.
-
-    An invalid list gives none, so that such a robot is never confirmed.
-    """
+    """Return the listed owners without repetitions. An invalid list gives none: such a robot is never confirmed."""
     if not isinstance(listed, list) or len(listed) > MAX_OWNERS:
         return ()
     if not all(isinstance(owner, str) and _valid_level(owner) for owner in listed):
@@ -177,7 +174,7 @@ def _clean(state: EstopState) -> EstopState:
 
 
 def is_of_another(topic: str, base: str) -> bool:
-    """True if ``topic`` is a topic of another component.
+    """True if ``topic`` belongs to another component.
 
     Capabilities may contain any topic, and their publisher may lack the right to publish there: a client that believed
     them would drive another robot.

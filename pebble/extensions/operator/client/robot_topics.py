@@ -1,4 +1,4 @@
-"""The robot topics to which operators' programs subscribe, and the topics that capabilities may name. Pure."""
+"""The robot topics that operators' programs subscribe to, and those that capabilities may name. Pure."""
 
 from typing import Any
 
@@ -81,7 +81,7 @@ def section_of(capabilities: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def own_topic(ref: str, topic: object, direction: str) -> bool:
-    """True if this is a topic of ``ref`` in that direction. Other topics in capabilities are ignored."""
+    """True if ``topic`` belongs to ``ref``, in that direction. Other topics in capabilities are ignored."""
     if not isinstance(topic, str) or not topic.startswith(f"{ref}/{direction}/") or parse_topic(topic) is None:
         return False
     try:

@@ -27,7 +27,7 @@ _STAMPS = 5  # heartbeats by which a clock of whole seconds is recognised
 
 
 class Liveness:
-    """The heartbeats of a component. As on the paper's operator page, the timeout follows their interval."""
+    """The heartbeats of a component. As on the paper's operator page, the timeout depends on their interval."""
 
     def __init__(self) -> None:
         self.received_at: float | None = None  # monotonic
@@ -73,7 +73,7 @@ class Liveness:
     def online(self, now: float, at_least_s: float = 0.0) -> bool | None:
         """True if the robot is online; None while there are too few heartbeats.
 
-        A silence below ``at_least_s`` does not count.
+        A silence of less than ``at_least_s`` does not count.
         """
         if self.reported_offline:
             return False
@@ -84,7 +84,7 @@ class Liveness:
         return age <= silent_after(interval, self.link, self.average_latency_s or 0.0) or age < at_least_s
 
     def online_to_people(self, now: float) -> bool | None:
-        """True if people are shown the component as online.
+        """True if the component is to be shown as online; None while that is unknown.
 
         A silence counts after 1.5 s, or later if heartbeats are irregular.
         """
@@ -175,7 +175,7 @@ class RobotView:
                 self.capabilities = codec.decode(c.CAPABILITIES, message.payload).value or before
 
     def _note_retained_drive(self, message: Message) -> None:
-        """Note whether a moving drive command is retained.
+        """Note whether a drive command that moves the robot is retained.
 
         A message that is empty and not retained itself removes it.
         """
@@ -204,11 +204,11 @@ class RobotView:
 
     @property
     def is_assumed(self) -> bool:
-        """True if the robot's capabilities are those that people assumed."""
+        """True if the robot's capabilities are assumed by people."""
         return "assumed" in self.capabilities
 
     def assume(self, axes: Collection[str], name: str = "") -> bool:
-        """Assume that a silent board drives by these axes, or by none; return True if that is a change."""
+        """Assume that a silent board drives along these axes, or not at all; return True if that is a change."""
         before = self.capabilities
         if self.silent:
             self.capabilities = assumed.assumed(self.base, axes, name)
@@ -223,7 +223,7 @@ class RobotView:
 
     @property
     def live(self) -> bool:
-        """True if anything but retained messages has arrived from the robot."""
+        """True if any message of the robot has arrived that is not retained."""
         return self.liveness.received_at is not None
 
     @property
@@ -258,7 +258,7 @@ class RobotView:
 
     @property
     def driveable(self) -> Driveable | None:
-        """Return the part of its status that says whether its motors obey."""
+        """Return the robot's judgement whether its motors obey; None if its status has none."""
         return driveable_of(self._status)
 
     def holds(self, program: str) -> bool:
@@ -278,7 +278,7 @@ class RobotView:
 
     @property
     def pace(self) -> Pace:
-        """Return the rate of commands to it, also while it is offline."""
+        """Return the rate of commands to the robot, also while it is offline."""
         return pace_of(self.link)
 
     def topic(self, channel: c.Channel) -> str | None:
@@ -294,12 +294,12 @@ class RobotView:
         return self.topic(c.DRIVE) is not None and self.liveness.online(now) is True
 
     def online(self, now: float) -> bool | None:
-        """True if people are shown it as online."""
+        """True if the robot is to be shown as online; None while that is unknown."""
         return self.liveness.online_to_people(now)
 
     @property
     def script(self) -> str:
-        """Return the title of the script that may move it; empty if none."""
+        """Return the title of a script that may move the robot; empty if there is none."""
         status = self.autonomy
         if status is None or not status.running or status.drives is False:
             return ""
@@ -307,12 +307,12 @@ class RobotView:
 
     @property
     def itself(self) -> str:
-        """Return the sentence that it drives itself; empty if a person drives, or nobody."""
+        """Return the sentence that the robot drives by itself; empty if it does not."""
         waits = self.latched or (self.autonomy is not None and self.autonomy.overridden is True)
         return words("itself", self.name, script=self.script) if self.script and not waits else ""
 
     def situation(self, now: float) -> Situation:
-        """Return the facts for and against driving it that the robot itself publishes."""
+        """Return the facts for and against driving that the robot itself publishes."""
         return Situation(
             online=self.online(now),
             latched=self.latched,

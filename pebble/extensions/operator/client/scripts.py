@@ -1,4 +1,4 @@
-"""The scripts of a robot, as its autonomy_manager publishes them, and the commands that start and stop them."""
+"""The scripts of a robot, as its autonomy_manager publishes them, and commands to start and stop them."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -36,7 +36,7 @@ class RobotScripts:
 
     @property
     def answer_s(self) -> float:
-        """Return how long to wait for a changed status before a command counts as ignored."""
+        """Return how long to wait for another status before a command counts as ignored."""
         return max(_STARTS_S, self.robot.pace.answer_s)
 
     def subscribe(self, transport: Transport) -> None:
@@ -62,8 +62,8 @@ class RobotScripts:
                 "the robot has published no scripts: is services.autonomy_manager.enabled true, is it up?"
             )
         if file not in self.files:
-            known = ", ".join(self.files) or "none"
-            raise PebbleError(f"there is no script {file}, only: {known}; just after the robot's start, try again")
+            names = ", ".join(self.files) or "none"
+            raise PebbleError(f"there is no script {file}, only: {names}; just after the robot's start, try again")
         if self.files[file].get("asked") is False:
             raise PebbleError(f"the robot has just started, and still asks {file} what it needs: try again")
         chosen = settings(self.files[file], words)
@@ -85,15 +85,15 @@ def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
     form = forms.listed(entry.get("configs"))
     options = {option: (setting, value) for setting in form for option, value in options_of(setting)}
     chosen: dict[str, Any] = {}
-    rest = iter(words)
-    for word in rest:
+    remaining = iter(words)
+    for word in remaining:
         option, given, text = word.partition("=")
         if option not in options:
-            known = ", ".join(options) or "it has none"
-            raise PebbleError(f"{option} is no option of {entry['file']}: {known}")
+            names = ", ".join(options) or "it has none"
+            raise PebbleError(f"{option} is no option of {entry['file']}: {names}")
         setting, value = options[option]
         if value is None and not given:
-            following = next(rest, None)
+            following = next(remaining, None)
             if following is None:
                 raise PebbleError(f"{option} needs a value")
             text = following

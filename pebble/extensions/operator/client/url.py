@@ -13,7 +13,7 @@ _PORTS = {"mqtt": 1883, "mqtts": 8883}
 
 
 class UrlError(PebbleError):
-    """A URL that is no usable address. Example: ``--url http://x: use mqtt://HOST[:PORT], …``."""
+    """An error: a URL is no usable address. Example: ``--url http://x: use mqtt://HOST[:PORT], …``."""
 
 
 def settings_of(
@@ -21,7 +21,7 @@ def settings_of(
 ) -> tuple[str, MqttSettings | ZenohSettings]:
     """Return the kind of transport and its settings. Raises UrlError, whose text never contains the password.
 
-    ``password_file``: the file in which the password was found, if it was in one.
+    ``password_file``: the file from which the password was read, if it was.
     """
     scheme, _, rest = url.partition(":")
     scheme = scheme.lower()

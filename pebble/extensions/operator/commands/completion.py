@@ -17,7 +17,7 @@ _LONGEST = 1_000_000  # bytes of a config
 
 
 def configs(context: Context) -> list[str]:
-    """Return the JSON files of this folder; the shell completes other paths itself."""
+    """Return the JSON files of this folder. The shell itself completes other paths."""
     commands = ["user", "audit"] if context.command.name == "serve" else []  # of `pebble web [CONFIG]`
     return [*commands, *sorted(str(path) for path in Path().glob("*.json"))]
 

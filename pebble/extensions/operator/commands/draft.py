@@ -23,7 +23,7 @@ class Draft:
 
 
 def draft(names: Names, name: str, text: str, *, retain: bool | None, qos: int | None, force: bool) -> Draft:
-    """Complete a message by the contract. Raises PebbleError for a retained command, unless forced or empty."""
+    """Return a message completed by the contract. Raises PebbleError for a retained command, unless forced or empty."""
     topic = check_topic(names.topic(name))
     channel = names.channel(topic)
     payload = _payload(text)
@@ -54,14 +54,14 @@ def _payload(text: str) -> bytes:
 
 
 def _warnings(channel: Channel, payload: bytes) -> list[str]:
-    found = []
+    warnings = []
     if channel.direction == OUTGOING:
-        found.append(f"{channel.metric} is published by robots; this message replaces the robot's")
+        warnings.append(f"{channel.metric} is published by robots; this message replaces the robot's")
     if channel.synonym_of is not None:
-        found.append(f"{channel.metric} is an older name of {channel.synonym_of}")
+        warnings.append(f"{channel.metric} is an older name of {channel.synonym_of}")
     if payload:
         try:
-            codec.decode(channel, payload, lambda _channel, _sender, text: found.append(text))
+            codec.decode(channel, payload, lambda _channel, _sender, text: warnings.append(text))
         except PayloadError as error:
-            found.append(f"robots will refuse this: {error}")
-    return found
+            warnings.append(f"robots will refuse this: {error}")
+    return warnings

@@ -128,7 +128,7 @@ def me(account: str | None = None) -> str:
 
 
 def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
-    """Send stops over a connection that receives nothing."""
+    """Send stops on a connection that receives nothing."""
     with interrupted_by_signals(), connected(target) as (transport, names):
         robots = None if every else [names.base]
         sender = StopSender(new_name(), by=me(names.account), why=why, now=time.monotonic(), robots=robots, hold=hold)
@@ -192,7 +192,7 @@ def _until_due(sender: StopSender, *, hears: bool) -> float:
 
 
 def _receive(listener: Listener, sender: StopSender, left: float) -> None:
-    """Handle what has arrived; if nothing has, wait for a message for up to ``left`` seconds."""
+    """Handle the messages that have arrived, or wait up to ``left`` seconds for one."""
     for _ in range(_BATCH):
         message = listener.next(left)
         if message is None:
@@ -202,7 +202,7 @@ def _receive(listener: Listener, sender: StopSender, left: float) -> None:
 
 
 class _Outbox:
-    """A publisher of a stop, which knows which robots it was sent to."""
+    """A publisher of a stop. It knows to which robots the stop was sent."""
 
     def __init__(self, transport: Transport, sender: StopSender) -> None:
         self._transport, self._sender = transport, sender
@@ -267,10 +267,7 @@ class _Report:
 
 
 def _echo(line: str, *, err: bool = False) -> None:
-    """Print ``line``.
-
-    If that fails, because the reader has ended or a disk is full, sending the stop goes on.
-    """
+    """Print ``line``. If that fails, because the reader has ended or a disk is full, the stop is sent all the same."""
     try:
         typer.echo(line, err=err)
     except OSError:
@@ -354,9 +351,11 @@ def _status(target: Target, *, every: bool) -> int:
             )
             transport.ask([topic for robot in discovery.all_robots() for topic in robot.estop.missing])
         if is_remote:
-            found, began = discovery.all_robots, time.monotonic()
+            robots_now, began = discovery.all_robots, time.monotonic()
             wait_for(lambda: not discovery.awaits_heartbeat(time.monotonic() - began), float("inf"))
-            wait_for(lambda: not any(robot.liveness.received_at and robot.estop.lacks for robot in found()), _ANSWER_S)
+            wait_for(
+                lambda: not any(robot.liveness.received_at and robot.estop.lacks for robot in robots_now()), _ANSWER_S
+            )
         robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
     for robot in robots:
         _print_states(robot.estop, robot.driveable, silent=is_remote and robot.liveness.received_at is None)
@@ -366,7 +365,7 @@ def _status(target: Target, *, every: bool) -> int:
 
 
 def _print_states(robot: RobotEstop, driveable: Driveable | None = None, *, silent: bool = False) -> None:
-    """Print a line for a robot that is free or has no emergency stop, else one for each stopped owner.
+    """Print one line if a robot is free or has no emergency stop, otherwise one for each stopped owner.
 
     ``silent``: it sends no heartbeat at present.
     """

@@ -71,7 +71,7 @@ def body(payload: bytes, width: int) -> str:
 
 
 def parsed(payload: bytes) -> Any:
-    """Return the JSON value; None if it is no JSON, or ``null``."""
+    """Return the JSON value; None if the payload is ``null``, or not JSON."""
     try:
         return json.loads(payload)
     except (ValueError, RecursionError):
@@ -203,7 +203,7 @@ def print_listing(listing: Listing, now: float, wall: float) -> None:
 
 
 def remarks(listing: Listing, wall: float) -> list[str]:
-    """Return a line for each stopped robot and for each with a thin link."""
+    """Return a line for each stopped robot, and one for each with a thin link."""
     discovery = Discovery()
     for record in listing.records.values():
         if record.last is not None:
@@ -247,7 +247,7 @@ def _age(record: TopicRecord, last: Message, now: float, wall: float) -> str:
 
 
 def _kind(names: Names, topic: str) -> tuple[str, str]:
-    """Return the kind of a topic's channel, and the style to print it in."""
+    """Return the kind of a topic's channel, and the style in which to print it."""
     channel = names.channel(topic)
     if channel is None:
         return "not in the contract", "dim"

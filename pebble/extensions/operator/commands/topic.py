@@ -76,8 +76,8 @@ def list_(
         listing = show.Listing(names)
         listener = Listener(transport, [filter_ or ("#" if target.robot is None else f"{names.base}/#")])
         end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            message = listener.next(left)
+        while (remaining_s := end - time.monotonic()) > 0:
+            message = listener.next(remaining_s)
             if message is not None:
                 listing.add(message, time.monotonic())
         show.print_listing(listing, time.monotonic(), time.time())
@@ -228,7 +228,7 @@ def _refuse_stopped(robot: RobotEstop | None) -> None:
 
 
 def _estop(transport: Transport, names: Names, topic: str) -> RobotEstop | None:
-    """Return the retained emergency stop of the robot that ``topic`` belongs to; None if it matches several."""
+    """Return the emergency stop of the robot to which ``topic`` belongs; None if it matches several."""
     address = parse_topic(topic)
     base = names.base if address is None else address.identity.base
     if is_pattern(base):

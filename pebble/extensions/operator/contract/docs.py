@@ -1,4 +1,4 @@
-"""The generator of the topic tables, payloads.schema.json and asyncapi.yaml."""
+"""Generates the topic tables, payloads.schema.json and asyncapi.yaml."""
 
 import inspect
 import json
@@ -45,7 +45,7 @@ def travels(channel: Channel) -> str:
 
 
 def authority(channel: Channel) -> str:
-    """Return which side of the bridge is right when the two differ."""
+    """Return the side of the bridge whose values count when the two sides differ."""
     if channel.direction == OUTGOING:
         return "robot"
     if channel.kind is Kind.FLAG:
@@ -158,7 +158,7 @@ def _source(struct: type[Payload]) -> str:
 
 
 def _remarks(struct: type[Payload]) -> dict[str, str]:
-    """Return the comments behind the fields of the structs: units and meanings."""
+    """Return the comments after the fields of a struct: units and meanings."""
     sources = [_source(base) for base in reversed(struct.__mro__) if issubclass(base, Payload)]
     lines = [line for source in sources for line in source.splitlines()]
     matches = (re.match(r"    (\w+): [^#]*#\s*(.+)$", line) for line in lines)

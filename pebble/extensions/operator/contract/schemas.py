@@ -37,7 +37,7 @@ def schemas() -> dict[str, Any]:
 
 
 def _accepted(channel: Channel, root: dict[str, Any]) -> dict[str, Any]:
-    """Return every accepted form: bare, and for incoming channels also wrapped."""
+    """Return the schema of every accepted form: bare, and for incoming channels also wrapped."""
     if channel.payload is bool:
         return {"description": channel.doc, "anyOf": [root, _wrapped("value", root), _wrapped("enabled", root)]}
     if channel.direction == INCOMING:

@@ -1,1 +1,1 @@
-"""Access to the server: which requests are looked at, and who has logged in."""
+"""Access to the server: which requests are accepted, and who has logged in."""

@@ -83,13 +83,13 @@ def session_of(connection: HTTPConnection) -> Session | None:
 
 
 def named(session: Session, name: str) -> Session:
-    """Set the name by which a person is shown; "" changes nothing. Used only on a server without a login."""
+    """Return the session with a person's ``name``; "" changes nothing. Only on a server without a login."""
     user = printable(name).strip()
     return dataclasses.replace(session, user=user) if user else session
 
 
 def printable(text: str) -> str:
-    """Return a text that a client sent as others may see it: 32 characters at most, "?" for all but printable ASCII."""
+    """Return a client's text in the form shown to others: at most 32 characters, "?" for all but printable ASCII."""
     return "".join(char if " " <= char <= "~" else "?" for char in text[:32])
 
 

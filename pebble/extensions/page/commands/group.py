@@ -127,8 +127,8 @@ def register(app: typer.Typer) -> None:
 def _of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) -> WebSettings:
     from pebble.extensions.page.setting import WebSettings
 
-    given = {key: value for key, value in options.items() if value is not None}
-    settings = WebSettings(**{"broker": broker, "people": default_folder() / PEOPLE, **given})
+    chosen = {key: value for key, value in options.items() if value is not None}
+    settings = WebSettings(**{"broker": broker, "people": default_folder() / PEOPLE, **chosen})
     folder = folder or _default_tls_folder(settings.host)
     if folder is not None:
         settings = replace(
@@ -143,9 +143,9 @@ def _of_config(file: Path, options: dict[str, Any], folder: Path | None) -> tupl
 
     config = load(file)
     web = config.section(WebInterface)
-    given = {key: value for key, value in options.items() if value is not None}
-    given["names"] = (*web.names, *options["names"])
-    web = msgspec.structs.replace(web, **given)
+    chosen = {key: value for key, value in options.items() if value is not None}
+    chosen["names"] = (*web.names, *options["names"])
+    web = msgspec.structs.replace(web, **chosen)
     if folder is None and web.tls.certificate is None and not web.plain_http:
         folder = _default_tls_folder(web.host)
     if folder is not None:

@@ -31,8 +31,8 @@ _AXES = {
 class TerminalDriver:
     """One person at one terminal. Pass messages to :meth:`receive`, keys to :meth:`press`; publish what is returned.
 
-    ``heartbeat``: whether the robot sends one on this connection. ``assume``: it is a board that drives, and does not
-    say so. Times are seconds of one monotonic clock that goes on while the machine is suspended.
+    ``heartbeat``: whether the robot sends one on this connection. ``assume``: it is a board that drives without saying
+    so. Times are seconds of a monotonic clock that also counts while the machine is suspended.
     """
 
     def __init__(
@@ -51,10 +51,10 @@ class TerminalDriver:
 
     @property
     def filters(self) -> list[str]:
-        """The topics that :meth:`receive` needs; within the robot there is no link."""
+        """Filters of the topics that :meth:`receive` needs. Within the robot there is no link."""
         channels = (c.ESTOP_STATE, c.CONTROL_STATE, c.CAPABILITIES, c.ONLINE, c.CHARGING_LEVEL, c.AUTONOMY_STATUS)
-        more = [*([c.LINK] if self._heartbeat else []), *([c.DRIVE] if self._assumes else [])]
-        return [channel.filter(self.robot.base) for channel in (*channels, *more)]
+        further = [*([c.LINK] if self._heartbeat else []), *([c.DRIVE] if self._assumes else [])]
+        return [channel.filter(self.robot.base) for channel in (*channels, *further)]
 
     def receive(self, message: Message, now: float, wall: float) -> None:
         self.robot.receive(channel_of(message.topic.removeprefix(f"{self.robot.base}/")), message, now, wall)
@@ -62,7 +62,7 @@ class TerminalDriver:
             self.stop.receive(message, now)
 
     def press(self, keys: Sequence[str], now: float) -> None:
-        """Handle the keys that were read; the newest of an axis counts."""
+        """Handle the keys that were read. Of keys for one axis the newest counts."""
         for key in keys:
             if key == "!" or (key == ESCAPE and now - self._escape_at <= _TWICE_S):
                 self._begin_stop(now)
@@ -81,7 +81,7 @@ class TerminalDriver:
             self.end(now)
 
     def tick(self, now: float, problem: str = "") -> list[Message]:
-        """Return the messages to publish now; call it every PERIOD_S. ``problem``: why there is no connection."""
+        """Return the messages to publish now. Call this every PERIOD_S. ``problem``: why there is no connection."""
         if now - self._ticked_at > SILENCE_S:  # this process stood still
             self.end(now)
         self._ticked_at = now
@@ -100,7 +100,7 @@ class TerminalDriver:
         return [*(self.stop.tick(now) if self.stop else []), *drives, *([] if problem else requests)]
 
     def end(self, now: float, *, leave: bool = False) -> None:
-        """End the gesture for good, and with ``leave`` release control. The pause before the next gesture begins."""
+        """End the gesture for good; with ``leave`` also release control. A pause follows before the next gesture."""
         self._out += self._tab.interrupt(self._gesture, now)
         self._pressed, self._key_at = True, now
         if leave:
@@ -109,11 +109,11 @@ class TerminalDriver:
 
     @property
     def unconfirmed(self) -> str:
-        """Return why an emergency stop from here is not confirmed; empty if none is pending."""
+        """Return why this terminal's emergency stop is not confirmed; empty if none is pending."""
         return "" if self.stop is None or self.stop.confirmed else self.stop.robots[self.robot.base].why
 
     def status(self) -> str:
-        """Return the status line: the command sent, or why none is. Parts of it come from others."""
+        """Return the status line: the command sent, or why none is sent. Parts of it come from others."""
         view, robot = self._driven.shown(self._tab, self._ticked_at), self.robot
         x, z, _ = self._wanted(self._ticked_at)
         idle = self._reason or ("let go first" if self._pressed else "ready")
@@ -131,7 +131,7 @@ class TerminalDriver:
         return " · ".join(filter(None, parts))
 
     def _assume(self, now: float) -> None:
-        """Assume that it is a board that drives, if it is online for a while without capabilities."""
+        """Assume that the robot is a board that drives, if it has been online for a while without capabilities."""
         if self._assumes:
             self._heard_at = min(self._heard_at, now) if self.robot.online(now) else float("inf")
             if now - self._heard_at >= HEARD_S:

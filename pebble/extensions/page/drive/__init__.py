@@ -1,1 +1,1 @@
-"""Driving by the pages of one server: who has control, who asks for it, and why it is refused."""
+"""Driving by the pages of one server: who has control, who asks for it, and why driving is refused."""

@@ -1,7 +1,7 @@
-"""A robot as the pages of this server drive it: who has control, and which commands reach it. Pure.
+"""A robot that the pages of this server drive: who has control, and which commands reach it. Pure.
 
-Motion belongs to a numbered gesture, from the moment the inputs leave neutral until they are released. An interrupted
-gesture has ended for good: a key that is held down moves nothing again before it was released.
+Motion belongs to a numbered gesture, which lasts from the moment the inputs leave neutral until they are released. An
+interrupted gesture has ended for good: a key that is held down moves nothing before it was released.
 """
 
 import secrets
@@ -51,7 +51,7 @@ class Event(Enum):
 
 
 class Step(NamedTuple):
-    """The effect of an event: the next state, and what to do."""
+    """The effect of an event: the next state, and the actions."""
 
     state: State
     halts: bool = False  # by a final zero, which is repeated
@@ -83,7 +83,7 @@ class Command(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Tab:
-    """A page's control connection. It moves one robot at a time."""
+    """The control connection of one page. It moves one robot at a time."""
 
     token: str
     user: str
@@ -101,7 +101,7 @@ class Tab:
 
 @dataclass(slots=True, eq=False)
 class Wish:
-    """A page's request for control, where the robot decides about it; its answer calls ``granted`` or ``failed``."""
+    """A page's request for control of a robot that itself decides. The answer calls ``granted`` or ``failed``."""
 
     client: ControlClient
     granted: Callable[[], None]
@@ -110,7 +110,7 @@ class Wish:
 
 
 class DrivenRobot:
-    """The driving of one robot. ``changed`` collects the robots that pages have to be shown again."""
+    """The driving of one robot. ``changed`` collects the robots whose drivers must be shown to pages again."""
 
     def __init__(self, ref: str, view: Callable[[], RobotView | None], changed: set[str]) -> None:
         self.ref = ref
@@ -136,7 +136,7 @@ class DrivenRobot:
 
     @property
     def keeps(self) -> bool:
-        """True if the robot itself decides who drives it; else this server does, for its own pages."""
+        """True if the robot itself decides who drives it. Otherwise this server does, for its own pages."""
         robot = self._view()
         return robot is not None and robot.controlled
 
@@ -154,7 +154,7 @@ class DrivenRobot:
 
     @property
     def moved_by(self) -> str:
-        """Return the user who moves the robot now, by a gesture or by the robot's state; empty if nobody does."""
+        """Return the user who moves the robot now, by a gesture or by the robot's state; empty if none does."""
         if other := self._elsewhere():
             return other.by
         return self.tab.user if self.tab is not None and self.state is State.MOVING else ""
@@ -164,7 +164,7 @@ class DrivenRobot:
         return self.tab is tab or tab in self._wishes
 
     def awaits(self, token: str, now: float) -> bool:
-        """True, once, if a page with this token has just had control and nobody else has it."""
+        """True, once, if a page with this token recently had control and no other client has it now."""
         awaited, until = self._awaited
         if awaited != token:
             return False
@@ -172,7 +172,7 @@ class DrivenRobot:
         return now <= until and self.state is State.FREE and self._elsewhere() is None
 
     def at_rest(self, now: float) -> bool:
-        """True if nothing about the robot has to be remembered."""
+        """True if the robot has nothing that must be remembered."""
         return self.state is State.FREE and not self._wishes and not self._repeats and now > self._awaited[1]
 
     def shown(self, tab: Tab, now: float) -> DriverView:
@@ -220,13 +220,13 @@ class DrivenRobot:
         return []
 
     def closed(self, tab: Tab, now: float, *, for_good: bool) -> list[Command]:
-        """Note that the connection has ended; ``for_good``: the user may no longer drive, so nothing is kept."""
+        """Note that a page's connection has ended; ``for_good``: the user may no longer drive, so nothing is kept."""
         if self.tab is tab and not for_good:
             self._awaited = (tab.token, now + AWAITED_S)
         return self.release(tab, now)
 
     def update(self, now: float) -> list[Command]:
-        """Note that the robot has answered, or has been replaced by another."""
+        """Note that the robot has published a state, or was replaced by another robot."""
         commands: list[Command] = []
         for tab, wish in list(self._wishes.items()):
             commands += self._answered(tab, wish, now)
@@ -261,7 +261,7 @@ class DrivenRobot:
         return [Command(self.ref, pace.dated(drive, now, self._key), pace.qos)], ""
 
     def stop(self, now: float) -> list[Command]:
-        """Halt the robot for anybody; the present gesture ends."""
+        """Halt the robot for any user; the present gesture ends."""
         self.interrupt(now)
         return self._final_zero(now)
 
@@ -333,7 +333,7 @@ class DrivenRobot:
         return commands
 
     def _is_over(self, wish: Wish, now: float) -> bool:
-        """True if the robot has confirmed the end of control; until then this server has it."""
+        """True if the robot has confirmed the end of control. Until then this server has it."""
         if not wish.client.done:
             wish.ended_at = float("inf")
             return False
@@ -342,14 +342,14 @@ class DrivenRobot:
         return state is None or state.id != wish.client.id or now - wish.ended_at > self.pace.answer_s
 
     def _elsewhere(self) -> ControlState | None:
-        """Return the robot's state if it has given control, but to another than this server."""
+        """Return the robot's state if it has given control to another server; else None."""
         state = self.published
         if state is None or not state.id or any(wish.client.id == state.id for wish in self._wishes.values()):
             return None
         return replace(state, by=state.by or "somebody")
 
     def _active(self, now: float) -> str:
-        """Return the user who drives now and has to be asked; empty if control can be taken."""
+        """Return the user who drives now and must be asked; empty if control can be taken."""
         if other := self._elsewhere():
             return other.by
         if self.tab is None or (self.state is State.HELD and now - self._idle_from >= TAKEN_FROM_IDLE_S):
@@ -369,7 +369,7 @@ class DrivenRobot:
         return words(Code.LATE) if tab.clock.late(op.t, now) else ""
 
     def _zero(self, tab: Tab, op: DriveOp, now: float) -> list[Command]:
-        """Forward a zero, in every state. At the end of a gesture it is the release."""
+        """Forward a zero, whatever the state. At the end of a gesture it is the release."""
         tab.over = max(tab.over, op.g)
         if tab.moves is self and op.g >= tab.gesture:
             self._on(Event.LETS_GO, now)

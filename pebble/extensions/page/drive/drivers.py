@@ -26,7 +26,7 @@ class Drivers:
         self.refusals = Refusals(broker, lambda ref: self.robot(ref).moved_by, robots.view)
 
     def robot(self, ref: str) -> DrivenRobot:
-        """Return that robot; robots at rest are not remembered."""
+        """Return that robot. A robot at rest is not remembered."""
         robot = self._driven.get(ref)
         if robot is None:
             robot = self._driven[ref] = DrivenRobot(ref, partial(self._robots.view, ref), self._changed)
@@ -61,9 +61,9 @@ class Drivers:
         return ref in self._driven and self._driven[ref].tab is not None
 
     def restore(self, token: str, tab: Tab) -> None:
-        """Give a page that has connected again the control that it had; no gesture goes on.
+        """Give a page that has connected again the control that it had; no gesture continues.
 
-        Its old connection may still be open, though nothing arrives on it any more.
+        Its old connection may still be open, although no more data arrives on it.
         """
         now = clock()
         old = {robot.tab for robot in self._driven.values() if robot.tab is not None and robot.tab.token == token}
@@ -102,7 +102,7 @@ class Drivers:
         return bool(commands) and commands[0].drive.moves, ""
 
     def stop(self, ref: str, by: str) -> None:
-        """Publish a zero for anybody, who need not have control."""
+        """Publish a zero for any user, also without control."""
         if self._robots.view(ref) is not None:
             self._publish(self.robot(ref).stop(clock()), by)
 
@@ -128,7 +128,7 @@ class Drivers:
     # -- inside
 
     def _turn(self, robot: DrivenRobot, now: float) -> None:
-        """Publish what is due; requests for control come after the zeros of the former driver."""
+        """Publish what is due for a robot; requests for control come after the zeros of the former driver."""
         commands, messages = robot.tick(now)
         self._publish(commands)
         send(self._broker.publish, messages)

@@ -1,4 +1,4 @@
-"""The reasons why a page's request to a robot is refused now, in words for people; "" if it is not."""
+"""Decides why a page's request to a robot is refused now, in words for people; "" if it is not refused."""
 
 import time
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from pebble.extensions.page import robot_commands
 
 
 class Refusals:
-    """The refusals of one server. ``moved_by`` returns who moves a component; ``robot_of`` finds its view."""
+    """The refusals of one server. ``moved_by`` returns who moves a component; ``robot_of`` returns its view."""
 
     def __init__(
         self, broker: Broker, moved_by: Callable[[str], str], robot_of: Callable[[str], RobotView | None]

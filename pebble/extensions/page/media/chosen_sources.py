@@ -1,4 +1,4 @@
-"""The picture sources that people have chosen for robots' pages; they hold for everybody, and are stored."""
+"""The picture sources that people have chosen for robots' pages. They apply to everybody, and are stored."""
 
 import logging
 from collections.abc import Callable
@@ -14,7 +14,7 @@ _PICTURE = "picture-from "  # what a setting of the server begins with; then the
 
 
 class ChosenSources:
-    """The chosen sources. ``on_change`` is called with the component whose page shows another source."""
+    """The chosen sources. ``on_change`` is called with a component whose page gets another source."""
 
     def __init__(self, people: People, robots: Robots, on_change: Callable[[str], None]) -> None:
         self._people, self._robots, self._on_change = people, robots, on_change

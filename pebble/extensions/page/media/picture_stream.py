@@ -97,7 +97,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
             self._request.wake()
 
     def _skip(self, now: float) -> None:
-        """Note that a picture is missing before this one, so that a key frame is needed."""
+        """Note that a picture is missing before this one: a key frame is needed."""
         for viewer in self.viewers:
             viewer.queue.lost(now)
         self._request.wake()
@@ -123,7 +123,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
             await self._help_viewers()
 
     def _can(self) -> list[frozenset[str]]:
-        """Return the encodings that each viewer decodes; for one that decodes none, those that this server converts."""
+        """Return the encodings that each viewer decodes, or those that this server converts if it decodes none."""
         encodings = frozenset(BEST_FIRST["video"])
         converted = frozenset(name for name in encodings if not rescue.unavailable(name))
         return [viewer.queue.can & encodings or converted for viewer in self.viewers]

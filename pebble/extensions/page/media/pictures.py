@@ -1,4 +1,4 @@
-"""Robots' pictures for pages: one request for each robot, however many pages show it, and stills."""
+"""Robots' pictures for pages, by one request for each robot however many pages show it, and stills."""
 
 import asyncio
 import struct
@@ -44,9 +44,9 @@ class MediaHub(Streams[PictureStream]):
         )
 
     async def snapshot(self, ref: str) -> tuple[bytes, float] | None:
-        """Return a JPEG of the newest key frame, or of a resting camera's last one, with its time (monotonic).
+        """Return a JPEG of the newest key frame, or the last one of a camera that is off, with its time (monotonic).
 
-        It starts no camera, and never waits: from a camera that is on for others, a picture is fetched for the next
+        It starts no camera, and never waits: from a camera that is on for others, it fetches a picture for the next
         call.
         """
         reports = self._robots.value(ref, MEDIA_STATUS.metric)
@@ -110,7 +110,7 @@ async def _send(websocket: WebSocket, viewer: PageViewer) -> None:
 
 
 async def _receive(websocket: WebSocket, stream: PictureStream, viewer: PageViewer) -> None:
-    """Read the page's answers until it closes the socket, or sends an invalid one."""
+    """Handle the page's answers until it closes the socket, or sends an invalid one."""
     while True:
         message = await websocket.receive()
         answer = message.get("bytes")

@@ -59,7 +59,7 @@ class RescueStream:
             self._task = asyncio.create_task(self._run())
 
     def feed(self, payload: bytes, *, keyframe: bool) -> None:
-        """Add a payload. It needs all of them, as a difference builds on those before it."""
+        """Add a payload. Every payload is needed, as a difference builds on those before it."""
         if self._task is None:
             return
         if keyframe or sum(map(len, self._pending)) > _MAX_WAITING_BYTES:

@@ -1,4 +1,4 @@
-"""Robots' sound for pages, and people's voices for robots: one request for each robot."""
+"""Robots' sound for pages, and people's voices for robots, by one request for each robot."""
 
 import asyncio
 import struct
@@ -37,7 +37,7 @@ NoteTalk = Callable[[str, Session, str, str], None]  # component, session, devic
 
 
 class SoundQueue:
-    """The packets that wait for one page; a new one displaces the oldest. Pure."""
+    """The packets that wait for one page; a newer one replaces the oldest. Pure."""
 
     def __init__(self) -> None:
         self._queue: deque[bytes] = deque()
@@ -64,7 +64,7 @@ class SoundQueue:
 
 
 class SoundPage:
-    """A page that plays a robot's sound or talks to it. ``can`` empty: it only talks."""
+    """A page that plays a robot's sound, or talks to the robot. ``can`` empty: it only talks."""
 
     def __init__(self, can: frozenset[str], session: Session, device: str = "", address: str = "") -> None:
         self.can, self.session, self.device, self.address = can, session, device, address
@@ -107,7 +107,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
     # -- talking
 
     def receive_voice(self, page: SoundPage, talk: int, piece: int, sound: bytes) -> None:
-        """Handle 20 ms of a page's voice. The first piece begins a talk, if it is allowed."""
+        """Handle 20 ms of a page's voice. The first piece begins a talk, if that is allowed."""
         now = time.monotonic()
         if talk <= page.over:
             return
@@ -241,7 +241,7 @@ async def _send(websocket: WebSocket, page: SoundPage) -> None:
 
 
 async def _receive(websocket: WebSocket, stream: SoundStream, page: SoundPage) -> None:
-    """Read a page's messages until it closes the socket, or sends an invalid one."""
+    """Handle a page's messages until it closes the socket, or sends an invalid one."""
     pace = Pace(time.monotonic())
     while True:
         message = await websocket.receive()

@@ -1,4 +1,4 @@
-"""A medium of each robot on its way to pages: the request while pages use it, and what pages are shown about it."""
+"""A medium of one robot on its way to pages: the request for it while pages use it, and its state for pages."""
 
 import asyncio
 import contextlib
@@ -32,7 +32,7 @@ ViewT = TypeVar("ViewT")
 
 
 class Arrivals:
-    """The arrivals of a medium: encoding, rate, and whether they continue. Pure: times are passed in."""
+    """The arrivals of a medium's payloads: encoding, rate, and whether they continue. Pure: times are passed in."""
 
     def __init__(self) -> None:
         self.encoding = ""  # of the newest payload
@@ -64,7 +64,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
     """
 
     def __init__(self, broker: Broker, robots: Robots, ref: str, medium: Medium, metric: str, view: ViewT) -> None:
-        """Pages are shown ``metric``; ``view`` is that of a robot at rest, which they are shown already."""
+        """Store the arguments. Pages show the state ``metric``; ``view`` is its value at rest, which they have."""
         self.ref = ref
         self.viewers: set[ViewerT] = set()
         self.view = self._at_rest = view  # as shown last
@@ -100,11 +100,11 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
 
     @abstractmethod
     async def _follow(self) -> None:
-        """Request what the viewers need; called a few times a second."""
+        """Request what the viewers need. Called a few times a second."""
 
     @abstractmethod
     def _make_view(self, state: str, why: str, rate: float, kbits: float) -> ViewT:
-        """Return what pages are shown about the medium."""
+        """Return the medium's state for pages."""
 
     def _end(self) -> None:
         """Note that the request has ended."""
@@ -130,7 +130,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
     # -- what pages are shown
 
     def _report(self) -> None:
-        """Show changes to pages, at most twice a second."""
+        """Publish changes to pages, at most twice a second."""
         now = time.monotonic()
         if now - self._shown_at < TICK_S:
             return
@@ -163,7 +163,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
         return "silent", f"no {_WHAT[self._request.medium]} for {int(quiet_s)} s"
 
     def _problem(self) -> str:
-        """Return what is wrong although payloads arrive; empty if nothing."""
+        """Return the problem of a medium whose payloads arrive; empty if there is none."""
         return ""
 
 
@@ -171,7 +171,7 @@ StreamT = TypeVar("StreamT", bound=MediaStream[Any, Any])
 
 
 class Streams(Generic[StreamT]):
-    """The streams of one medium, by robot; an ended one is forgotten."""
+    """The streams of one medium, by robot. An ended one is forgotten."""
 
     def __init__(self, channel: Channel, make: Callable[[str], StreamT]) -> None:
         self._channel, self._make = channel, make

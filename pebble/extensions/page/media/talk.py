@@ -1,4 +1,4 @@
-"""A person's voice on its way to a robot: one talk at a time, nothing late, as the robot's packets. Pure."""
+"""A person's voice on its way to a robot, as the robot's packets: one talk at a time, nothing late. Pure."""
 
 from typing import Final
 
@@ -14,7 +14,7 @@ _DRIFT_S: Final = 2e-5  # a piece: the clock of a page's microphone may be slow 
 
 
 class Talk:
-    """A talk of one page. After its end the page has to begin another one."""
+    """A talk of one page. After its end the page must begin another one."""
 
     def __init__(self, number: int, now: float) -> None:
         self.number = number  # of that page's connection
@@ -37,8 +37,8 @@ class Talk:
 class Voice:
     """The packets of all talks to one robot, by the server's clock.
 
-    Receivers of the original discard what has a smaller number than before, so numbers must not begin anew with
-    another talk, or another server: each talk begins at the number that belongs to the time.
+    Receivers of the original discard packets with smaller numbers than before, so another talk, or another server, must
+    not begin at 1: each talk begins at the number that belongs to its time.
     """
 
     def __init__(self) -> None:

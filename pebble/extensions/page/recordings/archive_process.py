@@ -23,17 +23,17 @@ AnswerT = TypeVar("AnswerT")
 
 
 def _spawn() -> SpawnContext:
-    """Return a way to start a process that imports nothing from the current folder."""
+    """Return a context for starting a process that imports nothing from the current folder."""
     os.environ["PYTHONSAFEPATH"] = "1"
     return multiprocessing.get_context("spawn")
 
 
 class BusyError(PebbleError):
-    """Too many questions at once."""
+    """An error: too many questions at once."""
 
 
 class ArchiveProcess:
-    """A process that answers questions about one folder, in turn; the first question starts it."""
+    """A process that answers questions about one folder, one after another. The first question starts it."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -77,7 +77,7 @@ class ArchiveProcess:
 
 
 class Job:
-    """A long job in a process of its own; its result is a file."""
+    """A long job in a process of its own, which writes its result to a file."""
 
     def __init__(self, function: Callable[..., None], *arguments: Any) -> None:
         """Start the process. ``function`` takes a Connection, then ``arguments``. Call it on the event loop."""
@@ -133,7 +133,7 @@ class Job:
 
 
 def _ended(code: int | None) -> str:
-    """Return why a process stopped answering, from its exit code."""
+    """Return why a process no longer answers, from its exit code."""
     if code == -signal.SIGKILL:
         return "its process was killed, as it is where memory runs out: end other programs, or choose less"
     return f"its process has ended ({code}): the log of the server says why"

@@ -81,7 +81,7 @@ class Link:
         self._write(BINARY, MEDIUM.pack(what, at_ms) + payload)
 
     def read(self, seconds: float) -> list[m.FromReplay]:
-        """Return the page's messages that arrive in time. Raises EOFError once the page has gone."""
+        """Return the page's messages that arrive in time. Raises EOFError once the page is gone."""
         if not select.select([self._connection], [], [], seconds)[0]:
             return []
         data = self._connection.recv(1 << 16)
@@ -102,7 +102,7 @@ class Link:
 
 
 class RobotSource:
-    """A robot in an archive. ``begins`` is called with a time, and the picture seen at that time.
+    """A robot in an archive. ``begins`` is called with a time and the picture at that time.
 
     Messages received exactly at a time belong to the state at that time.
     """
@@ -130,7 +130,7 @@ class RobotSource:
 
 
 class PlayedRobot:
-    """A recorded robot as a page sees it: the output of its player."""
+    """A recorded robot in the form for a page: the output of its player."""
 
     def __init__(self, link: Link, archive: Archive, ref: str, at_ns: int) -> None:
         self.sent = self.skipped = 0
@@ -151,7 +151,7 @@ class PlayedRobot:
         self._replayed = f"{SYSTEM}/{ref.partition('/')[2]}"
 
     def send(self, message: Recorded, _position_ns: int) -> bool:
-        """Send a recorded message, or note it for the next flush."""
+        """Send a recorded message, or keep it for the next flush."""
         at_ns, newest_ns = message.log_ns, self._newest_ns
         if at_ns - newest_ns > _GAP_NS:
             self._show(skipped=(newest_ns / 1e6, at_ns / 1e6))

@@ -48,7 +48,7 @@ _export_decoder = msgspec.json.Decoder(ExportRequest)
 
 @dataclass(slots=True)
 class _Timeline:
-    """A timeline, or its making. ``made``: JSON; that of before while a newer one is being made."""
+    """A timeline, or the job that makes it. ``made``: JSON; while a newer one is being made, that of before."""
 
     paths: list[str]
     active: bool
@@ -75,7 +75,7 @@ class _Export:
 
 
 class BadQuestionError(PebbleError):
-    """A missing or invalid parameter. Example: ``at: a number of milliseconds is needed``."""
+    """An error: a parameter is missing or invalid. Example: ``at: a number of milliseconds is needed``."""
 
 
 class Recordings:
@@ -103,9 +103,9 @@ class Recordings:
         self._scratch.cleanup()
 
     async def timeline(self, day: str, robot: str, *, again: bool = False) -> bytes | float:
-        """Return the timeline as JSON, or the share of the work that is done. Raises PebbleError.
+        """Return the timeline as JSON or, while it is made, how much is done (0 to 1). Raises PebbleError.
 
-        After a failure the work is done again only with ``again``, or for other recordings.
+        After a failure it is made again only with ``again``, or for other recordings.
         """
         key, period = (day, robot), _period_of(day)
         paths, active = await self.process.ask(questions.files, robot, *period)
@@ -117,8 +117,8 @@ class Recordings:
         await self._forget()
         if timeline.job.why:
             raise PebbleError(timeline.job.why)
-        made = timeline.take()
-        return timeline.job.done if made is None else made
+        json_text = timeline.take()
+        return timeline.job.done if json_text is None else json_text
 
     async def export(self, wanted: ExportRequest) -> str:
         """Start an export; return its id. Raises PebbleError, and BusyError while another one runs."""
@@ -204,7 +204,7 @@ def routes() -> list[Route]:
 
 
 def _answered(answers: _Answers) -> Callable[[Request], Awaitable[Response]]:
-    """Answer only with a session, and answer every error in one line."""
+    """Return a route that answers only with a session, and answers every error in one line."""
 
     async def endpoint(request: Request) -> Response:
         if login.session_of(request) is None:
@@ -229,9 +229,9 @@ async def _days(_: Request, recordings: Recordings) -> Response:
 
 
 async def _timeline(request: Request, recordings: Recordings) -> Response:
-    asked = request.query_params
-    made = await recordings.timeline(asked.get("day", ""), _robot(request), again=asked.get("again") == "1")
-    return JSONResponse({"indexing": made}, 202) if isinstance(made, float) else _json(made)
+    parameters = request.query_params
+    result = await recordings.timeline(parameters.get("day", ""), _robot(request), again=parameters.get("again") == "1")
+    return JSONResponse({"indexing": result}, 202) if isinstance(result, float) else _json(result)
 
 
 async def _begin_export(request: Request, recordings: Recordings) -> Response:

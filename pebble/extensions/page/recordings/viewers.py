@@ -1,4 +1,4 @@
-"""The pages that show recordings: each has a process that plays for it and ends with its socket."""
+"""The pages that show recordings. Each has a process that plays for it and ends with its socket."""
 
 import asyncio
 import socket
@@ -79,7 +79,7 @@ async def _send(websocket: WebSocket, reader: asyncio.StreamReader) -> str:
 
 
 async def _receive(websocket: WebSocket, writer: asyncio.StreamWriter) -> str:
-    """Pass on the page's requests; return why one is refused, or "" once the page has gone."""
+    """Pass on the page's requests; return why one is refused, or "" once the page is gone."""
     while True:
         message = await websocket.receive()
         if message["type"] != "websocket.receive":

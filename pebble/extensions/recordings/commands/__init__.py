@@ -1,1 +1,1 @@
-"""``pebble recordings`` and what else works on recordings."""
+"""``pebble recordings``, and other commands for recordings."""

@@ -65,15 +65,17 @@ def analyse(
     ):
         scratch = Path(folder)
         with errors_of_files():
-            found = sources(places, scratch, progress)
-        for line in found.unread:
+            indexed = sources(places, scratch, progress)
+        for line in indexed.unread:
             typer.echo(f"pebble: {shown(line)}", err=True)
-        for base in () if found.unread else bases:
-            check_name("robot", base, found.robots, places)
-        traffic = analyse_traffic(found, scratch, since_ns=since_ns, until_ns=until_ns, robots=bases, progress=progress)
+        for base in () if indexed.unread else bases:
+            check_name("robot", base, indexed.robots, places)
+        traffic = analyse_traffic(
+            indexed, scratch, since_ns=since_ns, until_ns=until_ns, robots=bases, progress=progress
+        )
         written = write_report(traffic, output, csv=csv, advance=progress)
     _print(traffic, written)
-    return 1 if found.unread else 0
+    return 1 if indexed.unread else 0
 
 
 def _print(traffic: Traffic, written: list[Path]) -> None:

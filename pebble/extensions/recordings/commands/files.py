@@ -75,9 +75,11 @@ def rm(
 
 def _rm(owner: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keeps, *, yes: bool) -> int:
     entries, folder = owner.entries(), owner.root
-    left = sum(report_left(f"{entry.path}: is not finished, or damaged") for entry in entries if not entry.is_finished)
+    unsure = sum(
+        report_left(f"{entry.path}: is not finished, or damaged") for entry in entries if not entry.is_finished
+    )
     finished = [entry.path for entry in entries if entry.is_finished]
-    if not left:
+    if not unsure:
         check_names(Query(base), finished, [folder])
     due = [path for path in finished if _reaches_into(path, *period_ns)]
     what = f"{shown(base)} " if base else "everything "
@@ -90,25 +92,25 @@ def _rm(owner: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keep
         for number, path in enumerate(due, 1):
             try:
                 names = path.stat().st_nlink
-                made = rewrite(path, path, keeps=keeps)
+                copy = rewrite(path, path, keeps=keeps)
             except (PebbleError, OSError) as error:
-                left += report_left(error)
+                unsure += report_left(error)
                 continue
-            if made.left_out:
-                deleted += made.left_out
+            if copy.left_out:
+                deleted += copy.left_out
                 if names > 1:
-                    left += 1
+                    unsure += 1
                     typer.echo(f"pebble: {path}: has other names (hard links), which keep all of it", err=True)
                 index_path(path).unlink(missing_ok=True)
-                if made.is_empty:
+                if copy.is_empty:
                     path.unlink()
             advance(number)
     typer.echo(f"{deleted:,} messages deleted")
-    if left:
+    if unsure:
         typer.echo(
-            f"pebble: {left} files may hold more of it: pebble recordings rm FILE deletes one as a whole", err=True
+            f"pebble: {unsure} files may hold more of it: pebble recordings rm FILE deletes one as a whole", err=True
         )
-    return 1 if left else 0
+    return 1 if unsure else 0
 
 
 def _reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:
@@ -143,29 +145,29 @@ def _mend_file(source: Path, target: Path | None) -> int:
     if target.exists():
         raise PebbleError(f"{target} exists already")
     with as_owner(target.parent), errors_of_files(target):
-        made = rewrite(source, target)
-    typer.echo(f"{target}: {made.messages:,} messages, {made.missing:,} missing")
-    report_unread([f"{source}: {made.unread}"] if made.unread else [])
-    return 0 if made.messages else 1
+        copy = rewrite(source, target)
+    typer.echo(f"{target}: {copy.messages:,} messages, {copy.missing:,} missing")
+    report_unread([f"{source}: {copy.unread}"] if copy.unread else [])
+    return 0 if copy.messages else 1
 
 
 def _mend_all(folder: Folder) -> int:
-    left, failed = [entry.path for entry in folder.entries() if entry.is_active], False
-    for path in left:
+    unfinished, failed = [entry.path for entry in folder.entries() if entry.is_active], False
+    for path in unfinished:
         try:
-            made = mend_leftover(path)
+            copy = mend_leftover(path)
         except (PebbleError, OSError) as error:
             failed |= bool(report_left(f"{path.name}: {error}"))
             continue
-        failed |= not made.is_whole
-        typer.echo(f"{finished_path(path).name}: {made.messages:,} messages, {made.missing:,} missing")
-    if not left:
+        failed |= not copy.is_whole
+        typer.echo(f"{finished_path(path).name}: {copy.messages:,} messages, {copy.missing:,} missing")
+    if not unfinished:
         typer.echo("nothing to mend")
     return 1 if failed else 0
 
 
 def _archive_of(path: Path) -> Path:
-    """Return the recorder's folder above a file, which has folders for years, months and days."""
+    """Return the recorder's folder above a file, whose folders are years, months and days."""
     folder = path.resolve().parent
     while _DATE.fullmatch(folder.name):
         folder = folder.parent

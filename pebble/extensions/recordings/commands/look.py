@@ -80,7 +80,7 @@ def search(
     """Print the messages that match, in the order of time."""
     since_ns, until_ns = period(since, until)
     query = Query(None if robot is None else base_of(robot), tuple(topic or ()), text)
-    paths, found, damages = files(places), 0, Damages()
+    paths, matches, damages = files(places), 0, Damages()
     catalogue.check_names(query, paths, places)
     for message in merged(paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages):
         if not query.accepts(message):
@@ -89,10 +89,10 @@ def search(
         line = one_line(show.body(message.payload, _ONE_LINE))
         topic_ = one_line(shown(message.channel.topic))
         typer.echo(f"{local_time(message.log_ns, fraction=True)}  {topic_}{flag}  {line}")
-        found += 1
-        if found == count:
+        matches += 1
+        if matches == count:
             break
-    typer.echo(f"{found:,} messages", err=True)
+    typer.echo(f"{matches:,} messages", err=True)
     return report_unread(problems(damages))
 
 
@@ -106,10 +106,10 @@ def _print_topics(counts: Counter[str]) -> None:
 def _looked_at(
     places: list[Path], since: str | None, until: str | None, *, check: bool, inside: bool = False
 ) -> tuple[list[FileInfo], list[str]]:
-    """Return the files of a period by their times, and a line for each that cannot be read completely.
+    """Return the files of a period in the order of time, and a line for each that cannot be read completely.
 
-    Files are read completely with ``check``, or if that takes only seconds; else their summaries count. ``inside``:
-    count only messages of the period, for which files that reach beyond it are read.
+    Files are read completely with ``check``, or if that takes only seconds; otherwise their summaries count.
+    ``inside``: count only messages of the period, for which files that reach beyond it are read.
     """
     since_ns, until_ns = period(since, until)
     counted_ns = {"since_ns": since_ns, "until_ns": until_ns} if inside else {}
@@ -154,10 +154,10 @@ def _state(info: FileInfo) -> str:
 
 
 def _print_events(paths: Iterable[Path]) -> None:
-    found = list(catalogue.events(path for path in paths if ".media." not in path.name))
-    if found:
+    events = list(catalogue.events(path for path in paths if ".media." not in path.name))
+    if events:
         typer.echo("\nWhat happened to the recording:")
-    for event in found:
+    for event in events:
         name, at = event.pop("event"), event.pop("t", 0)
         since, until = event.pop("since", None), event.pop("until", None)
         if isinstance(since, int) and isinstance(until, int):

@@ -18,7 +18,7 @@ _QUIET_S = 2.0  # before progress is shown
 
 @contextmanager
 def progress_of_steps() -> Iterator[Callable[[str, float], None]]:
-    """Yield a function that reports a step and the share of it that is done.
+    """Yield a function that reports a step of the work, and how much of it is done (0 to 1).
 
     It shows a bar on a terminal if the work takes over two seconds.
     """
@@ -40,7 +40,7 @@ def progress_of_steps() -> Iterator[Callable[[str, float], None]]:
 
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[float], None]]:
-    """Yield a function that reports the share of a single step that is done."""
+    """Yield a function that reports how much of a single step is done (0 to 1)."""
     with progress_of_steps() as show:
         yield lambda done: show(what, done / max(1, total))
 

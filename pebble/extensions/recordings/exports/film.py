@@ -1,4 +1,4 @@
-"""A robot's pictures and sound as a film, or its sound alone, timed by when they were received."""
+"""A robot's pictures and sound as a film, or its sound alone, timed by their arrival at the recorder."""
 
 import heapq
 import tempfile
@@ -123,7 +123,7 @@ def _media(messages: Iterable[Recorded], robot: str, on_time: Progress) -> Itera
 
 
 def _sound_packets(av: Any, path: Path, out: Any, codec: str) -> Iterator[Any]:
-    """Yield the sound's packets while the file is read, so that only a part of it is in memory."""
+    """Yield the sound's packets while the file is read, so that only a part of the sound is in memory."""
     with av.open(str(path), format="wav") as source:
         wav = source.streams.audio[0]
         layout = "mono" if wav.channels == 1 else "stereo"  # wav has no names for them
@@ -134,7 +134,7 @@ def _sound_packets(av: Any, path: Path, out: Any, codec: str) -> Iterator[Any]:
 
 
 class _Pictures:
-    """An H.264 stream of one size, that of the first picture; others, in any encoding, are scaled to it."""
+    """An H.264 stream of the size of its first picture. Others, in any encoding, are scaled to that."""
 
     def __init__(self, av: Any, out: Any) -> None:
         from pebble.extensions.media.decode import VideoDecoder
@@ -176,9 +176,9 @@ class _Pictures:
 
 
 def _lasting(packets: list[Any]) -> list[Any]:
-    """Return the packets, each with a length.
+    """Return the packets, each with a duration.
 
-    Only the last one's length counts: the others are shown until the next.
+    Only the last one's duration counts: the others are shown until the next.
     """
     for packet in packets:
         packet.duration = _LAST_PICTURE_MS

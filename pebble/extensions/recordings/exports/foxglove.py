@@ -76,13 +76,13 @@ class _Export:
             self._add(message, converted)
 
     def _add(self, message: Recorded, converted: Converted) -> None:
-        made, topic = converted.message, f"{message.channel.topic}/{converted.ending}"
+        protobuf, topic = converted.message, f"{message.channel.topic}/{converted.ending}"
         if topic not in self._channels:
-            schema = Schema(made.DESCRIPTOR.full_name, "protobuf", self._schemas.descriptors(made))
+            schema = Schema(protobuf.DESCRIPTOR.full_name, "protobuf", self._schemas.descriptors(protobuf))
             self._channels[topic] = Channel(0, topic, "protobuf", {}, schema)
         stamp = _time_of(message)
-        self._copy.add(Recorded(self._channels[topic], 0, message.log_ns, stamp, stamped(made, stamp)))
-        self.counts[made.DESCRIPTOR.name] += 1
+        self._copy.add(Recorded(self._channels[topic], 0, message.log_ns, stamp, stamped(protobuf, stamp)))
+        self.counts[protobuf.DESCRIPTOR.name] += 1
 
     def _add_json(self, message: Recorded) -> None:
         payload, topic = as_object(message.payload), message.channel.topic

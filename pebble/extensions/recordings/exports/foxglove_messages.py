@@ -62,17 +62,17 @@ class Schemas:
 
     def descriptors(self, message: Any) -> bytes:
         """Return the file descriptors of a message, each after those that it imports: a schema in MCAP's terms."""
-        found: dict[str, Any] = {}
+        files: dict[str, Any] = {}
 
         def add(file: Any) -> None:
             for needed in file.dependencies:
-                if needed.name not in found:
+                if needed.name not in files:
                     add(needed)
-            found[file.name] = file
+            files[file.name] = file
 
         add(message.DESCRIPTOR.file)
         together = self._descriptors.FileDescriptorSet()
-        for file in found.values():
+        for file in files.values():
             file.CopyToProto(together.file.add())
         return bytes(together.SerializeToString())
 
@@ -130,10 +130,10 @@ class Media:
         if sound is None:
             return None
         schema, ending = SOUND
-        made = self._make(
+        message = self._make(
             schema, data=sound.pcm, format="pcm-s16", sample_rate=sound.rate, number_of_channels=sound.channels
         )
-        return Converted(made, ending)
+        return Converted(message, ending)
 
     def decoder(self, topic: str) -> VideoDecoder:
         """Return the decoder of this topic's pictures.
@@ -196,8 +196,8 @@ class Telemetry:
         if x is None or y is None:
             return None
         frame = str(value.get("frame_id") or "map")
-        made = self._pose(frame, x, y, _number(value, "z_m") or 0.0, _number(value, "yaw_rad") or 0.0)
-        return Converted(made, "pose")
+        message = self._pose(frame, x, y, _number(value, "z_m") or 0.0, _number(value, "yaw_rad") or 0.0)
+        return Converted(message, "pose")
 
     def _pose(self, frame: str, x: float, y: float, z: float, heading_rad: float) -> Any:
         pose = self._make("PoseInFrame", frame_id=frame)
@@ -277,7 +277,7 @@ def _id(topic: str) -> str:
 
 def _number(value: dict[str, Any], *names: str) -> float | None:
     """Return the first of the named fields that is a number; None if there is none."""
-    found = (value.get(name) for name in names)
+    values = (value.get(name) for name in names)
     return next(
-        (float(number) for number in found if isinstance(number, int | float) and not isinstance(number, bool)), None
+        (float(number) for number in values if isinstance(number, int | float) and not isinstance(number, bool)), None
     )

@@ -120,24 +120,24 @@ def _add_text(line: _Written, payload: bytes) -> None:
 
 def _message(number: int, line: bytes) -> Recorded | BadLine:
     try:
-        found = _decoder.decode(line)
-        check_topic(found.topic.removeprefix("$"))  # our own events have one
-        log_ns = _stamp_ns(bytes(found.timestamp))
+        parsed = _decoder.decode(line)
+        check_topic(parsed.topic.removeprefix("$"))  # our own events have one
+        log_ns = _stamp_ns(bytes(parsed.timestamp))
         if not 0 <= log_ns <= _LATEST_NS:
             raise ValueError("the stamp is no time between 1970 and 2262")
     except (ValueError, OverflowError, RecursionError, TransportError) as error:  # msgspec's are ValueErrors
         return BadLine(number, str(error))
-    payload = found.payload_b64
+    payload = parsed.payload_b64
     encoding = "json" if payload[:1] in (b"{", b"[") else "application/octet-stream"
-    channel = Channel(0, found.topic, encoding, _metadata(found))
+    channel = Channel(0, parsed.topic, encoding, _metadata(parsed))
     return Recorded(channel, 0, log_ns, stamp_ns(payload), payload)
 
 
 def _metadata(line: _Line) -> dict[str, str]:
     """Return the metadata of a recording's channel."""
     flags = {"retained": line.retain if line.retained is None else line.retained, TRUNCATED: line.payload_truncated}
-    known = {"qos": str(line.qos), "retain": str(int(line.retain))}
-    return known | {name: "1" for name, is_set in flags.items() if is_set}
+    delivery = {"qos": str(line.qos), "retain": str(int(line.retain))}
+    return delivery | {name: "1" for name, is_set in flags.items() if is_set}
 
 
 def _stamp_ns(stamp: bytes) -> int:

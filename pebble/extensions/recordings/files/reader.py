@@ -66,7 +66,7 @@ Chooses = Callable[[Channel], bool]
 
 
 class Chunk(NamedTuple):
-    """The position and contents of a chunk; ``channels`` empty: unknown, so it may hold any."""
+    """The position and contents of a chunk; ``channels`` empty: unknown, so it may hold any channel."""
 
     start_ns: int
     end_ns: int
@@ -126,12 +126,12 @@ class RecordingFile:
 
     @property
     def is_cut_off(self) -> bool:
-        """True if the file ends in the middle of a record or in zeros, as a kill leaves it."""
+        """True if the file ends in the middle of a record or in zeros, as after a kill."""
         return self._scan.is_cut_off
 
     @property
     def problem(self) -> str:
-        """Return the parts that could not be read, in words; "" if all that was read so far was intact."""
+        """Return the unreadable parts, in words; "" if everything that was read so far was intact."""
         return self.damage.report(active=self.path.name.endswith(ACTIVE))
 
     def reaches_into(self, since_ns: int, until_ns: int) -> bool:
@@ -140,7 +140,7 @@ class RecordingFile:
         return bool(self.chunks) and self.first_ns < until_ns and not ends
 
     def refresh(self) -> None:
-        """Find what was written since the last call; a finished file does not change."""
+        """Find records that were written since the last call. A finished file does not change."""
         if self.statistics is None:
             self._look_through()
 
@@ -173,7 +173,7 @@ class RecordingFile:
         return self._unpacked(chunk, chooses)[0]
 
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Return the file's metadata by name; if two have one name, the last."""
+        """Return the file's metadata by name; of several with one name the last."""
         from mcap.records import Metadata
 
         return {record.name: record.metadata for record in self.beside() if isinstance(record, Metadata)}
@@ -274,7 +274,7 @@ class RecordingFile:
         self._take_indexes(are_all=False)
 
     def _take_index(self, record: Found) -> None:
-        """Count the messages of a channel in the last chunk, unless there was damage between."""
+        """Count the messages of a channel in the last chunk, unless damage lies between."""
         entries = record.end - record.at - INDEX.size
         if self._indexed is not None and record.at == self._indexed_to and entries >= 0:
             channel = INDEX.unpack(self._read(record.at, INDEX.size))[2]
@@ -309,7 +309,7 @@ class RecordingFile:
 
     def _unpacked(self, chunk: Chunk, chooses: Chooses) -> tuple[list[Recorded], tuple[int, int] | None]:
         """Return the chosen messages of a chunk, and the sequence numbers of its first and last message."""
-        found: list[Recorded] = []
+        messages: list[Recorded] = []
         first, last = -1, -1
         chosen: dict[int, Channel | None] = {}  # by channel number; None: not chosen
         unnamed: set[int] = set()
@@ -328,17 +328,19 @@ class RecordingFile:
                     chosen[channel_number] = channel if channel.topic == OLD_OTHER or chooses(channel) else None
                 if channel_number in unnamed:
                     self.damage.unnamed += 1
-                taken = chosen[channel_number]
-                if taken is not None:
-                    found.append(Recorded(taken, sequence, log_ns, publish_ns, data[begin + MESSAGE.size : end]))
+                channel_or_none = chosen[channel_number]
+                if channel_or_none is not None:
+                    messages.append(
+                        Recorded(channel_or_none, sequence, log_ns, publish_ns, data[begin + MESSAGE.size : end])
+                    )
             # Old files have all topics without a channel on one: they are chosen by the topic inside the message.
             if any(channel is not None and channel.topic == OLD_OTHER for channel in chosen.values()):
-                found = [message for message in map(_with_own_topic, found) if chooses(message.channel)]
+                messages = [message for message in map(_with_own_topic, messages) if chooses(message.channel)]
         except DamageError as error:
             self.damage.add(chunk.at, error, chunk.messages)
             return [], None
-        found.sort(key=_time)
-        return found, (first, last) if first >= 0 else None
+        messages.sort(key=_time)
+        return messages, (first, last) if first >= 0 else None
 
     def _opened(self, chunk: Chunk, chooses: Chooses, opened: list[int]) -> Iterator[Recorded]:
         opened[0] += chunk.length
@@ -366,7 +368,7 @@ class RecordingFile:
             channels.setdefault(record.id, channel)
 
     def _channel(self, number: int) -> Channel:
-        """Return the channel of this number, from any place that declares it: the first chunk that does may be lost."""
+        """Return the channel of this number from any place that declares it, as the first such chunk may be lost."""
         if number not in self.channels and number in self._names:
             self.channels[number] = self._names[number]
         if number not in self.channels and not self._looked_everywhere:

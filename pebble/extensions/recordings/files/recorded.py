@@ -1,4 +1,4 @@
-"""The contents of a recording: channels, messages, and damage."""
+"""The contents of a recording: channels, messages and damage."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ FOREVER_NS: Final = 1 << 64  # after all times that a file can hold
 
 
 class RecordingError(PebbleError):
-    """A file that cannot be read as a recording. Example: ``walk.mcap: No such file or directory``."""
+    """An error: a file cannot be read as a recording. Example: ``walk.mcap: No such file or directory``."""
 
 
 class DamageError(PebbleError):
-    """Bytes that are not the record they should be. Example: ``a chunk's checksum is wrong``."""
+    """An error: bytes are not the record that they should be. Example: ``a chunk's checksum is wrong``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,7 @@ class Damage:
 
 
 def unnamed(number: int) -> Channel:
-    """Return a stand-in for a channel whose declaration is lost."""
+    """Return a substitute for a channel whose declaration is lost."""
     return Channel(number, f"{UNNAMED}{number}", "application/octet-stream")
 
 

@@ -81,7 +81,7 @@ def unpack_chunk(body: bytes) -> bytes:
 
 
 def with_own_topic(channel: Channel, payload: bytes) -> tuple[Channel, bytes]:
-    """Split a payload that begins with its channel's topic and metadata. Raises DamageError."""
+    """Return channel and payload of a payload that begins with topic and metadata. Raises DamageError."""
     from mcap.data_stream import ReadDataStream
     from mcap.records import Metadata
 
@@ -92,7 +92,7 @@ def with_own_topic(channel: Channel, payload: bytes) -> tuple[Channel, bytes]:
 
 
 def record_of(data: bytes) -> McapRecord:
-    """Parse a complete record. Raises DamageError, also for a channel whose lengths do not fit exactly."""
+    """Return the parsed record. Raises DamageError, also for a channel whose lengths do not fit exactly."""
     from mcap.data_stream import RecordBuilder
     from mcap.records import Channel as ChannelRecord
     from mcap.stream_reader import StreamReader
@@ -108,7 +108,7 @@ def record_of(data: bytes) -> McapRecord:
 
 
 def summary_of(tail: bytes) -> Summary | None:
-    """Parse the end of a file, from its summary on. Raises DamageError."""
+    """Return the summary in the end of a file, from its summary on; None if there is none. Raises DamageError."""
     from mcap.reader import NonSeekingReader
 
     with _damage():

@@ -1,4 +1,4 @@
-"""Copies of recordings: the readable part of a damaged or unfinished one, or one without some of its messages."""
+"""Copies of recordings: the readable part of a damaged or unfinished one, or all but some of its messages."""
 
 import errno
 import os
@@ -45,10 +45,10 @@ def rewrite(source: Path, target: Path, *, keeps: Keeps = lambda _message: True)
         raise RecordingError(f"{target} exists already")
     before = _state(source)
     try:
-        made = _copy(source, part, keeps, complete=in_place)
-        if in_place and not made.left_out:
-            return made
-        _check(part, made)
+        copy = _copy(source, part, keeps, complete=in_place)
+        if in_place and not copy.left_out:
+            return copy
+        _check(part, copy)
         if _state(source) != before:
             raise RecordingError(f"{source}: was changed meanwhile")
         if target.exists() != in_place:
@@ -57,7 +57,7 @@ def rewrite(source: Path, target: Path, *, keeps: Keeps = lambda _message: True)
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
-    return made
+    return copy
 
 
 def _copy_state(source: Path, part: Path) -> None:
@@ -65,9 +65,9 @@ def _copy_state(source: Path, part: Path) -> None:
     try:
         shutil.copystat(source, part)
     except OSError:
-        found = source.stat()
-        set_mode(part, stat.S_IMODE(found.st_mode))
-        os.utime(part, ns=(found.st_atime_ns, found.st_mtime_ns))
+        status = source.stat()
+        set_mode(part, stat.S_IMODE(status.st_mode))
+        os.utime(part, ns=(status.st_atime_ns, status.st_mtime_ns))
 
 
 def copy_beside(source: RecordingFile, writer: RecordingWriter, without: Container[str] = (DAMAGE, OLD_COPY)) -> int:
@@ -171,13 +171,13 @@ def _refuse_part(file: RecordingFile, metadata: dict[str, dict[str, str]]) -> No
 
 
 def _state(path: Path) -> tuple[int, ...]:
-    """Return a value that differs if the file is replaced or written to."""
+    """Return a value that changes if the file is replaced or written to."""
     about = path.stat()
     return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns
 
 
 def _check(part: Path, made: Rewritten) -> None:
-    """Read a copy again before it replaces the source. Raises RecordingError."""
+    """Read a copy once more before it replaces the source. Raises RecordingError."""
     with RecordingFile(part) as file:
         messages = sum(len(file.messages(chunk)) for chunk in file.chunks)
         if messages != made.messages or file.damage.report():

@@ -1,4 +1,4 @@
-"""A scan for the records of a file without a summary, from its begin to its end, also after damage."""
+"""A scan for the records of a file without a summary, from its beginning to its end, also after damage."""
 
 from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
@@ -25,7 +25,7 @@ Read = Callable[[int, int], bytes]
 
 
 class Found(NamedTuple):
-    """A record."""
+    """A record that was found, with its place."""
 
     op: int
     at: int
@@ -33,9 +33,10 @@ class Found(NamedTuple):
 
 
 class Scan:
-    """A scan that continues where it ended when the file has grown.
+    """A scan that continues where it ended, when the file has grown.
 
-    ``name``: the file's, for errors; ``is_ours``: what our own files never hold counts as damage.
+    ``name``: the file's, for errors; ``is_ours``: it is a file of ours, in which records that we never write count as
+    damage.
     """
 
     def __init__(self, name: object, read: Read, damage: Damage, *, is_ours: bool) -> None:
@@ -46,7 +47,7 @@ class Scan:
 
     @property
     def is_cut_off(self) -> bool:
-        """True if only zeros, or the begin of a record, follow the last record, as a kill leaves it."""
+        """True if only zeros, or the beginning of a record, follow the last record, as after a kill."""
         rest = self._read(self._at, min(self._damage.torn, LARGEST_RECORD))
         if len(rest) < HEAD.size or not any(rest):
             return len(rest) >= self._damage.torn
@@ -62,20 +63,20 @@ class Scan:
         while self._at < size and not self._ended:
             record = self._record_at(self._at)
             if record is None:
-                again = self._next_chunk(max(self._at + 1, self._searched))
-                if again is None:
+                next_chunk = self._next_chunk(max(self._at + 1, self._searched))
+                if next_chunk is None:
                     self._searched = max(self._searched, size - _OVERLAP)
                     break
-                self._damage.add(self._at, f"{again - self._at:,} bytes are no record")
-                self._at = again
+                self._damage.add(self._at, f"{next_chunk - self._at:,} bytes are no record")
+                self._at = next_chunk
                 continue
-            found = Found(record[0], self._at, record[1])
-            self._at, self._ended = found.end, found.op == Op.DATA_END
-            yield found
+            found_record = Found(record[0], self._at, record[1])
+            self._at, self._ended = found_record.end, found_record.op == Op.DATA_END
+            yield found_record
         self._damage.torn = 0 if self._ended else max(0, size - self._at)
 
     def _record_at(self, at: int) -> tuple[int, int] | None:
-        """Return the opcode of the record at ``at``, and its end; None if there is no complete record."""
+        """Return the opcode and the end of the record at ``at``; None if there is no complete record."""
         head = self._read(at, HEAD.size)
         if len(head) < HEAD.size:
             return None
@@ -123,11 +124,11 @@ class Scan:
     def _next_chunk(self, at: int) -> int | None:
         """Return the position of the next chunk with the right checksum."""
         while at < self._size:
-            part, found = self._read(at, _SEARCHED + _OVERLAP), -1
-            while (match := LOOKS_LIKE_CHUNK.search(part, found + 1)) is not None and match.start() < _SEARCHED:
-                found = match.start()
-                if (record := self._record_at(at + found)) is not None and self._is_whole(at + found, record[1]):
-                    return at + found
+            part, offset = self._read(at, _SEARCHED + _OVERLAP), -1
+            while (match := LOOKS_LIKE_CHUNK.search(part, offset + 1)) is not None and match.start() < _SEARCHED:
+                offset = match.start()
+                if (record := self._record_at(at + offset)) is not None and self._is_whole(at + offset, record[1]):
+                    return at + offset
             at += _SEARCHED
         return None
 

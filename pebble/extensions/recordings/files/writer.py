@@ -61,7 +61,7 @@ class RecordingWriter:
         self._writer.add_attachment(create_ns, log_ns, name, media_type, data)
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Declare the form of messages; return its number for :meth:`channel`."""
+        """Declare the schema of messages; return its number for :meth:`channel`."""
         number: int = self._writer.register_schema(name, encoding, data)
         return number
 
@@ -103,16 +103,16 @@ class RecordingWriter:
 
 
 class _Output(BufferedIOBase):
-    """The file as the package writes to it: each of its calls is written completely."""
+    """The file as the package ``mcap`` writes to it: each of its calls is written completely."""
 
     def __init__(self, writer: RecordingWriter, file: File) -> None:
         self.size = self.messages = 0
         self._writer, self._file = writer, file
 
     def write(self, data: bytes) -> int:  # type: ignore[override]
-        rest = memoryview(data)
-        while rest:
-            rest = rest[self._file.write(rest) :]
+        unwritten = memoryview(data)
+        while unwritten:
+            unwritten = unwritten[self._file.write(unwritten) :]
         self.size += len(data)
         if data[:1] == _CHUNK:  # the package writes a chunk in one call, and holds back no message
             self.messages = self._writer.messages
@@ -124,9 +124,9 @@ class _Output(BufferedIOBase):
 
 
 def _packed(channels: list[Channel]) -> bytes:
-    """Return the records of the channels that have no schema.
+    """Return the records of the channels without a schema.
 
-    Of channels with one, the schema would have to be repeated as well.
+    For other channels the schema would have to be repeated as well.
     """
     from mcap.data_stream import RecordBuilder
 

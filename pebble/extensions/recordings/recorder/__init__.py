@@ -1,1 +1,1 @@
-"""The recorder: from a connection to files."""
+"""The recorder, which writes the messages of a connection into files."""

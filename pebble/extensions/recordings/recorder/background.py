@@ -1,4 +1,4 @@
-"""The recorder's threads beside the writer: they make files durable, and finish them."""
+"""The recorder's threads beside the writer: they sync files to disk, and finish them."""
 
 import ctypes
 import logging
@@ -18,7 +18,7 @@ SYNC_S: Final = 5.0  # a power cut loses as much
 
 
 class Background:
-    """Two threads: one makes files durable every few seconds and returns free memory, the other does long jobs."""
+    """Two threads: one syncs files every few seconds and returns free memory, the other does long jobs."""
 
     def __init__(self) -> None:
         self._jobs = ThreadPoolExecutor(1, "pebble-recorder-finish")

@@ -1,4 +1,4 @@
-"""The clock for times of received messages: wall time that jumps only where the recorder says so. Pure."""
+"""The clock for times of arrival: wall time without jumps, except those that the recorder reports. Pure."""
 
 from collections.abc import Callable
 from typing import Final
@@ -8,7 +8,7 @@ _FOLLOWED_PER_S: Final = 5_000_000  # nanoseconds per second: clocks drift, and 
 
 
 class RecordingClock:
-    """Wall time as an offset to a clock that cannot be set and goes on while the machine is suspended.
+    """Wall time as an offset from a clock that cannot be set and counts while the machine is suspended.
 
     ``wall_ns`` and ``boot_ns`` return those clocks, in nanoseconds.
     """
@@ -19,14 +19,14 @@ class RecordingClock:
         self.offset_ns = wall_ns() - self._checked_at
 
     def at(self, boot_ns: int) -> int:
-        """Return the wall time (nanoseconds since 1970) of a time of the other clock."""
+        """Return the wall time (nanoseconds since 1970) for a time of the other clock."""
         return boot_ns + self.offset_ns
 
     def now(self) -> int:
         return self.at(self._boot_ns())
 
     def follow(self) -> float:
-        """Follow the wall clock; to be called once a second. Return by how many seconds it was set, else 0.
+        """Follow the wall clock; call this once a second. Return by how many seconds it was set, else 0.
 
         Small differences are followed slowly, so that time never stands still within a file.
         """

@@ -1,4 +1,4 @@
-"""The choice of recordings that make room for new ones. Pure."""
+"""Chooses the recordings to delete for new ones. Pure."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ def surplus(entries: Iterable[Entry], options: Options, disk: Disk) -> list[Entr
 
 
 def outdated(entries: Iterable[Entry], options: Options, now: float) -> Entry | None:
-    """Return a file of pictures and sound that is too old.
+    """Return a file of pictures and sound that is too old, or None.
 
     Only one at a time, because the clock may have been set wrong.
     """
@@ -48,7 +48,7 @@ def outdated(entries: Iterable[Entry], options: Options, now: float) -> Entry | 
 
 
 def _deletable(entries: list[Entry]) -> list[Entry]:
-    """Return the files that may be deleted, in that order."""
+    """Return the files that may be deleted, the first to delete first."""
     finished = sorted((entry for entry in entries if entry.is_finished), key=lambda entry: entry.number)
     media = [entry for entry in finished if entry.is_media]
     state = [entry for entry in finished if not entry.is_media]

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 
 class Due:
-    """Tasks that are repeated, each with its interval."""
+    """Tasks to repeat, each with its interval."""
 
     def __init__(self, boot_ns: Callable[[], int]) -> None:
         self._boot_ns = boot_ns

@@ -1,4 +1,4 @@
-"""The finisher of files beside the writer: of complete ones, and of those that a kill or a full disk left."""
+"""Finishes files beside the writer: complete ones, and those that a kill or a full disk left unfinished."""
 
 import logging
 from collections.abc import Callable
@@ -23,15 +23,15 @@ def mend(path: Path) -> Rewritten:
     RecordingError, OSError.
     """
     target = finished_path(path)
-    made = rewrite(path, target)
-    if made.is_empty:
+    copy = rewrite(path, target)
+    if copy.is_empty:
         target.unlink()
     sync_folder(path.parent)
-    if made.is_whole:
+    if copy.is_whole:
         path.unlink()
     else:
         rename(path, _damaged_path(path))
-    return made
+    return copy
 
 
 def _damaged_path(path: Path) -> Path:
@@ -39,7 +39,7 @@ def _damaged_path(path: Path) -> Path:
 
 
 class Finisher:
-    """A queue of files to finish, for ``background``. ``event`` records what became of a file that was left."""
+    """A queue of files to finish, for ``background``. ``event`` records what became of an unfinished file."""
 
     def __init__(self, background: Background, event: Callable[..., None], on_finished: Callable[[], None]) -> None:
         self._background, self._event, self._on_finished = background, event, on_finished
@@ -76,7 +76,7 @@ class Finisher:
             self._unfinished.discard(path)
             return
         try:
-            made = mend(path)
+            copy = mend(path)
         except RecordingError as error:
             self._set_aside(path, str(error))
             return
@@ -84,10 +84,10 @@ class Finisher:
             self._later(path, error)
             return
         self._unfinished.discard(path)
-        if not made.is_whole:
-            self._event("damaged", file=path.name, why=made.unread)
-        if not made.is_empty:
-            self._event("recovered", file=path.name, messages=made.messages, missing=made.missing)
+        if not copy.is_whole:
+            self._event("damaged", file=path.name, why=copy.unread)
+        if not copy.is_empty:
+            self._event("recovered", file=path.name, messages=copy.messages, missing=copy.missing)
             self._on_finished()
 
     def _set_aside(self, path: Path, why: str) -> None:
@@ -100,7 +100,7 @@ class Finisher:
         self._event("damaged", file=path.name, why=why)
 
     def _later(self, path: Path, error: OSError) -> None:
-        """Keep a file readable as it is until there is room; log that once."""
+        """Leave a file as it is until there is room, still readable; log that once."""
         if path not in self._unfinished:
             log.warning("%s is not finished yet: %s", path.name, error.strerror or error)
         self._unfinished.add(path)

@@ -1,4 +1,4 @@
-"""The folder of recordings: names and numbers of its files, its lock, and what may be deleted. One recorder uses it."""
+"""The folder of recordings: its files' names and numbers, its lock, and files to delete. One recorder uses it."""
 
 import errno
 import logging
@@ -98,7 +98,7 @@ class Folder:
 
     @classmethod
     def is_in_use(cls, root: Path) -> bool:
-        """True if a recorder writes there, or may without being noticed."""
+        """True if a recorder writes in ``root``, or might without being noticed."""
         with as_owner(root):
             if not (root / LOCK).exists():
                 return False
@@ -121,7 +121,7 @@ class Folder:
 
     def entries(self) -> list[Entry]:
         """Return the recorder's files, the oldest first; links and foreign files are left out."""
-        found = []
+        entries = []
         for path in self._files():
             match = _NAME.fullmatch(path.name)
             try:
@@ -129,8 +129,8 @@ class Folder:
             except OSError:
                 continue
             if match is not None and stat.S_ISREG(about.st_mode):
-                found.append(Entry(path, int(match["number"]), match["lane"], about.st_size, about.st_mtime))
-        return sorted(found, key=lambda entry: entry.number)
+                entries.append(Entry(path, int(match["number"]), match["lane"], about.st_size, about.st_mtime))
+        return sorted(entries, key=lambda entry: entry.number)
 
     def _files(self) -> Iterator[Path]:
         for folder, _, names in os.walk(self.root):

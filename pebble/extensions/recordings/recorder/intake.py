@@ -80,11 +80,11 @@ class Intake:
             self._counters["dropped"] += messages
 
     def add_order(self, topic: str, source: str) -> None:
-        """Add an order for the writer between the messages before and after it; ``topic`` names it."""
+        """Add an order to the writer, in its place between the messages; ``topic`` names it."""
         self._events.append(Item(self._boot_ns(), topic, b"", None, None, "", source))
 
     def take(self) -> list[Item]:
-        """Return all waiting items, in the order in which they came."""
+        """Return all waiting items in the order of their arrival."""
         items = [self._events.popleft() for _ in range(len(self._events))]
         with self._lock:
             for waiting in (self._state, self._media):

@@ -1,4 +1,4 @@
-"""A lane: a series of files, for the state of all robots, or for the pictures and sound of one."""
+"""Lanes: series of files, one for the state of all robots, and one for the pictures and sound of each."""
 
 import os
 import re
@@ -81,7 +81,7 @@ class OpenFile:
         return self._taken - since
 
     def take_lacking(self) -> list[Item]:
-        """Return, after an error, the messages that were not written, and forget them."""
+        """Return and forget, after an error, the messages that were not written."""
         lacking = self.writer.messages - self.writer.flushed
         items, self.pending = self.pending, []
         return items[max(0, len(items) - lacking) :] if lacking else []
@@ -102,7 +102,7 @@ class OpenFile:
         self.path.unlink(missing_ok=True)
 
     def is_there(self) -> bool:
-        """True if the file's name still leads to it: its folder may have been removed."""
+        """True if the file's name still leads to this file: its folder may have been removed."""
         try:
             return os.path.samestat(self.path.stat(), os.fstat(self.file.fileno()))
         except OSError:
@@ -132,14 +132,14 @@ class RawFile:
 
 
 def _metadata(item: Item) -> dict[str, str]:
-    found = {} if item.qos is None else {"qos": str(item.qos)}
+    metadata = {} if item.qos is None else {"qos": str(item.qos)}
     if item.retain is not None:
-        found["retain"] = str(int(item.retain))
+        metadata["retain"] = str(int(item.retain))
     if item.retained:
-        found["retained"] = item.retained
+        metadata["retained"] = item.retained
     if item.source:
-        found["source"] = item.source
-    return found
+        metadata["source"] = item.source
+    return metadata
 
 
 def _is_json(payload: bytes) -> bool:

@@ -1,4 +1,4 @@
-"""The files that a recorder writes at present, one for each lane."""
+"""The files that a recorder is writing, one for each lane."""
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -14,7 +14,7 @@ _TOPICS, _BYTES = 10_000, 16 << 20
 
 
 class RetainedValues:
-    """The present retained values, by connection and topic. A new file begins with them."""
+    """The newest retained values, by connection and topic. A new file begins with them."""
 
     def __init__(self) -> None:
         self._values = BoundedTable[Item](_TOPICS, _BYTES, lambda item: len(item.payload))
@@ -25,10 +25,10 @@ class RetainedValues:
         If the broker does not tell how it was published, a topic known to be retained stays so.
         """
         key = f"{item.source} {item.topic}"
-        known = self._values.get(key)
-        if item.retained and known is not None and not known.retained:
+        stored = self._values.get(key)
+        if item.retained and stored is not None and not stored.retained:
             return  # fetched by another connection, while a newer one had come
-        if not item.retain and not (item.retain is None and known is not None):
+        if not item.retain and not (item.retain is None and stored is not None):
             return
         if item.payload:
             self._values[key] = item._replace(retain=True)
@@ -36,7 +36,7 @@ class RetainedValues:
             self._values.pop(key, None)
 
     def forget(self, source: str) -> None:
-        """Forget a connection's values, as they are fetched again."""
+        """Forget a connection's values, because they will be fetched again."""
         for key in [key for key in self._values if key.startswith(f"{source} ")]:
             del self._values[key]
 
@@ -59,7 +59,7 @@ class OpenFiles:
 
     @property
     def by_lane(self) -> dict[str, OpenFile]:
-        """Return a copy, so that files may be opened and taken while it is iterated."""
+        """Return a copy of the table, so that files may be opened and taken during an iteration."""
         return dict(self._files)
 
     @property

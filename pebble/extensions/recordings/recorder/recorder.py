@@ -1,4 +1,4 @@
-"""The recorder: receives at once, writes on one thread, makes files durable on another.
+"""The recorder: receives without waiting, writes on one thread, syncs to disk on another.
 
 Only those two threads ever wait for the disk. The queue is bounded and drops pictures and sound before state. Every
 lost message is counted, and the loss is recorded as soon as there is room.
@@ -55,13 +55,13 @@ class Recorder:
         """Start. Raises RecordingError if the folder cannot be used or the package ``mcap`` is not installed."""
         require_package()
         self.folder.take()
-        left = self._writing.mend_leftovers()
-        self.note("start", pid=os.getpid(), leftovers=left)
+        leftovers = self._writing.mend_leftovers()
+        self.note("start", pid=os.getpid(), leftovers=leftovers)
         self._background.start()
         self._thread.start()
 
     def stop(self) -> None:
-        """Write all that was received, and finish the files."""
+        """Write everything that was received, and finish the files."""
         self.note("stop")
         self._stopping.set()
         self._thread.join()
@@ -80,7 +80,7 @@ class Recorder:
         retained: bool = False,
         source: str = "",
     ) -> None:
-        """Queue a message. ``retained``: it is an old value, which the broker sent for a new subscription.
+        """Queue a message. ``retained``: an old value, which the broker sent for a new subscription.
 
         ``qos``, ``retain``: as it was published; None if unknown.
         """
@@ -95,7 +95,7 @@ class Recorder:
 
     @property
     def blocked(self) -> str:
-        """Return why nothing can be written now; empty if it can."""
+        """Return why no file can be written now; empty if one can."""
         return self._writing.blocked
 
     @property

@@ -48,15 +48,12 @@ class Source:
         return self._transport.problem
 
     def start(self, timeout: float = 3.0) -> None:
-        """Connect, and go on trying. Raises TransportError for settings that can never work."""
+        """Connect, and keep trying. Raises TransportError for settings that can never work."""
         self._open(timeout)
         self.check()
 
     def check(self) -> None:
-        """Record what the transport had to drop; begin and end fetching retained messages.
-
-        Called once a second.
-        """
+        """Record how much the transport dropped; begin and end fetching retained messages. Called once a second."""
         counted = self._transport.counters.snapshot()
         for name in _LOSSES:
             new = counted.get(name, 0) - self._losses.get(name, 0)
@@ -156,7 +153,7 @@ class _Copies:
 
     @property
     def failed(self) -> bool:
-        """True if the connection has never lasted for long enough."""
+        """True if the connection has never lasted long enough."""
         now = time.monotonic()
         return now > self._ends_at and now - self._quiet_since <= _QUIET_S
 
@@ -174,7 +171,7 @@ class _Copies:
 
 
 def _once(filters: list[str], receive: Callable[[Message], None]) -> Iterator[tuple[str, Callable[[Message], None]]]:
-    """Yield each filter with a handler, such that a message that matches several filters is received once."""
+    """Yield each filter with its handler. A message that matches several filters is received once."""
     for number, filter_ in enumerate(filters):
         yield filter_, partial(_receive_unless, filters[:number], receive) if number else receive
 

@@ -1,4 +1,4 @@
-"""The work of the recorder's writer thread: messages into files, deletion for room, and what to do without room."""
+"""The work of the recorder's writer thread: it writes messages, deletes files for room, and waits without room."""
 
 import errno
 import logging
@@ -34,7 +34,7 @@ _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 
 
 class _Blocked(NamedTuple):
-    """A time in which nothing can be written, and why."""
+    """A time in which no file can be written, and the reason."""
 
     why: str
     since_ns: int
@@ -43,7 +43,7 @@ class _Blocked(NamedTuple):
 
 
 class Context(NamedTuple):
-    """The values that the parts of a recorder share."""
+    """The objects that the parts of a recorder share."""
 
     folder: Folder
     options: Options
@@ -75,11 +75,11 @@ class Writing:
 
         Without a lock they may be another recorder's; then they stay as they are.
         """
-        ours = self._files.paths
-        left = [entry.path for entry in self._folder.entries() if entry.is_active and entry.path not in ours]
-        for path in left if self._folder.is_locked else ():
+        open_paths = self._files.paths
+        leftovers = [entry.path for entry in self._folder.entries() if entry.is_active and entry.path not in open_paths]
+        for path in leftovers if self._folder.is_locked else ():
             self._finisher.mend(path)
-        return len(left)
+        return len(leftovers)
 
     # -- messages
 
@@ -126,7 +126,7 @@ class Writing:
             self._fail(lane, error)
 
     def flush(self) -> None:
-        """Write out what was added to the files."""
+        """Write all added messages to the files."""
         for lane, file in self._files.by_lane.items():
             self._flush(lane, file)
 
@@ -149,12 +149,12 @@ class Writing:
             self._forget_removed(lane)
 
     def _finish(self, lane: str) -> None:
-        """Finish the file of a lane, unless it has failed in the meantime."""
+        """Finish the file of a lane, unless it has failed."""
         if lane in self._files.by_lane:
             self._finisher.finish(self._files.take(lane))
 
     def note_drops(self) -> None:
-        """Record as an event what was dropped because the queue was full."""
+        """Record, as an event, how much was dropped because the queue was full."""
         total = self._counters["dropped"]
         if total > self._noted_drops and self._blocked is None:
             self._intake.note("dropped", messages=total - self._noted_drops, why="the disk is too slow")
@@ -163,7 +163,7 @@ class Writing:
     # -- when files cannot be written
 
     def _fail(self, lane: str, error: OSError) -> None:
-        """Close a failed file as it is; its unwritten messages go into the next one."""
+        """Close a failed file as it is. Its unwritten messages go into the next one."""
         file = self._files.take(lane)
         self._lacking += file.take_lacking()
         self._counters["written"] += file.take_written()
@@ -249,7 +249,7 @@ class Writing:
             self.try_again()
 
     def _follow_folder(self) -> None:
-        """Use the folder that is at the path now. Raises RecordingError and OSError."""
+        """Use the folder that is now at the path. Raises RecordingError and OSError."""
         if self._folder.in_place:
             return
         self.flush()  # forgets the files that are not there any more

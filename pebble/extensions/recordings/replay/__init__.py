@@ -1,1 +1,1 @@
-"""Replay: a recording, published again."""
+"""Replay: publishes a recording again."""

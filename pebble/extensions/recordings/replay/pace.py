@@ -1,4 +1,4 @@
-"""The position in a recording that is played at a certain speed. Pure: the clock is passed in."""
+"""The present position in a recording that is played at a certain speed. Pure: the clock is passed in."""
 
 from collections.abc import Callable
 
@@ -6,7 +6,7 @@ SLOWEST, FASTEST = 0.1, 100.0
 
 
 class Pace:
-    """A speed and a start. Positions are in nanoseconds since 1970; ``now``, in seconds, never goes back."""
+    """A speed and a starting point. Positions are in nanoseconds since 1970; ``now``, in seconds, never goes back."""
 
     def __init__(self, now: Callable[[], float], *, speed: float, slowest: float) -> None:
         self._now, self._slowest = now, slowest
@@ -31,5 +31,5 @@ class Pace:
         return self.from_ns + int((self._now() - self._from) * self._speed * 1e9)
 
     def due_s(self, position_ns: int, now: float) -> float:
-        """Return in how many seconds a position is reached; negative if it was reached before."""
+        """Return the seconds until a position is reached; negative if it is passed."""
         return (position_ns - self.from_ns) / 1e9 / self._speed + self._from - now

@@ -1,4 +1,4 @@
-"""The player of a recording: in its order and at its pace. Pure: clocks, waiting and publishing are passed in."""
+"""Plays a recording in order and at its pace. Pure: clocks, waiting and publishing are passed in."""
 
 from collections.abc import Callable, Iterator
 from typing import Final, Protocol
@@ -22,11 +22,11 @@ class Source(Protocol):
     """The recording that a player plays."""
 
     def messages(self, since_ns: int, until_ns: int) -> Iterator[Recorded]:
-        """Yield the messages of a period by the time at which they were received."""
+        """Yield the messages of a period in the order of their arrival."""
         ...
 
     def state_before(self, at_ns: int, publishes: Chooses) -> list[Recorded]:
-        """Return what a subscriber would know at a time, ending with the pictures that the next one builds on."""
+        """Return what a subscriber would know at a time; last, the pictures that the next one builds on."""
         ...
 
 
@@ -51,7 +51,7 @@ class Output(Protocol):
 
 
 class BusOutput:
-    """An output that publishes on a bus, and a zero after commands that moved something.
+    """An output that publishes messages, and a zero after commands that moved something.
 
     ``publish`` returns False for a message that it cannot take now; ``wall_ns`` returns the time since 1970.
     """
@@ -71,17 +71,17 @@ class BusOutput:
 
         Its stamps are moved so that it seems as old now as it was at ``position_ns``.
         """
-        found = self._rules.outgoing(message, self._wall_ns() - position_ns)
-        if found is None:
+        outgoing = self._rules.outgoing(message, self._wall_ns() - position_ns)
+        if outgoing is None:
             self.skipped += 1
             return True
-        if not self._publish(found.message):
+        if not self._publish(outgoing.message):
             return False
         self.sent += 1
-        if found.moves is not None:
-            self._moved.pop(found.message.topic, None)
-            if found.moves:
-                self._moved[found.message.topic] = None
+        if outgoing.moves is not None:
+            self._moved.pop(outgoing.message.topic, None)
+            if outgoing.moves:
+                self._moved[outgoing.message.topic] = None
         return True
 
     def halt(self) -> None:
@@ -93,7 +93,7 @@ class BusOutput:
 
 
 class Reading:
-    """A position in a recording, at the next message to publish; ``skipped`` counts those left out."""
+    """A position in a recording, at the next message to publish; ``skipped``: how many were left out."""
 
     def __init__(self, source: Source, publishes: Chooses, until_ns: int) -> None:
         self.next: Recorded | None = None
@@ -119,7 +119,7 @@ class Reading:
 
 
 class Player:
-    """A player that plays to the end; within its calls of ``wait`` it may be paused, moved and stopped."""
+    """A player that plays to the end. Inside its calls of ``wait`` it may be paused, moved and stopped."""
 
     def __init__(
         self,
@@ -163,7 +163,7 @@ class Player:
 
     @property
     def restores(self) -> bool:
-        """True while the state before the newest seek is being sent."""
+        """True while the state for a new position is being sent."""
         return bool(self._reading.state)
 
     @property
@@ -184,7 +184,7 @@ class Player:
         self._pace.change(speed, self.position_ns)
 
     def run(self) -> None:
-        """Play to the end or until :meth:`stop`, then stop what moves, also after an error."""
+        """Play to the end or until :meth:`stop`; then stop everything that moves, also after an error."""
         try:
             self._open(self._since_ns, self._since_ns if self._stays else 0)
             if self._reading.next is not None and not self._stays:

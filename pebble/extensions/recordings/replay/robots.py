@@ -17,9 +17,9 @@ Make = Callable[[str, Message | None], Transport]
 
 
 class ReplayedRobots:
-    """A publisher in the names of robots, which are published as offline at the end.
+    """A publisher in the names of robots, which it finally publishes as offline.
 
-    ``wall_ms``: returns the time since 1970.
+    ``wall_ms`` returns the time since 1970.
     """
 
     def __init__(self, make: Make, bases: Iterable[str], *, wall_ms: Callable[[], int]) -> None:

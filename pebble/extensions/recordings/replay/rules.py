@@ -35,7 +35,7 @@ _ZERO: Final = codec.encode(c.DRIVE, Drive(valid_ms=0))  # final: no script resu
 
 
 class ReplayError(PebbleError):
-    """A replay that cannot be done. Example: ``--base pebble is the base of pebble/robots/goob itself: …``."""
+    """An error: a replay cannot be done. Example: ``--base pebble is the base of pebble/robots/goob itself: …``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,7 +136,7 @@ class Rules:
         return self._options.incoming and declared in _MILD
 
     def _moves(self, payload: bytes) -> bool | None:
-        """Return whether a drive command moves; None if it is not to be sent: an unreadable one, or a script's."""
+        """Return True if a drive command moves the robot; None if it must not be sent: unreadable, or a script's."""
         try:
             command: Drive = codec.decode(c.DRIVE, payload)
         except PayloadError:
@@ -179,7 +179,7 @@ def _section(name: str, section: Any, recorded: str, base: str) -> Any:
 
 
 def zero(topic: str) -> Message:
-    """Return the message that stops a robot which a command on ``topic`` may have set in motion."""
+    """Return the message that stops a robot after a command on ``topic``."""
     return Message(topic, _ZERO, QoS.DELIVERED)
 
 

@@ -20,7 +20,7 @@ _HEARTBEATS: Final = frozenset({ONLINE.suffix, HEARTBEAT.suffix})
 
 
 class ReplaySource:
-    """Recordings as one stream; after a seek it begins with what a subscriber would know at that time."""
+    """Recordings as one stream. After a seek it begins with the state that a subscriber would know."""
 
     def __init__(self, paths: Iterable[Path]) -> None:
         """Read the end of each file, or all of an unfinished one. Raises RecordingError."""
@@ -37,7 +37,7 @@ class ReplaySource:
         return [channel for channels in self._files.values() for channel in channels]
 
     def messages(self, since_ns: int = 0, until_ns: int = FOREVER_NS) -> Iterator[Recorded]:
-        """Yield messages by the time at which they were received; ``until_ns`` is not included."""
+        """Yield messages in the order of their arrival, up to before ``until_ns``."""
         return merged(self._files, since_ns=since_ns, until_ns=until_ns, damages=self.damages)
 
     def state_before(self, at_ns: int, publishes: Chooses = lambda _channel: True) -> list[Recorded]:
@@ -62,24 +62,26 @@ class ReplaySource:
         def chooses(channel: Channel) -> bool:
             return _may_be_pictures(channel) and publishes(channel)
 
-        found: dict[str, list[Recorded]] = {}
+        since_keyframe: dict[str, list[Recorded]] = {}
         paths = self._having(chooses, since_ns, at_ns)
         for message in merged(paths, since_ns=since_ns, until_ns=at_ns, chooses=chooses):
             if is_keyframe(message.payload):
-                found[message.channel.topic] = [message]
-            elif message.channel.topic in found and is_picture(message.payload):
-                found[message.channel.topic].append(message)
-        pictures = [message for messages in found.values() if len(messages) <= _PICTURES for message in messages]
+                since_keyframe[message.channel.topic] = [message]
+            elif message.channel.topic in since_keyframe and is_picture(message.payload):
+                since_keyframe[message.channel.topic].append(message)
+        pictures = [
+            message for messages in since_keyframe.values() if len(messages) <= _PICTURES for message in messages
+        ]
         return sorted(pictures, key=lambda message: message.log_ns)
 
     def _having(self, chooses: Callable[[Channel], bool], since_ns: int, until_ns: int) -> list[Path]:
-        """Return the files of that time with such channels, so that no media are decompressed in vain."""
+        """Return the files of that time with channels that ``chooses`` accepts, so that only these are decompressed."""
         having = [path for path, channels in self._files.items() if any(map(chooses, channels))]
         return [path for path in having if reaches_into(path, since_ns, until_ns)]
 
 
 def _is_state(channel: Channel) -> bool:
-    """True if a new subscriber would get the topic's newest message at once."""
+    """True if a new subscriber would get the newest message of the topic at once."""
     suffix = _suffix(channel)
     if not suffix.startswith(f"{OUTGOING}/") or suffix in _HEARTBEATS:
         return False

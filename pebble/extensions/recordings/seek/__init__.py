@@ -1,1 +1,1 @@
-"""Random access to recordings: messages of a time, the state before it, pictures, days."""
+"""Random access to recordings: messages of a period, the state before it, pictures, days."""

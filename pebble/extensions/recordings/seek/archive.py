@@ -1,4 +1,4 @@
-"""A folder of recordings, queried for one robot at one time: its state, its messages, its picture."""
+"""An archive: a folder of recordings, from which a robot's state, messages and picture at a time are read."""
 
 import re
 import time
@@ -29,7 +29,7 @@ _NAME: Final = re.compile(r"(?P<stamp>\d{8}T\d{6}Z)-\d{6,}\.(?P<lane>.+?)\.mcap(
 
 
 class _Named(NamedTuple):
-    """The facts in the name of a recorder's file; files of other programs have none."""
+    """The facts in a file name that a recorder made; None for files of other programs."""
 
     path: Path
     lane: str  # "": any
@@ -51,19 +51,19 @@ class Archive:
             self._open.popitem()[1].close()
 
     def messages(self, robot: str, since_ns: int, until_ns: int) -> list[Recorded]:
-        """Return the messages that a robot published and was sent, from ``since_ns`` to before ``until_ns``."""
-        found: list[Recorded] = []
+        """Return the messages from and to a robot, from ``since_ns`` to before ``until_ns``."""
+        messages: list[Recorded] = []
         for file in self.files(robot, since_ns, until_ns):
             for chunk in _within(file, file.channels_of(robot), since_ns, until_ns):
-                found += (
+                messages += (
                     message
                     for message in file.messages_of(chunk)
                     if since_ns <= message.log_ns < until_ns
                     and _is_of(message.channel, robot)
                     and not is_carried(message.channel)
                 )
-        found.sort(key=lambda message: message.log_ns)
-        return found
+        messages.sort(key=lambda message: message.log_ns)
+        return messages
 
     def state(self, robot: str, at_ns: int) -> list[Recorded]:
         """Return the newest message of each of a robot's topics before ``at_ns``, without media, oldest first."""
@@ -72,10 +72,10 @@ class Archive:
         if not files:
             return []
         file = max(files, key=lambda file_: file_.first_ns)
-        wanted = {channel.topic for channel in file.channels.values() if _is_of(channel, robot)}
-        found: dict[str, Recorded] = {}
+        topics = {channel.topic for channel in file.channels.values() if _is_of(channel, robot)}
+        newest: dict[str, Recorded] = {}
         for chunk in reversed(_within(file, file.channels_of(robot), 0, at_ns)):
-            missing = wanted - found.keys()
+            missing = topics - newest.keys()
             if not missing:
                 break
             if chunk.channels and not any(
@@ -84,16 +84,17 @@ class Archive:
                 continue
             for message in reversed(file.messages_of(chunk)):
                 topic = message.channel.topic
-                if message.log_ns < at_ns and topic not in found and _is_of(message.channel, robot):
-                    found[topic] = message
+                if message.log_ns < at_ns and topic not in newest and _is_of(message.channel, robot):
+                    newest[topic] = message
         return sorted(
-            (message for message in found.values() if not is_media(message.payload)), key=lambda message: message.log_ns
+            (message for message in newest.values() if not is_media(message.payload)),
+            key=lambda message: message.log_ns,
         )
 
     def log_lines(self, robot: str, at_ns: int) -> list[Recorded]:
         """Return the last lines of a robot's log before ``at_ns``, oldest first."""
         topic = LOGS.topic(robot)
-        found: list[Recorded] = []
+        newest_first: list[Recorded] = []
         for file in reversed(self.files(robot, at_ns - _LOG_NS, at_ns, media=False)):
             numbers = frozenset(number for number, channel in file.channels.items() if channel.topic == topic)
             for chunk in reversed(_within(file, numbers, at_ns - _LOG_NS, at_ns)):
@@ -102,13 +103,13 @@ class Archive:
                     for message in file.messages_of(chunk)
                     if message.channel.topic == topic and message.log_ns < at_ns
                 ]
-                found += reversed(lines)
-                if len(found) >= LOG_LINES:
+                newest_first += reversed(lines)
+                if len(newest_first) >= LOG_LINES:
                     break
-        return sorted(found[:LOG_LINES], key=lambda message: message.log_ns)
+        return sorted(newest_first[:LOG_LINES], key=lambda message: message.log_ns)
 
     def pictures(self, robot: str, at_ns: int) -> list[Recorded]:
-        """Return the last picture before ``at_ns``, preceded by those it needs; empty if there is none."""
+        """Return the last picture before ``at_ns`` after those that it builds on; empty if there is none."""
         chain: list[Recorded] = []
         size = 0
         for message in self._pictures_before(robot, at_ns):
@@ -124,20 +125,20 @@ class Archive:
         return []
 
     def next_ns(self, robot: str, at_ns: int) -> int | None:
-        """Return the time of the robot's next message from ``at_ns`` on; None if there is none."""
-        found: int | None = None
+        """Return the time of the first message of the robot from ``at_ns`` on; None if there is none."""
+        earliest_ns: int | None = None
         for file in sorted(self.files(robot, at_ns, 1 << 63), key=lambda file_: file_.first_ns):
-            if found is not None and file.first_ns >= found:
+            if earliest_ns is not None and file.first_ns >= earliest_ns:
                 break
             first_ns = _first(file, robot, at_ns)
             if first_ns is not None:
-                found = first_ns if found is None else min(found, first_ns)
-        return found
+                earliest_ns = first_ns if earliest_ns is None else min(earliest_ns, first_ns)
+        return earliest_ns
 
     def files(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[SeekableFile]:
-        """Return the opened files that may hold messages of a robot in a period, in the order of time."""
+        """Return the files that may hold messages of a robot in a period, opened, in the order of time."""
         lane = lane_of(f"{robot}/", is_media=True)
-        found = []
+        files = []
         for named in self._list():
             if named.lane.startswith(MEDIA) and (not media or named.lane not in (lane, OTHER_MEDIA)):
                 continue
@@ -146,8 +147,8 @@ class Archive:
             file = self._opened(named.path)
             if file is None or not file.chunks or file.first_ns >= until_ns or file.last_ns < since_ns:
                 continue
-            found.append(file)
-        return sorted(found, key=lambda file_: file_.first_ns)
+            files.append(file)
+        return sorted(files, key=lambda file_: file_.first_ns)
 
     def all_files(self) -> Iterator[SeekableFile]:
         """Yield all files, each opened."""
@@ -155,7 +156,7 @@ class Archive:
         yield from (file for file in files if file is not None)
 
     def unread(self) -> dict[Path, str]:
-        """Return, for each file that was looked at, what could not be read."""
+        """Return what could not be read, by file, of the files that were opened."""
         return self._failed | {path: file.problem for path, file in self._open.items() if file.problem}
 
     # -- files
@@ -165,14 +166,14 @@ class Archive:
         if now - self._listed_at >= LIST_S:
             self._named = sorted(_named(path) for path in recordings_in(self.folder) if path.is_file())
             self._listed_at = now
-            there = {named.path for named in self._named}
-            for path in [path for path in self._open if path not in there]:
+            paths = {named.path for named in self._named}
+            for path in [path for path in self._open if path not in paths]:
                 self._open.pop(path).close()
-            self._failed = {path: why for path, why in self._failed.items() if path in there}
+            self._failed = {path: why for path, why in self._failed.items() if path in paths}
         return self._named
 
     def _opened(self, path: Path) -> SeekableFile | None:
-        """Return a file, opened; None if it has gone or is no recording."""
+        """Return a file, opened; None if it is gone or is no recording."""
         file = self._open.pop(path, None)
         try:
             if file is not None and file.is_replaced():

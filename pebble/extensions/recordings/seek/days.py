@@ -1,4 +1,4 @@
-"""The days of an archive, with their contents, from the summaries of its files."""
+"""The days of an archive with their contents, from the summaries of its files."""
 
 import json
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ _MOST_DAYS: Final = 31  # of one chunk
 class Day(Struct):
     """A day (UTC). ``first``, ``last``: epoch milliseconds. ``gaps``: times that were not recorded.
 
-    ``driven``: for about how many seconds each robot was sent drive commands, in steps of the recording's chunks.
+    ``driven``: by robot, about how many seconds it was sent drive commands, in steps of the recording's chunks.
     ``unread``: a line for each file that cannot be read completely, on the day of its last change.
     """
 
@@ -38,7 +38,7 @@ class Day(Struct):
 
 
 class Days:
-    """A table of days, which remembers the contents of files that do not change any more."""
+    """The table of days. It remembers the contents of files that no longer change."""
 
     def __init__(self, archive: Archive) -> None:
         self._archive = archive
@@ -49,7 +49,7 @@ class Days:
 
         A file counts for each day that has messages of it; its bytes for the first.
         """
-        found: dict[str, Day] = {}
+        by_name: dict[str, Day] = {}
         for file in self._archive.all_files():
             days = self._known.get(file.path)
             if days is None:
@@ -57,14 +57,14 @@ class Days:
                 if file.damage.finished:
                     self._known[file.path] = days
             for day in days:
-                _merge(found.setdefault(day.day, Day(day.day, first=day.first)), day)
+                _merge(by_name.setdefault(day.day, Day(day.day, first=day.first)), day)
         for path, why in self._archive.unread().items():
             with suppress(OSError):  # it is deleted by now
                 about = path.stat()
                 name, ms = _day_of(int(about.st_mtime)), about.st_mtime * 1e3
-                day = found.setdefault(name, Day(name, bytes=about.st_size, first=ms, last=ms))
+                day = by_name.setdefault(name, Day(name, bytes=about.st_size, first=ms, last=ms))
                 day.unread.append(f"{path.name}: {why}")
-        return sorted(found.values(), key=lambda day: day.day, reverse=True)
+        return sorted(by_name.values(), key=lambda day: day.day, reverse=True)
 
 
 def _days(file: SeekableFile) -> list[Day]:
@@ -86,12 +86,12 @@ def _driven(file: SeekableFile, begin: int, end: int) -> dict[str, float]:
     """Return the driven seconds within a day, by robot."""
     drives = {number: robot_of(channel) for number, channel in file.channels.items() if _drives(channel.topic)}
     robots = {number: robot for number, robot in drives.items() if robot is not None}
-    found: dict[str, float] = {}
+    seconds: dict[str, float] = {}
     for chunk in file.chunks if robots else []:
         within = max(0, min(chunk.end_ns, end) - max(chunk.start_ns, begin)) / 1e9
         for robot in {robots[number] for number in chunk.channels if number in robots} if within else ():
-            found[robot] = found.get(robot, 0.0) + within
-    return found
+            seconds[robot] = seconds.get(robot, 0.0) + within
+    return seconds
 
 
 def _drives(topic: str) -> bool:
@@ -124,15 +124,15 @@ def _merge(day: Day, other: Day) -> None:
 def _gaps(file: SeekableFile) -> list[int]:
     """Return the gaps that the recorder noted."""
     numbers = {number for number, channel in file.channels.items() if channel.topic == EVENTS}
-    found = []
+    times = []
     for chunk in file.chunks if numbers else []:
         if not chunk.channels.isdisjoint(numbers):
-            found += [
+            times += [
                 message.log_ns
                 for message in file.messages_of(chunk)
                 if message.channel.id in numbers and _is_gap(message.payload)
             ]
-    return found
+    return times
 
 
 def _is_gap(payload: bytes) -> bool:

@@ -1,4 +1,4 @@
-"""A recording that is read at any place; the last used chunks stay decompressed."""
+"""A recording that is read at any place. The chunks used last stay decompressed."""
 
 import os
 from collections import OrderedDict
@@ -26,7 +26,7 @@ class SeekableFile(RecordingFile):
         return {robot for channel in self.channels.values() if (robot := robot_of(channel)) is not None}
 
     def channels_of(self, robot: str) -> frozenset[int]:
-        """Return a robot's channels and, in files of the last version, the channel of all other topics."""
+        """Return a robot's channels and, in files of the last version, the common channel of other topics."""
         return frozenset(
             number
             for number, channel in self.channels.items()
@@ -41,15 +41,15 @@ class SeekableFile(RecordingFile):
 
     def messages_of(self, chunk: Chunk) -> list[Recorded]:
         """Return the messages of a chunk in the order of time; empty if the chunk is damaged."""
-        known = self._unpacked_chunks.get(chunk.at)
-        if known is None:
-            known = self._unpacked_chunks[chunk.at] = self.messages(chunk)
+        messages = self._unpacked_chunks.get(chunk.at)
+        if messages is None:
+            messages = self._unpacked_chunks[chunk.at] = self.messages(chunk)
             if len(self._unpacked_chunks) > _CACHED:
                 self._unpacked_chunks.popitem(last=False)
         self._unpacked_chunks.move_to_end(chunk.at)
-        return known
+        return messages
 
 
 def is_carried(channel: Channel) -> bool:
-    """True if the message was copied to the begin of the file, and is older than the file."""
+    """True if the message was copied to the beginning of the file, and is older than the file."""
     return channel.metadata.get("retained") == CARRIED

@@ -1,4 +1,4 @@
-"""Functions that a second process runs to answer questions about recordings. They take and return plain data.
+"""Functions with which a second process answers questions about recordings. They take and return plain data.
 
 That process (:class:`pebble.extensions.page.recordings.archive_process.ArchiveProcess`) has one archive. In the page
 server's own process, reading files would delay the loop that passes on drive commands.
@@ -63,22 +63,22 @@ def days() -> bytes:
 
 def files(robot: str, since_ns: int, until_ns: int) -> tuple[list[str], bool]:
     """Return a robot's recordings in a period, and whether one is still being written."""
-    found = [str(file.path) for file in _archive.files(robot, since_ns, until_ns)]
-    return found, any(path.endswith(ACTIVE) for path in found)
+    paths = [str(file.path) for file in _archive.files(robot, since_ns, until_ns)]
+    return paths, any(path.endswith(ACTIVE) for path in paths)
 
 
 # -- jobs, each in a process of its own: they take long
 
 
 def make_timeline_job(answer: Connection, paths: list[str], target: Path, robot: str, period: tuple[int, int]) -> None:
-    """Index what is not indexed, and write the timeline to ``target`` as JSON."""
+    """Index recordings that have no index, and write the timeline to ``target`` as JSON."""
     _in_background(_NICE)
 
     def work() -> str:
         places, progress = [Path(path) for path in paths], _Progress(answer)
         with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
-            made = make_timeline(places, Path(scratch), robot, *period, progress.share)
-        target.write_bytes(msgspec.json.encode(made))
+            timeline = make_timeline(places, Path(scratch), robot, *period, progress.share)
+        target.write_bytes(msgspec.json.encode(timeline))
         return ""
 
     answer_with(answer, work)
@@ -118,7 +118,7 @@ def export_job(
 
 
 class _Progress:
-    """A sender of the share of the work that is done: in steps of a percent, and as a sign of life."""
+    """A sender of how much of the work is done: in steps of a percent, and as a sign of life."""
 
     def __init__(self, answer: Connection) -> None:
         self._answer, self._sent, self._sent_at = answer, -1, 0.0
@@ -131,7 +131,7 @@ class _Progress:
 
 
 def answer_with(answer: Connection, work: Callable[[], str]) -> None:
-    """Do the work of a job, and answer with its result. ``work`` returns what it could not read."""
+    """Do the ``work`` of a job, which returns what it could not read; answer with the result."""
     try:
         answer.send(("ready", work()[:_LONGEST_WHY]))
     except Exception as error:
@@ -141,7 +141,7 @@ def answer_with(answer: Connection, work: Callable[[], str]) -> None:
 
 
 def reason(error: Exception) -> str:
-    """Return what has failed and what to do, in one line."""
+    """Return the problem and what to do, in one line."""
     match error:
         case PebbleError():
             words = str(error)

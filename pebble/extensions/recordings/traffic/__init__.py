@@ -1,1 +1,1 @@
-"""Analysis of robots and networks from recordings: index, analysis, report."""
+"""Analysis of robots and networks by recordings: index, analysis, report."""

@@ -1,4 +1,4 @@
-"""The use of a robot that a message shows: driving, watching, a sound, a script. Pure."""
+"""The use of a robot that a message shows, such as driving, watching, a sound or a script. Pure."""
 
 import re
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from pebble.errors import PayloadError
 
 
 class Activity(IntEnum):
-    """Numbers of the index. Those from DRIVE to AUTONOMY belong to a session (paper 4.1); a warning does not."""
+    """Kinds of activity, as numbers of the index. DRIVE to AUTONOMY belong to a session (paper 4.1)."""
 
     NONE = 0
     DRIVE = 1
@@ -40,7 +40,7 @@ _BY_SUFFIX: Final = {
 
 
 def activity_of(suffix: str) -> Callable[[bytes], Activity]:
-    """Return the activity that the payloads of a topic show, by its part below the base (``incoming/drive-values``).
+    """Return a function from a payload to its activity, for a topic below the base (``incoming/drive-values``).
 
     Not for media.
     """

@@ -27,7 +27,7 @@ _EVENTS: Final = """
 
 
 class RecorderEvents(Struct):
-    """The events that recorders noted about themselves."""
+    """The events that recorders noted about their own work."""
 
     gaps: list[Gap]
     starts: list[int]  # ns; what was before is not known
@@ -53,7 +53,7 @@ def analyse(
     """
     with connected(scratch, memory_mb=_MEMORY_MB, threads=_THREADS) as connection:
         recorder = recorder_events(connection, sources.indexes, since_ns, until_ns)
-        found, spans = list[RobotTraffic](), list[int]()
+        results, spans = list[RobotTraffic](), list[int]()
         names = [name for name in sources.robots if not robots or name in robots]
         for number, name in enumerate(names):
             progress(name, number / len(names))
@@ -62,13 +62,13 @@ def analyse(
             messages, size, first_ns, last_ns = queries.totals()
             if messages:
                 spans += [first_ns, last_ns]
-                found.append(_robot(queries, name, messages, size))
+                results.append(_robot(queries, name, messages, size))
         progress("", 1.0)
-    if not found:
+    if not results:
         raise RecordingError("there is no message of a robot in this period: see pebble recordings list")
     return Traffic(
         since_ns=min(spans), until_ns=max(spans), recordings=len(sources.indexes), missing=sources.missing,
-        dropped=recorder.dropped, gaps=recorder.gaps, robots=found, unread=sources.unread,
+        dropped=recorder.dropped, gaps=recorder.gaps, robots=results, unread=sources.unread,
     )  # fmt: skip
 
 
@@ -83,17 +83,17 @@ def _robot(queries: RobotQueries, name: str, messages: int, size: int) -> RobotT
 
 def recorder_events(connection: Any, indexes: Sequence[Path], since_ns: int, until_ns: int) -> RecorderEvents:
     """Return the recorders' events of a period; create the table ``breaks`` that `RobotQueries` needs."""
-    found = RecorderEvents([], [])
+    events = RecorderEvents([], [])
     rows = connection.execute(_EVENTS.format(events=parquet(indexes))).fetchall() if indexes else []
     for event, ns, since, until, why, messages in rows:
         if event == "gap" and since is not None and until is not None and since < until_ns and until >= since_ns:
-            found.gaps.append(Gap(since, until, why or ""))
-            found.dropped += messages
+            events.gaps.append(Gap(since, until, why or ""))
+            events.dropped += messages
         elif event in ("start", "clock"):
-            found.starts.append(ns)
+            events.starts.append(ns)
         elif event == "dropped" and since_ns <= ns < until_ns:
-            found.dropped += messages
+            events.dropped += messages
     connection.execute("CREATE TEMP TABLE breaks (since_ns BIGINT, until_ns BIGINT)")
-    for pause in found.breaks():
+    for pause in events.breaks():
         connection.execute("INSERT INTO breaks VALUES (?, ?)", pause)
-    return found
+    return events

@@ -1,4 +1,4 @@
-"""DuckDB with little memory, as the index and the analysis use it."""
+"""DuckDB with little memory, for the index and the analysis."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _GLOB: Final = re.compile(r"([*?\[])")
 
 
 def require_packages(*names: str) -> None:
-    """Raise PebbleError with those packages of the extra "archive" that are not installed."""
+    """Raise PebbleError that names the packages of the extra "archive" that are not installed."""
     missing = [name for name in names if find_spec(name) is None]
     if missing:
         raise PebbleError(f'{" and ".join(missing)} missing: pip install "pebble-robot[archive]"')

@@ -36,7 +36,7 @@ _TALL: Final = 30  # a highest bar of so many times the lowest makes the axis lo
 
 
 class Figure(Struct, frozen=True):
-    """A drawing, with the text that a new reader needs."""
+    """A drawing with a text that explains it to a new reader."""
 
     number: str  # in the paper
     title: str
@@ -45,7 +45,7 @@ class Figure(Struct, frozen=True):
 
 
 def figures(robot: RobotTraffic) -> list[Figure]:
-    """Return the figures that a robot has data for."""
+    """Return the figures for which a robot has data."""
     drawn = [_outages(robot), _latency(robot), _bandwidth(robot)]
     return [figure for figure in drawn if figure is not None]
 
@@ -121,12 +121,14 @@ def draw_bandwidth(axes: Axes, shown: Sequence[Bandwidth]) -> None:
     """Draw the median and the 95th percentile of each family, in sessions and while idle."""
     names = [family for family in reversed(FAMILIES) if any(bandwidth.family == family for bandwidth in shown)]
     for time, label, colour, offset, marker in _TIMES:
-        mine = [bandwidth for bandwidth in shown if bandwidth.time == time]
-        places = [names.index(bandwidth.family) - offset for bandwidth in mine]
-        medians = [max(bandwidth.median_kbps, 0.01) for bandwidth in mine]
-        axes.hlines(places, medians, [max(bandwidth.p95_kbps, 0.01) for bandwidth in mine], color=colour, linewidth=2)
+        of_time = [bandwidth for bandwidth in shown if bandwidth.time == time]
+        places = [names.index(bandwidth.family) - offset for bandwidth in of_time]
+        medians = [max(bandwidth.median_kbps, 0.01) for bandwidth in of_time]
+        axes.hlines(
+            places, medians, [max(bandwidth.p95_kbps, 0.01) for bandwidth in of_time], color=colour, linewidth=2
+        )
         axes.plot(medians, places, marker, color=colour, markersize=6, label=label)
-        for bandwidth, place in zip(mine, places, strict=True):
+        for bandwidth, place in zip(of_time, places, strict=True):
             right = max(bandwidth.p95_kbps, 0.01)
             axes.annotate(
                 _short(bandwidth.median_kbps), (right, place), xytext=(6, 0), textcoords="offset points", va="center",

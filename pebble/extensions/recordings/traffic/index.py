@@ -1,6 +1,6 @@
 """The index of a recording: a row for each message, without payloads, in ``NAME.parquet`` beside ``NAME.mcap``.
 
-It may be deleted: it is made again when needed. :data:`COLUMNS` are its columns; its rows are ordered by robot and
+It may be deleted: it is made again when needed. :data:`COLUMNS` lists its columns; its rows are ordered by robot and
 time. Its metadata (``parquet_kv_metadata``) hold the state of the recording from which it was made.
 """
 # ruff: noqa: S608  (what is put into queries are names of files and texts, in quotes)
@@ -78,7 +78,7 @@ _COPY: Final = """
 
 
 class About(Struct):
-    """The facts of an index about its recording."""
+    """The facts about a recording that its index holds."""
 
     recording: str  # its name
     size: int  # of the file, when it was indexed
@@ -92,10 +92,10 @@ def index_path(recording: Path) -> Path:
 
 
 def about(index: Path, connection: DuckDBPyConnection) -> About | None:
-    """Return the facts in an index; None for another file. Raises RecordingError if it cannot be read."""
-    found = dict(connection.execute(f"SELECT key, value FROM parquet_kv_metadata({quoted(index)})").fetchall())
+    """Return these facts from an index; None for another file. Raises RecordingError if it cannot be read."""
+    metadata = dict(connection.execute(f"SELECT key, value FROM parquet_kv_metadata({quoted(index)})").fetchall())
     try:
-        texts = {key.decode(): value.decode() for key, value in found.items()}
+        texts = {key.decode(): value.decode() for key, value in metadata.items()}
         numbers = [int(texts[name]) for name in ("size", "changed_ns", "missing")]
         size, changed_ns, missing = numbers
         return About(texts["recording"], size, changed_ns, missing, texts["unread"])
@@ -107,22 +107,22 @@ def is_of(index: Path, recording: Path, connection: DuckDBPyConnection) -> bool:
     """True if the index was made from the recording in its present state."""
     if not index.is_file():
         return False
-    made, now = about(index, connection), recording.stat()
-    return made is not None and (made.size, made.changed_ns) == (now.st_size, now.st_mtime_ns)
+    facts, now = about(index, connection), recording.stat()
+    return facts is not None and (facts.size, facts.changed_ns) == (now.st_size, now.st_mtime_ns)
 
 
 def write_index(recording: Path, index: Path, scratch: Path, advance: Advance = lambda _share: None) -> None:
     """Index a recording in any state.
 
-    ``advance`` is called with the share of the file that is done. Raises RecordingError, OSError.
+    ``advance`` is called with how much of the file is done (0 to 1). Raises RecordingError, OSError.
     """
     state = recording.stat()
     part = index.with_name(f".{index.name}.{os.getpid()}")
     with connected(scratch, memory_mb=_MEMORY_MB) as connection:
         rows = _Rows(connection)
         missing, unread = rows.read(recording, advance)
-        made = About(recording.name, state.st_size, state.st_mtime_ns, missing, unread)
-        pairs = ", ".join(f"{name}: {quoted(getattr(made, name))}" for name in About.__struct_fields__)
+        facts = About(recording.name, state.st_size, state.st_mtime_ns, missing, unread)
+        pairs = ", ".join(f"{name}: {quoted(getattr(facts, name))}" for name in About.__struct_fields__)
         try:
             connection.execute(_COPY.format(path=quoted(part), about=f"{{{pairs}}}"))
             part.replace(index)

@@ -170,10 +170,10 @@ class RobotQueries:
         return messages, size, first, last
 
     def bandwidth(self) -> list[traffic.Bandwidth]:
-        found = [traffic.Bandwidth(*row) for row in self._rows(_BANDWIDTH)]
+        bandwidths = [traffic.Bandwidth(*row) for row in self._rows(_BANDWIDTH)]
         order = {name: number for number, name in enumerate((*traffic.FAMILIES, *traffic.TIMES))}
-        known = [bandwidth for bandwidth in found if bandwidth.time in order]
-        return sorted(known, key=lambda bandwidth: (order[bandwidth.family], order[bandwidth.time]))
+        listed = [bandwidth for bandwidth in bandwidths if bandwidth.time in order]
+        return sorted(listed, key=lambda bandwidth: (order[bandwidth.family], order[bandwidth.time]))
 
     def sessions(self) -> list[traffic.Session]:
         return [traffic.Session(since, until) for since, until in self._rows("FROM sessions")]
@@ -191,7 +191,7 @@ class RobotQueries:
         return traffic.Latency(count, median, p95, self._histogram(p1, p99)) if count else None
 
     def _histogram(self, p1_ms: float, p99_ms: float) -> traffic.Histogram:
-        """Return the counts up to a little above the 99th percentile.
+        """Return the histogram of latencies, up to a little above the 99th percentile.
 
         The first bin begins at 0, or below if the robot's clock is ahead.
         """

@@ -66,16 +66,16 @@ def write_report(
 
 
 def remarks(traffic: Traffic) -> list[str]:
-    """Return the remarkable facts, a sentence each."""
-    found = []
+    """Return remarks about unusual facts, a sentence each."""
+    sentences = []
     if traffic.gaps:
-        found.append(f"Nothing was recorded {_times(len(traffic.gaps))}; these times are left out of outages.")
+        sentences.append(f"Nothing was recorded {_times(len(traffic.gaps))}; these times are left out of outages.")
     if traffic.dropped or traffic.missing:
-        found.append(
+        sentences.append(
             f"{traffic.dropped} messages were not recorded for lack of room or speed, "
             f"and {traffic.missing} were lost to damage of recordings."
         )
-    return found + [f"Not all could be read of {line}." for line in traffic.unread]
+    return sentences + [f"Not all could be read of {line}." for line in traffic.unread]
 
 
 def _page(traffic: Traffic, advance: Callable[[str, float], None]) -> str:
@@ -105,9 +105,9 @@ def _head(traffic: Traffic) -> Iterable[str]:
     )
     links = [f'<a href="#robot-{number}">{_text(_id(robot))}</a>' for number, robot in enumerate(traffic.robots)]
     yield f'<nav>{" ".join(links)} <a href="#words">words</a></nav>'
-    found = remarks(traffic)
-    if found:
-        items = "".join(f"<li>{_text(remark)}</li>" for remark in found)
+    sentences = remarks(traffic)
+    if sentences:
+        items = "".join(f"<li>{_text(remark)}</li>" for remark in sentences)
         yield f'<h2>What stands out</h2><ul class="remarks">{items}</ul>'
     table = media_bandwidth(traffic)
     if table.rows:

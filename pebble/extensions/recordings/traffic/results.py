@@ -28,7 +28,7 @@ LARGEST_LATENCY_S: Final = 86_400  # stamps further away are of clocks that do n
 
 
 class Bandwidth(Struct, frozen=True):
-    """The kbit/s of a family's messages, in active seconds."""
+    """The kbit/s of a family of messages, in its active seconds."""
 
     family: str
     time: str  # one of TIMES
@@ -65,7 +65,7 @@ class Histogram(Struct, frozen=True):
 
 
 class Latency(Struct, frozen=True):
-    """The times from heartbeats' stamps to their reception, by the two clocks."""
+    """The times from heartbeats' stamps to their arrival, by the two clocks."""
 
     count: int
     median_ms: float

@@ -1,4 +1,4 @@
-"""The indexes that an analysis needs: existing ones, and new ones where they are missing."""
+"""The indexes for an analysis: existing ones, and new ones for recordings without."""
 # ruff: noqa: S608  (what is put into queries are names of files in quotes)
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _OLD: Final = "index"  # the folder in which the last version had its index
 
 
 class Sources(Struct):
-    """The indexes of recordings, and their contents."""
+    """The indexes of recordings, with what they contain."""
 
     indexes: list[Path] = field(default_factory=list)
     robots: list[str] = field(default_factory=list)
@@ -41,23 +41,22 @@ class Sources(Struct):
 def sources(places: Iterable[Path], scratch: Path, progress: Progress = lambda _what, _share: None) -> Sources:
     """Return the indexes of all recordings in ``places``, files or folders.
 
-    Missing indexes are made: beside the recording if its folder can be written, else, as for files that are still being
-    written, below ``scratch``. Recordings in a folder that were deleted after they had been indexed count. Raises
-    RecordingError.
+    Missing indexes are made: beside the recording if its folder can be written, otherwise, as for files that are still
+    being written, below ``scratch``. Recordings that were indexed and then deleted count, too. Raises RecordingError.
     """
-    found = Sources()
+    indexed = Sources()
     scratch.mkdir(parents=True, exist_ok=True)
     with connected(scratch, memory_mb=_MEMORY_MB) as connection:
         for path in _indexes([place.resolve() for place in places], scratch, connection, progress):
-            made = about(path, connection)
-            if made is not None:
-                found.indexes.append(path)
-                found.missing += made.missing
-                found.unread += [f"{made.recording}: {made.unread}"] if made.unread else []
-        if found.indexes:
-            names = f"SELECT DISTINCT robot FROM {parquet(found.indexes)} WHERE robot <> '' ORDER BY robot"
-            found.robots = [robot for (robot,) in connection.execute(names).fetchall()]
-    return found
+            facts = about(path, connection)
+            if facts is not None:
+                indexed.indexes.append(path)
+                indexed.missing += facts.missing
+                indexed.unread += [f"{facts.recording}: {facts.unread}"] if facts.unread else []
+        if indexed.indexes:
+            names = f"SELECT DISTINCT robot FROM {parquet(indexed.indexes)} WHERE robot <> '' ORDER BY robot"
+            indexed.robots = [robot for (robot,) in connection.execute(names).fetchall()]
+    return indexed
 
 
 def _indexes(places: list[Path], scratch: Path, connection: DuckDBPyConnection, progress: Progress) -> Iterator[Path]:

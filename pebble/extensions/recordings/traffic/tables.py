@@ -1,4 +1,4 @@
-"""The tables of an analysis, for its report and as CSV files. Times are UTC."""
+"""The tables of an analysis, for its report and for CSV files. Times are UTC."""
 
 import csv
 from collections.abc import Sequence
@@ -33,9 +33,9 @@ def media_bandwidth(traffic: Traffic) -> Table:
     ]  # fmt: skip
     rows = []
     for robot in traffic.robots:
-        both = robot.of(VIDEO), robot.of(AUDIO)
-        if any(both):
-            cells = [(None, None) if row is None else (row.median_kbps, row.p95_kbps) for row in both]
+        bandwidths = robot.of(VIDEO), robot.of(AUDIO)
+        if any(bandwidths):
+            cells = [(None, None) if row is None else (row.median_kbps, row.p95_kbps) for row in bandwidths]
             rows.append([robot.robot, *cells[0], *cells[1]])
     return Table("table-4-1-media-bandwidth", "Table 4.1: bandwidth of media, of active seconds", columns, rows)
 
@@ -94,5 +94,5 @@ def write_csv(table: Table, folder: Path) -> Path:
 
 
 def _cell(value: Any) -> Any:
-    """Return a cell that no spreadsheet takes for a formula, since anyone may choose the names in topics."""
+    """Return a cell that no spreadsheet takes for a formula: names in topics come from anybody."""
     return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value

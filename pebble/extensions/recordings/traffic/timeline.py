@@ -65,21 +65,21 @@ def timeline(
     paths: list[Path], scratch: Path, robot: str, since_ns: int, until_ns: int, progress: Progress
 ) -> Timeline:
     """Return a robot's day from the recordings ``paths``; missing indexes are made. Raises RecordingError."""
-    found = sources(paths, scratch, progress)
+    indexed = sources(paths, scratch, progress)
     with connected(scratch, memory_mb=_MEMORY_MB) as connection:
-        recorder = recorder_events(connection, found.indexes, since_ns, until_ns)
+        recorder = recorder_events(connection, indexed.indexes, since_ns, until_ns)
         gaps = [Stretch(_ms(gap.since_ns), _ms(gap.until_ns), gap.why) for gap in recorder.gaps]
-        if robot not in found.robots:
+        if robot not in indexed.robots:
             return Timeline(since_ns // 10**6, gaps=gaps)
         queries = RobotQueries(connection, robot)
-        queries.load(found.indexes, since_ns, until_ns)
-        made = _stepped(connection)
-        made.gaps = gaps
-        made.sessions = [Stretch(1000 * session.since_s, 1000 * session.until_s) for session in queries.sessions()]
+        queries.load(indexed.indexes, since_ns, until_ns)
+        day = _stepped(connection)
+        day.gaps = gaps
+        day.sessions = [Stretch(1000 * session.since_s, 1000 * session.until_s) for session in queries.sessions()]
         interval_ms = queries.interval_ms()
         for outage in () if interval_ms is None else queries.outages(interval_ms):
-            made.outages.append(Stretch(_ms(outage.since_ns), _ms(outage.since_ns) + outage.length_ms))
-    return made
+            day.outages.append(Stretch(_ms(outage.since_ns), _ms(outage.since_ns) + outage.length_ms))
+    return day
 
 
 def _stepped(connection: Any) -> Timeline:
@@ -88,9 +88,9 @@ def _stepped(connection: Any) -> Timeline:
         return Timeline(0)
     first = min(activity)
     count = max(activity) - first + 1
-    made = Timeline(1000 * STEP_S * first)
-    made.activity = [activity.get(first + number, 0) for number in range(count)]
-    return made
+    day = Timeline(1000 * STEP_S * first)
+    day.activity = [activity.get(first + number, 0) for number in range(count)]
+    return day
 
 
 def _ms(ns: int) -> float:

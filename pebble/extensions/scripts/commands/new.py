@@ -1,4 +1,4 @@
-"""A first script for a new user: it follows a tag, and has a test and a robot in a simulated room."""
+"""A first script for a new user, which follows a tag, with its test and its robot in a simulated room."""
 
 import re
 import tempfile
@@ -39,7 +39,7 @@ def write(name: str, folder: Path) -> Iterator[Path]:
 
 
 def _alike(target: Path) -> Path | None:
-    """Return an existing name that differs only in case, as many file systems ignore case; else empty."""
+    """Return an existing path that differs only in case, which many file systems ignore; else None."""
     if not target.parent.is_dir():
         return None
     return next((path for path in target.parent.iterdir() if path.name.lower() == target.name.lower()), None)

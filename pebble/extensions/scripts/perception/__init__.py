@@ -1,4 +1,4 @@
-"""Perception: tags in pictures, distance from wheels, and what a robot does about both.
+"""Perception for scripts: tags in pictures, distances from wheels, and controllers that use both.
 
 Pure: pictures, samples and times are passed in, poses and drive commands are returned.
 """

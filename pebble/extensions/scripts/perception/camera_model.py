@@ -1,4 +1,4 @@
-"""The geometry of a camera: from the calibration file that the original's tool writes, or from its field of view."""
+"""The geometry of a camera, from the calibration file that the original's tool writes, or from its field of view."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ class FollowSettings(Struct, frozen=True, kw_only=True):
 
 
 class Command(NamedTuple):
-    """A drive command, and why."""
+    """A drive command with its reason."""
 
     x: float = 0.0
     z: float = 0.0
@@ -97,7 +97,7 @@ class Pulses:
 
 
 class Follower:
-    """A follower of a tag. Call ``step`` at about 10 Hz, with where the tag is, or None if it is not in the picture."""
+    """A follower of a tag. Call ``step`` at about 10 Hz with the tag's place, None if it is not in the picture."""
 
     def __init__(self, settings: FollowSettings) -> None:
         self.settings = settings
@@ -133,7 +133,7 @@ class Follower:
         return Command(x, 0.0, "turn")
 
     def _approach(self, error: float, angle: float) -> Command:
-        """Return the command for a tag within the cone. ``error`` > 0: it is too far away."""
+        """Return the command for a tag inside the cone. ``error`` > 0: it is too far away."""
         settings = self.settings
         x = max(-settings.turn_power, min(settings.turn_power, _STEER_PER_RAD * angle))
         if error < 0.0:

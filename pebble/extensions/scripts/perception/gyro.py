@@ -1,4 +1,4 @@
-"""Heading from the inertial sensor: the rate about the vertical axis, without its bias, as long as it is plausible."""
+"""Heading by the inertial sensor: its rate about the vertical axis without its bias, while that is plausible."""
 
 import logging
 import math
@@ -15,7 +15,7 @@ _LEAST_RATIO, _MOST_RATIO = 0.5, 2.0  # sensor to wheels; else it is mounted oth
 
 
 class GyroHeading:
-    """The turns of an inertial sensor that lies flat; + is counter-clockwise."""
+    """The turns measured by an inertial sensor that lies flat; + is counter-clockwise."""
 
     def __init__(self) -> None:
         self._turn_rad = 0.0  # since it was taken
@@ -28,7 +28,7 @@ class GyroHeading:
         self._trusted = True
 
     def sample(self, z_dps: float, mcu_ms: int, now: float, *, at_rest: bool) -> None:
-        """Take a sample; ``at_rest``: no wheel turns, so that what it measures is its bias."""
+        """Add a sample; ``at_rest``: no wheel turns, so it shows the bias."""
         gap_ms = _GAP_MS + 1 if self._mcu_ms is None else mcu_ms - self._mcu_ms
         self._mcu_ms, self._at = mcu_ms, now
         if at_rest:
@@ -39,7 +39,7 @@ class GyroHeading:
             self._limited = self._limited or abs(z_dps) >= _LIMIT_DPS
 
     def take(self, wheels_rad: float, now: float) -> float | None:
-        """Return the turn since the last call, for a turn of ``wheels_rad`` by the wheels; None: ask the wheels."""
+        """Return the turn since the last call; None: use ``wheels_rad``, the turn that the wheels show."""
         turn, self._turn_rad = self._turn_rad, 0.0
         limited, self._limited = self._limited, False
         if now - self._at > _FRESH_S or limited or not self._trusted:

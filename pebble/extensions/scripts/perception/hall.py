@@ -1,8 +1,8 @@
-"""The distance of a wheel from a hall sensor beside its ring of magnets: a sine, two half waves per pair of poles.
+"""The distance of a wheel by a hall sensor beside its ring of magnets: a sine, two half waves per pair of poles.
 
 A step is one half wave. Between steps the arcsine of the level gives the phase, so the distance is exact to about a
-millimetre. A single sensor does not show the direction: that is taken from the drive command. A second sensor a
-quarter of a wave away shows it, and is used if it agrees with the commands.
+millimetre. A single sensor does not show the direction: the drive command does. A second sensor a quarter of a wave
+away shows it, and is used if it agrees with the commands.
 """
 
 import math
@@ -36,7 +36,7 @@ class HallSample(NamedTuple):
 
 
 class SensorRange:
-    """The extremes of a sensor, which differ from sensor to sensor and drift."""
+    """The extreme values of a sensor, which differ between sensors and drift."""
 
     def __init__(self) -> None:
         self.extrema = 0  # so far
@@ -61,7 +61,7 @@ class SensorRange:
             self._end_of_half_wave(value)
 
     def level(self, value: float) -> float:
-        """Return a value as a part of the range, −1..1."""
+        """Return a value as its place in the range, −1..1."""
         middle, swing = (self.low + self.high) / 2, (self.high - self.low) / 2
         return max(-1.0, min(1.0, (value - middle) / swing))
 
@@ -76,14 +76,14 @@ class SensorRange:
 
 
 class PhaseTracker:
-    """The phase of one wave, unwrapped, from levels of a sine and the power that moves it.
+    """The phase of a sine wave, unwrapped, from a sensor's levels and the power that moves the wheel.
 
-    The levels alone fit a wheel that turns backwards just as well: which of the two it is comes from the expected
-    speed, and the phase never goes back by more than noise explains.
+    The levels alone fit a wheel that turns backwards just as well. The expected speed decides between the two, and the
+    phase never goes back by more than noise explains.
     """
 
     def __init__(self, *, falls: bool = False) -> None:
-        """Begin. ``falls``: the first level is on the falling half of the wave, seen by a wheel that turns forward."""
+        """Start. ``falls``: the first level is on the falling half of the wave, for a wheel that turns forward."""
         self.phase: float | None = None  # None: no sample yet
         self.surprise = 0.0  # the sum of all differences from the expected phases
         self.rejected = 0  # samples that fit a turn against the expected one better
@@ -94,7 +94,7 @@ class PhaseTracker:
         self._falls = falls
 
     def update(self, level: float, power: float) -> float:
-        """Return the phase that was added."""
+        """Return the phase added since the last level."""
         base = math.asin(level)
         if self.phase is None:
             self.phase = self._farthest = math.pi - base if self._falls else base
@@ -113,7 +113,7 @@ class PhaseTracker:
         return self._move_to(self.phase, nearest, power)
 
     def update_pair(self, phase: float, power: float) -> float:
-        """Return the phase that was added, as ``update``, from the phase itself, which is known but for whole waves."""
+        """Return the phase added since the last sample, as ``update``; ``phase`` is known but for whole waves."""
         if self.phase is None:
             self.phase = self._farthest = phase
             return 0.0
@@ -121,7 +121,7 @@ class PhaseTracker:
         return self._move_to(self.phase, predicted + math.remainder(phase - predicted, math.tau), power)
 
     def _predict(self, power: float) -> float:
-        """Return the phase that this sample is expected to add: by the power, and by the measured speed if it agrees.
+        """Return the phase that this sample should add: by the power, and by the measured speed if that agrees.
 
         When the expected direction changes, the farthest phase in that direction is the present one.
         """
@@ -152,7 +152,7 @@ class _Counts:
 
 
 class HallWheel:
-    """One wheel. ``mm_per_step`` is the distance of half a wave."""
+    """One wheel. ``mm_per_step`` is the distance for half a wave."""
 
     def __init__(self, mm_per_step: float) -> None:
         self.mm_per_step = mm_per_step
@@ -164,12 +164,12 @@ class HallWheel:
 
     @property
     def ready(self) -> bool:
-        """True if distances are final, or there is none yet; until then, each new one may correct the last."""
+        """True if distances are final, or there are none yet. Until then, each may correct the last."""
         return self._warm_up is None or not self._range.swings
 
     @property
     def mm(self) -> float:
-        """The distance so far; reverse is negative."""
+        """Distance so far; reverse is negative."""
         return self._counts.rad / math.pi * self.mm_per_step
 
     @property
@@ -178,7 +178,7 @@ class HallWheel:
 
     @property
     def unknown(self) -> int:
-        """The steps whose direction was unknown: they are in no distance."""
+        """Steps in an unknown direction, which count in no distance."""
         return int(self._counts.unknown_rad / math.pi)
 
     @property
@@ -190,7 +190,7 @@ class HallWheel:
         return self._tracker.rejected
 
     def update(self, sample: HallSample) -> float:
-        """Return the distance since the last sample, in mm. Until :attr:`ready`, it may correct what was returned."""
+        """Return the distance since the last sample, in mm. Until :attr:`ready` it may correct earlier results."""
         extrema = self._range.extrema
         self._range.update(sample.value)
         if sample.quadrature is not None:
@@ -207,7 +207,7 @@ class HallWheel:
         return self.mm - before
 
     def _bound_warm_up(self, samples: list[HallSample]) -> None:
-        """Forget the rest before the first motion, and end a slow first motion, whose range is known soon."""
+        """Limit the samples of the warm-up: end it if an extreme was seen, otherwise forget their older half."""
         if len(samples) < _WARM_UP_SAMPLES:
             return
         if self._range.extrema:
@@ -216,7 +216,7 @@ class HallWheel:
             del samples[: len(samples) // 2]
 
     def _replay(self, samples: list[HallSample]) -> None:
-        """Track all samples so far again: the range is better known now, and on which half of a wave they began."""
+        """Track all samples so far again, since the range and the first half of the wave are better known now."""
         self._second_sign = self._second_sensor(samples)
         starts = [self._replayed(samples, PhaseTracker(falls=falls)) for falls in (False, True)]
         self._tracker, self._counts = min(starts, key=lambda start: start[0].surprise)

@@ -1,4 +1,4 @@
-"""A controller that follows a tag, and drives on to where it was by odometry while it is out of sight, for a while."""
+"""A controller that follows a tag and, while it is out of sight, drives by odometry to its last place."""
 
 import math
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ _TURN_POWER = 0.6
 
 
 class Pose(NamedTuple):
-    """Metres and radians in the odometry's frame; counter-clockwise is positive."""
+    """A pose in the odometry's frame: metres, and radians, counter-clockwise positive."""
 
     x_m: float
     y_m: float
@@ -24,7 +24,7 @@ class Pose(NamedTuple):
 
 
 def pose_of(odometry: WheelOdometry | None) -> Pose | None:
-    """Return the pose in a payload of any producer, in metres or millimetres; None if there is none in it."""
+    """Return the pose in a payload of any producer, in metres or millimetres; None if it has none."""
     if odometry is None:
         return None
     value = odometry.value
@@ -57,7 +57,7 @@ class OdomFollower:
         self._seen_at = self._planned_at = self._reached_at = float("-inf")
 
     def see(self, now: float, place: Place | None, pose: Pose | None) -> None:
-        """Take where the tag is, or None if it is not in the picture, and the pose at that time, if known."""
+        """Note the tag's place (None: not in the picture), and the pose at that time, if known."""
         self._place, self._seen_at = place, now
         if place is not None:
             self._goal = None if pose is None else self._plan(place, pose)
@@ -74,7 +74,7 @@ class OdomFollower:
         return Command(reason="goal reached") if now - self._reached_at < self.settings.goal_hold_s else vision
 
     def _plan(self, place: Place, pose: Pose) -> tuple[float, float] | None:
-        """Return the point at the wanted distance from the tag, on the way to it; None if it is near."""
+        """Return the point on the way to the tag that has the wanted distance from it; None if it is near."""
         settings = self.settings
         advance = place.distance_m - settings.target_distance_m
         if advance <= max(settings.distance_threshold_m, settings.min_goal_advance_m):
@@ -83,7 +83,7 @@ class OdomFollower:
         return pose.x_m + advance * math.cos(bearing), pose.y_m + advance * math.sin(bearing)
 
     def _to_goal(self, now: float, goal: tuple[float, float], pose: Pose) -> Command | None:
-        """Return the command that leads to the goal; None if it has been reached, or the time is over."""
+        """Return the command that leads to the goal; None if the goal is reached, or its time is over."""
         settings = self.settings
         dx, dy = goal[0] - pose.x_m, goal[1] - pose.y_m
         distance = math.hypot(dx, dy)

@@ -31,7 +31,7 @@ Length = Annotated[float, Meta(gt=0, le=5000)]
 
 
 class Calibration(Struct, frozen=True, kw_only=True):
-    """The wheels as `pebble calibrate wheels` has measured them; the content of ``odometry.json``."""
+    """The wheels as `pebble calibrate wheels` has measured them: the content of ``odometry.json``."""
 
     version: Literal[1] = 1
     made: str  # date and time
@@ -63,13 +63,13 @@ class OdometrySettings(Struct, frozen=True, kw_only=True):
 
     @property
     def step_mm(self) -> tuple[float, float]:
-        """A step of the left and of the right wheel, one for each magnet."""
+        """Length of a step of the left and of the right wheel; a step is one magnet."""
         step = math.pi * self.wheel_diameter_mm / self.magnets
         return self.left_mm_per_event or step, self.right_mm_per_event or step
 
 
 def calibrated(settings: OdometrySettings, calibration: Calibration) -> OdometrySettings:
-    """Return the settings with what was measured, where they are not set otherwise than by default."""
+    """Return the settings with measured values in place of those that have their defaults."""
     default = OdometrySettings()
     if settings.step_mm == default.step_mm:
         steps = {"left_mm_per_event": calibration.left_step_mm, "right_mm_per_event": calibration.right_step_mm}
@@ -80,7 +80,7 @@ def calibrated(settings: OdometrySettings, calibration: Calibration) -> Odometry
 
 
 class WheelPose(NamedTuple):
-    """The pose in the frame of the start: x ahead, y to the left, heading −π..π, counter-clockwise positive."""
+    """A pose in the frame of the start: x ahead, y to the left, heading −π..π, counter-clockwise positive."""
 
     x_mm: float = 0.0
     y_mm: float = 0.0
@@ -89,7 +89,7 @@ class WheelPose(NamedTuple):
 
 @dataclass(slots=True)
 class _Part:
-    """A part of the way, as an arc: one sample, or all of the time in which distances are corrected."""
+    """A part of the way, as an arc: of one sample, or of the whole time in which distances are corrected."""
 
     ahead_mm: float = 0.0
     turn_rad: float = 0.0
@@ -106,7 +106,7 @@ class _Part:
 
 
 class _Wheel:
-    """A wheel, when it turned last, and how often it did not although it was commanded to."""
+    """A wheel, with the time when it last turned, and how often it did not turn although commanded."""
 
     def __init__(self, mm_per_step: float) -> None:
         self.hall = HallWheel(mm_per_step)
@@ -131,7 +131,7 @@ class _Wheel:
 
 
 class Directions:
-    """The power of both motors, and the direction in which each wheel may turn: a single sensor does not show it."""
+    """The power of both motors, and the direction in which each wheel may turn, which one sensor does not show."""
 
     def __init__(self, now: float) -> None:
         self._power = (0.0, 0.0)  # left, right
@@ -143,7 +143,7 @@ class Directions:
         self._power = (power.left, power.right)
 
     def at(self, now: float) -> tuple[tuple[float, int], tuple[float, int]]:
-        """Return power and possible direction of the left and the right wheel; directions remain in coasting."""
+        """Return (power, possible direction) of the left and the right wheel. A coasting wheel keeps its direction."""
         self._note_signs(now)
         left, right = (s if now <= until else 0 for s, until in zip(self._signs, self._signs_until, strict=True))
         return (self._power[0], left), (self._power[1], right)
@@ -156,7 +156,7 @@ class Directions:
 
 
 class Odometry:
-    """The odometry of one robot: feed it every power that the wheels are commanded, and every sample."""
+    """The odometry of one robot. Pass it every power that the wheels are commanded, and every sample."""
 
     def __init__(self, settings: OdometrySettings, now: float) -> None:
         self.pose = self._base = WheelPose()
@@ -178,13 +178,13 @@ class Odometry:
         self._power.command(power, now)
 
     def imu(self, imu: ImuFast, now: float) -> None:
-        """Take a sample of the inertial sensor."""
+        """Add a sample of the inertial sensor."""
         still_s = now - max(self._left.turned_at, self._right.turned_at)
         at_rest = still_s > _UNCHANGED_S and not self._powered
         self._gyro.sample(imu.value.gyro_dps.z, imu.mcu_ms, now, at_rest=at_rest)
 
     def touch(self, values: TouchValues, now: float) -> None:
-        """Take a sample of the hall sensors."""
+        """Add a sample of the hall sensors."""
         self._samples += 1
         settings, (left_power, right_power) = self._settings, self._power.at(now)
         second = None if settings.second_channel == "none" else getattr(values, settings.second_channel)

@@ -1,4 +1,4 @@
-"""Tags as the contract's payloads: locations, the followed tag, and what is drawn over the picture."""
+"""The contract's payloads about tags: locations, the followed tag, and drawings over the picture."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ Size = tuple[int, int]  # width, height of the picture
 
 
 def corners_norm(tag: Tag, size: Size) -> Corners:
-    """Return the corners as parts of the picture, 0..1."""
+    """Return the corners as fractions of the picture's size, 0..1."""
     return [(_part(x, size[0]), _part(y, size[1])) for x, y in tag.corners]
 
 

@@ -1,15 +1,15 @@
-"""A steady rate made of events that come at another one, such as 10 commands a second from 15 pictures."""
+"""A steady rate chosen from events at another rate, such as 10 commands a second from 15 pictures."""
 
 
 class Rate:
-    """A steady rate. Call ``due`` at every event; what is late is not repeated."""
+    """A steady rate. Call ``due`` at every event; a missed turn is not made up."""
 
     def __init__(self, hz: float) -> None:
         self.hz = hz
         self._due = float("-inf")
 
     def due(self, now: float) -> bool:
-        """True if the next turn is due. Comparing with the time since the last one would lose a part of each period."""
+        """True if the next turn is due. Turns have fixed times: since the last one, a part would be lost each time."""
         self._due = min(self._due, now + 1.0 / self.hz)  # the rate was raised
         if now < self._due:
             return False

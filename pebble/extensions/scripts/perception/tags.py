@@ -1,4 +1,4 @@
-"""AprilTags in a picture, with OpenCV: which they are, how far away, and in which direction."""
+"""AprilTags in a picture, by OpenCV: their ids, distances and directions."""
 
 import math
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ _HINTS = {(4,): ": leave out the last with picture[:, :, :3]", (1,): ": use pict
 
 
 class Place(NamedTuple):
-    """The place of a tag's middle, seen from the camera; ``angle_rad`` is positive to the right."""
+    """The place of a tag's middle as seen from the camera; ``angle_rad`` is positive to the right."""
 
     distance_m: float
     angle_rad: float
@@ -43,13 +43,13 @@ class Tag(NamedTuple):
 
     @property
     def area(self) -> float:
-        """The area in square pixels."""
+        """Area in square pixels."""
         x, y = self.corners.T
         return abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
 
 
 class TagGeometry:
-    """The place of a tag of ``size_m`` (edge of its black square) from its corners."""
+    """A converter of the corners of a tag of ``size_m`` (edge of its black square) to its place."""
 
     def __init__(self, size_m: float, camera: CameraModel | None = None) -> None:
         half = size_m / 2
@@ -94,11 +94,10 @@ class TagFinder:
         self._geometry = TagGeometry(size_m, camera)
 
     def find(self, picture: Any) -> list[Tag]:
-        """Return all tags, by their ids, in an array of (height, width, 3) bytes, blue first, or (height, width).
+        """Return all tags in a picture, ordered by id; of several with one id the largest first.
 
-        Of several with one id the largest is the first.
-
-        Pictures are used as they come: av_daemon has rotated them. Raises PebbleError for anything else.
+        ``picture`` is an array (height, width, 3) of bytes, blue first, or (height, width). It is not rotated here:
+        av_daemon has done that. Raises PebbleError for anything else.
         """
         picture = _checked(picture)
         height, width = picture.shape[:2]
@@ -123,7 +122,7 @@ def _checked(picture: Any) -> Any:
 
 
 def largest(tags: Sequence[Tag], tag_id: int) -> Tag | None:
-    """Return the tag with this id that looks largest; None: there is none."""
+    """Return the tag with this id that looks largest; None if there is none."""
     return max((tag for tag in tags if tag.id == tag_id), key=lambda tag: tag.area, default=None)
 
 

@@ -1,7 +1,7 @@
-"""The drive commands of a script that are published, and when. Pure: the caller receives, waits and has a clock.
+"""Decides which drive commands of a script are published, and when. Pure: the caller receives, waits and has a clock.
 
-The wheels belong to the motor owner, whose arbiter decides. This only knows what the owners and other senders have
-published, so that a script learns that its commands have no effect, and that others are not disturbed.
+The wheels belong to the motor owner, whose arbiter decides. This part only knows the messages of owners and other
+senders. It tells a script that its commands have no effect, and keeps it from disturbing others.
 """
 
 from collections.abc import Callable, Mapping
@@ -68,12 +68,12 @@ class DriveSender:
         return obeyed
 
     def drive_another(self, now: float) -> str:
-        """Note a command for another robot, and return :meth:`refusal`: what ends this run ends that, too."""
+        """Note a command for another robot; return :meth:`refusal`, as the end of this run ends that, too."""
         self._tried = True
         return self.refusal(now)
 
     def end(self, why: str, now: float) -> None:
-        """Publish the final zero, if the script has ever commanded anything; nothing is published after it."""
+        """Publish a final zero, if the script has ever sent a command, and nothing after it."""
         if self._final:
             return
         self._end, self._final = self._end or why, True
@@ -82,7 +82,7 @@ class DriveSender:
             self._send(replace(_ZERO, source=SCRIPT, run=self.run), now)
 
     def tick(self, now: float) -> None:
-        """Publish what waits for its turn, unless it is refused by now."""
+        """Publish the command that waits for its turn, unless it has become refused."""
         if self._pending is None or now < self._turn:
             return
         pending, self._pending = self._pending, None
@@ -92,14 +92,14 @@ class DriveSender:
     # -- what others have published
 
     def receive(self, drive: Drive, now: float) -> None:
-        """Take a drive command of another sender, that arrives now."""
+        """Handle a drive command of another sender, which arrives now."""
         if not drive.signed:
             self._person_at = now
         elif isinstance(drive.run, int) and newer(drive.run, self.run):
             self._superseded = True
 
     def owners(self, states: Mapping[str, EstopState], now: float) -> None:
-        """Take the newest states of all motor owners."""
+        """Handle the newest states of all motor owners."""
         if self._tried:
             for owner, state in states.items():
                 self._compare(owner, self._owners.get(owner), state)
@@ -119,7 +119,7 @@ class DriveSender:
         return now - self._person_at < HOLD_S
 
     def refusal(self, now: float) -> str:
-        """Return why a command has no effect now, as far as is known; empty: it has."""
+        """Return why a command has no effect now, as far as is known; empty if it has one."""
         if self._end:
             return self._end
         if self._latched is not None:
@@ -129,7 +129,7 @@ class DriveSender:
         return "a person drives" if self.overridden(now) else ""
 
     def ended(self, now: float) -> str:
-        """Return why this run can never drive again; empty: it may, or it never wanted to."""
+        """Return why this run can never drive again; empty if it can, or never wanted to."""
         if not self._end and self._tried:
             if self._superseded:
                 self._end = SUPERSEDED
@@ -139,14 +139,14 @@ class DriveSender:
 
     @property
     def due(self) -> float | None:
-        """The time to call :meth:`tick`, and to look at :meth:`ended`; None: not before something happens."""
+        """Time to call :meth:`tick`, and to check :meth:`ended`; None: only after another event."""
         times = [] if self._pending is None else [self._turn]
         if self._barred_at is not None and not self._end:
             times.append(self._barred_at + _GRACE_S)
         return min(times, default=None)
 
     def _compare(self, owner: str, before: EstopState | None, now: EstopState) -> None:
-        """Compare states: a run never outlives an emergency stop, nor an owner that has forgotten what it barred."""
+        """Compare an owner's states: a run never outlives an emergency stop, or an owner that has forgotten its bar."""
         if self._end or before is None:
             return
         if before.boot != now.boot:

@@ -1,4 +1,4 @@
-"""The end of a script on a signal, whatever its main thread does: asleep, busy, or blocked in C code."""
+"""Ends a script on a signal, even if its main thread sleeps, is busy, or is blocked in C code."""
 
 import os
 import select
@@ -21,7 +21,7 @@ class Guard:
     """
 
     def __init__(self, end: Callable[[int], None]) -> None:
-        """Guard the main thread, from which alone this is called."""
+        """Guard the main thread. Call this there."""
         self._end = end
         self._reader, self._writer = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
@@ -39,7 +39,7 @@ class Guard:
         os._exit(128 + number)
 
     def _next(self, timeout: float | None) -> int:
-        """Return the next signal that ends; after one, only Ctrl-C again, or 0 after ``timeout`` seconds."""
+        """Return the next signal that ends the script; after the first only Ctrl-C, or 0 after ``timeout`` seconds."""
         wanted = _NUMBERS if timeout is None else (signal.SIGINT,)
         while select.select([self._reader], [], [], timeout)[0]:
             for number in os.read(self._reader, 512):
@@ -48,12 +48,12 @@ class Guard:
         return 0
 
     def _release(self) -> None:
-        """Let a fork end as any program: a signal to it is none to the script."""
+        """Let a forked child end as any program does: a signal to it is not one to the script."""
         signal.set_wakeup_fd(-1)
         for number in _NUMBERS:
             signal.signal(number, signal.SIG_DFL)
 
 
 def _let_others_run(*_: object) -> None:
-    """Pause the main thread, if it runs Python: else each step of the guard would wait 5 ms for the global lock."""
+    """Pause the main thread if it runs Python: otherwise each step of the guard waits 5 ms for the global lock."""
     time.sleep(_PAUSE_S)

@@ -1,4 +1,4 @@
-"""Another robot of the LAN, as a script of this one sees it."""
+"""Another robot of the LAN, as a script of this robot uses it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _SLOT_S = 0.019  # between commands: at most 50 in a second
 
 
 class NotGrantedError(PebbleError):
-    """The other robot's config does not let this one do that."""
+    """An error: the other robot's config does not permit this robot to do that."""
 
 
 class Way(NamedTuple):
-    """The parts of its robot that a neighbour needs. ``check`` raises once the script is to end."""
+    """The parts of its robot that a neighbour needs. ``check`` raises once the script must end."""
 
     transport: Transport
     wheels: Wheels
@@ -65,7 +65,7 @@ class Neighbour:
         """Drive the other robot, for 0.3 s at most, like :meth:`Robot.drive`.
 
         False: the command has no effect, as far as is known. Raises NotGrantedError if the other robot's config does
-        not let this robot drive it.
+        not permit this robot to drive it.
         """
         self._way.check_drives()
         command = Drive(x=float(x), z=float(z), y=float(y), source=SCRIPT, run=self._way.wheels.run)
@@ -90,7 +90,7 @@ class Neighbour:
 
     @property
     def why_refused(self) -> str:
-        """The reason why :meth:`drive` would have no effect now; empty: it would have one, as far as is known."""
+        """Reason why :meth:`drive` would have no effect now; empty if it would have one, as far as is known."""
         state = self._state
         if state is None:
             return f"{self.name} is not heard"
@@ -98,7 +98,7 @@ class Neighbour:
         return refusal.why if refusal is not None and refusal.run == self._way.wheels.run else ""
 
     def end(self) -> None:
-        """Stop what this script moves there."""
+        """Stop the motion that this script causes there."""
         self._over = True
         if self._moves:
             self._send(Drive(source=SCRIPT, run=self._way.wheels.run))

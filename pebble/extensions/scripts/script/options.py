@@ -1,4 +1,4 @@
-"""A script's options: a msgspec Struct becomes the form that operators see, and a command line becomes the Struct."""
+"""A script's options as a msgspec Struct: operators' form is made from it, and a command line fills it."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def form(options: type[msgspec.Struct]) -> list[Setting]:
 def parse(
     options: type[Options], arguments: list[str], parser: argparse.ArgumentParser
 ) -> tuple[Options, argparse.Namespace]:
-    """Return the Struct that these words of a command line describe, and the values of all options of ``parser``.
+    """Return the Struct that the words of a command line describe, and the values of all options of ``parser``.
 
-    Words that are wrong end the process with exit code 2 and one line on stderr.
+    Wrong words end the process with exit code 2 and one line on stderr.
     """
     settings = form(options)
     for setting in settings:
@@ -93,7 +93,7 @@ def _setting(field: inspect.Field, hint: Any) -> Setting:
 
 
 def _plain(kind: inspect.Type, name: str) -> tuple[Any, dict[str, Any], bool]:
-    """Return the type inside of Meta and ``| None``, what the Meta says beside it, and whether None is allowed."""
+    """Return the type inside of Meta and ``| None``, the Meta's other facts, and whether None is allowed."""
     meta: dict[str, Any] = {}
     optional = False
     while True:
@@ -186,7 +186,7 @@ def _converter(setting: Setting) -> Callable[[str], object]:
 
 
 def _joined(arguments: list[str], settings: list[Setting]) -> list[str]:
-    """Return words with ``--x=-1e-05`` for ``--x -1e-05``: argparse takes some numbers for options."""
+    """Return words with ``--x=-1e-05`` for ``--x -1e-05``, which argparse would take for an option."""
     valued = {setting.arg for setting in settings if setting.type != "bool"}
     joined: list[str] = []
     words = iter(arguments)

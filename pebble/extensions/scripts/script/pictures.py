@@ -1,4 +1,4 @@
-"""The pictures of a robot's camera, for a loop of the script's own or one over them."""
+"""The pictures of a robot's camera, one at a time or in a loop."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Pictures:
-    """The robot's camera; it is opened, and its modules are imported, at first use. One thread reads; any may close."""
+    """The robot's camera. It is opened, and its modules are imported, at first use. One thread reads; any may close."""
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir
@@ -25,7 +25,7 @@ class Pictures:
         self._closed = False
 
     def every(self, **options: Any) -> Iterator[Picture]:
-        """Yield all pictures from now on, the newest each time; see `pebble.camera`."""
+        """Yield pictures from now on, always the newest; see `pebble.camera`."""
         with self._open(**options) as view:
             yield from view
 

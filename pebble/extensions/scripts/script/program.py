@@ -1,4 +1,4 @@
-"""The program of a function that gets a robot and its options: ``run(main)``."""
+"""Runs a function as a program, with a robot and its options: ``run(main)``."""
 
 import inspect
 import logging
@@ -66,7 +66,7 @@ def run(
 
 
 def run_for(config: Path, main: Callable[[Robot], None], *, name: str, drives: bool = True) -> None:
-    """Run ``main(robot)`` as a script, for a command of ``pebble`` whose process does nothing else.
+    """Run ``main(robot)`` as a script, for a command of ``pebble`` that does nothing else.
 
     Raises PebbleError if there is no such robot, and what ``main`` raises; Stopped if the script was ended.
     """
@@ -75,7 +75,7 @@ def run_for(config: Path, main: Callable[[Robot], None], *, name: str, drives: b
 
 
 def _options_of(main: Callable[..., None]) -> type[msgspec.Struct] | None:
-    """Return the type of main's second parameter. Raises TypeError for what cannot be called."""
+    """Return the type of main's second parameter; None without one. Raises TypeError if main cannot be called."""
     parameters = list(inspect.signature(main, eval_str=True).parameters.values())
     if not 1 <= len(parameters) <= 2:
         raise TypeError(f"{main.__name__}: write main(robot) or main(robot, options)")
@@ -185,7 +185,7 @@ class _Program:
 
 
 def _connected(config: Config, path: Path) -> Transport:
-    """Return the open local transport. Raises PebbleError with what is missing, for a script started at a shell."""
+    """Return the open local transport. Raises PebbleError that names what is missing, for a script run in a shell."""
     transport = local_transport(config, f"script-{os.getpid()}")
     transport.open(_CONNECT_S)
     if transport.state is not State.CONNECTED and RUN not in os.environ:
@@ -198,10 +198,7 @@ def _connected(config: Config, path: Path) -> Transport:
 
 
 def _numbered(config: Config) -> Callable[[int], int]:
-    """Return a function that gives the run's number: the manager's, else a new one above its argument.
-
-    Raises ConfigError.
-    """
+    """Return a function that gives the run's number: the manager's, else one above its argument. Raises ConfigError."""
     text = os.environ.get(RUN)
     if text is None:
         return lambda above: next_run(config, above)

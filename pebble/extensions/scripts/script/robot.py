@@ -1,4 +1,4 @@
-"""A robot as its script sees it: pictures, messages, and wheels."""
+"""A robot as its script uses it: pictures, messages and wheels."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ EXIT_ENDED = 3  # of a script whose run was ended: by an operator, an emergency 
 
 
 class Stopped(SystemExit):
-    """The script is to end. Raised by every call on the robot from then on; nothing moves any more."""
+    """An error: the script must end. Every later call on the robot raises it, and nothing moves any more."""
 
 
 class _Arrived(NamedTuple):
@@ -62,7 +62,7 @@ class _Arrived(NamedTuple):
 
 
 class _Latest:
-    """The newest payload of each channel that was asked for."""
+    """The newest payload of each channel that the script has asked for."""
 
     def __init__(self, subscribe: Callable[[Channel, Callable[..., None]], None], clock: Callable[[], float]) -> None:
         self._subscribe, self._clock = subscribe, clock
@@ -81,9 +81,9 @@ class _Latest:
 
 
 class Robot:
-    """The robot of this script. Any thread may call every method; none may be called in a fork of the process.
+    """The robot of this script. Any thread may call every method, but no fork of the process.
 
-    Every method raises :class:`Stopped` once the script is to end.
+    Every method raises :class:`Stopped` once the script must end.
     """
 
     def __init__(
@@ -97,9 +97,9 @@ class Robot:
         clock: Callable[[], float] = time.monotonic,
         drives: bool = True,
     ) -> None:
-        """Store the arguments. ``transport`` is open already.
+        """Store the arguments. ``transport`` is already open.
 
-        ``number`` returns the run's number, above the one that it is given. ``drives``: the script may drive.
+        ``number`` returns the run's number, above the number that it is given. ``drives``: the script may drive.
         """
         self.config = config
         self.log = logging.getLogger(f"pebble.script.{name}")
@@ -178,7 +178,7 @@ class Robot:
 
     @property
     def why_refused(self) -> str:
-        """The reason why :meth:`drive` would have no effect now; empty: it would have one, as far as is known."""
+        """Reason why :meth:`drive` would have no effect now; empty if it would have one, as far as is known."""
         return self._wheels.refusal()
 
     def publish(self, channel: Channel, value: Any, **names: str) -> bool:
@@ -215,7 +215,7 @@ class Robot:
     # -- its end
 
     def end(self, why: str, exit_code: int = 0) -> None:
-        """Publish the final stop, close the cameras, and have every further call raise Stopped. From any thread."""
+        """Publish the final stop and close the cameras; every later call raises Stopped. From any thread."""
         if os.getpid() != self._pid:
             return
         if not self._stopped.is_set():

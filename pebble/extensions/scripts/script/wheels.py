@@ -1,4 +1,4 @@
-"""A script's drive commands on the robot's local transport, and whether they have an effect."""
+"""Sends a script's drive commands on the robot's local transport, and tells whether they have an effect."""
 
 import logging
 import threading
@@ -21,10 +21,10 @@ log = logging.getLogger(__name__)
 
 
 class Wheels:
-    """One run of a script at the wheels of its robot. Any thread may call every method.
+    """The wheels of a robot, for one run of a script. Any thread may call every method.
 
-    ``number`` gives the run's number, above the given one. ``on_ended`` is called once, from a thread of its own, with
-    the reason why this run can never drive again.
+    ``number`` returns the run's number, above the given one. ``on_ended`` is called once, from another thread, with the
+    reason why this run can never drive again.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Wheels:
         return obeyed
 
     def drive_another(self) -> str:
-        """Return why no command for another robot may be sent now; empty: it may. To be called before each."""
+        """Return why no command for another robot may be sent now; empty if one may. Call this before each."""
         with self._lock:
             now = self._clock()
             self._sender.owners(self.estop.states, now)
@@ -79,12 +79,12 @@ class Wheels:
         return self._sender.overridden(self._clock())
 
     def refusal(self) -> str:
-        """Return why a command has no effect now, as far as is known; empty: it has."""
+        """Return why a command has no effect now, as far as is known; empty if it has one."""
         with self._lock:
             return self._sender.refusal(self._clock())
 
     def end(self, why: str) -> None:
-        """Publish the final zero; nothing is published after it."""
+        """Publish the final zero, and nothing after it."""
         self._over = True
         locked = self._lock.acquire(timeout=_STUCK_S)
         try:
@@ -100,7 +100,7 @@ class Wheels:
             self._thread.start()
 
     def _report(self, refusal: str) -> None:
-        """Log when commands begin to have an effect, and when they have none any more."""
+        """Log when commands begin to have an effect, and when they no longer have one."""
         before, self._reported = self._reported, refusal
         if refusal in (before, ENDED):  # the reason of the end follows
             return
@@ -114,7 +114,7 @@ class Wheels:
         return newest(state.last_barred for state in self.estop.states.values())
 
     def _tick(self) -> None:
-        """Publish what has waited for its turn, and notice the end of the run, while the script does other things."""
+        """Publish the command that waits for its turn, and notice the end of the run, while the script is busy."""
         while not self._over:
             with self._lock:
                 now = self._clock()

@@ -1,7 +1,7 @@
-"""Measures of a trial, by what its operator sent and received. Pure; all times are ns of CLOCK_MONOTONIC.
+"""The measures of a trial, from the messages that its operator sent and received. Pure.
 
-Late is not lost: sound captured in a window counts as delivered if it arrived before the trial's end; its delay is in
-the latencies.
+All times are ns of CLOCK_MONOTONIC. Late is not lost: sound captured in a window counts as delivered if it arrived
+before the trial's end; its delay is in the latencies.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Plan(msgspec.Struct, kw_only=True):
 
 
 class Arrival(NamedTuple):
-    """A received message; ``sent_ns``: when it was sent, or when a picture or the first sample was captured."""
+    """A received message; ``sent_ns``: the time of sending, or of the capture of a picture or a first sample."""
 
     sent_ns: int
     arrived_ns: int
@@ -69,7 +69,7 @@ class Window(NamedTuple):
         return (self.ended_ns - self.began_ns) / 1e9
 
     def overlap_s(self, sound: Arrival) -> float:
-        """Return seconds of the packet that were captured in the window."""
+        """Return how many seconds of the packet were captured in the window."""
         ended_ns = sound.sent_ns + round(1e9 * sound.seconds)
         return max(0, min(ended_ns, self.ended_ns) - max(sound.sent_ns, self.began_ns)) / 1e9
 
@@ -103,7 +103,7 @@ class Report(msgspec.Struct, kw_only=True, omit_defaults=True):
 
 
 def heard(sounds: Iterable[Arrival], window: Window) -> Heard:
-    """Return the figures of a window's sound; a packet that came twice counts once."""
+    """Return the figures of a window's sound. A packet that came twice counts once."""
     packets = [packet for packet in {sound.number: sound for sound in sounds}.values() if window.overlap_s(packet) > 0]
 
     def percent(within_ms: float) -> float:
@@ -114,7 +114,7 @@ def heard(sounds: Iterable[Arrival], window: Window) -> Heard:
 
 
 def seen(pictures: Iterable[Arrival], window: Window) -> Seen:
-    """Return the figures of a window's pictures; those that arrived outside of the window do not count."""
+    """Return the figures of a window's pictures. Those that arrived outside of the window do not count."""
     inside = [picture for picture in pictures if window.began_ns <= picture.arrived_ns < window.ended_ns]
     moments = [window.began_ns, *sorted(picture.arrived_ns for picture in inside), window.ended_ns]
     gaps_s = [(after - before) / 1e9 for before, after in pairwise(moments)]
@@ -123,7 +123,7 @@ def seen(pictures: Iterable[Arrival], window: Window) -> Seen:
 
 
 def driven_ms(commands: Sequence[Command], entries: Sequence[Entry]) -> list[float]:
-    """Return the time of each command until it, or a newer one that overtook it, reached the MCU.
+    """Return the time that each command, or a newer one that overtook it, took to reach the MCU.
 
     Lost ones are left out.
     """
@@ -137,7 +137,7 @@ def driven_ms(commands: Sequence[Command], entries: Sequence[Entry]) -> list[flo
 
 
 def cells_of(subject: str, trial: str, report: Report, entries: Sequence[Entry]) -> Iterator[Cell]:
-    """Yield the cells of a subject in one trial; ``entries`` are its MCU's."""
+    """Yield the results of a subject in one trial; ``entries`` are from its MCU."""
     params = {"trial": trial}
     if report.heard is not None and report.seen is not None:
         yield round_cell(subject, DELIVERED, "%", [report.heard.delivered_percent], params)

@@ -1,4 +1,4 @@
-"""Networks between a robot and its broker that can be impaired and restored while both use them.
+"""Networks between a robot and its broker that can be impaired and restored while they are in use.
 
 Two network namespaces with a veth pair between them: rate by TBF and loss by nftables, all of it in the kernel.
 ``python -m pebble.extensions.lab.bench.impair.network`` is a process that holds them. When it ends, the devices
@@ -38,7 +38,7 @@ _TABLE = "table ip impair { chain arriving { type filter hook prerouting priorit
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """The network from the robot to its broker."""
+    """The impairment of the network from the robot to its broker."""
 
     name: str
     kbit: float | None = None  # per second; None: no limit
@@ -46,10 +46,10 @@ class Condition:
 
 
 class NamespaceNetwork(Worker):
-    """One robot's network: the process that holds its namespaces, whose end cuts all connections.
+    """One robot's network: a process that holds its namespaces. When it ends, all connections are cut.
 
-    ``on_robot`` and ``on_remote`` wrap a command so that it runs on the robot's or the broker's side. Several networks
-    may be open at the same time, independent; ``name`` is for messages. Raises PebbleError.
+    ``on_robot`` and ``on_remote`` wrap a command so that it runs on the robot's or the broker's side. Several
+    independent networks may be open at the same time; ``name`` is for messages. Raises PebbleError.
     """
 
     def __init__(self, name: str = "") -> None:
@@ -90,7 +90,7 @@ class _Side:
         self._path, self._address = path, address
 
     def inside(self, command: Sequence[str]) -> list[str]:
-        """Return the command on this side. The process is replaced: pid and signals stay."""
+        """Return the command line that runs a command on this side, with the same pid and signals."""
         return ["nsenter", f"--net={self._path}", "--", *command]
 
     def set_up(self) -> None:
@@ -130,7 +130,7 @@ def _queue(kbit: float | None) -> str:
 
 @cache
 def why_no_namespaces() -> str | None:
-    """Return what prevents such networks; None: nothing. Tested with every feature a condition may use."""
+    """Return why such networks cannot be made here, tested with every feature; None if they can."""
     try:
         with closing(NamespaceNetwork("on trial")) as network:
             network.apply(Condition("trial", kbit=1000, loss=0.01))
@@ -140,7 +140,7 @@ def why_no_namespaces() -> str | None:
 
 
 def require_namespaces() -> None:
-    """Raise PebbleError if there are none."""
+    """Raise PebbleError if such networks cannot be made here."""
     if why := why_no_namespaces():
         raise PebbleError(f"no network namespaces: {why}")
 

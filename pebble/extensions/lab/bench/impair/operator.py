@@ -1,4 +1,4 @@
-"""The operator of one robot, on the broker's side of the network: drives, and receives video, then audio.
+"""The operator of one robot, on the broker's side of the network: it drives, and receives video, then audio.
 
 As a process: ``python -m pebble.extensions.lab.bench.impair.operator HOST PORT BASE PLAN``, the plan as JSON. It
 reports when the robot is ready, then serves each line, ``trial`` or ``recover``, and ends when its standard input
@@ -42,7 +42,7 @@ _FRESH_MS, _FRESH_HEARTBEATS, _STARTUP_S = 500, 3, 20.0
 
 
 class MediaSubscriber(MediaReceiver):
-    """Records when each picture and each sound packet arrived."""
+    """A record of the arrivals of pictures and sound packets."""
 
     def __init__(self, transport: Transport, base: str) -> None:
         self.seen: list[Arrival] = []
@@ -59,7 +59,7 @@ class MediaSubscriber(MediaReceiver):
 
 
 class TrialOperator:
-    """Drives over one connection and receives media over another."""
+    """An operator that drives over one connection and receives media over another."""
 
     def __init__(self, host: str, port: int, base: str, plan: Plan) -> None:
         self._base, self._plan = base, plan
@@ -86,7 +86,7 @@ class TrialOperator:
         return Report()
 
     def recover(self) -> Report:
-        """Wait until the network delivers no old messages. Raises PebbleError if the robot does not recover."""
+        """Wait until no old messages arrive any more. Raises PebbleError if the robot does not recover."""
         _pause(self._over_at + self._plan.quiet_s - time.monotonic())
         if not _wait(self._is_fresh, _STARTUP_S):
             raise PebbleError(f"no fresh heartbeat {_STARTUP_S:.0f} s after the network was restored")
@@ -159,16 +159,16 @@ class TrialOperator:
 
 
 def _wait(condition: Callable[[], bool], seconds: float, meanwhile: Callable[[], None] = lambda: None) -> bool:
-    """Wait for ``condition``, at most ``seconds``; return whether it was met. Calls ``meanwhile`` now and then."""
+    """Wait for ``condition``, at most ``seconds``, calling ``meanwhile`` now and then; return whether it was met."""
     end = time.monotonic() + seconds
-    while not (met := condition()) and (left := end - time.monotonic()) > 0:
-        time.sleep(min(left, _POLL_S))
+    while not (met := condition()) and (remaining_s := end - time.monotonic()) > 0:
+        time.sleep(min(remaining_s, _POLL_S))
         meanwhile()
     return met
 
 
 def _pause(seconds: float, meanwhile: Callable[[], None] = lambda: None) -> Window:
-    """Wait for ``seconds``; return the window from the beginning to the end."""
+    """Wait for ``seconds``; return that time as a window."""
     began_ns = time.monotonic_ns()
     _wait(lambda: False, seconds, meanwhile)
     return Window(began_ns, time.monotonic_ns())

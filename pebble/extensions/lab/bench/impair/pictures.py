@@ -1,4 +1,4 @@
-"""Pictures of robots on impaired networks, over the trials as in the paper's Figures 4.7 and 4.8."""
+"""Charts of robots on impaired networks, over the trials as in the paper's Figures 4.7 and 4.8."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _CROSS: Final[Style] = {"color": "#1a1a1a", "marker": "x", "linestyle": "", "mar
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Panel:
-    """A line for each subject over the trials: a percentile of a measure, not drawn if it is infinite."""
+    """A chart with a line per subject over the trials: a percentile of a measure, not drawn where it is infinite."""
 
     label: str
     measure: str
@@ -52,7 +52,7 @@ _LATENCY: Final = (
 
 
 def over_trials(cells: Sequence[Cell], more: str) -> list[Picture]:
-    """Return delivery and latency of audio over the trials; ``more`` is a part of their captions."""
+    """Return charts of delivery and latency of audio over the trials; ``more`` is added to their captions."""
     form = "over the trials, in the form of the paper's Figure"
     captions = {
         "audio-delivery": (f"Audio delivery {form} 4.7; {more}", _DELIVERY),
@@ -65,7 +65,7 @@ def over_trials(cells: Sequence[Cell], more: str) -> list[Picture]:
 
 
 def _draw_trials(cells: Sequence[Cell], title: str, shown_panels: Sequence[Panel]) -> Figure:
-    """Draw all panels; logarithmic ones have one scale."""
+    """Return a figure with all panels; logarithmic ones have one scale."""
     figure, all_axes = panels(len(shown_panels), 1, (10.5, 3.4), title)
     names = list(dict.fromkeys(str(cell.params["trial"]) for cell in cells))
     style_of = styles([cell.variant for cell in cells])

@@ -70,7 +70,7 @@ SUBJECTS: Final = tuple(f"{transport} {form}" for form in FORMS for transport in
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The variants and trials, and the seconds of each phase of a trial, see Plan."""
+    """The variants and trials, and the seconds of each phase of a trial (see Plan)."""
 
     trials: Sequence[str] = TRIALS
     subjects: Sequence[str] = SUBJECTS
@@ -99,7 +99,7 @@ def run(settings: Settings, console: Console) -> Shown:
 
 
 def shown(results: Results, window_s: float) -> Shown:
-    """Return the tables and pictures of results."""
+    """Return the tables and charts of the results."""
     caption = f"windows of {window_s:g} s; “original”: this program with the original's encodings"
     return Shown(results, [table(results.cells), transports(results)], over_trials(results.cells, caption))
 
@@ -109,7 +109,7 @@ def shown(results: Results, window_s: float) -> Shown:
 
 @dataclass(frozen=True, slots=True)
 class ImpairedRobot:
-    """One subject. The local broker and the robot's processes are on its side of the network; the rest is beyond it."""
+    """One subject: the robot and its local broker on their side of the network, the rest on the other side."""
 
     subject: str
     network: NamespaceNetwork
@@ -119,7 +119,7 @@ class ImpairedRobot:
     limit_s: float  # for its operator's next report; the limits of that are shorter
 
     def report(self) -> Report:
-        """Wait for the operator's report. Raises PebbleError for a problem, a timeout, or if a process has ended."""
+        """Return the operator's next report. Raises PebbleError for a problem, a timeout, or an ended process."""
         try:
             report = msgspec.convert(self.operator.answer(self.limit_s), Report)
         except PebbleError as error:
@@ -131,7 +131,7 @@ class ImpairedRobot:
         return report
 
     def trial(self, condition: Condition) -> list[Cell]:
-        """Run a trial once nothing of the one before is on its way. Raises PebbleError."""
+        """Run a trial once all messages of the last one have arrived or are lost. Raises PebbleError."""
         self.operator.send("recover")
         self.report()
         self.network.apply(condition)
@@ -143,7 +143,7 @@ class ImpairedRobot:
 
 
 def start(subject: str, settings: Settings, processes: Processes) -> ImpairedRobot:
-    """Start all its processes; it is not yet ready. Raises PebbleError."""
+    """Start all processes of a subject, and return it, not yet ready. Raises PebbleError."""
     transport, _, form = subject.partition(" ")
     folder = processes.folder / str(SUBJECTS.index(subject))
     folder.mkdir()
@@ -165,7 +165,7 @@ def start(subject: str, settings: Settings, processes: Processes) -> ImpairedRob
 
 @contextmanager
 def robots(settings: Settings) -> Iterator[list[ImpairedRobot]]:
-    """Start all robots, which are not yet ready. Raises PebbleError if something does not start."""
+    """Start all robots, and yield them, not yet ready. Raises PebbleError if something does not start."""
     with Processes() as processes:
         yield [start(subject, settings, processes) for subject in SUBJECTS if subject in settings.subjects]
 
@@ -185,7 +185,7 @@ def measure(settings: Settings, progress: Progress, ended: list[str]) -> Iterato
 
 
 def _trials(settings: Settings, every: Sequence[ImpairedRobot], progress: Progress, ended: list[str]) -> list[Cell]:
-    """Run all trials; robots of one form at the same time, to limit the load on small machines."""
+    """Return the results of all trials. Robots of one form run at the same time, to limit the load."""
     cells: list[Cell] = []
     together = grouped(every, lambda robot: robot.subject.partition(" ")[2])
     with ThreadPoolExecutor(len(every), thread_name_prefix="subject") as pool:
@@ -224,24 +224,27 @@ _COLUMNS: Final[tuple[tuple[str, str, int], ...]] = (
 def table(cells: Sequence[Cell]) -> Table:
     """Return a table with a row for each subject in each trial."""
     grid = plain_table("Trials", ["trial", "subject", *(head for head, *_ in _COLUMNS)], left=2, caption=_STAND_IN)
-    for trial, some in grouped(cells, lambda cell: str(cell.params["trial"])).items():
+    for trial, of_trial in grouped(cells, lambda cell: str(cell.params["trial"])).items():
         grid.add_section()
-        for number, (subject, own) in enumerate(grouped(some, lambda cell: cell.variant).items()):
-            measured = {cell.measure: cell for cell in own}
+        for number, (subject, of_subject) in enumerate(grouped(of_trial, lambda cell: cell.variant).items()):
+            measured = {cell.measure: cell for cell in of_subject}
             values = (digits(value_of(measured[measure], percent)) for _, measure, percent in _COLUMNS)
             grid.add_row("" if number else trial, subject, *values)
     return grid
 
 
 def transports(results: Results) -> Table:
-    """Return Zenoh inside the robot compared with MQTT, with trials as rounds: both ran at the same time."""
+    """Return a comparison of Zenoh with MQTT inside the robot; trials count as rounds, as both ran at once."""
     title = "Zenoh to MQTT inside the robot, medians over the trials"
     grid = plain_table(title, ["form", *_COMPARED], caption=f"{_STAND_IN} {RATIOS}")
     for form in FORMS:
         intervals = []
         for measure in _COMPARED.values():
-            cells = [[results.find(f"{kind} {form}", measure, trial=trial) for trial in TRIALS] for kind in _KINDS]
-            zenoh, mqtt = ([cell.samples if cell else [] for cell in some] for some in cells)
+            samples = []  # of each kind, by trial
+            for kind in _KINDS:
+                cells = [results.find(f"{kind} {form}", measure, trial=trial) for trial in TRIALS]
+                samples.append([cell.samples if cell else [] for cell in cells])
+            zenoh, mqtt = samples
             intervals.append(str(paired(zenoh, mqtt)))
         grid.add_row(form, *intervals)
     return grid

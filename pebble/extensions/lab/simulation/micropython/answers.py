@@ -1,4 +1,4 @@
-"""Answers of a DNS server and an SNTP server to the packets of a board. Pure: bytes in, bytes out."""
+"""Replies of a DNS server and of an SNTP server to a board's packets. Pure: bytes in, bytes out."""
 
 import socket
 import struct
@@ -12,7 +12,7 @@ _TTL_S = 60
 
 
 def name_answer(query: bytes, addresses_of: Callable[[str], str | Sequence[str] | None]) -> bytes | None:
-    """Answer a DNS query for IPv4 addresses, one or several; None for any other packet (RFC 1035, 4.1)."""
+    """Return the reply to a DNS query for IPv4 addresses, one or several; None for other packets (RFC 1035, 4.1)."""
     try:
         name, end = _name(query, 12)
         kind, class_ = struct.unpack_from("!HH", query, end)
@@ -32,7 +32,7 @@ def name_answer(query: bytes, addresses_of: Callable[[str], str | Sequence[str] 
 
 
 def time_answer(request: bytes, epoch_s: float) -> bytes | None:
-    """Answer an SNTP request as a stratum 2 server; None for any other packet (RFC 4330, 4)."""
+    """Return the reply of a stratum 2 server to an SNTP request; None for other packets (RFC 4330, 4)."""
     if len(request) < 48 or request[0] & 7 != 3:
         return None
     stamp = struct.pack("!II", *_stamp(epoch_s))
@@ -46,7 +46,7 @@ def _stamp(epoch_s: float) -> tuple[int, int]:
 
 
 def _name(packet: bytes, at: int) -> tuple[str, int]:
-    """Return the dotted name that starts at ``at``, in lower case, and its end."""
+    """Return the dotted name that starts at ``at``, in lower case, and the place after it."""
     labels = []
     while length := packet[at]:
         labels.append(packet[at + 1 : at + 1 + length].decode("ascii").lower())

@@ -45,19 +45,19 @@ class FirmwareRobot(Protocol):
 
 
 class Network(Protocol):
-    """The radio of a board that has one; provides its modules at each boot."""
+    """The radio of a board that has one. It provides the board's network modules at each boot."""
 
     def modules(self) -> dict[str, Any]:
-        """Return ``network``, ``socket`` and ``ssl`` in the state after a boot."""
+        """Return ``network``, ``socket`` and ``ssl`` in their state after a boot."""
 
 
 class Board:
-    """One board. ``load`` a robot's firmware, then call its ``step`` for each turn of its loop.
+    """A board. ``load`` a robot's firmware, then call its ``step`` for each turn of its loop.
 
-    All times come from ``clock``, which may be shared with other boards. Ticks (period 2**30) start at
-    ``ticks_at_boot_ms``. ``seed`` is that of the random numbers; default: derived from ``uid``. ``port`` is the board
-    type; default: that of the loaded robot. A reset clears what the firmware did (outputs, modules, unread input), and
-    nothing else; so ``files`` survive it, and a power cut.
+    All times come from ``clock``, which boards may share. Ticks (period 2**30) start at ``ticks_at_boot_ms``. ``seed``
+    is for random numbers; by default it is derived from ``uid``. ``port`` is the board type; by default that of the
+    loaded robot. A reset clears what the firmware did (outputs, modules, unread input) and nothing else: ``files``
+    survive it, and a power cut.
     """
 
     def __init__(
@@ -87,13 +87,13 @@ class Board:
 
     @property
     def firmware(self) -> FirmwareModules:
-        """The modules of this boot, for example ``firmware.module("goob.pins")``."""
+        """Modules of this boot, for example ``firmware.module("goob.pins")``."""
         if self._firmware is None:
             self._firmware = FirmwareModules(self._modules(), {"open": self.files.open, "print": self.print})
         return self._firmware
 
     def load(self, robot: str, settings: dict[str, Any] | None = None) -> FirmwareRobot:
-        """Boot, and build the ``robot`` of firmware/ with these ``settings`` (its private_config.json)."""
+        """Boot with the firmware of ``robot`` and its ``settings`` (private_config.json); return its robot object."""
         self.configure_for(robot)
         self.boot()
         self.files[SETTINGS_FILE] = json.dumps(settings or {}).encode()
@@ -101,7 +101,7 @@ class Board:
         return built
 
     def configure_for(self, robot: str) -> None:
-        """Become the board type of ``robot``, which defines the names of pins, unless a type was given."""
+        """Use the board type of ``robot``, which defines the names of pins, unless a type was given."""
         if not self._port_is_fixed:
             self.port = OF_ROBOT.get(robot, SAMD21)
 
@@ -118,15 +118,15 @@ class Board:
     def pause(self, seconds: float) -> None:
         """Block the firmware for ``seconds``; timers run, and the watchdog resets the board if it expires."""
         until = self.clock.now() + seconds
-        while self.timers.running and (left := until - self.clock.now()) > 0.0:
-            self.timers.wait(min(left, self.watchdog.left()))
+        while self.timers.running and (remaining_s := until - self.clock.now()) > 0.0:
+            self.timers.wait(min(remaining_s, self.watchdog.left()))
             self.watchdog.check()
         self.clock.sleep(min(until - self.clock.now(), self.watchdog.left()))
         self.watchdog.check()
         self.console.interrupted()
 
     def _wait_for_input(self) -> None:
-        """Wait while the firmware reads without input: only its timers run."""
+        """Wait while the firmware reads and there is no input: only its timers run."""
         if not self.timers.running:
             raise WouldHang("the firmware waits for input while no timer is running")
         self.timers.wait(self.watchdog.left())
@@ -154,7 +154,7 @@ class Board:
         return self.pins.level(self.port.pin(pin))
 
     def set_volts(self, pin: PinName, volts: Volts) -> None:
-        """Set the voltage at the ADC of ``pin``: a value, or a function that is called at each measurement."""
+        """Set the voltage at the ADC of ``pin``: a number, or a function that is called at each measurement."""
         self.pins.set_volts(self.port.pin(pin), volts)
 
     def set_pin(self, pin: PinName, high: Level) -> None:
@@ -189,7 +189,7 @@ class Board:
             self._pwm_timers.free(str(pin))
 
     def print(self, *values: object, sep: str = " ", end: str = "\n", file: Any = None) -> None:
-        """Print as the firmware does: to the serial port or to ``file``."""
+        """Print as MicroPython does, to the serial port or to ``file``."""
         text = sep.join(map(str, values)) + end
         if file is None:
             self.console.write(text.replace("\n", "\r\n").encode())

@@ -10,11 +10,11 @@ _BUFFER = 256  # bytes that the board buffers for a host that does not read
 
 
 class Console:
-    """The host sends with ``type`` and receives with ``take_output``.
+    """The serial port of a board. The host sends with ``type`` and receives with ``take_output``.
 
-    ``interrupt`` is the byte that stops the program (Ctrl-C), -1 for none: micropython.kbd_intr. With ``reading``
-    off, the host has the port open but reads nothing: the board's buffer fills up, and then each write takes half a
-    second and loses its data, as with a real USB port.
+    ``interrupt`` is the byte that stops the program (Ctrl-C), -1 for none: micropython.kbd_intr. With ``reading`` off,
+    the host has the port open but reads nothing: the board's buffer fills up, and then each write takes half a second
+    and loses its data, as with a real USB port.
     """
 
     def __init__(self, pause: Callable[[float], None], wait: Callable[[], None]) -> None:
@@ -51,7 +51,7 @@ class Console:
         return len(self.typed)
 
     def interrupted(self) -> None:
-        """Raise KeyboardInterrupt after Ctrl-C; called wherever the firmware checks its input."""
+        """Raise KeyboardInterrupt if Ctrl-C was received. Called wherever the firmware checks its input."""
         if self.is_interrupted:
             self.is_interrupted = False
             raise KeyboardInterrupt
@@ -62,12 +62,12 @@ class Console:
         while len(typed) < count:
             self._wait()
             self.interrupted()
-        taken = typed[:count]
+        chunk = typed[:count]
         del typed[:count]
-        return taken
+        return chunk
 
     def write(self, data: Any) -> int:
-        """Return how many bytes the host has received or will receive."""
+        """Write to the host; return how many bytes it has received, or will receive."""
         if not self.reading:
             room = max(0, _BUFFER - len(self._output))
             if len(data) > room:
@@ -82,7 +82,7 @@ class Console:
 
 
 class Input:
-    """sys.stdin is text, its ``buffer`` is bytes; both can be polled."""
+    """The board's sys.stdin: text, with ``buffer`` for bytes; both can be polled."""
 
     def __init__(self, console: Console, *, text: bool = True, buffer: bool = True) -> None:
         self._console, self._text = console, text
@@ -96,7 +96,7 @@ class Input:
         return mask & POLLIN if console.typed else 0
 
     def read(self, count: int) -> Any:
-        """Read exactly ``count``, waiting as long as needed, as MicroPython does."""
+        """Read exactly ``count``, and wait for them as MicroPython does."""
         data = self._take(count)
         return data.decode() if self._text else bytes(data)
 
@@ -110,7 +110,7 @@ class Input:
 
 
 class Output:
-    """sys.stdout is text, its ``buffer`` is bytes; both can be polled."""
+    """The board's sys.stdout: text, with ``buffer`` for bytes; both can be polled."""
 
     def __init__(self, console: Console, *, text: bool = True, buffer: bool = True) -> None:
         self._console, self._text = console, text
@@ -122,7 +122,7 @@ class Output:
         return mask & POLLOUT if console.reading or console.writable() else 0
 
     def write(self, data: Any, start: int = 0, length: int | None = None) -> int:
-        """Write as ``write(data)`` or ``write(data, offset, length)``; return the size written."""
+        """Write, as ``write(data)`` or ``write(data, offset, length)``; return the number of bytes written."""
         data = data if length is None else data[start : start + length]
         if not self._text:
             return self._console.write(data)

@@ -1,20 +1,20 @@
-"""The errors of a simulated board: those that its firmware receives, and those that report a bug in it."""
+"""The errors of a simulated board: those that its firmware receives, and those that report a bug in the firmware."""
 
 import os
 
 
 def failure(code: int) -> OSError:
-    """Make an OSError as MicroPython raises it. CPython sets ``errno`` only if there is a text too."""
+    """Return an OSError as MicroPython raises it. CPython sets ``errno`` only if there is a text, too."""
     return OSError(code, os.strerror(code))
 
 
 class FirmwareFault(BaseException):
-    """The firmware did something that fails on a real board. A BaseException, so that no firmware catches it."""
+    """An error: the firmware did what fails on a real board. A BaseException, so that firmware does not catch it."""
 
 
 class WouldHang(FirmwareFault):
-    """A call that would never return."""
+    """An error: the call would never return on a real board."""
 
 
 class SharedPwm(FirmwareFault):
-    """Two pins share one PWM channel: both would have the signal that was set last."""
+    """An error: two pins share one PWM channel, so that both would have the signal set last."""

@@ -10,11 +10,11 @@ from pebble.extensions.lab.simulation.micropython.faults import failure
 
 
 class Files(dict[str, bytes]):
-    """Contents by absolute path. What the firmware changes is also in ``folder``, if given, and read from there.
+    """The contents of files by absolute path. With ``folder`` they are read from there, and changes are written there.
 
-    As with LittleFS a written file changes when it is closed, and a rename replaces its target at once.
-    ``before(what, path, data)`` is called before each change by the firmware; ``what`` is "write" or "rename".
-    It may raise an OSError, or an exception of the test's own in place of a power cut.
+    As with LittleFS, a written file changes when it is closed, and a rename replaces its target at once. ``before(what,
+    path, data)`` is called before each change by the firmware; ``what`` is "write" or "rename". It may raise an
+    OSError, or an exception of a test, in place of a power cut.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -26,7 +26,7 @@ class Files(dict[str, bytes]):
             self.update({f"/{file.name}": file.read_bytes() for file in folder.iterdir() if file.is_file()})
 
     def open(self, path: str, mode: str = "r") -> IO[bytes] | IO[str]:
-        """Return the firmware's ``open``, for reading or for writing a whole file."""
+        """Open a file as the firmware's ``open`` does: to read it, or to write it as a whole."""
         raw: io.BytesIO
         if mode in ("w", "wb"):
             raw = _Written(self, path)
@@ -62,7 +62,7 @@ class Files(dict[str, bytes]):
 
 
 class _Written(io.BytesIO):
-    """A file that is being written."""
+    """A file that is open for writing."""
 
     def __init__(self, files: Files, path: str) -> None:
         super().__init__()

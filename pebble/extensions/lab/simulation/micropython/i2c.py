@@ -7,10 +7,10 @@ from pebble.extensions.lab.simulation.micropython.faults import failure
 
 
 class Device(Protocol):
-    """A device on the bus. Both methods may raise OSError for a missing acknowledgement."""
+    """A device on the bus. Both methods may raise OSError if it does not acknowledge."""
 
     def write(self, data: bytes) -> None:
-        """Receive ``data``, which follows the address."""
+        """Handle ``data``, which follows the address."""
 
     def read(self, count: int) -> bytes:
         """Return exactly ``count`` bytes."""

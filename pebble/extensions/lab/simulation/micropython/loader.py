@@ -27,7 +27,7 @@ class FirmwareModules:
     """The modules of one board: firmware files from ``root``, and ``modules`` that are built into its MicroPython.
 
     The host's ``sys.modules`` is not used. Files are compiled once per process; a traceback names the real file and
-    line. ``names`` are further builtins of the board, such as its ``open`` and ``print``.
+    line. ``names`` are more builtins of the board, such as its ``open`` and ``print``.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class FirmwareModules:
     def _import(
         self, name: str, _globals: object = None, _locals: object = None, wanted: Any = (), level: int = 0
     ) -> Any:
-        """Return the board's ``__import__``."""
+        """Import as the board's ``__import__`` does."""
         if level:
             raise ImportError("firmware imports by full names: relative imports differ between ports", name=name)
         module = self.module(name)

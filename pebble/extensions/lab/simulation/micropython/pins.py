@@ -1,4 +1,4 @@
-"""The pins of a simulated board, seen from outside: outputs of the firmware, and levels and voltages at inputs."""
+"""The pins of a simulated board, seen from outside: the firmware's outputs, and levels and voltages at inputs."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ Level = bool | Callable[[], bool] | None
 
 
 class Pins:
-    """Levels of the outputs (0..1: the duty cycle for PWM), and the volts and levels at the inputs.
+    """The levels of outputs (0..1: the duty cycle for PWM), and the volts and levels at inputs.
 
     ``before_change`` is called just before an output changes, so that its old level can still be read.
     """

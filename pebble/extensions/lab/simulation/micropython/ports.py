@@ -1,4 +1,4 @@
-"""Differences between MicroPython's ports that matter to our firmware."""
+"""The differences between MicroPython's ports that matter to our firmware."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -34,7 +34,7 @@ def _refuse(name: PinName) -> PinName:
 
 
 def _samd_wdt(timeout_ms: int) -> int:
-    """Return a power of two, rounded down (ports/samd/machine_wdt.c)."""
+    """Return the watchdog's real timeout: a power of two, rounded down (ports/samd/machine_wdt.c)."""
     return 1 << (max(512, min(16_384, timeout_ms)).bit_length() - 1)
 
 

@@ -1,6 +1,7 @@
 """The pins of the XIAO SAMD21: their names, and which of them can make a PWM signal.
 
-From MicroPython's ports/samd: boards/SEEED_XIAO_SAMD21/pins.csv, mcu/samd21/pin-af-table.csv and pin_af.c.
+The facts are from MicroPython's ports/samd: boards/SEEED_XIAO_SAMD21/pins.csv, mcu/samd21/pin-af-table.csv and
+pin_af.c.
 """
 
 from typing import Final
@@ -41,7 +42,7 @@ _CHANNELS: Final = (4, 2, 2)  # of TCC0, TCC1, TCC2; output n has channel n modu
 
 
 def pin(name: str) -> str:
-    """Return the MCU's own name of a pin (``PA02``). Raises ValueError with MicroPython's message if there is none."""
+    """Return the MCU's name of a pin (``PA02``). Raises ValueError with MicroPython's message if there is none."""
     if name not in _NAMES:
         raise ValueError(f"not a Pin: {name!r}")
     return _NAMES[name]
@@ -56,7 +57,7 @@ class PwmTimers:
         self._of_pin: dict[str, tuple[int, int]] = {}
 
     def take(self, pin: str) -> None:
-        """Assign the channel that MicroPython would: of the first timer not yet started, else of the first timer."""
+        """Assign the channel that MicroPython assigns: that of a timer not yet started, else of the first timer."""
         if pin in self._of_pin:
             return
         possible = _TIMERS.get(pin, ())

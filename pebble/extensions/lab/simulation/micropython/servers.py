@@ -1,4 +1,4 @@
-"""A DNS server and an SNTP server on loopback UDP, for simulated boards with real sockets."""
+"""A DNS server and an SNTP server on loopback, for simulated boards with real sockets."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MOST = 16  # addresses in an answer, which has 512 bytes at most (RFC 1035, 2.3
 
 
 class LoopbackServers:
-    """Both servers. ``routes`` is for HostNetwork; call ``serve`` when one of ``sockets`` is readable."""
+    """A DNS and an SNTP server. ``routes`` is for HostNetwork; call ``serve`` when one of ``sockets`` is readable."""
 
     def __init__(self) -> None:
         self._addresses: dict[str, list[str]] = {TIME_HOST: [_TIME_ADDRESS]}  # of names that are known
@@ -48,11 +48,11 @@ class LoopbackServers:
             sock.close()
 
     def _resolve(self, name: str) -> list[str] | None:
-        """Return the addresses of a name by this machine's resolver; None: there is none, which may change."""
+        """Return the addresses of a name by this machine's resolver; None if there is none at present."""
         if name not in self._addresses:
             with suppress(OSError):
-                found = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_STREAM)
-                self._addresses[name] = list(dict.fromkeys(str(address[4][0]) for address in found))[:_MOST]
+                answers = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_STREAM)
+                self._addresses[name] = list(dict.fromkeys(str(address[4][0]) for address in answers))[:_MOST]
         return self._addresses.get(name)
 
 

@@ -8,11 +8,11 @@ from pebble.extensions.lab.simulation.micropython.clock import Clock
 
 
 class BoardReset(BaseException):
-    """A reset of the board. A BaseException, so that no firmware catches it; the runner reboots the board."""
+    """A reset of the board. Firmware catches no BaseException; the runner does, and reboots the board."""
 
 
 class Watchdog:
-    """A watchdog that resets the board unless it is fed in time, once armed."""
+    """A watchdog: once armed, it resets the board unless it is fed in time."""
 
     def __init__(self, clock: Clock) -> None:
         self.feeds = 0
@@ -24,7 +24,7 @@ class Watchdog:
         self.timeout_ms, self._fed_at = timeout_ms, self._clock.now()
 
     def disarm(self) -> None:
-        """Stop the watchdog, as only a reset does."""
+        """Stop the watchdog, which only a reset of the board does."""
         self.timeout_ms = None
 
     def feed(self) -> None:
@@ -33,7 +33,7 @@ class Watchdog:
         self._fed_at = self._clock.now()
 
     def left(self) -> float:
-        """Return seconds until it resets the board."""
+        """Return the seconds until it resets the board."""
         if self.timeout_ms is None:
             return math.inf
         return max(0.0, self._fed_at + self.timeout_ms / 1000 - self._clock.now())
@@ -43,13 +43,13 @@ class Watchdog:
         return self.timeout_ms is not None and now >= self._fed_at + self.timeout_ms / 1000
 
     def check(self) -> None:
-        """Reset the board if it was not fed in time."""
+        """Raise BoardReset if it was not fed in time."""
         if self.starved(self._clock.now()):
             raise BoardReset("the watchdog was not fed in time")
 
 
 class SoftTimers:
-    """Timers that run while the program waits. ``on_wait`` is called after each part of a wait, for tests."""
+    """Timers that run while the program waits. Tests may use ``on_wait``, called after each part of a wait."""
 
     def __init__(self, clock: Clock) -> None:
         self.on_wait: Callable[[], None] = lambda: None
@@ -69,11 +69,11 @@ class SoftTimers:
         self._busy = False
 
     def wait(self, longest_s: float) -> None:
-        """Wait until the next timer has run, at most ``longest_s``."""
+        """Wait until the next timer has run, but at most ``longest_s``."""
         now = self._clock.now()
-        left = min(self._due.values()) - now
-        self._clock.sleep(max(0.0, min(left, longest_s)))
-        if left <= longest_s:
+        until_due_s = min(self._due.values()) - now
+        self._clock.sleep(max(0.0, min(until_due_s, longest_s)))
+        if until_due_s <= longest_s:
             self._call()
         self.on_wait()
 

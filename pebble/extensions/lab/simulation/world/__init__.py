@@ -1,1 +1,1 @@
-"""A world in which simulated robots drive, stop at walls and at each other, and see."""
+"""A world in which simulated robots drive, stop at walls and at each other, and have cameras."""

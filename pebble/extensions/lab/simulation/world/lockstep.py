@@ -1,6 +1,6 @@
 """A simulated world on one virtual clock that the caller advances: real firmware, motion, contacts and cameras.
 
-The same calls give the same bytes and pixels, on every run and however busy the machine is.
+The same calls give the same bytes and pixels, in every run and however busy the machine is.
 """
 
 from collections import deque
@@ -23,7 +23,7 @@ _SAMPLES = round((LONGEST_LATENCY_MS + LONGEST_EXPOSURE_MS) / 1000 / PERIOD_S) +
 
 
 class CameraMode(NamedTuple):
-    """The size of pictures in pixels, and how many there are per second."""
+    """The size of pictures in pixels, and their number per second."""
 
     width: int = 640
     height: int = 480
@@ -31,7 +31,7 @@ class CameraMode(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A picture, BGR, (height, width, 3), and what time it shows."""
+    """A picture, BGR, (height, width, 3), and the time that it shows."""
 
     pixels: Image
     at: float
@@ -83,7 +83,7 @@ class LockstepWorld:
 
 
 class LockstepRobot:
-    """A robot of a LockstepWorld, which calls ``tick`` and ``sample``: its serial line, its camera, and the truth."""
+    """A robot of a LockstepWorld, which calls ``tick`` and ``sample``: its serial line, camera and true state."""
 
     def __init__(self, world: World, name: str, floor: Floor, camera: CameraMode) -> None:
         self.name = name
@@ -104,7 +104,7 @@ class LockstepRobot:
         return RobotPose(pose.x_mm / 1000, pose.y_mm / 1000, pose.heading_rad)
 
     def place(self, x: float, y: float, heading: float) -> None:
-        """Put the robot down elsewhere: metres and radians."""
+        """Put the robot down at a place: metres and radians."""
         self.mcu.body.advance()
         self.motion.place(Pose(x * 1000, y * 1000, heading))
 
@@ -120,14 +120,14 @@ class LockstepRobot:
         return output
 
     def drive(self, x: float, z: float) -> None:
-        """Send what ``serial_mcu_bridge`` makes of a drive command: throttle ``z``, steering ``x``, + turns right."""
+        """Send ``serial_mcu_bridge``'s line for a drive command: throttle ``z``, steering ``x``, + is right."""
         left, right = (min(1.0, max(-1.0, speed)) for speed in (z + x, z - x))
         self.write(b"M %.3f %.3f\n" % (round(left, 3) + 0.0, round(right, 3) + 0.0))  # + 0.0: no "-0.000"
 
     # -- the camera
 
     def picture(self) -> Picture | None:
-        """Return the newest picture, unless it has been taken already. It is rendered only then."""
+        """Return the newest picture, unless it was returned before. It is rendered only when asked for."""
         due = int(self._now * self._camera.fps + 1e-6)
         if due == self._pictures:
             return None

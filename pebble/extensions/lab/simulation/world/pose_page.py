@@ -1,6 +1,6 @@
-"""The poses of a running world's robots, in a file in memory: one program writes it, every robot's camera reads it.
+"""The poses of a running world's robots, in a file in memory: one program writes it, the robots' cameras read it.
 
-Each writing replaces the file, so a reader never waits, and never sees half of one.
+Each write replaces the file, so a reader never waits, and never sees half of it.
 """
 
 import fcntl
@@ -22,29 +22,29 @@ _SAMPLES = 64  # per robot: 1.28 s
 
 
 class _Page(msgspec.Struct):
-    """The file. ``start_ns``: when its program began; ``robots``: the samples of each, oldest first."""
+    """The content of the file. ``start_ns``: when its program began; ``robots``: each robot's samples, oldest first."""
 
     start_ns: int
     robots: dict[str, list[Sample]]
 
 
 def page_path(world: Path) -> Path:
-    """Return the page of a world file, the same for all programs of one user."""
+    """Return the path of the page of a world file, the same for all programs of one user."""
     folder = Path("/dev/shm")  # noqa: S108 - the page's own folder is checked
     digest = hashlib.sha256(str(world.resolve()).encode()).hexdigest()[:16]
     return folder / f"pebble-worlds-{os.getuid()}" / digest
 
 
 class PosePage:
-    """The writer. Raises DeviceError if another program runs this world, or the page cannot be made."""
+    """The writer of the page. Raises DeviceError if another program runs this world, or the page cannot be made."""
 
     def __init__(self, path: Path, names: Iterable[str]) -> None:
         self._path, self._new, self._start_ns = path, path.with_suffix(".new"), time.monotonic_ns()
         self._samples: dict[str, deque[Sample]] = {name: deque(maxlen=_SAMPLES) for name in names}
         try:
             path.parent.mkdir(mode=0o700, exist_ok=True)
-            found = path.parent.lstat()
-            if found.st_uid != os.getuid() or found.st_mode & 0o022 or not path.parent.is_dir():
+            status = path.parent.lstat()
+            if status.st_uid != os.getuid() or status.st_mode & 0o022 or not path.parent.is_dir():
                 raise DeviceError(f"{path.parent}: is not a folder that only you may write, remove it")
             self._lock = os.open(path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o600)  # stays: a lock needs no end
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -56,13 +56,13 @@ class PosePage:
             raise DeviceError(f"{path}: the world's poses cannot be written: {error.strerror}") from None
 
     def write(self, ns: int, poses: Sequence[RobotPose]) -> None:
-        """Add where the robots are at ``ns``, in the order of ``names``."""
+        """Add the robots' poses at ``ns``, in the order of ``names``."""
         for samples, pose in zip(self._samples.values(), poses, strict=True):
             samples.append(Sample(ns, pose))
         self._replace()
 
     def close(self) -> None:
-        """Remove the page: a world that does not run has none, and readers notice at once."""
+        """Remove the page, by which readers notice at once that the world has ended."""
         self._path.unlink(missing_ok=True)
         os.close(self._lock)
 
@@ -80,7 +80,7 @@ class PoseReader:
         self._start_ns = self._read().start_ns
 
     def tracks(self) -> dict[str, Track]:
-        """Return the poses of every robot that has a sample; none once the world has ended or was started again."""
+        """Return the poses of every robot that has a sample; none once the world has ended or has restarted."""
         try:
             page = self._read()
         except FileNotFoundError:

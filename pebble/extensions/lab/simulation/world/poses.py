@@ -1,4 +1,4 @@
-"""The poses of a robot during the last second, and at any moment in between."""
+"""The poses of a robot in the last second, and interpolated between them."""
 
 import math
 from bisect import bisect_right
@@ -15,7 +15,7 @@ class RobotPose(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """A pose and when it was valid, monotonic nanoseconds."""
+    """A pose, with its time in monotonic nanoseconds."""
 
     ns: int
     pose: RobotPose
@@ -32,14 +32,18 @@ class Track:
         return self.samples[-1]
 
     def at(self, ns: int) -> RobotPose:
-        """Return the pose at ``ns``, interpolated; the oldest or newest one for a time outside the samples."""
+        """Return the pose at ``ns``, interpolated; for a time outside of the samples the oldest or newest."""
         after = bisect_right(self.samples, ns, key=lambda sample: sample.ns)
         if after in (0, len(self.samples)):
             return self.samples[max(0, after - 1)].pose
-        (start, one), (end, two) = self.samples[after - 1], self.samples[after]
+        (start, earlier), (end, later) = self.samples[after - 1], self.samples[after]
         part = (ns - start) / (end - start)
-        turn = math.remainder(two.heading - one.heading, math.tau)
-        return RobotPose(one.x + part * (two.x - one.x), one.y + part * (two.y - one.y), one.heading + part * turn)
+        turn = math.remainder(later.heading - earlier.heading, math.tau)
+        return RobotPose(
+            earlier.x + part * (later.x - earlier.x),
+            earlier.y + part * (later.y - earlier.y),
+            earlier.heading + part * turn,
+        )
 
 
 def poses_at(tracks: Mapping[str, Track], ns: int) -> dict[str, RobotPose]:

@@ -1,4 +1,4 @@
-"""A simulated world as a program: the MCUs of its robots behind pseudo terminals, and their poses for their cameras."""
+"""A simulated world as a program: its robots' MCUs behind pseudo terminals, and poses for their cameras."""
 
 import math
 import os
@@ -32,7 +32,7 @@ Mcus = dict[str, PtyMcu]
 
 
 class Snapshot(msgspec.Struct, frozen=True):
-    """A line of a report: one JSON object, ten times a second. ``ns`` is time.monotonic_ns()."""
+    """A line of a report: a JSON object, ten times a second. ``ns`` is time.monotonic_ns()."""
 
     ns: int
     robots: dict[str, BoardState]
@@ -43,8 +43,8 @@ def run(
 ) -> int:
     """Run until a signal, or with ``control`` until standard input ends. Raises PebbleError.
 
-    ``folder`` is for serial ports, ``trace`` for what MCUs receive, ROBOT.trace.jsonl. ``report``: write a
-    :class:`Snapshot` to standard output ten times a second.
+    ``folder`` is for serial ports, ``trace`` for files ROBOT.trace.jsonl of the lines that MCUs receive. ``report``:
+    write a :class:`Snapshot` to standard output ten times a second.
     """
     end, path = EndSignal(), file.absolute()
     world = read_world(path)
@@ -72,17 +72,17 @@ def run(
 
 
 def port_path(folder: Path, robot: str) -> Path:
-    """Return the serial port of a robot's motor MCU."""
+    """Return the path of the serial port of a robot's motor MCU."""
     return folder / f"{robot}.port"
 
 
 def imu_port_path(folder: Path, robot: str) -> Path:
-    """Return the serial port of its inertial sensor's MCU, if it has one."""
+    """Return the path of the serial port of the robot's inertial sensor, if it has one."""
     return folder / f"{robot}.imu-port"
 
 
 def trace_path(folder: Path, robot: str) -> Path:
-    """Return the file for what a robot's MCU receives."""
+    """Return the path of the file with the lines that a robot's MCU receives."""
     return folder / f"{robot}.trace.jsonl"
 
 
@@ -106,7 +106,7 @@ def _mcus(world: World, motions: Mapping[str, RobotMotion], folder: Path, trace:
 
 
 def _imus(world: World, motions: Mapping[str, RobotMotion], folder: Path) -> Mcus:
-    """Return the IMUs: they only read the motion, which the thread of the motor MCU advances."""
+    """Return the inertial sensors' MCUs. They only read the motion; the motor MCU's thread advances it."""
     return {
         name: PtyMcu("goob_imu", imu_port_path(folder, name), motion=motions[name])
         for name, place in world.robots.items()
@@ -115,7 +115,7 @@ def _imus(world: World, motions: Mapping[str, RobotMotion], folder: Path) -> Mcu
 
 
 def _publish_poses(page: PosePage, mcus: Mcus, end: EndSignal, *, report: bool) -> None:
-    """Write samples to the page until the end is requested."""
+    """Write the robots' poses to the page until the end is requested."""
     due, count = time.monotonic(), 0
     while not end.wait(max(0.0, due - time.monotonic())):
         due = max(due + PERIOD_S, time.monotonic())
@@ -129,7 +129,7 @@ def _publish_poses(page: PosePage, mcus: Mcus, end: EndSignal, *, report: bool) 
 
 
 def _introduction(path: Path, mcus: Mcus, imus: Mcus) -> str:
-    """Return where the robots are, and what belongs in their configs."""
+    """Return a text with the robots' ports, and the lines for their configs."""
     lines = [f"the world of {path} runs; Ctrl-C ends it"]
     for name, mcu in mcus.items():
         video = msgspec.json.encode({"backend": "synthetic", "device": f"{path}#{name}"}).decode()
@@ -154,16 +154,16 @@ def _run_commands(mcus: Mcus, end: EndSignal) -> None:
 
 
 def _command(mcus: Mcus, words: list[str]) -> str:
-    """Execute one line of standard input; return what is wrong with it."""
+    """Execute one line of standard input; return what is wrong with it, or ""."""
     if len(words) < 2 or words[0] not in mcus:
         return f"begin with a robot ({', '.join(mcus)}) and a command"
     mcu, command, arguments = mcus[words[0]], words[1], words[2:]
-    known = actions(mcu)
-    if command in known and not arguments:
-        known[command]()
+    commands = actions(mcu)
+    if command in commands and not arguments:
+        commands[command]()
         return ""
     if command != "place":
-        return f"known commands: {', '.join(known)}, place X Y DEGREES"
+        return f"known commands: {', '.join(commands)}, place X Y DEGREES"
     try:
         x, y, degrees = map(float, arguments)
         mcu.place(Pose(x * 1000, y * 1000, math.remainder(math.radians(degrees), math.tau)))

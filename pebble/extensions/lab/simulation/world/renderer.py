@@ -1,6 +1,6 @@
-"""Draws what the camera of a robot in a simulated world sees.
+"""Draws the pictures of a robot's camera in a simulated world.
 
-All surfaces are upright and the camera is level, so what hides what is decided in the plan, seen from above.
+All surfaces are upright and the camera is level, so a plan, seen from above, shows which surface hides which.
 """
 
 import math
@@ -28,7 +28,7 @@ _Floats: TypeAlias = NDArray[np.float64]
 
 
 class Renderer:
-    """Pictures of ``width`` x ``height``, BGR, of the robot ``me``; the same calls give the same pixels."""
+    """Pictures of ``width`` x ``height``, BGR, of the robot ``me``. The same calls give the same pixels."""
 
     def __init__(self, world: World, me: str, width: int, height: int) -> None:
         import cv2  # 16 MB, only where pictures are made
@@ -48,7 +48,7 @@ class Renderer:
         self._count = 0
 
     def render(self, tracks: Mapping[str, Track], ns: int, out: Image) -> None:
-        """Draw what the camera sees at ``ns`` into ``out``, of shape (height, width, 3), with all of its faults."""
+        """Draw the camera's picture at ``ns`` into ``out``, of shape (height, width, 3), with the camera's faults."""
         cv2, lens = self._cv2, self._lens
         self._expose(tracks, ns, out)
         if lens.blur:
@@ -65,7 +65,7 @@ class Renderer:
         self._count += 1
 
     def _expose(self, tracks: Mapping[str, Track], ns: int, out: Image) -> None:
-        """Draw the mean of what is seen during the exposure, which ends at ``ns``."""
+        """Draw the average of the scene during the exposure, which ends at ``ns``."""
         exposure_ns = self._lens.motion_blur_ms * 1e6
         times = [ns - round(exposure_ns * part / (_EXPOSURES - 1)) for part in range(_EXPOSURES)]
         views = [poses_at(tracks, moment) for moment in (times if exposure_ns else [ns])]
@@ -97,7 +97,7 @@ class Renderer:
     # -- plan: (n, 2, 2) left and right edge of each surface, as distance ahead of the camera and to its right
 
     def _seen(self, surfaces: Sequence[Surface], me: RobotPose) -> tuple[_Floats, list[int]]:
-        """Return the parts of surfaces that are in front of the camera, and the index of the surface of each."""
+        """Return the parts of surfaces that are in front of the camera, each with the index of its surface."""
         edges = np.array([(surface.left, surface.right) for surface in surfaces])
         plan = self._to_camera(edges, me)
         (ahead1, right1), (ahead2, right2) = plan[:, 0].T, plan[:, 1].T
@@ -126,11 +126,11 @@ class Renderer:
         return np.asarray((points - (me.x, me.y)) @ np.array([[cosine, sine], [sine, -cosine]]))
 
     def _columns(self, plan: _Floats) -> _Floats:
-        """Return where in the picture the edges are."""
+        """Return the columns in the picture of the edges in the plan."""
         return np.asarray(self._middle[0] + self._focal * plan[..., 1] / plan[..., 0])
 
     def _rows(self, surface: Surface, plan: _Floats) -> _Floats:
-        """Return top and bottom at both edges."""
+        """Return the rows in the picture of top and bottom, at both edges."""
         heights = self._lens.height_m - np.array((surface.top, surface.bottom))
         return np.asarray(self._middle[1] + self._focal * heights[None] / plan[:, :1])
 
@@ -175,12 +175,12 @@ class Renderer:
 
     @staticmethod
     def _share(surface: Surface, plan: _Floats) -> float:
-        """Return how much larger the surface is than the part in the plan."""
+        """Return the ratio of the surface's width to that of its part in the plan."""
         whole = math.dist(surface.left, surface.right)
         return whole / max(1e-9, math.dist(plan[0], plan[1]))
 
     def _warp(self, texture: Image, to_space: _Floats, box: tuple[int, int, int, int], out: Image) -> None:
-        """Draw a texture, whose pixels have the middle at .5, into the ``box`` of a picture."""
+        """Draw a texture into the ``box`` of a picture. The middle of its pixels is at .5."""
         x0, y0, x1, y1 = box
         lens = np.array(
             [[self._focal, 0.0, self._middle[0] - x0], [0.0, self._focal, self._middle[1] - y0], [0.0, 0.0, 1.0]]
@@ -209,20 +209,20 @@ class Renderer:
 
 
 def _back_to_front(plan: _Floats, layers: Sequence[int], columns: _Floats) -> list[int]:
-    """Return the order in which surfaces are drawn. Of crossing ones, the farther one is first."""
+    """Return the order in which to draw surfaces. Of crossing surfaces, the farther one is first."""
     covers = _covers(plan, np.array(layers), columns)
     distance = (plan.mean(axis=1) ** 2).sum(axis=1)
-    left, order = set(range(len(plan))), []
-    while left:
-        rest = sorted(left, key=lambda index: -distance[index])
-        free = [index for index in rest if not covers[index, rest].any()]
-        order += (chosen := free or rest[:1])
-        left.difference_update(chosen)
+    undrawn, order = set(range(len(plan))), []
+    while undrawn:
+        farthest_first = sorted(undrawn, key=lambda index: -distance[index])
+        free = [index for index in farthest_first if not covers[index, farthest_first].any()]
+        order += (chosen := free or farthest_first[:1])
+        undrawn.difference_update(chosen)
     return order
 
 
 def _covers(plan: _Floats, layers: NDArray[np.int_], columns: _Floats) -> NDArray[np.bool_]:
-    """Return at ``[i, j]`` whether surface i hides a part of j. The camera is at 0, 0."""
+    """Return a matrix that is true at ``[i, j]`` if surface i hides a part of j. The camera is at 0, 0."""
     start, along = plan[:, 0], plan[:, 1] - plan[:, 0]
     normal = np.stack((along[:, 1], -along[:, 0]), axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
     normal *= np.where((start * normal).sum(axis=1, keepdims=True) > 0, -1.0, 1.0)  # towards the camera
@@ -241,7 +241,7 @@ def _covers(plan: _Floats, layers: NDArray[np.int_], columns: _Floats) -> NDArra
 def _floor(world: World) -> tuple[Image, _Floats]:
     """Return a texture of tiles, and the matrix from its pixels to the floor.
 
-    Of the room, or of 20 m around the origin.
+    It covers the room, or 20 m around the origin.
     """
     import cv2
 
@@ -260,7 +260,7 @@ def _floor(world: World) -> tuple[Image, _Floats]:
 
 
 def _noise(width: int, height: int, sigma: float) -> Image:
-    """Return Gaussian noise, what it adds and what it takes away; pictures get different parts of it."""
+    """Return Gaussian noise as two images, its positive and its negative part; pictures use different cut-outs."""
     shape = (height + _NOISES, width + _NOISES, 3)
     grain = np.round(np.random.default_rng(2).standard_normal(shape, np.float32) * np.float32(sigma))
     return np.stack((grain.clip(0, 255), (-grain).clip(0, 255))).astype(np.uint8)

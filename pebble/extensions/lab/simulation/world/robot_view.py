@@ -1,4 +1,4 @@
-"""The view of a camera on a robot in a simulated world, whose program shares the poses of the robots."""
+"""The view of a robot's camera in a simulated world, whose program shares the robots' poses."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ STALE_S = 1.0  # a world that has written nothing for so long does not run
 
 
 class RobotView:
-    """The view from the robot that ``device`` (``world.json#goob``) names.
+    """The camera view of the robot that ``device`` (``world.json#goob``) names.
 
-    Raises DeviceError for a file or robot that is wrong, NotRunningError while the world does not run.
+    Raises DeviceError if the file or the robot is wrong, NotRunningError while the world does not run.
     """
 
     def __init__(self, device: str, width: int, height: int) -> None:
@@ -36,7 +36,7 @@ class RobotView:
         self.look()
 
     def look(self) -> int:
-        """Choose the moment of the next picture; return it, monotonic ns. Raises NotRunningError."""
+        """Choose the moment of the next picture; return it in monotonic ns. Raises NotRunningError."""
         self._tracks = self._page.tracks()
         track = self._tracks.get(self._robot)
         if track is None or time.monotonic_ns() - track.newest.ns > STALE_S * 1e9:
@@ -45,7 +45,7 @@ class RobotView:
         return self._at_ns
 
     def draw(self, out: Image) -> None:
-        """Draw the picture of the moment that ``look`` returned, into an array of shape (height, width, 3)."""
+        """Draw the picture of that moment into an array of shape (height, width, 3)."""
         self._renderer.render(self._tracks, self._at_ns, out)
 
     def _not_running(self) -> NotRunningError:

@@ -1,4 +1,4 @@
-"""The robot of a script in a lockstep world: ``main(robot, options)`` runs in it as it is, on a virtual clock."""
+"""The robot of a script in a lockstep world: it runs ``main(robot, options)`` unchanged, on a virtual clock."""
 
 import importlib.util
 import logging
@@ -30,7 +30,7 @@ Handler = Callable[..., None]
 
 
 def load_script(file: Path) -> ModuleType:
-    """Return the module of a script's ``run.py``; many share the name, so an import would find only the first.
+    """Return the module of a script's ``run.py``. Scripts share that name, so an import would find only the first.
 
     Raises OSError, and what the module raises.
     """
@@ -46,8 +46,8 @@ def load_script(file: Path) -> ModuleType:
 class SimulatedRobot(Robot):
     """A robot of the world in ``file``, for tests of a script.
 
-    Time passes only in ``camera()``, ``picture()`` and ``sleep()``, so the same test always has the same result. What
-    a script would receive from other programs, a test passes to :meth:`receive`; what it publishes is in ``published``.
+    Time passes only in ``camera()``, ``picture()`` and ``sleep()``, so the same test always has the same result. A test
+    passes messages of other programs to :meth:`receive`; the script's own messages are in ``published``.
 
     Example::
 
@@ -57,7 +57,7 @@ class SimulatedRobot(Robot):
     """
 
     def __init__(self, file: Path | str, name: str = "goob") -> None:
-        """Read the world. Raises ConfigError for a file that is wrong, PebbleError if the robot is not in it."""
+        """Read the world. Raises ConfigError if the file is wrong, PebbleError if the robot is not in it."""
         model = read_world(Path(file))
         if name not in model.robots:
             raise PebbleError(f"{file}: there is no robot {name!r}, only {', '.join(model.robots) or 'an empty world'}")
@@ -80,7 +80,7 @@ class SimulatedRobot(Robot):
     # -- for tests
 
     def run(self, main: Callable[..., None], *options: Any, seconds: float) -> None:
-        """Run a script for ``seconds``, or until it returns. The wheels are stopped in the end."""
+        """Run a script for ``seconds``, or until it returns; then stop the wheels."""
         self._end_at = self.world.now() + seconds
         try:
             main(self, *options)
@@ -90,13 +90,13 @@ class SimulatedRobot(Robot):
         self.published += [(channel, value()) for channel, value in self._last_values.items()]
 
     def distance_to(self, *, tag: int) -> float:
-        """Return how far the robot's middle is from a tag's, along the floor, in m.
+        """Return the distance of the robot's middle from a tag's, along the floor, in m.
 
-        Raises PebbleError if there is none.
+        Raises PebbleError if there is no such tag.
         """
-        for one in self._model.tags:
-            if one.id == tag:
-                return math.hypot(one.x - self._body.pose.x, one.y - self._body.pose.y)
+        for placed in self._model.tags:
+            if placed.id == tag:
+                return math.hypot(placed.x - self._body.pose.x, placed.y - self._body.pose.y)
         raise PebbleError(f"there is no tag {tag} in this world")
 
     @property
@@ -105,7 +105,7 @@ class SimulatedRobot(Robot):
         return self._body
 
     def receive(self, channel: Channel, value: Any) -> None:
-        """Take a message of another program; a drive command without a source is a person's."""
+        """Receive a message of another program. A drive command without a source is a person's."""
         self._messages[channel] = (value, self.world.now())
         if channel == DRIVE:
             self._sender.receive(value, self.world.now())
@@ -125,7 +125,7 @@ class SimulatedRobot(Robot):
     # -- for scripts
 
     def camera(self, *, width: int | None = None, views: bool = False, timeout: float | None = None) -> Iterator[Image]:
-        """Yield each picture once; time passes until there is one."""
+        """Yield each picture once. Time passes while there is none."""
         del width, views, timeout
         while True:
             self._pass_step()

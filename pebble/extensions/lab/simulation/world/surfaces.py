@@ -22,9 +22,11 @@ _BODY_COLOURS: Final[tuple[Colour, ...]] = ((60, 150, 60), (60, 60, 180), (170, 
 
 
 class Surface(NamedTuple):
-    """An upright rectangle from ``left`` to ``right`` as seen from its front; where it covers another exactly, the
-    higher ``layer`` is in front. It has a colour, or a texture in several sizes, the largest first, perhaps with masks
-    of what is not transparent."""
+    """An upright rectangle from ``left`` to ``right``, seen from its front. It has a colour or a texture.
+
+    Of surfaces in the same place, the one with the higher ``layer`` is in front. A texture comes in several sizes, the
+    largest first, perhaps with masks of its opaque parts.
+    """
 
     left: tuple[float, float]
     right: tuple[float, float]
@@ -55,7 +57,7 @@ class Surfaces:
         ]
 
     def surfaces(self, poses: Mapping[str, RobotPose], me: str) -> list[Surface]:
-        """Return all of them, of the robots at these poses; without the robot ``me``, which does not see itself."""
+        """Return all surfaces, with robots at these poses, but without the robot ``me``, which does not see itself."""
         robots = [
             surface
             for index, name in enumerate(self._world.robots)
@@ -86,7 +88,7 @@ class Surfaces:
 
 
 def _edges(x: float, y: float, half: float, yaw: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the left and right edge of a surface whose middle is at x, y and whose front looks to ``yaw``."""
+    """Return the left and right edge of a surface with its middle at x, y and its front towards ``yaw``."""
     right_x, right_y = -math.sin(yaw) * half, math.cos(yaw) * half
     return (x - right_x, y - right_y), (x + right_x, y + right_y)
 
@@ -106,7 +108,7 @@ def _bgr(colour: str) -> Colour:
 
 
 def _drawn(drawing: Drawing) -> Surface:
-    """Return the surface of a drawing; between its shapes it has the first shape's colour, and is masked."""
+    """Return the surface of a drawing. Between its shapes it has the first shape's colour, and is masked."""
     import cv2
 
     picture = np.full((_DRAWING_PX, _DRAWING_PX, 3), _bgr(drawing.shapes[0].colour), np.uint8)
@@ -125,7 +127,7 @@ def _modules(world: World) -> int:
 
 
 def _tag_textures(family: str, number: int) -> tuple[Image, ...]:
-    """Return the tag with a white border of one module, and halves of it down to one pixel per module."""
+    """Return the tag with a white border of one module, in sizes halved down to one pixel per module."""
     import cv2
 
     dictionary = _dictionary(family)
@@ -136,7 +138,7 @@ def _tag_textures(family: str, number: int) -> tuple[Image, ...]:
 
 
 def _halved(texture: Any, smallest: int) -> tuple[Image, ...]:
-    """Return a square texture, and halves of it down to a size."""
+    """Return a square texture in sizes halved down to ``smallest``."""
     import cv2
 
     textures = [texture]

@@ -1,7 +1,7 @@
-"""Bodies of robots on the floor: round, solid, stopped by walls and by each other.
+"""The bodies of robots on the floor: round, solid, stopped by walls and by each other.
 
-A robot that drives against something stays where it touches it: its wheels slip, so they and their hall sensors turn as
-driven. It still turns on the spot and drives away. Nothing is pushed, nothing slides along a wall, nothing bounces.
+A robot that drives against something stays where it touches it. Its wheels slip, so they and their hall sensors turn as
+driven. It still turns on the spot and drives away. Nothing is pushed, slides along a wall, or bounces.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _ROUNDING_MM = 1e-6
 
 
 class Floor:
-    """The poses of all robots of a world. Safe from any thread, as each robot's motion has its own."""
+    """The poses of all robots of a world. Thread-safe, because each robot's motion has a thread of its own."""
 
     def __init__(self, world: World) -> None:
         self._lock = threading.Lock()
@@ -26,11 +26,11 @@ class Floor:
         self._poses = {name: start_pose(world, name) for name in world.robots}
 
     def mover(self, name: str) -> Mover:
-        """Return the floor under one robot."""
+        """Return the floor as one robot's ground."""
         return Mover(self, name)
 
     def move(self, name: str, start: Pose, end: Pose) -> Pose:
-        """Move a robot as far as it is free; return where it is then, with the heading of ``end``."""
+        """Move a robot as far as the way is free; return its pose then, with the heading of ``end``."""
         with self._lock:
             before = self._clearance_mm(name, start.x_mm, start.y_mm)
             part = 1.0 if self._free(name, start, end, 1.0, before) else self._contact(name, start, end, before)
@@ -43,7 +43,7 @@ class Floor:
             self._poses[name] = pose
 
     def _contact(self, name: str, start: Pose, end: Pose, before: float) -> float:
-        """Return the largest part of the move that is free."""
+        """Return how much of the move is free, 0 to 1."""
         free, blocked = 0.0, 1.0
         for _ in range(_HALVINGS):
             middle = (free + blocked) / 2
@@ -54,12 +54,12 @@ class Floor:
         return free
 
     def _free(self, name: str, start: Pose, end: Pose, part: float, before: float) -> bool:
-        """True if the robot overlaps nothing there, or less than it does now."""
+        """True if the robot overlaps nothing after this part of the move, or less than it does now."""
         after = self._clearance_mm(name, *_between(start, end, part))
         return after >= min(0.0, before) - _ROUNDING_MM
 
     def _clearance_mm(self, name: str, x_mm: float, y_mm: float) -> float:
-        """Return the way from the robot's body to the nearest obstacle; negative: they overlap."""
+        """Return the distance from the robot's body to the nearest obstacle; negative if they overlap."""
         radius_mm = self._radius_mm[name]
         walls = (wall.distance(x_mm / 1000, y_mm / 1000) * 1000 - radius_mm for wall in self._walls)
         others = (
@@ -71,7 +71,7 @@ class Floor:
 
 
 class Mover:
-    """The floor under one robot."""
+    """The floor as the ground of one robot."""
 
     def __init__(self, floor: Floor, name: str) -> None:
         self._floor, self._name = floor, name
@@ -89,7 +89,7 @@ def start_pose(world: World, name: str) -> Pose:
 
 
 def motion_of(world: World, name: str, floor: Floor) -> RobotMotion:
-    """Return the motion of a robot from where it starts, on its wheels."""
+    """Return the motion of a robot, on its wheels, from the place where it starts."""
     place = world.robots[name]
     wheels = Wheels(place.left_wheel_mm, place.right_wheel_mm, place.track_mm)
     return RobotMotion(start_pose(world, name), floor.mover(name), wheels)

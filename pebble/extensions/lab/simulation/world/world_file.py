@@ -54,7 +54,7 @@ class Lens(Section, frozen=True, kw_only=True):
 
 
 class Tag(Section, frozen=True, kw_only=True):
-    """An AprilTag: the middle of its black square, of ``size_m``, is at x, y, z; its front looks to ``yaw_deg``."""
+    """An AprilTag. The middle of its black square, of ``size_m``, is at x, y, z; its front looks to ``yaw_deg``."""
 
     id: TagId
     x: Metres
@@ -72,7 +72,10 @@ class Shape(Section, frozen=True, kw_only=True):
 
 
 class Drawing(Section, frozen=True, kw_only=True):
-    """A window, a plant: its middle is at x, y, z, its front looks to ``yaw_deg``; later shapes cover earlier ones."""
+    """A window or a plant.
+
+    Its middle is at x, y, z, its front looks to ``yaw_deg``; later shapes cover earlier ones.
+    """
 
     x: Metres
     y: Metres
@@ -84,7 +87,7 @@ class Drawing(Section, frozen=True, kw_only=True):
 
 
 class Start(Section, frozen=True, kw_only=True):
-    """A robot where it starts: a round body, seen as a box with ``tag`` on all four sides."""
+    """A robot at its start: a round body, drawn as a box with ``tag`` on all four sides."""
 
     kind: Literal["goob", "fred"] = "goob"
     x: Metres
@@ -109,7 +112,7 @@ class Room(Section, frozen=True, kw_only=True):
 
     @property
     def walls(self) -> tuple[Wall, ...]:
-        """Counter-clockwise: their left sides look into the room."""
+        """The four walls, counter-clockwise: their left sides face into the room."""
         corners = (
             (self.x_min, self.y_min),
             (self.x_max, self.y_min),
@@ -136,7 +139,7 @@ class Wall(Section, frozen=True, kw_only=True):
     colour: Annotated[Colour | None, doc("Without one it is light.")] = None
 
     def distance(self, x: float, y: float) -> float:
-        """Return the way from a point to the nearest point of the wall."""
+        """Return the distance from a point to the nearest point of the wall."""
         along_x, along_y = self.x2 - self.x1, self.y2 - self.y1
         part = ((x - self.x1) * along_x + (y - self.y1) * along_y) / (along_x**2 + along_y**2)
         part = min(1.0, max(0.0, part))
@@ -144,7 +147,7 @@ class Wall(Section, frozen=True, kw_only=True):
 
 
 class World(Section, frozen=True, kw_only=True):
-    """A whole world. Without a room its floor is endless."""
+    """A world. Without a room its floor is endless."""
 
     family: Literal["APRILTAG_16h5", "APRILTAG_25h9", "APRILTAG_36h10", "APRILTAG_36h11"] = "APRILTAG_25h9"
     camera: Lens = Lens()
@@ -156,12 +159,12 @@ class World(Section, frozen=True, kw_only=True):
 
     @property
     def all_walls(self) -> tuple[Wall, ...]:
-        """The room's and those in it."""
+        """All walls: the room's, and those inside it."""
         return (*(self.room.walls if self.room else ()), *self.walls)
 
 
 def read_world(path: Path) -> World:
-    """Read a world file. Raises ConfigError with every mistake in it, each with the file and its place."""
+    """Return the world in a file. Raises ConfigError with every mistake, each with the file and its place."""
     raw = decode(read_text(path), str(path))
     try:
         return parse_world(raw)
@@ -189,7 +192,7 @@ def split_device(device: str) -> tuple[Path, str]:
 
 
 def open_world(path: Path, robot: str) -> World:
-    """Return the world of this file, in which there is this robot. Raises DeviceError, one line."""
+    """Return the world of this file, in which the robot must be. Raises DeviceError with one line."""
     try:
         world = read_world(path)
     except ConfigError as error:
@@ -201,7 +204,7 @@ def open_world(path: Path, robot: str) -> World:
 
 
 def _check(world: World, notes: Notes) -> None:
-    """Note what contradicts itself in a world whose values are right one by one."""
+    """Note contradictions in a world whose values are valid one by one."""
     for index, wall in enumerate(world.walls):
         if (wall.x1, wall.y1) == (wall.x2, wall.y2):
             notes.problem(("walls", index), "begins where it ends")
@@ -236,10 +239,11 @@ def _check_robots(robots: Mapping[str, Start], notes: Notes) -> None:
     for name, place in robots.items():
         if place.imu and place.kind != "goob":
             notes.problem(("robots", name, "imu"), f"must be false, a {place.kind} has no inertial sensor")
-    for (name, one), (other, two) in combinations(robots.items(), 2):
-        apart, least = math.hypot(one.x - two.x, one.y - two.y), one.radius_m + two.radius_m
+    for (name, start), (other_name, other_start) in combinations(robots.items(), 2):
+        apart = math.hypot(start.x - other_start.x, start.y - other_start.y)
+        least = start.radius_m + other_start.radius_m
         if apart < least:
-            notes.problem(("robots", other), f"stands {apart:.2f} m from {name}, must be {least:g} m or more")
+            notes.problem(("robots", other_name), f"stands {apart:.2f} m from {name}, must be {least:g} m or more")
 
 
 def _check_places(world: World, notes: Notes) -> None:

@@ -1,4 +1,4 @@
-"""The media that may be requested of a robot, by its capabilities. Pure."""
+"""The media that a robot offers, by its capabilities. Pure."""
 
 from collections.abc import Collection, Sequence
 from typing import Any, Final, Literal, NamedTuple
@@ -19,7 +19,7 @@ BEST_FIRST: Final[dict[Medium, tuple[str, ...]]] = {"video": ("h264", "pbvd", "j
 
 
 class Words(NamedTuple):
-    """The words for a medium."""
+    """The words for a medium in messages to people."""
 
     lacking: str
     fixed: str

@@ -1,8 +1,8 @@
-"""The queue of a robot's pictures for one page, and the choice of its rescue stream. Pure: times are passed in.
+"""The queue of a robot's pictures for one page, and the choice between its two streams. Pure: times are passed in.
 
-A page acknowledges each frame when it has drawn it, and few frames are under way at a time: without that, a slow
-connection shows what happened seconds ago. A difference is of no use without all before it since the last key frame,
-so where one is left out, all are until the next key frame.
+A page acknowledges each frame when it has drawn it, and few frames are under way at a time: otherwise a slow connection
+would show what happened seconds ago. A difference is of no use without everything before it since the last key frame,
+so if one is left out, all are until the next key frame.
 """
 
 from collections import deque
@@ -30,7 +30,7 @@ _RETRY_S: Final = 60.0  # in the rescue stream, before the robot's own pictures 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A message to pages, whose bytes all of them share."""
+    """A message to pages; all pages share its bytes."""
 
     seq: int
     data: bytes
@@ -102,7 +102,7 @@ class ViewerQueue:
             self._late_at = now
 
     def forget_lateness(self, now: float) -> None:
-        """Forget that frames were late, as those sent earlier say nothing about later ones."""
+        """Forget that frames were late: earlier ones say nothing about later ones."""
         self.late_acks, self._late_at = 0, now
 
     def wait_for_keyframe(self) -> None:
@@ -131,7 +131,7 @@ class ViewerQueue:
         return self.window < WINDOW and frame.encoding != "h264"
 
     def _begin_at(self, frame: Frame) -> None:
-        """Choose where a page begins: one that keeps up gets the earlier frames too, a slow one only the newest."""
+        """Choose a page's first frames: if it keeps up, also earlier ones; if it is slow, only the newest."""
         late = self.window < WINDOW or len(self._queue) > _FRESH_FRAMES
         if self.waiting or late or self._queued_bytes() + len(frame.data) > MAX_QUEUED_BYTES:
             self.wait_for_keyframe()
@@ -188,7 +188,7 @@ class ViewerQueue:
         return self.late_acks >= THIN_FRAMES
 
     def rescue(self, now: float) -> None:
-        """Move the page to the rescue stream: for a while if it is slow, else until the next key frame."""
+        """Move the page to the rescue stream: for a while if it is slow, otherwise until the next key frame."""
         if self.overflowed or self.is_thin:
             self._retry_at = now + _RETRY_S
         self.rescued = True
@@ -206,10 +206,10 @@ class ViewerQueue:
 
 
 def assess(viewers: Collection[ViewerQueue], encoding: str, now: float, *, can_rescue: bool) -> bool:
-    """Move viewers between the two streams; return whether to request a key frame (at most once a second).
+    """Move viewers between the two streams; return True to request a key frame (at most once a second).
 
-    A key frame costs all viewers and the robot's uplink. One is requested if most wait, or once for a viewer that is
-    new; a slow viewer among fast ones gets the rescue stream instead, and so does one whose connection is thin.
+    A key frame costs all viewers and the robot's uplink. One is requested if most wait, or once for a new viewer. A
+    slow viewer among fast ones gets the rescue stream instead, and so does one whose connection is thin.
     """
     for viewer in viewers if can_rescue else ():
         if not viewer.rescued and (viewer.is_thin or not viewer.decodes(encoding)):

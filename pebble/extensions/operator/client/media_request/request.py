@@ -1,4 +1,4 @@
-"""A request for a robot's pictures or sound: what to send to begin it, to keep it, and to end it. Pure."""
+"""A request for a robot's pictures or sound: the messages that begin it, keep it, and end it. Pure."""
 
 from collections import deque
 from contextlib import suppress
@@ -20,12 +20,12 @@ _SENT: Final = 20
 
 
 class ViewerRequest:
-    """One medium of one robot. Times are seconds of a monotonic clock.
+    """A request for one medium of one robot. Times are seconds of a monotonic clock.
 
-    Subscribe to ``flag_topic`` and ``media_topic``, pass what arrives to :meth:`receive`, and publish what the other
-    methods return by :func:`send`. What was running before stays, and a flag that another operator lowers stays
-    lowered. With ``shares``, subscribe to ``control_topic`` as well: a stream that others use keeps its encoding, and
-    is left to them at the end.
+    Subscribe to ``flag_topic`` and ``media_topic``, pass what arrives to :meth:`receive`, and publish the other
+    methods' messages by :func:`send`. A medium that was running before stays, and a flag that another operator lowers
+    stays lowered. With ``shares``, subscribe to ``control_topic`` as well: a stream that others use keeps its encoding,
+    and is left to them at the end.
     """
 
     def __init__(self, base: str, medium: Medium, capabilities: dict[str, Any], *, shares: bool = False) -> None:
@@ -69,9 +69,9 @@ class ViewerRequest:
         return False
 
     def _receive_request(self, message: Message) -> None:
-        """Note a request: this client's, or the newest of others.
+        """Note a request: this client's own, or the newest of others.
 
-        A request for a key frame is by a viewer, as this client is.
+        A request for a key frame comes from a viewer, as this client is.
         """
         if message.payload in self.sent:
             self.sent.remove(message.payload)
@@ -82,7 +82,7 @@ class ViewerRequest:
                     self._others = request if request.enabled else None
 
     def tick(self, now: float) -> list[Message]:
-        """Return the messages to send now; a request without an answer is repeated."""
+        """Return the messages to send now. A request without an answer is repeated."""
         if self.settled:
             is_quiet = now - max(self._sent_at, self._received_at) > _REPEAT_S
             return [self._ask(now)] if is_quiet else []
@@ -93,11 +93,11 @@ class ViewerRequest:
             return []
         if now < self._began_at + self._waits_s():
             return []
-        self.settled, asked = True, [self._ask(now)]
+        self.settled, messages = True, [self._ask(now)]
         if not self._is_up:
             self._is_up = self._raised = True
-            asked.insert(0, self._flag_message(up=True))
-        return asked
+            messages.insert(0, self._flag_message(up=True))
+        return messages
 
     def _waits_s(self) -> float:
         """Return how long to wait for a payload, which shows that the medium is running."""
@@ -112,8 +112,8 @@ class ViewerRequest:
         if now - self._keyframe_at < _KEYFRAME_S:
             return []
         self._keyframe_at = now
-        known = encoding if encoding in self._encodings() else None
-        return [self._message(MediaRequest(enabled=True, encoding=known, keyframe=True))]
+        offered = encoding if encoding in self._encodings() else None
+        return [self._message(MediaRequest(enabled=True, encoding=offered, keyframe=True))]
 
     def leave(self) -> None:
         """Leave the medium running for another operator who has requested it too."""

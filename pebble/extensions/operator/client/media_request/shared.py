@@ -1,4 +1,4 @@
-"""A robot's pictures or sound, requested while anybody wants them and a little longer."""
+"""A robot's pictures or sound, requested while they are wanted here and a little longer."""
 
 import asyncio
 import contextlib
@@ -43,14 +43,14 @@ class SharedRequest:
         self._wakeup = asyncio.Event()
 
     def want(self, wanted: bool) -> None:
-        """Set whether anything shows or plays the medium now."""
+        """Set whether the medium is shown or played now."""
         if wanted or self._wanted:
             self._wanted_at = time.monotonic()
         self._wanted = wanted
         self.wake()
 
     def wake(self) -> None:
-        """Have the next step done soon."""
+        """Let the next step come soon."""
         self._wakeup.set()
 
     def close(self) -> None:
@@ -82,7 +82,7 @@ class SharedRequest:
             await self._withdraw()
 
     async def follow(self, robot: RobotView, encoding: str | None) -> None:
-        """Request the medium if it is wanted and the robot allows it; to be called in each step."""
+        """Request the medium if it is wanted and the robot permits it. Call this in each step."""
         capabilities = robot.capabilities
         self.waits = _WAITS[self.medium] if robot.holds(_PROGRAMS[self.medium]) else ""
         self.problem = refusal(self.ref, capabilities, self.medium)

@@ -1,4 +1,4 @@
-"""A decoder from the bytes of a terminal to names of keys. Pure: times are passed in."""
+"""A decoder of a terminal's bytes to names of keys. Pure: times are passed in."""
 
 import re
 
@@ -19,7 +19,7 @@ _NAMED |= {begin + end: arrow for begin in (b"\x1b[", b"\x1bO") for end, arrow i
 
 
 class KeyDecoder:
-    """A decoder that keeps an incomplete key: arrow keys, function keys and Escape begin with the same byte."""
+    """A decoder that keeps an incomplete key, because arrow keys, function keys and Escape begin with the same byte."""
 
     def __init__(self) -> None:
         self._waiting = b""  # the beginning of a sequence
@@ -48,7 +48,7 @@ class KeyDecoder:
 
 
 def _names(key: bytes) -> list[str]:
-    """Yield the name of a key; nothing for a key without a meaning."""
+    """Return the name of a key in a list, which is empty for a key without a meaning."""
     if key in _NAMED:
         return [_NAMED[key]]
     text = "" if key[0] == 0x1B else key.decode(errors="ignore").lower()

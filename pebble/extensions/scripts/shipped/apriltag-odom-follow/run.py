@@ -21,13 +21,13 @@ def main(robot: Robot, options: FollowSettings) -> None:
     robot.publish_at_end(APRILTAG_DATA, lambda: tag_data(options.tag_id, None, (0, 0), time.time()))
     tags: list[Tag] = []
     tag: Tag | None = None
-    seen, due = None, time.monotonic()
+    last_tag, due = None, time.monotonic()
     while True:
         now = time.monotonic()
         newest = robot.latest(APRILTAG_LOCATIONS, options.tag_timeout_s)
         pose = pose_of(robot.latest(WHEEL_ODOMETRY, POSE_AGE_S))
-        if newest is not seen:
-            seen = newest
+        if newest is not last_tag:
+            last_tag = newest
             tags = tags_in(newest, options.tag_id, geometry) if newest else []
             tag = largest(tags, options.tag_id)
             follower.see(now, tag and tag.place, pose)

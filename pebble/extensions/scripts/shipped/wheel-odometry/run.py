@@ -37,7 +37,7 @@ def main(robot: Robot, options: OdometrySettings) -> None:
     log = RateLimitedLog(robot.log)
 
     def take(method: Callable[..., None]) -> Callable[..., None]:
-        """Return a handler that queues: a sample gets its direction from the commands that came before it."""
+        """Return a handler that queues a call: samples and commands are handled in the order of their arrival."""
 
         def receive(value: Any, **_: str) -> None:
             try:
@@ -73,7 +73,7 @@ def main(robot: Robot, options: OdometrySettings) -> None:
 
 
 def tuned(robot: Robot, options: OdometrySettings) -> OdometrySettings:
-    """Return the settings with the calibration of the config's folder, else, if wanted, the original's track width."""
+    """Return the settings with the calibration in the config's folder, else, if wanted, the original's track width."""
     try:
         raw = (robot.config.folder / CALIBRATION).read_bytes()
         return calibrated(options, decode(raw, type=Calibration))
@@ -86,7 +86,7 @@ def tuned(robot: Robot, options: OdometrySettings) -> OdometrySettings:
 
 
 def tune_state(robot: Robot) -> dict[str, float]:
-    """Return the tuning program's numbers but for the lengths of a step: it counts steps twice, beyond repair."""
+    """Return the tuning program's numbers without its step lengths, as it counts steps twice."""
     try:
         values = convert(
             json.loads((robot.config.folder / TUNE_STATE).read_text(encoding="utf-8"))["current_values"], dict[str, Any]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class SimulatedTimer:
-    """``Timer(-1, period=ms, callback=)``: called again and again while the program sleeps, or waits for input."""
+    """``Timer(-1, period=ms, callback=)``: calls the function periodically while the program sleeps, or waits."""
 
     _board: Board
 
@@ -84,13 +84,13 @@ class SimulatedUart:
         return self._console.unread
 
     def readinto(self, buffer: bytearray | memoryview) -> int | None:
-        """Read available bytes; None if there are none."""
+        """Read the available bytes into ``buffer``; return their number, None if there are none."""
         data = self._console.take(min(len(buffer), self._console.unread))
         buffer[: len(data)] = data
         return len(data) or None
 
     def write(self, data: Any, start: int, length: int) -> int | None:
-        """Return how many bytes were taken; None if none."""
+        """Write to the host; return how many bytes were accepted, None if none."""
         return self._console.write(data[start : start + length]) or None
 
 
@@ -107,7 +107,7 @@ _KINDS: Final[dict[str, type]] = {
 
 
 class Machine(SimpleNamespace):
-    """The module. Its classes belong to this board and are made at first use, because a class takes 3 KB."""
+    """The module ``machine``. Its classes belong to this board, and are made at first use: a class takes 3 KB."""
 
     def __init__(self, board: Board) -> None:
         super().__init__(

@@ -25,7 +25,7 @@ _CONSTANTS = {name: int(getattr(socket, name)) for name in ("AF_INET", "SOCK_STR
 
 
 class HostNetwork:
-    """The network of one board. Packets to an address in ``routes`` go to the address there instead.
+    """The network of one board. ``routes``: other addresses to use in place of those that the board uses.
 
     The scheduler reads ``new_sockets``, which it then watches, and ``unread``, whether more can be read at once.
     """
@@ -65,21 +65,21 @@ class HostNetwork:
         return self._to.get(address, address)
 
     def board_address(self, address: Address) -> Address:
-        """Return the address under which the board knows this one."""
+        """Return the address by which the board knows the host's ``address``."""
         return self._from.get(address, address)
 
     def _socket(self, kind: int) -> HostTcp | HostUdp:
         if len(self.open) >= MAX_SOCKETS:
             raise OSError(errno.ENFILE, "too many sockets: one is not closed")
-        made = HostTcp(self) if kind == socket.SOCK_STREAM else HostUdp(self)
-        self.open.append(made)
-        return made
+        opened = HostTcp(self) if kind == socket.SOCK_STREAM else HostUdp(self)
+        self.open.append(opened)
+        return opened
 
 
 def socket_module(make: Any) -> SimpleNamespace:
-    """Make the module ``socket`` of one board; ``make`` opens a socket of the given type.
+    """Return the module ``socket`` of one board; ``make`` opens a socket of the given type.
 
-    It has no getaddrinfo: that blocks a real board for seconds.
+    It has no getaddrinfo, which blocks a real board for seconds.
     """
 
     def open_socket(_family: int = socket.AF_INET, kind: int = socket.SOCK_STREAM, _protocol: int = 0) -> Any:
@@ -98,7 +98,7 @@ def numeric(address: Address) -> Address:
 
 
 class _HostSocket:
-    """Common part of both kinds of socket: they never block, and receive nothing without Wi-Fi."""
+    """The base class of both sockets: they never block, and receive nothing without Wi-Fi."""
 
     def __init__(self, network: HostNetwork, kind: socket.SocketKind) -> None:
         self._network = network
@@ -118,7 +118,7 @@ class _HostSocket:
         self._sock.close()
 
     def ready(self, mask: int) -> int:
-        """Return the events for poll() of the board."""
+        """Return the events in ``mask`` that are present, for the board's poll()."""
         if self._sock.fileno() < 0:
             return 32  # POLLNVAL
         if not self._network.radio.connected:
@@ -140,28 +140,28 @@ class HostTcp(_HostSocket, Stream):
         self._established = False
 
     def connect(self, address: Address) -> None:
-        """Start to connect. Always raises OSError: EINPROGRESS on success."""
+        """Start to connect. Raises OSError in any case: EINPROGRESS on success."""
         self._need_wifi()
         code = self._sock.connect_ex(self._network.route(numeric(address)))
         raise failure(code or errno.EINPROGRESS)
 
     def secure(self, context: ssl.SSLContext, server_hostname: str | None) -> None:
-        """Put TLS around the connection, at the same file descriptor."""
+        """Add TLS to the connection, at the same file descriptor."""
         self._sock = context.wrap_socket(self._sock, server_hostname=server_hostname, do_handshake_on_connect=False)
 
     def _receive(self, size: int) -> bytes | None:
         if not self._network.radio.connected:
             return None
         try:
-            got = self._sock.recv(size)
-            self._network.problem = "" if got else "the broker closed the connection"
+            chunk = self._sock.recv(size)
+            self._network.problem = "" if chunk else "the broker closed the connection"
         except _LATER:
-            got = None
+            chunk = None
         except OSError as error:
             self._network.problem = error.strerror or str(error)
             raise (as_on_a_board(error) if isinstance(error, ssl.SSLError) else error) from None
-        self._network.unread = got is not None and len(got) == size
-        return got
+        self._network.unread = chunk is not None and len(chunk) == size
+        return chunk
 
     def _send(self, data: bytes) -> int | None:
         if not self._network.radio.connected:

@@ -47,7 +47,7 @@ def micropython_module(board: Board) -> SimpleNamespace:
 
 
 def random_module(board: Board) -> SimpleNamespace:
-    """Return CPython's generator, one per board, so that runs are repeatable."""
+    """Return the module ``random`` with a generator of its own for each board, so that runs are repeatable."""
     return SimpleNamespace(getrandbits=board.random.getrandbits)
 
 
@@ -56,7 +56,7 @@ def _refuse(name: str) -> Any:
 
 
 def _loads(text: str | bytes | bytearray) -> Any:
-    """Parse JSON. Raises ValueError for anything else, including NaN, infinity and too deep nesting."""
+    """Return the value of JSON text. Raises ValueError for anything else, also NaN, infinity and too deep nesting."""
     try:
         decoded = text if isinstance(text, str) else str(text, "utf-8")
         return json.loads(decoded, parse_constant=_refuse)

@@ -15,7 +15,7 @@ _ROUNDING: Final = 1e-6  # ms: 0.57 s are 569.9999999999999 ms
 
 
 class BoardTime:
-    """Ticks since boot on ``clock``; they start at ``ticks_at_boot_ms``, so that tests can choose when they wrap."""
+    """The module ``time``: ticks since boot on ``clock``, from ``ticks_at_boot_ms``, so tests choose the wrap."""
 
     def __init__(self, clock: Clock, pause: Callable[[float], None], ticks_at_boot_ms: int = 0) -> None:
         self._clock, self._pause = clock, pause
@@ -45,7 +45,7 @@ class BoardTime:
 
 
 def gmtime(seconds: int) -> tuple[int, ...]:
-    """Return year, month, day, hour, minute, second, weekday, day of the year; counted from 2000 as the ESP32 does."""
+    """Return (year, month, day, hour, minute, second, weekday, day of the year); counted from 2000, as on ESP32."""
     return tuple(time.gmtime(seconds + _YEAR_2000_S))[:8]
 
 

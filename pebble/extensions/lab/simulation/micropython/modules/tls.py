@@ -1,4 +1,4 @@
-"""The ``ssl`` module of a simulated board: CPython's TLS behind MicroPython's interface, non-blocking."""
+"""The ``ssl`` module of a simulated board: CPython's TLS with MicroPython's interface, non-blocking."""
 
 import ssl
 from types import SimpleNamespace
@@ -25,7 +25,7 @@ class Context:
     def wrap_socket(
         self, sock: Any, *, server_hostname: str | None = None, do_handshake_on_connect: bool = True
     ) -> Any:
-        """Make a connected socket encrypt what it sends; its reads and writes continue the handshake."""
+        """Make a connected socket encrypt its data. Its reads and writes continue the handshake."""
         if do_handshake_on_connect:
             raise WouldHang("a blocking TLS handshake: use wrap_socket(…, do_handshake_on_connect=False)")
         self._context.check_hostname = server_hostname is not None and self.verify_mode != ssl.CERT_NONE
@@ -44,6 +44,6 @@ def ssl_module() -> SimpleNamespace:
 
 
 def as_on_a_board(error: ssl.SSLError) -> OSError:
-    """Convert to MicroPython's errors of mbedTLS: plain OSErrors with a negative number and a text."""
+    """Return ``error`` as MicroPython's mbedTLS raises it: a plain OSError with a negative number and a text."""
     code = -0x2700 if isinstance(error, ssl.SSLCertVerificationError) else -0x7200
     return OSError(code, str(error.reason or "SSL"))

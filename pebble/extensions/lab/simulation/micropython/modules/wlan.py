@@ -1,4 +1,4 @@
-"""The ``network`` module of a simulated board: a Wi-Fi station whose access point can be lost and come back."""
+"""The ``network`` module of a simulated board: a Wi-Fi station whose access point can disappear and come back."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ADDRESS: Final = ("10.0.0.42", "255.255.255.0", "10.0.0.1", "10.0.0.53")  # own,
 class Radio:
     """The station of one board. ``lose`` and ``restore`` move its access point; the firmware uses the rest.
 
-    ``rejoins``: the driver rejoins by itself, as both ports do by default.
+    ``rejoins``: the driver joins again by itself, as both ports do by default.
     """
 
     def __init__(self, now: Callable[[], float], platform: Platform) -> None:
@@ -32,7 +32,7 @@ class Radio:
         self._wanted = self._wanted and self.rejoins
 
     def restore(self) -> None:
-        """Bring the access point back; a station that is joining has joined after ``join_s``."""
+        """Bring the access point back into range. A station that is joining has joined after ``join_s``."""
         if not self._in_range:
             self._in_range = True
             self._join()
@@ -88,11 +88,11 @@ class Wlan:
         return ADDRESS if self._radio.connected else ("0.0.0.0", "0.0.0.0", "0.0.0.0", "0.0.0.0")  # noqa: S104
 
     def config(self, **values: Any) -> None:
-        """Ignore it: power saving has no visible effect."""
+        """Do nothing: power saving has no visible effect."""
 
 
 def network_module(radio: Radio) -> SimpleNamespace:
-    """Make the module ``network`` of one board; its station is ``radio``, and its own access point is never used."""
+    """Return the module ``network`` of one board, with ``radio`` as its station. Its own access point is never used."""
     interfaces = {Wlan.IF_STA: Wlan(radio), Wlan.IF_AP: Wlan(Radio(lambda: 0.0, radio.platform))}
 
     def wlan(interface: int = Wlan.IF_STA) -> Wlan:
