@@ -55,7 +55,7 @@ def test_a_group_moves_a_board_that_lists_it_as_its_drive_command_would(kind: st
     drill = online(kind)
     (capabilities,) = published(drill, "capabilities")
     lists = capabilities["value"].get("groups") == ["drive-values"]
-    assert lists is (kind == "minilamp"), "benjr has no room"
+    assert lists is (kind == "minilamp"), "benjr has little room"
     drill.clock.watch = drill.check = lambda: None  # type: ignore[method-assign]
     for moves in (lists and GROUPS[group], False):  # the second time it is stopped
         drill.broker.publish(f"{BASE}/incoming/group", group, qos=1)

@@ -92,8 +92,8 @@ def test_a_group_of_commands_passes_over_zenoh(tmp_path: Path) -> None:
             return until(rig.mcu.turning, 0.3)
 
         assert until(turns, 20)
-        assert until(lambda: "L 0.000 1.000 0.000" in rig.mcu.lines, 5)
-        assert rig.mcu.lines.index("L 0.000 1.000 0.000") == rig.mcu.lines.index("M 0.300 0.300") + 1
+        lines = [entry.line for entry in rig.mcu.entries() if entry.event == "line"]
+        assert "M 0.300 0.300, L 0.000 1.000 0.000" in ", ".join(lines), "one write"
 
 
 class Program:
