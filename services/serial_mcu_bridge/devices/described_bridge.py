@@ -265,21 +265,17 @@ class DescribedBridge(SerialService):
         except PayloadError as error:
             self.refusals.malformed(GROUP, error)
             return
-        commands = {m.metric: codec.plain(MCU_COMMAND, m.payload) for m in members if m.channel is MCU_COMMAND}
-        if commands:
-            self.post_message(GROUP, partial(self._command_group, commands))
+        self.post_message(GROUP, partial(self._command_group, members))
 
-    def _command_group(self, commands: dict[str, dict[str, Any]]) -> None:
+    def _command_group(self, members: tuple[groups.Member, ...]) -> None:
         if self.device is None:
             return
-        mine = {metric: values for metric, values in commands.items() if metric.startswith(f"mcu/{self.device.uid}/")}
         takes = {route.generic.metric: route.interface for route in self.device.incoming}
-        if not mine:
-            return
-        if mine.keys() <= takes.keys():
-            self._send_commands([(takes[metric], values) for metric, values in mine.items()])
-        else:
-            self._refuse_command(f"{', '.join(sorted(mine.keys() - takes.keys()))} is not there")
+        mine = [member for member in members if member.metric.startswith(f"mcu/{self.device.uid}/")]
+        if unknown := [member.metric for member in mine if member.metric not in takes]:
+            self._refuse_command(f"{unknown[0]} is not there")
+        elif mine:
+            self._send_commands([(takes[one.metric], codec.plain(MCU_COMMAND, one.payload)) for one in mine])
 
     def _command(self, device: Device, route: Route, values: dict[str, Any]) -> None:
         name = route.interface.name
