@@ -66,7 +66,6 @@ ROLES = tuple(_RIGHTS)
 #: Roles that go with no other one, but for a page that is also an expander.
 _ALONE = frozenset(ProgramRole)
 _BOTH = {ProgramRole.PAGE, ProgramRole.EXPANDER}
-SHORT = "~/{name}"  # the topic of a robot's groups of streams, besides its own
 
 
 class Rule(NamedTuple):
@@ -191,7 +190,7 @@ def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
         elif ProgramRole.ROBOT in account.roles or ProgramRole.BOARDS in account.roles:
             yield from (Rule(access, f"{base}/#") for access in ("read", "write"))
             if ProgramRole.ROBOT in account.roles and not at_hub:
-                yield Rule("write", SHORT.format(name=name))
+                yield Rule("write", f"{c.SHORT}{name}")
         else:
             yield from (Rule("read", f"{base}/{direction}/#") for direction in (INCOMING, OUTGOING))
             yield Rule("write", f"{base}/{INCOMING if at_hub else OUTGOING}/#")
@@ -220,7 +219,7 @@ def _of_expander() -> Iterator[Rule]:
             yield Rule("write", channel.filter(_ANY))
     for suffix in (c.WIRE.suffix, c.STREAMS.suffix, c.EXPANDER.suffix, f"{INCOMING}/{BY}/+/{c.EXPANDER.metric}"):
         yield Rule("read", f"{_ANY}/{suffix}")
-    yield Rule("read", SHORT.format(name="+"))
+    yield Rule("read", f"{c.SHORT}+")
 
 
 def _of_rights(

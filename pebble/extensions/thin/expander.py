@@ -12,11 +12,11 @@ from math import inf
 import msgspec
 
 from pebble.contract import EXPANDER, INCOMING, OUTGOING, STREAMS, WIRE, Channel, Kind, channel_of, codec
-from pebble.contract.channels import is_reserved
+from pebble.contract.channels import SHORT, is_reserved
 from pebble.contract.names import BY
 from pebble.contract.payloads import Wire
 from pebble.errors import PayloadError, TransportError
-from pebble.extensions.thin.packed import HEARD_S, SHORT, unpacked
+from pebble.extensions.thin.packed import HEARD_S, unpacked
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports import Message, QoS, Transport
 

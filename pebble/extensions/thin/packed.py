@@ -13,7 +13,6 @@ from pebble.errors import PayloadError
 MOST_BYTES = 64 * 1024  # of the JSON: a bomb is inflated no further
 LAST_DICT = 31
 HEARD_S = 5.0  # so long an expander counts as there; it says every 2 s that it is
-SHORT = "~/"  # in front of a short name
 
 _Streams = dict[str, msgspec.Raw]
 

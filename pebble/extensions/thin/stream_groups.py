@@ -12,9 +12,10 @@ from msgspec.structs import replace
 
 from pebble.config import Config
 from pebble.contract import EXPANDER, OUTGOING, STREAMS, WIRE, channel_of, codec
+from pebble.contract.channels import SHORT
 from pebble.contract.payloads import Wire
 from pebble.errors import PayloadError
-from pebble.extensions.thin.packed import HEARD_S, LAST_DICT, SHORT, joined, packed
+from pebble.extensions.thin.packed import HEARD_S, LAST_DICT, joined, packed
 from pebble.runtime.addresses import Addresses
 from pebble.services.mqtt_bridge.same_broker import now_ms
 from pebble.transports import Message, QoS, Transport
