@@ -252,8 +252,8 @@ class DescribedBridge(SerialService):
     def _listen_generic(self, device: Device, *, private: bool) -> None:
         self._generic += [
             self.listen(route.generic, partial(self._command, device, route))
-            for route in device.incoming
-            if route.interface.local_only is private
+            for route in device.routes.values()
+            if route.interface.direction is Direction.IN and route.interface.local_only is private
         ]
 
     # -- commands
@@ -270,7 +270,8 @@ class DescribedBridge(SerialService):
     def _command_group(self, members: tuple[groups.Member, ...]) -> None:
         if self.device is None:
             return
-        takes = {route.generic.metric: route.interface for route in self.device.incoming}
+        interfaces = ((route.generic.metric, route.interface) for route in self.device.routes.values())
+        takes = {metric: interface for metric, interface in interfaces if interface.direction is Direction.IN}
         mine = [member for member in members if member.metric.startswith(f"mcu/{self.device.uid}/")]
         if unknown := [member.metric for member in mine if member.metric not in takes]:
             self._refuse_command(f"{unknown[0]} is not there")

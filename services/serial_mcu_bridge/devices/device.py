@@ -59,11 +59,6 @@ class Device:
         return any(route.interface.profile == imu.MOTION for route in self.routes.values())
 
     @property
-    def incoming(self) -> list[Route]:
-        """The routes of the interfaces that take commands."""
-        return [route for route in self.routes.values() if route.interface.direction is Direction.IN]
-
-    @property
     def local_only(self) -> McuLocalOnly:
         """The topics of this MCU's interfaces that stay on the robot."""
         routes = [route for route in self.routes.values() if route.interface.local_only]

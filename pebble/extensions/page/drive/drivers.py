@@ -2,9 +2,8 @@
 
 from collections.abc import Callable
 from functools import partial
+from math import inf
 from typing import NamedTuple
-
-import msgspec
 
 from pebble.contract import DRIVE, GROUP, Channel
 from pebble.extensions.operator.client.broker import Broker
@@ -14,6 +13,7 @@ from pebble.extensions.page import messages as m
 from pebble.extensions.page.drive.driven_robot import Command, DrivenRobot, Tab
 from pebble.extensions.page.drive.refusals import Refusals
 from pebble.extensions.page.robots import Robots
+from pebble.extensions.thin.packed import joined
 from pebble.transports import Message
 from pebble.transports.clock import since_boot as clock
 
@@ -27,7 +27,7 @@ class _Company(NamedTuple):
     metric: str
     message: Message
     by: str
-    sent_at: float = float("inf")
+    sent_at: float = inf
 
 
 class Drivers:
@@ -165,28 +165,24 @@ class Drivers:
         send(self._broker.publish, messages)
 
     def _publish(self, commands: list[Command], by: str = "") -> bool:
-        """Publish a person's drive commands to the robot's own topic; return False if one was not accepted."""
+        """Publish a person's drive commands to the robot's own topic; return False if one was not accepted.
+
+        What is to accompany a command shares its message; a zero goes alone, and first.
+        """
         accepted = True
-        for command in commands:
-            accepted = self._publish_one(command, by) and accepted
+        for ref, drive, qos in commands:
+            topic, view = self._robots.topic(ref, DRIVE), self._robots.view(ref) or RobotView(ref)
+            payload, company = view.encode(drive), self._company.get(ref)
+            if drive.moves and company is not None and company.sent_at == inf:
+                members = {DRIVE.metric: payload, company.metric: company.message.payload}
+                topic, payload = GROUP.topic(ref), joined(members)
+                self._company[ref] = company._replace(sent_at=clock())
+            accepted = self._broker.publish(topic, payload, qos=qos, by=by) and accepted
+            if not drive.moves:
+                self._publish_company(ref)
         if self._changed:
             self._robots.mark_drivers(set(self._changed))
             self._changed.clear()
-        return accepted
-
-    def _publish_one(self, command: Command, by: str) -> bool:
-        """Publish a drive command, in a group with what is to accompany it; a zero goes alone, and first."""
-        ref, drive, qos = command
-        topic, payload = self._robots.topic(ref, DRIVE), (self._robots.view(ref) or RobotView(ref)).encode(drive)
-        company = self._company.get(ref)
-        if company is not None and drive.moves and company.sent_at > clock():
-            members = {DRIVE.metric: payload, company.metric: company.message.payload}
-            topic = GROUP.topic(ref)
-            payload = msgspec.json.encode({metric: msgspec.Raw(raw) for metric, raw in members.items()})
-            self._company[ref] = company._replace(sent_at=clock())
-        accepted = self._broker.publish(topic, payload, qos=qos, by=by)
-        if not drive.moves:
-            self._publish_company(ref)
         return accepted
 
     def _publish_company(self, ref: str) -> None:
