@@ -42,7 +42,7 @@ _Roles = Annotated[
     typer.Option(
         "--role",
         help="viewer, driver, maintainer, safety, admin, or several: driver,safety; else page, robot, neighbour, "
-        "gateway, boards, hub.",
+        "gateway, boards, hub, expander.",
         metavar="ROLE[,ROLE]",
     ),
 ]
