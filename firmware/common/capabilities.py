@@ -16,15 +16,15 @@ _CAPABILITIES = const(
 )
 
 
-def describe(epoch_ms: int, root: bytes, name: str, stops, charging: bytes, axes: bytes) -> bytes:
+def describe(epoch_ms: int, root: bytes, name: str, stops, charging: bytes, axes: bytes, groups: bytes) -> bytes:
     """Make the payload; ``root`` is the base of the topics, ``name`` what people call it; empty: nothing else.
 
     ``stops`` is the `EmergencyStop`. ``charging``: whether it reports that status, in JSON. ``axes``: those besides
-    x and z, likewise.
+    x and z, likewise. ``groups``: the list of what it takes in a group, with a comma; empty: it takes none.
     """
     can, cannot = b"true", b"false"
     named = b',"name":' + json.dumps(name).encode() if name else b""
-    values = [epoch_ms, b'"named":true,' if stops.names else b""] + root.split(b"/")
+    values = [epoch_ms, groups + (b'"named":true,' if stops.names else b"")] + root.split(b"/")
     values += [named, axes, can if stops.controllable else cannot, root, can if stops.stoppable else cannot]
     values += [root, root, root, charging, root, root]
     return _CAPABILITIES % tuple(values + [b'{"available":false,"controls":false}'] * 7)

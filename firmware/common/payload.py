@@ -10,6 +10,7 @@ _MAX_BYTES = const(512)
 _MAX_BRACKETS = const(32)  # limits the parser's memory, which grows with depth
 
 
+_GROUP = const(b'{"drive-values":')
 _WATCHDOG_MS = const(60_000)  # longer than any: larger numbers are cut, because they would need memory
 
 
@@ -41,6 +42,13 @@ def load(raw: memoryview | bytes):
     if highest > 127:
         bytes(raw).decode()  # parsers of boards do not check for UTF-8
     return json.loads(raw)  # type: ignore[type-var]  # any buffer will do (extmod/modjson.c)
+
+
+def drive_of(raw: memoryview | bytes) -> memoryview | bytes | None:
+    """Return the drive command in a group of commands. None: the group has other members, which no board takes."""
+    text = bytes(raw)
+    alone = text.startswith(_GROUP) and text.endswith(b"}") and b"\0" not in text
+    return raw[len(_GROUP) : -1] if alone else None
 
 
 def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int, str] | None:

@@ -15,6 +15,7 @@ _THRESHOLD = const(0.25)  # below it a motor stays off
 
 class Body:
     axes = b',"y"'  # its grousers
+    groups = b'"groups":["drive-values"],'
 
     def __init__(self) -> None:
         self._motors = [Motor(pair) for pair in (pins.LEFT, pins.RIGHT, pins.GROUSERS)]

@@ -12,7 +12,7 @@ from common.arbiter import PERSON, REFUSED
 from common.capabilities import describe
 from common.deadman import DeadMan
 from common.estop import EmergencyStop
-from common.payload import parse
+from common.payload import drive_of, parse
 from common.settings import base, get
 from common.ticks import add, diff
 from wifi.clock import Clock
@@ -27,7 +27,7 @@ _DRIVE = const(1)
 _CONTROL = const(2)
 _TAKE = const(3)
 _RESET = const(4)
-_TOPICS = const(5)
+_GROUP = const(5)
 _HEARTBEAT_MS = const(250)
 _REPORT_EVERY = const(20)  # heartbeats: 5 s
 
@@ -37,7 +37,7 @@ class NetworkRobot:
 
     def __init__(self, settings: dict, body, charging: bytes, wrap) -> None:
         """``body`` has ``drive(x, z, y)``, True if anything moves; ``stop()``; ``report(publish)``; ``refresh()``.
-        ``axes``, if it has the auxiliary one: see `describe`.
+        ``axes``, if it has the auxiliary one: see `describe`; ``groups``, if its board has room for groups of commands.
 
         ``charging``: whether it reports a charging status, in JSON. ``wrap`` wraps a socket in TLS; None: no TLS.
         """
@@ -54,7 +54,9 @@ class NetworkRobot:
         words = "drive", "free", "refuse"
         strangers = words.index(get(settings, "security", "strangers", words[2 if names else 1]))
         topics = b"estop", b"drive-values", b"control", b"control/take", b"estop-reset"
-        plain = _TOPICS if not names else _DRIVE + 1 if strangers == 2 else _CONTROL + 1
+        if hasattr(body, "groups"):
+            topics += (b"group",)
+        plain = len(topics) if not names else _DRIVE + 1 if strangers == 2 else _CONTROL + 1
         self.session = Session(settings, root, topics, plain, names, wrap, self._take)
         self.stops = EmergencyStop(now, _DRIVE_LIMIT_MS, strangers, names)
         self.deadman = DeadMan(_DRIVE_LIMIT_MS)
@@ -123,11 +125,13 @@ class NetworkRobot:
         client = self.session.client
         raw = client.data[client.first : client.last]
         if kind == "subscribed":
-            granted = bytes(raw)  # the last five are all topics, with names if those are checked
-            if granted[_DRIVE - _TOPICS] > 127:
+            granted = bytes(raw)
+            stop = granted[_ESTOP]
+            granted = granted[-len(client.topics) :]  # these are all topics, with names if those are checked
+            if granted[_DRIVE] > 127:
                 raise ValueError("subscription refused")
-            self.stops.stoppable = granted[_ESTOP] <= 127 and granted[_RESET - _TOPICS] <= 127
-            self.stops.controllable = granted[_CONTROL - _TOPICS] <= 127
+            self.stops.stoppable = stop <= 127 and granted[_RESET] <= 127
+            self.stops.controllable = granted[_CONTROL] <= 127
             self._heartbeats = 0
             self._due = now
         elif client.retained:  # stale
@@ -141,8 +145,8 @@ class NetworkRobot:
         stops = self.stops
         by = self.session.client.by
         sender = by or ("-" if stops.names else "")  # as Linux robots show a sender without a name
-        if topic == _DRIVE:
-            self._judge(raw, sender, now)
+        if topic == _DRIVE or topic == _GROUP:  # noqa: SIM109 - a tuple would need memory
+            self._judge(raw if topic == _DRIVE or raw is None else drive_of(raw), sender, now)
         elif raw is not None and not len(raw):  # it removes a retained message
             pass
         elif topic == _CONTROL or topic == _TAKE:  # noqa: SIM109 - a tuple would need memory
@@ -190,7 +194,9 @@ class NetworkRobot:
         if not self._heartbeats:
             now_ms = self._clock.read(now)
             axes = getattr(self.body, "axes", b"")
-            session.publish(b"capabilities", describe(now_ms, session.root, self.name, stops, self.charging, axes), 1)
+            groups = getattr(self.body, "groups", b"")
+            text = describe(now_ms, session.root, self.name, stops, self.charging, axes, groups)
+            session.publish(b"capabilities", text, 1)
             stops.changed = stops.lease.changed = True
             self._due = now
         else:

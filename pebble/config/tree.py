@@ -145,6 +145,7 @@ class Link(Section, frozen=True, kw_only=True):
     group_hz: Annotated[
         Annotated[float, Meta(ge=0, le=10)], doc("Send streams together, so often a second; 0: each by itself.")
     ] = 0.0
+    short: Annotated[Level | None, doc("Send them on `~/SHORT`, with fewer bytes.")] = None
 
     @property
     def slowest(self) -> LinkLevel:

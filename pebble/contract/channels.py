@@ -190,6 +190,7 @@ CONTROL_VOUCHED = _c("control-vouched", Kind.EVENT, p.ControlVouched,
                      rate_hz=2, remote=False)  # fmt: skip
 STREAMS = _c("group", Kind.STREAM, bytes, "The newest of several streams; deflated with a dictionary of `wire`.")
 WIRE = _c("wire", Kind.STATE, p.Wire, "How the streams in a group are written.")
+SHORT = "~/"  # in front of a robot's short name, for groups of streams
 LINK = _c("link", Kind.STATE, p.LinkState, "What the link to the remote broker carries; only where it may be thin.")
 BRIDGE_PROBE = _c(
     "bridge-probe",

@@ -349,6 +349,7 @@ class Wire(Payload, frozen=True, kw_only=True, omit_defaults=True):
     named: bool = False  # it takes commands only with an account's name in the topic
     dict_id: Annotated[int, Meta(ge=1, le=31)] | UnsetType = UNSET  # the first byte of groups that need ``dict``
     dict: str | UnsetType = UNSET  # the dictionary of their deflate
+    short: str | UnsetType = UNSET  # their topic, once an expander has heard it
 
 
 class LogRecord(Payload, frozen=True, kw_only=True):

@@ -41,6 +41,32 @@ def online(
     return drill
 
 
+GROUPS = {
+    b'{"drive-values":{"z":1.0,"valid_ms":400}}': True,
+    b'{"drive-values":{"z":1.0},"lights-solid":{"r":1}}': False,
+    b'{"lights-solid":{"r":1}}': False,
+    b'{"drive-values":{"z":1.0},"estop":{}}': False,
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_group_moves_a_board_that_lists_it_as_its_drive_command_would(kind: str, group: bytes) -> None:
+    drill = online(kind)
+    (capabilities,) = published(drill, "capabilities")
+    lists = capabilities["value"].get("groups") == ["drive-values"]
+    assert lists is (kind == "minilamp"), "benjr has little room"
+    drill.clock.watch = drill.check = lambda: None  # type: ignore[method-assign]
+    for moves in (lists and GROUPS[group], False):  # the second time it is stopped
+        drill.broker.publish(f"{BASE}/incoming/group", group, qos=1)
+        drill.run(drill.seconds + 0.2)
+        assert any(drill.outputs()) is moves
+        drill.run(drill.seconds + 0.4)
+        assert not any(drill.outputs()), "for as long as it is valid"
+        drill.stop()
+        drill.run(drill.seconds + 0.3)
+
+
 def published(drill: Drill, metric: str) -> list[Any]:
     return [json.loads(payload) for payload in drill.received(f"{BASE}/outgoing/{metric}")]
 

@@ -196,10 +196,14 @@ class SerialRig:
             mcu.plug()
         return mcu
 
-    def bridge(self, name: str = "one", protocol: str = "pebble_serial_v1", **section: Any) -> Running:
+    def bridge(
+        self, name: str = "one", protocol: str = "pebble_serial_v1", *, groups: bool = False, **section: Any
+    ) -> Running:
         """Start the service for the MCU of that name; ``section`` is the rest of its config."""
         line = {"enabled": True, "protocol": protocol, "serial": {"port": str(self.folder / name)}, **section}
-        config = view_of(self.network.config(self.folder, {"instances": {name: line}}, robot=self._robot), name)
+        services = {"mqtt_bridge": {"link": {"groups": True}}} if groups else {}
+        lines = {"instances": {name: line}}
+        config = view_of(self.network.config(self.folder, lines, robot=self._robot, **services), name)
         transport = self.network.robots_transport(config, f"serial-{name}")
         service = part(SERIAL_PROTOCOLS[protocol].service)
         running = self.lines[name] = Running(service(config, transport, instance=name))

@@ -55,8 +55,8 @@ def at_the_operators_hub(hall: Hall) -> Iterator[Rig]:
     with hall.running():
         operator: Any = Watcher(hall.local)
         with Rig("zenoh", name="goob", operator=operator, start=False) as rig:
-            raw = json.loads(rig.config.read_text()) | {"security": {"level": "named"}}
-            raw["services"]["mqtt_bridge"] = {"enabled": True, "remote": remote}
+            raw = json.loads(rig.config.read_text()) | {"security": {"level": "named", "strangers": "free"}}
+            raw["services"]["mqtt_bridge"] = {"enabled": True, "remote": remote, "link": {"groups": True}}
             started(rig, raw)
             assert until(lambda: "have a connection of their own" in rig.log.read_text(), 20)
             yield rig
@@ -81,6 +81,19 @@ def started(rig: Rig, raw: dict[str, Any]) -> None:
     rig.config.write_text(json.dumps(raw))
     rig.config.chmod(0o600)
     rig.start()
+
+
+def test_a_group_of_commands_passes_over_zenoh(tmp_path: Path) -> None:
+    hall, group = Hall(tmp_path / "hall", "named"), {"drive-values": {"z": 0.3}, "lights-solid": {"g": 1}}
+    with at_the_operators_hub(hall) as rig, closing(create("zenoh", "otto", hall.settings("otto")).open(10)) as otto:
+
+        def turns() -> bool:
+            otto.publish(f"{GOOB}/incoming/by/otto/group", json.dumps(group).encode(), qos=QoS.DELIVERED)
+            return until(rig.mcu.turning, 0.3)
+
+        assert until(turns, 20)
+        lines = [entry.line for entry in rig.mcu.entries() if entry.event == "line"]
+        assert "M 0.300 0.300, L 0.000 1.000 0.000" in ", ".join(lines), "one write"
 
 
 class Program:

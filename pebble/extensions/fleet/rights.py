@@ -17,6 +17,7 @@ class Right(StrEnum):
     RESET = "reset"
     TAKE = "take"
     SYSTEM = "system"
+    EXPAND = "expand"
     PEOPLE = "people"
 
 
@@ -42,5 +43,6 @@ WRITES: Mapping[Right, tuple[Channel | str, ...]] = {
     ),
     Right.RESET: (c.ESTOP_RESET,),
     Right.TAKE: (c.CONTROL_TAKE,),
-    Right.SYSTEM: (c.REBOOT, c.SERVICE_RESTART, c.GIT_PULL, c.REMOTE_MIRROR, c.EXPANDER),
+    Right.SYSTEM: (c.REBOOT, c.SERVICE_RESTART, c.GIT_PULL, c.REMOTE_MIRROR),
+    Right.EXPAND: (c.EXPANDER,),  # who may not publish streams must not say so: a robot would send none by themselves
 }

@@ -43,6 +43,7 @@ class ProgramRole(StrEnum):
     GATEWAY = "gateway"
     BOARDS = "boards"  # a gateway at the broker of a LAN, where the robots are that it carries
     HUB = "hub"  # a Zenoh hub or router, which carries what all accounts send
+    EXPANDER = "expander"  # beside a broker: `pebble topic expand`, or a page server with `expand`
 
 
 _EVERYBODY = frozenset({Right.LOOK, Right.STOP})
@@ -52,17 +53,19 @@ _RIGHTS: Mapping[str, frozenset[Right]] = {
     Role.DRIVER: _DRIVING,
     Role.MAINTAINER: _DRIVING | {Right.TAKE, Right.SYSTEM},
     Role.SAFETY: _DRIVING | {Right.RESET, Right.TAKE},
-    Role.ADMIN: frozenset(Right),
-    ProgramRole.PAGE: frozenset(Right) - {Right.PEOPLE},
+    Role.ADMIN: frozenset(Right) - {Right.EXPAND},
+    ProgramRole.PAGE: frozenset(Right) - {Right.PEOPLE, Right.EXPAND},
     ProgramRole.NEIGHBOUR: frozenset(),
     ProgramRole.ROBOT: frozenset(),  # robots and gateways have the topics of their own bases
     ProgramRole.GATEWAY: frozenset(),
     ProgramRole.BOARDS: frozenset(),
     ProgramRole.HUB: frozenset(),  # at a broker; at a hub everything
+    ProgramRole.EXPANDER: frozenset({Right.EXPAND}),
 }
 ROLES = tuple(_RIGHTS)
-#: Roles that go with no other one.
+#: Roles that go with no other one, but for a page that is also an expander.
 _ALONE = frozenset(ProgramRole)
+_BOTH = {ProgramRole.PAGE, ProgramRole.EXPANDER}
 
 
 class Rule(NamedTuple):
@@ -131,7 +134,7 @@ def add_up(roles: Sequence[str]) -> str:
     if unknown or not roles:
         return f"{unknown[0] if unknown else ''!r} is no role: use {', '.join(ROLES)}"
     alone = [role for role in roles if role in _ALONE]
-    return f"{alone[0]} goes with no other role" if alone and len(set(roles)) > 1 else ""
+    return f"{alone[0]} goes with no other role" if alone and len(set(roles)) > 1 and set(roles) != _BOTH else ""
 
 
 def rules(
@@ -186,6 +189,8 @@ def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
             return
         elif ProgramRole.ROBOT in account.roles or ProgramRole.BOARDS in account.roles:
             yield from (Rule(access, f"{base}/#") for access in ("read", "write"))
+            if ProgramRole.ROBOT in account.roles and not at_hub:
+                yield Rule("write", f"{c.SHORT}{name}")
         else:
             yield from (Rule("read", f"{base}/{direction}/#") for direction in (INCOMING, OUTGOING))
             yield Rule("write", f"{base}/{INCOMING if at_hub else OUTGOING}/#")
@@ -207,6 +212,16 @@ def _of_neighbour(base: str) -> Iterator[Rule]:
     yield Rule("write", c.FROM_NEIGHBOUR.topic(f"{kind}/+", robot=name))
 
 
+def _of_expander() -> Iterator[Rule]:
+    """Yield the rules for the outgoing topics that an expander publishes, and for what it reads."""
+    for channel in c.CHANNELS:
+        if channel.kind is Kind.STREAM and channel.remote and channel.bridged and channel is not c.STREAMS:
+            yield Rule("write", channel.filter(_ANY))
+    for suffix in (c.WIRE.suffix, c.STREAMS.suffix, c.EXPANDER.suffix, f"{INCOMING}/{BY}/+/{c.EXPANDER.metric}"):
+        yield Rule("read", f"{_ANY}/{suffix}")
+    yield Rule("read", f"{c.SHORT}+")
+
+
 def _of_rights(
     name: str, held: frozenset[Right], level: SecurityLevel, plain: Sequence[str], extra: Extra
 ) -> Iterator[Rule]:
@@ -224,3 +239,5 @@ def _of_rights(
                     yield Rule("write", f"{base}/{INCOMING}/{metric}")
     if Right.DRIVE in held:
         yield Rule("write", c.BRIDGE_PROBE.filter(f"+/{SERVERS}/+"))
+    if Right.EXPAND in held:
+        yield from _of_expander()

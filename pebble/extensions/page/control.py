@@ -213,7 +213,10 @@ class Control:
             self._refuse(op, why)
             return
         message = robot_commands.publication(op, self._server.robots.capabilities(op.ref))
-        if not self._server.broker.publish(
+        joins = isinstance(op, m.LightsOp) and self._server.drivers.accompany(
+            self._tab, op.ref, robot_commands.channel_for(op), message
+        )
+        if not joins and not self._server.broker.publish(
             message.topic,
             message.payload,
             retain=message.retain,

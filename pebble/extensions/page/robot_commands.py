@@ -24,9 +24,14 @@ _DESCRIBE = c.MCU_DESCRIBE.metric.rpartition("/")[2]  # on this topic bridges as
 _FLAGS = {flag.metric.removeprefix("flags/"): flag for flag in FLAGS.values()}
 
 
+def channel_for(op: m.RobotOp) -> Channel:
+    """Return the channel of this request."""
+    return _command(op).channel
+
+
 def right(op: m.RobotOp) -> str:
     """Return the right that a person needs for this request."""
-    return right_of(_command(op).channel)
+    return right_of(channel_for(op))
 
 
 def ends(op: m.RobotOp) -> bool:

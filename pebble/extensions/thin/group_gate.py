@@ -14,12 +14,14 @@ from pebble.contract import (
     INCOMING,
     LIGHTS_FLASH,
     LIGHTS_SOLID,
+    MCU_COMMAND,
     OUTLET_COMMAND,
     SOUNDBOARD_COMMAND,
     codec,
     groups,
 )
 from pebble.contract.capabilities import CapabilitiesValue
+from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import PayloadError
 from pebble.forwarding.command_ages import ends_something
 from pebble.forwarding.forwarder import Forwarder, Pass
@@ -30,8 +32,8 @@ from pebble.runtime.addresses import Addresses
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports import Message
 
-#: Channels that motor owners take from the group; their copies are marked.
-MARKED = (DRIVE, LIGHTS_SOLID, LIGHTS_FLASH)
+#: Channels that owners of serial lines take from the group; their copies are marked.
+MARKED = (DRIVE, LIGHTS_SOLID, LIGHTS_FLASH, MCU_COMMAND)
 _log = RateLimitedLog(logging.getLogger(__name__), period_s=60.0)
 
 
@@ -41,7 +43,7 @@ def encoded(members: Iterable[groups.Member]) -> bytes:
 
 
 def copy_of(member: groups.Member) -> bytes:
-    """Return a member as a payload for programs that know no groups; marked if motor owners take the group itself."""
+    """Return the payload for programs that know no groups; marked as a copy if its owner takes the group itself."""
     if member.channel not in MARKED:
         return member.payload
     return msgspec.json.encode(msgspec.json.decode(member.payload) | {groups.MARK: True})
@@ -71,9 +73,10 @@ class _Part(NamedTuple):
 class GroupGate:
     """A gate before a forwarder, for messages from outside. Messages that are no groups go on to :attr:`pass_on`.
 
-    A group passes if each member would: it is published whole, and then each member by itself. Motor owners obey the
-    whole and ignore the copies, which are marked. If a member may not pass, the group is dropped, except for members
-    that only end something. Marked copies from outside are refused: observers would see motion that does not happen.
+    A group passes if each member would: it is published whole, and then each member by itself. Owners of serial lines
+    obey the whole and ignore the copies, which are marked. A group of which a member may not pass is dropped, but for
+    members that only end something. Marked copies from outside are refused: observers would see motion that is not
+    there.
     """
 
     def __init__(self, forwarder: Forwarder, addresses: Addresses, note_drive: Callable[[bytes], None]) -> None:
@@ -152,11 +155,13 @@ def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
     link = config.services.mqtt_bridge.link
     if not link.groups:
         return value
+    lines = config.serial_instances().values()
     has = {
         DRIVE: value.drive and value.drive.available,
         LIGHTS_SOLID: value.lights and value.lights.solid,
         LIGHTS_FLASH: value.lights and value.lights.flash,
         SOUNDBOARD_COMMAND: value.soundboard and value.soundboard.available,
         OUTLET_COMMAND: value.outlets and value.outlets.available,
+        MCU_COMMAND: any(SERIAL_PROTOCOLS[line.protocol].describes_itself for line in lines),
     }
     return replace(value, groups=[channel.metric for channel, offered in has.items() if offered])

@@ -2,7 +2,7 @@
 
 from pebble.config.problems import Path
 from pebble.config.reader import Reader, Rule
-from pebble.config.tree import Link, Root
+from pebble.config.tree import Link, MqttBridge, Root
 
 _LINK: Path = ("services", "mqtt_bridge", "link")
 
@@ -20,7 +20,15 @@ def _check(reader: Reader, root: Root, _: Path) -> Root:
 def _check_link(reader: Reader, link: Link, path: Path) -> Link:
     if link.group_hz and link.profile == "wide":
         reader.notes.problem((*path, "group_hz"), 'has no effect at profile "wide": write "thin" or "auto"')
+    if link.short and not link.group_hz:
+        reader.notes.problem((*path, "short"), "has no effect without group_hz")
     return link
 
 
-RULES: tuple[Rule, ...] = ((Root, _check), (Link, _check_link))
+def _check_bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
+    if bridge.link.short and bridge.remote is not None and bridge.remote.kind != "mqtt":
+        reader.notes.problem((*path, "link", "short"), f"{bridge.remote.kind} has no short names: leave it out")
+    return bridge
+
+
+RULES: tuple[Rule, ...] = ((Root, _check), (Link, _check_link), (MqttBridge, _check_bridge))

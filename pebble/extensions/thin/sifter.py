@@ -54,7 +54,7 @@ class Sifter:
     ) -> Forward | Drop:
         if source.side is not Side.LOCAL or subject.prompt:
             if self._groups is not None and subject.channel is EXPANDER:
-                self._groups.heard()
+                self._groups.heard(message.payload)
                 return Drop.STAYS
             return self._forwarder.pass_now(source, subject, message, forward, account)
         if self._groups is not None and self._joins(subject, message, forward) and self._groups.takes(message):

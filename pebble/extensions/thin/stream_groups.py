@@ -1,14 +1,20 @@
 """Sends streams of a robot in groups, while an expander beside the remote broker splits them."""
 
+import logging
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from math import inf
 
 import msgspec
+from msgspec import UNSET
 from msgspec.structs import replace
 
-from pebble.contract import OUTGOING, STREAMS, WIRE, codec
+from pebble.config import Config
+from pebble.contract import EXPANDER, OUTGOING, STREAMS, WIRE, channel_of, codec
+from pebble.contract.channels import SHORT
 from pebble.contract.payloads import Wire
+from pebble.errors import PayloadError
 from pebble.extensions.thin.packed import HEARD_S, LAST_DICT, joined, packed
 from pebble.runtime.addresses import Addresses
 from pebble.services.mqtt_bridge.same_broker import now_ms
@@ -18,28 +24,33 @@ from pebble.transports.counters import Counters
 _MOST_STREAMS, _MOST_BYTES = 64, 2048  # in a group, and of each of them; others are sent by themselves
 _LEARN_S, _LEARN_AGAIN_S = 3.0, 60.0  # until a group is the dictionary of later ones: by then it has all streams
 _CROWDED = 4  # so much longer between two groups, while a queue stands
+_TRIES = 5  # of a short name that no expander hears
+log = logging.getLogger(__name__)
 
 
 class StreamGroups:
     """The newest message of each stream, sent together ``group_hz`` times a second. Any thread adds messages.
 
-    A group is deflated with an earlier group as its dictionary, which is published as a retained message.
+    A group is deflated with an earlier one as the dictionary, which is published retained. A short name is used only
+    while an expander says that it hears it: a broker may refuse it, and another robot may have it.
     """
 
     def __init__(
         self,
+        config: Config,
         addresses: Addresses,
         remote: Transport,
-        group_hz: float,
         counters: Counters,
         clock: Callable[[], float],
-        *,
-        named: bool,
     ) -> None:
+        link = config.services.mqtt_bridge.link
         self._below = f"{addresses.base}/{OUTGOING}/"
         self._topic, self._wire = addresses[STREAMS].topic, addresses[WIRE].topic
+        self._short = f"{SHORT}{link.short}" if link.short else ""
+        self._is_heard, self._tries = False, 0  # of the short name
         self._remote, self._counters, self._clock = remote, counters, clock
-        self._hz, self._named = group_hz, named
+        self._hz, self._named = link.group_hz, config.security.named
+        self._known_only = config.security.level != "open"  # brokers let an expander's account publish nothing else
         self._lock = threading.Lock()  # guards the messages that wait
         self._waiting: dict[str, bytes] = {}  # by metric
         self._heard_at = self._sent_at = self._learned_at = -inf
@@ -48,15 +59,25 @@ class StreamGroups:
         self._known: frozenset[str] = frozenset()  # metrics in the dictionary
         self._is_announced = False
 
-    def heard(self) -> None:
-        """Note that an expander has announced itself."""
+    def heard(self, raw: bytes) -> None:
+        """Note that an expander is there, and whether it hears the short name; if not, say something there."""
         now = self._clock()
-        self._since = now if now - self._heard_at > HEARD_S else self._since
+        if now - self._heard_at > HEARD_S:
+            self._since, self._tries = now, 0
         self._heard_at = now
+        with suppress(PayloadError, AttributeError):
+            self._is_heard = codec.plain(EXPANDER, raw).get("short") == self._short
+        self._tries = 0 if self._is_heard else self._tries + bool(self._short)
+        if 1 <= self._tries <= _TRIES:
+            self._remote.publish(self._short, b"{}", qos=QoS.LATEST)
+        elif self._tries == _TRIES + 1:
+            log.warning("no expander hears %s: the broker refuses it, or another robot has it", self._short)
 
     def takes(self, message: Message) -> bool:
         """Keep a message for the next group, and return True. False: send it by itself."""
         metric, payload = message.topic.removeprefix(self._below), message.payload
+        if self._known_only and channel_of(f"{OUTGOING}/{metric}") is None:
+            return False
         if self._clock() - self._heard_at > HEARD_S or metric == message.topic or len(payload) > _MOST_BYTES:
             return False
         try:
@@ -86,14 +107,15 @@ class StreamGroups:
             waiting = dict(self._waiting)
         text = joined(waiting)
         raw = packed(text, self._dict_id, self._dictionary)
-        if not takes_room(len(raw) + len(self._topic)):
+        topic = self._short if self._short and self._is_heard else self._topic
+        if not takes_room(len(raw) + len(topic)):
             return
         with self._lock:
             for metric, payload in waiting.items():
                 if self._waiting.get(metric) is payload:
                     del self._waiting[metric]
         self._sent_at = now
-        self._remote.publish(self._topic, raw, qos=QoS.LATEST)
+        self._remote.publish(topic, raw, qos=QoS.LATEST)
         self._learn(text, frozenset(waiting), now)
 
     def _learn(self, text: bytes, metrics: frozenset[str], now: float) -> None:
@@ -105,7 +127,7 @@ class StreamGroups:
         self._publish_wire()
 
     def _publish_wire(self) -> None:
-        wire = Wire(group_hz=self._hz, named=self._named)
+        wire = Wire(group_hz=self._hz, named=self._named, short=self._short or UNSET)
         if self._dictionary:
             wire = replace(wire, dict_id=self._dict_id, dict=self._dictionary.decode())
         self._is_announced = True  # without a connection it is sent at the next one

@@ -117,10 +117,7 @@ class ThinUplink(Uplink):
         self._groups: StreamGroups | None = None
         if section.link.group_hz:
             self.channels = (LINK, WIRE)
-            named = config.security.named
-            self._groups = StreamGroups(
-                addresses, remote, section.link.group_hz, forwarder.counters, clock, named=named
-            )
+            self._groups = StreamGroups(config, addresses, remote, forwarder.counters, clock)
         self._sifter = Sifter(forwarder, gate or forwarder, self._groups)
         self._late, self._hold = LateRun(), MediaHold(config.on_demand_programs(), notifier.hold)
         forwarder.note_age = lambda late: self._late.note(late, clock())

@@ -6,7 +6,19 @@ import time
 from functools import partial
 from typing import Any
 
-from pebble.contract import IMU, IMU_FAST, MCU_COMMAND, MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, Channel, Kind, codec
+from pebble.contract import (
+    GROUP,
+    IMU,
+    IMU_FAST,
+    MCU_COMMAND,
+    MCU_DESCRIBE,
+    MCU_LOCAL_ONLY,
+    MCU_VALUE,
+    Channel,
+    Kind,
+    codec,
+    groups,
+)
 from pebble.contract.payloads import McuManifest, McuSample
 from pebble.errors import DeviceError, PayloadError
 from pebble.runtime.parent import Notifier
@@ -33,12 +45,13 @@ from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import (
     PROTOCOL,
     RESERVED,
     Direction,
+    Interface,
     InterfaceKind,
     Manifest,
 )
 from pebble.services.serial_mcu_bridge.serial_service import SerialService
 from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine
-from pebble.transports import Message, Subscription
+from pebble.transports import Message, QoS, Subscription
 
 CLAIM_S = 0.25  # between publishing claims and using them: another device has objected by then
 _WATCH_S = 0.5
@@ -63,6 +76,7 @@ class DescribedBridge(SerialService):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
+        self._takes_groups = self.config.services.mqtt_bridge.link.groups
         self._session = Session(self.config.base)
         self.watchdog = ImuWatchdog(self.options, self.instance)
         self._peers = PeerDevices()
@@ -76,7 +90,7 @@ class DescribedBridge(SerialService):
         self._timer: Timer | None = None
 
     def start(self) -> None:
-        self.post(self._subscribe_to_manifests)
+        self.post(self._subscribe)
         super().start()
 
     def stop(self) -> None:
@@ -244,21 +258,49 @@ class DescribedBridge(SerialService):
 
     # -- commands
 
+    def _receive_group(self, message: Message, _value: Any, _names: dict[str, str]) -> None:
+        """Take the members of a group that are for this device, to be written at once, or not at all."""
+        try:
+            members = groups.decode(message.payload)
+        except PayloadError as error:
+            self.refusals.malformed(GROUP, error)
+            return
+        self.post_message(GROUP, partial(self._command_group, members))
+
+    def _command_group(self, members: tuple[groups.Member, ...]) -> None:
+        if self.device is None:
+            return
+        interfaces = ((route.generic.metric, route.interface) for route in self.device.routes.values())
+        takes = {metric: interface for metric, interface in interfaces if interface.direction is Direction.IN}
+        mine = [member for member in members if member.metric.startswith(f"mcu/{self.device.uid}/")]
+        if unknown := [member.metric for member in mine if member.metric not in takes]:
+            self._refuse_command(f"{unknown[0]} is not there")
+        elif mine:
+            self._send_commands([(takes[one.metric], codec.plain(MCU_COMMAND, one.payload)) for one in mine])
+
     def _command(self, device: Device, route: Route, values: dict[str, Any]) -> None:
         name = route.interface.name
+        if self._takes_groups and values.get(groups.MARK) is True:
+            return  # the copy of a group's member
         if device is not self.device:
             self.counters.add("no_device")
             self.log_limited.warning("no device", "%s: dropped a command, the device is not there", name)
             return
+        self._send_commands([(route.interface, values)])
+
+    def _send_commands(self, wanted: list[tuple[Interface, dict[str, Any]]]) -> None:
         try:
-            send = self._session.command(route.interface, values, self.clock(), _now_ms())
+            send = self._session.commands(wanted, self.clock(), _now_ms())
         except PayloadError as error:
-            self.counters.add("refused")
-            self.log_limited.warning("command", "refused a command: %s", error)
+            self._refuse_command(str(error))
             return
         if not self.line.send(send.kind, send.data):
             self.counters.add("no_device")
         self._arm()
+
+    def _refuse_command(self, why: str) -> None:
+        self.counters.add("refused")
+        self.log_limited.warning("command", "refused a command: %s", why)
 
     # -- aliases
 
@@ -280,8 +322,11 @@ class DescribedBridge(SerialService):
 
     # -- the other devices of this robot
 
-    def _subscribe_to_manifests(self) -> None:
+    def _subscribe(self) -> None:
         self.transport.subscribe(self.addresses[MCU_DESCRIBE].topic, self._on_manifest, echo=False, direct=True)
+        if self._takes_groups:
+            receive = self.refusals.reader(GROUP, self._receive_group)
+            self.transport.subscribe(self.addresses[GROUP].topic, receive, qos=QoS.DELIVERED, direct=True)
 
     def _on_manifest(self, message: Message) -> None:
         """Handle the manifest of any device, on the transport's thread."""

@@ -5,7 +5,7 @@ Pure: bytes and clock values in, events out; the bytes to send are events too. T
 
 import logging
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -124,7 +124,7 @@ class Session:
         self._by_id: dict[int, Interface] = {}
         self.known: OrderedDict[Hello, Manifest] = OrderedDict()
         self._commands: OrderedDict[int, _Command] = OrderedDict()
-        self._slots: dict[int, int] = {}  # of the newest command, by interface
+        self._slots: dict[str, int] = {}  # of the newest command, by its interfaces
         self._sequence = 0
         self._ask_at: float | None = None
         self._received_at = self._pinged_at = self._asked_at = float("-inf")
@@ -178,16 +178,19 @@ class Session:
 
     def command(self, interface: Interface, values: Mapping[str, Any], now: float, wall_ms: int) -> Send:
         """Return the frame that sets ``interface`` to ``values``. Raises PayloadError for values out of range."""
-        try:
-            payload = struct_v1.pack(interface.fields, values)
-        except PayloadError as error:
-            raise PayloadError(f"{interface.name}: {error}") from None
-        data = self._frame(Type.CMD, wall_ms, interface.id, payload)
-        self._commands[self._sequence] = _Command(interface.name, now + ANSWER_S)
-        if len(self._commands) > _OPEN_COMMANDS:
-            self._commands.popitem(last=False)
-        slot = self._slots[interface.id] = (self._slots.get(interface.id, 0) + 1) % WAITING
-        return Send(f"command {interface.id}/{slot}", data)
+        return self.commands([(interface, values)], now, wall_ms)
+
+    def commands(self, wanted: Sequence[tuple[Interface, Mapping[str, Any]]], now: float, wall_ms: int) -> Send:
+        """Return the frames that set several interfaces, for one write. Raises PayloadError if any cannot be set."""
+        data, payloads = b"", [_packed(interface, values) for interface, values in wanted]
+        for (interface, _), payload in zip(wanted, payloads, strict=True):
+            data += self._frame(Type.CMD, wall_ms, interface.id, payload)
+            self._commands[self._sequence] = _Command(interface.name, now + ANSWER_S)
+            if len(self._commands) > _OPEN_COMMANDS:
+                self._commands.popitem(last=False)
+        kind = "+".join(str(interface.id) for interface, _ in wanted)
+        slot = self._slots[kind] = (self._slots.get(kind, 0) + 1) % WAITING
+        return Send(f"command {kind}/{slot}", data)
 
     # -- received frames
 
@@ -285,3 +288,10 @@ class Session:
     def _frame(self, kind: Type, wall_ms: int, interface: int = 0, payload: bytes = b"") -> bytes:
         self._sequence = self._sequence % _U32 + 1
         return encode(Frame(kind, payload, interface, self._sequence, wall_ms & _U32))
+
+
+def _packed(interface: Interface, values: Mapping[str, Any]) -> bytes:
+    try:
+        return struct_v1.pack(interface.fields, values)
+    except PayloadError as error:
+        raise PayloadError(f"{interface.name}: {error}") from None

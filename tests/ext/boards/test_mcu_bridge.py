@@ -6,6 +6,7 @@ import logging
 import os
 import time
 from contextlib import suppress
+from typing import Any
 
 import pytest
 
@@ -141,6 +142,42 @@ def test_what_does_not_fit_never_reaches_the_mcu(memory_rig: SerialRig, caplog: 
     assert mcu.obeyed() == [(1, b"\0\0")]
     assert running.service.counters["refused"] == len(bad)
     assert "lamp: on is missing" in caplog.text
+
+
+GOOD: dict[str, Any] = {"mcu/hs105-sta/o1_set": {"on": True}, "mcu/hs105-sta/o2_set": {"on": False}}
+
+
+@pytest.mark.parametrize(
+    ("group", "obeyed"),
+    [
+        (GOOD, [(1, b"\1"), (3, b"\0")]),
+        ({"drive-values": {"z": 0.5}, **GOOD, "mcu/another/arm": {"angle": 3}}, [(1, b"\1"), (3, b"\0")]),
+        (GOOD | {"mcu/hs105-sta/o2_set": {"on": 1}}, []),
+        (GOOD | {"mcu/hs105-sta/o9_set": {"on": True}}, []),
+        (GOOD | {"estop": {}}, []),
+        ({"drive-values": {"z": 0.5}}, []),
+    ],
+)
+def test_of_a_group_a_board_gets_all_its_commands_in_a_write_or_none(
+    memory_rig: SerialRig, group: dict[str, Any], obeyed: list[tuple[int, bytes]]
+) -> None:
+    mcu, running = memory_rig.up(STATION, groups=True)
+    written: list[bytes] = []
+    send = running.service.line.send  # type: ignore[attr-defined]
+    running.service.line.send = lambda kind, data: written.append(data) or send(kind, data)  # type: ignore[attr-defined]
+    memory_rig.world.command("group", group)
+    for metric, command in group.items():
+        memory_rig.world.command(metric, command | {"group": True})
+    memory_rig.world.command("mcu/hs105-sta/o4_set", {"on": True})
+    assert mcu.obeyed(len(obeyed) + 1) == [*obeyed, (7, b"\1")]
+    assert len(written) == 1 + bool(obeyed)
+
+
+def test_without_the_key_a_board_takes_no_groups(memory_rig: SerialRig) -> None:
+    mcu, _ = memory_rig.up(STATION)
+    memory_rig.world.command("group", GOOD)
+    memory_rig.world.command("mcu/hs105-sta/o4_set", {"on": True, "group": True})
+    assert mcu.obeyed() == [(7, b"\1")]
 
 
 def test_a_retained_command_is_refused(rig: SerialRig) -> None:

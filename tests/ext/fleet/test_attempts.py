@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import ExitStack
 
 import pytest
 
@@ -12,6 +13,7 @@ from pebble.contract import CHANNELS, INCOMING
 from pebble.extensions.fleet.broker_files import acl_text
 from pebble.extensions.fleet.folder import Fleet, Server
 from pebble.extensions.fleet.roles import ROLES, WRITES, Account
+from pebble.extensions.thin.expander import is_stream
 from pebble.transports.base import Message, QoS
 from pebble.transports.topics import matches
 from tests.ext.fleet.broker_client import BrokerClient, Place, RefusedError
@@ -38,13 +40,28 @@ ACCOUNTS = {name: Account(roles=roles) for name, roles in PEOPLE.items()} | {
     "near": Account(roles=("boards",), bases=(FRED, LAMP)),
     "lan": Account(roles=("neighbour",), bases=(FRED,)),
     "hub": Account(roles=("hub",)),
+    "exp": Account(roles=("expander",)),
+    "page-2": Account(roles=("page", "expander")),
 }
 LOOK = {"estop", "front-camera"}
 DRIVE = LOOK | {
     *("drive-values", "control", "lights-solid", "lights-flash", "audio", "audio-stream", "soundboard-command"),
     *("autonomy-command", "mcu/u1/led", "outlets/a/power", "mip-raw", "flags/mqtt-video", "flags/mqtt-audio", "group"),
 }
-SYSTEM = {"flags/reboot", "flags/service-restart", "flags/git-pull", "flags/remote-mirror", "expander"}
+SYSTEM = {"flags/reboot", "flags/service-restart", "flags/git-pull", "flags/remote-mirror"}
+#: Outgoing topics that an expander publishes, and others.
+STREAMS = {"touch-sensors", "wheel-odometry", "sensors/imu", "apriltag-data", "mcu/u1/imu"}
+NO_STREAMS = {
+    "online",
+    "control/serial",
+    "estop/serial",
+    "capabilities",
+    "group",
+    "wire",
+    "front-camera",
+    "link",
+    "x/y",
+}
 MAY = {
     "vera": LOOK,
     "otto": DRIVE,
@@ -54,16 +71,19 @@ MAY = {
     "max": DRIVE | SYSTEM | {"control/take", "estop-reset"},
     "admin": DRIVE | SYSTEM | {"control/take", "estop-reset"},
     "page-1": DRIVE | SYSTEM | {"control/take", "estop-reset"},
+    "page-2": DRIVE | SYSTEM | {"control/take", "estop-reset", "expander"},
+    "exp": {"expander"},
 }
 METRICS = sorted(
     DRIVE
     | SYSTEM
-    | {"control/take", "estop-reset", "junk", "flags/junk", "estop/x", "outlets/power", "by/otto/by/otto/estop"}
+    | {"control/take", "estop-reset", "expander", "junk", "flags/junk", "estop/x", "outlets/power"}
+    | {"by/otto/by/otto/estop"}
 )
 TOPICS = [
     *(f"{base}/incoming/{metric}" for base in (GOOB, LAMP) for metric in METRICS),
-    *(f"{GOOB}/incoming/by/{name}/{metric}" for name in ("otto", "sam", "goob", "nobody") for metric in METRICS),
-    *(f"{GOOB}/outgoing/{metric}" for metric in ("online", "control/serial", "estop/serial", "capabilities")),
+    *(f"{GOOB}/incoming/by/{name}/{metric}" for name in ("otto", "sam", "goob", "exp", "nobody") for metric in METRICS),
+    *(f"{GOOB}/outgoing/{metric}" for metric in sorted(STREAMS | NO_STREAMS)),
     *(f"{FRED}/{metric}" for metric in ("outgoing/online", "incoming/drive-values", "incoming/flags/reboot")),
     "pebble/servers/x1/outgoing/bridge-probe",
     "pebble/servers/x1/outgoing/online",
@@ -71,6 +91,9 @@ TOPICS = [
     "pebble/gateways/other/outgoing/online",
     "pebble/robots/new/outgoing/online",
 ]
+
+
+EXPANDERS = ("exp", "page-2")
 
 
 def lets_through(name: str, topic: str, level: str) -> bool:
@@ -89,11 +112,13 @@ def lets_through(name: str, topic: str, level: str) -> bool:
     if name in ("hub", "lan"):
         return False  # test_zenoh has what they are at a hub
     if not rest:
-        return topic == "pebble/servers/x1/outgoing/bridge-probe" and name != "vera"
+        if name in EXPANDERS and topic.partition("/outgoing/")[2] in STREAMS:
+            return True
+        return topic == "pebble/servers/x1/outgoing/bridge-probe" and name not in ("vera", "exp")
     if rest == "estop":
-        return True
+        return name != "exp"
     if level == "login":
-        return rest in MAY[name] or (rest == "estop-reset" and name != "vera")
+        return rest in MAY[name] or (rest == "estop-reset" and name not in ("vera", "exp"))
     if base == LAMP and rest in MAY[name]:
         return True
     by, _, named = rest.partition("/")
@@ -103,7 +128,9 @@ def lets_through(name: str, topic: str, level: str) -> bool:
 
 def is_shown(name: str, topic: str) -> bool:
     """By hand."""
-    if name in PEOPLE:
+    if name in EXPANDERS and topic.endswith(("/outgoing/wire", "/outgoing/group", "/expander")):
+        return True
+    if name in PEOPLE or name == "page-2":
         return "/outgoing/" in topic or "/incoming/flags/" in topic
     bases = {"goob": (GOOB,), "fred": (FRED,), "lamp": (LAMP,), "near": (FRED, LAMP), "gate": ("pebble/robots",)}
     gateway = name == "gate" and re.fullmatch("pebble/gateways/[^/]*/outgoing/online", topic)
@@ -183,6 +210,31 @@ def test_each_account_reads_what_it_may_and_nothing_else(broker: FleetBroker, pl
     for client in senders.values():
         client.__exit__()
     assert wrong == []
+
+
+def test_a_robot_has_the_short_name_of_its_account_and_expanders_read_it(broker: FleetBroker, place: Place) -> None:
+    with ExitStack() as opened:
+        clients = {name: opened.enter_context(BrokerClient(place, name, broker.passwords[name])) for name in ACCOUNTS}
+        for client in clients.values():
+            client.subscribe(["~/+"])
+        for name, client in clients.items():
+            for short in ("~/goob", "~/3f"):
+                client.publish(short, name.encode())
+            client.flush()
+        for client in clients.values():
+            client.subscribe(["pebble/end"])  # answered after what was delivered before
+        seen = {name: client.received for name, client in clients.items() if client.received}
+    assert seen == {name: [("~/goob", b"goob")] for name in EXPANDERS}
+
+
+def test_an_account_may_publish_the_streams_that_an_expander_publishes() -> None:
+    streams = {channel for channel in CHANNELS if is_stream(channel)}
+    fleet = Fleet(level="login", brokers=(Server(host="hall"),), accounts=ACCOUNTS)
+    rules = {rule.filter for rule in fleet.rules_of("exp")}
+    assert {channel.filter("+/+/+") for channel in streams} == {one for one in rules if "/outgoing/" in one} - {
+        "+/+/+/outgoing/wire",
+        "+/+/+/outgoing/group",
+    }
 
 
 @pytest.mark.parametrize("name", ["vera", "otto", "fred"])

@@ -151,7 +151,7 @@ def test_each_account_reads_what_it_may_and_nothing_else(hall: Hall) -> None:
     public = {STATE, FLAG}
     everything = {*public, DRIVE, NAMED}
     expected = dict.fromkeys(NAMES, public) | {"goob": everything, "gate": everything, "lan": {STATE}}
-    expected |= {name: set() for name in ("fred", "lamp", "near")}
+    expected |= {name: set() for name in ("fred", "lamp", "near", "exp")}
     found = {}
     for topic in public:
         hall.eye.publish(topic, b"before", qos=QoS.DELIVERED, retain=True)

@@ -11,7 +11,7 @@ import pytest
 from msgspec import UNSET
 
 from pebble import contract as c
-from pebble.contract import codec
+from pebble.contract import codec, groups
 from pebble.contract.levels import LEVELS
 from pebble.contract.payloads import LinkLevel, LinkState
 from pebble.extensions.operator.client.pace_of_link import WIDE
@@ -51,7 +51,10 @@ class World:
         self.views = {base: RobotView(base) for base in (GOOB, FRED)}
         broker = SimpleNamespace(publish=self._publish)
         robots = SimpleNamespace(
-            view=self.views.get, topic=lambda ref, *_: c.DRIVE.topic(ref), mark_drivers=self.marked.update
+            view=self.views.get,
+            topic=lambda ref, *_: c.DRIVE.topic(ref),
+            mark_drivers=self.marked.update,
+            capabilities=lambda ref: self.views[ref].capabilities,
         )
         self.drivers = Drivers(broker, robots)  # type: ignore[arg-type]
         self.drivers.refusals = SimpleNamespace(
@@ -112,6 +115,8 @@ class World:
                 self.views[ref].capabilities = {"outlets": {}}
             case ["tells", "nothing"]:
                 self.views[ref].capabilities = {}
+            case ["takes", "groups"]:
+                self.views[ref].capabilities["groups"] = ["drive-values", "lights-solid"]
             case ["takes", "names"]:
                 self.nameless = "goob takes commands with names only"
 
@@ -130,6 +135,10 @@ class World:
                 self.wait(float(seconds), lambda: self.drive(tab, ref, int(g), [], z=0.5))
             case ["rests", g, *late]:
                 self.drive(tab, ref, int(g), [word for word in late if word != "finally"], final="finally" in late)
+            case ["shines", colour]:
+                lights = Message(c.LIGHTS_SOLID.topic(ref), b'{"r": %s}' % colour.encode(), QoS.DELIVERED)
+                if not self.drivers.accompany(tab, ref, c.LIGHTS_SOLID, lights):
+                    self._publish(lights.topic, lights.payload)
             case ["releases"]:
                 self.drivers.release(tab, ref)
             case ["leaves"] | ["out"]:
@@ -219,8 +228,13 @@ class World:
         if not self.accepts:
             return False
         base, _, metric = topic.partition("/incoming/")
-        self._arriving.append(Message(topic, payload, qos))
-        if metric == c.DRIVE.metric:
+        members = {metric: payload}
+        if metric == c.GROUP.metric:
+            members = {member.metric: member.payload for member in groups.decode(payload)}
+        self._arriving += [Message(f"{base}/incoming/{one}", raw, qos) for one, raw in members.items()]
+        if lights := members.get(c.LIGHTS_SOLID.metric):
+            self.happened.append(f"{'with ' * (len(members) > 1)}light {json.loads(lights)['r']}")
+        if payload := members.get(c.DRIVE.metric, b""):
             drive = codec.decode(c.DRIVE, payload)
             self.sent.append((base, drive, qos))
             keyed = self.views[base].controlled and self.drivers.robot(base).client is not None
@@ -243,6 +257,44 @@ def world(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Wo
 
 #: They are the same whether or not the robot keeps control.
 HISTORIES = {
+    # -- lights
+    "lights travel with the next command, and again by themselves": """
+        robot takes groups
+        ann shines 1: light 1
+        ann takes
+        ann drives 1: go
+        ann shines 2
+        ann shines 3
+        wait 0.05
+        ann drives 1: with light 3, go
+        wait 0.05
+        ann drives 1: go
+        ann goes on 1 for 1.5: go, light 3, go""",
+    "a zero goes before the lights, and alone": """
+        robot takes groups
+        ann takes
+        ann drives 1: go
+        ann shines 2
+        ann rests 1: zero, light 2
+        ann drives 2: go
+        ann shines 3
+        wait 0.2
+        stop: final, light 3""",
+    "lights of a page that does not drive are newer than those that wait": """
+        robot takes groups
+        ann takes
+        ann drives 1: go
+        ann shines 2
+        ben shines 4: light 4
+        wait 0.05
+        ann drives 1: go
+        ann rests 1: zero""",
+    "a robot that lists no groups is sent none": """
+        ann takes
+        ann drives 1: go
+        ann shines 2: light 2
+        wait 0.05
+        ann drives 1: go""",
     # -- gestures
     "a gesture moves and its release stops": """
         ann takes

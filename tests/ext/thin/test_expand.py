@@ -8,14 +8,21 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from pebble.extensions.fleet.roles import Account
+from pebble.extensions.operator.client.connection import put_names
+from pebble.extensions.operator.client.names import Names
 from pebble.extensions.page.server import expand
+from pebble.extensions.thin.expander import Expander
 from pebble.extensions.thin.packed import joined, packed
-from pebble.transports import MqttSettings, QoS, create
-from tests.support import ROOT, Broker, Child, until
+from pebble.transports import MqttSettings, QoS, Transport, create
+from tests.ext.fleet.brokers import HOST, FleetBroker
+from tests.support import ROOT, Broker, Child, free_port, until
 
 BASE = "pebble/robots/goob"
 STREAMS = {"touch-sensors": b'{"value": {"a0": 1}}', "wheel-odometry": b'{"value": {"x": 1.50}}'}
@@ -68,3 +75,40 @@ def test_plain_topics_come_of_groups(broker: Broker, beside: Callable[[Broker], 
         assert until(comes, 20)
     assert {metric: seen[f"{BASE}/outgoing/{metric}"] for metric in STREAMS} == STREAMS
     robot.close()
+
+
+ACCOUNTS = {"goob": Account(roles=("robot",), bases=(BASE,)), "vera": Account(roles=("viewer",))}
+
+
+@pytest.mark.parametrize("level", ["login", "named"])
+@pytest.mark.parametrize(("roles", "comes"), [(("expander",), True), (("page", "expander"), True), (("page",), False)])
+def test_at_a_fleets_broker_it_has_an_account_of_its_own(
+    tmp_path: Path, level: Any, roles: tuple[str, ...], comes: bool
+) -> None:
+    """The robot sends by the name of its account, once that is heard; a viewer sees the plain topics."""
+    accounts, said, seen = ACCOUNTS | {"exp": Account(roles=roles)}, list[bytes](), dict[str, bytes]()
+    with FleetBroker(tmp_path / "hall", accounts, level=level, unencrypted=free_port()) as hall, ExitStack() as opened:
+
+        def client(name: str) -> Transport:
+            port = hall.unencrypted or 0
+            settings = MqttSettings(host=HOST, port=port, username=name, password=hall.passwords[name])
+            return opened.enter_context(create("mqtt", name, settings))
+
+        robot, vera, exp = map(client, ("goob", "vera", "exp"))
+        expander = Expander(exp)
+        put_names(exp, Names("", None, "exp"), expander.is_named)
+        robot.subscribe(f"{BASE}/incoming/#", lambda message: said.append(message.payload), qos=QoS.DELIVERED)
+        vera.subscribe(f"{BASE}/outgoing/#", lambda message: seen.update({message.topic: message.payload}))
+        wire = b'{"group_hz": 2, "short": "~/goob", "named": %s}' % str(level == "named").lower().encode()
+        robot.publish(f"{BASE}/outgoing/wire", wire, qos=QoS.DELIVERED, retain=True)
+        expander.start()
+
+        def arrives() -> bool:
+            expander.announce()
+            robot.publish("~/goob", TEXT, qos=QoS.LATEST)
+            return until(
+                lambda: f"{BASE}/outgoing/wheel-odometry" in seen and b'"short":"~/goob"' in b"".join(said), 0.3
+            )
+
+        assert until(arrives, 20 if comes else 3) is comes
+        assert bool(said) is comes, "it is not even said that it is there"

@@ -8,7 +8,8 @@ import pytest
 
 from pebble.contract import groups
 from pebble.errors import ConfigError
-from pebble.forwarding.routing import Drop
+from pebble.forwarding.forwarder import Forwarder
+from pebble.forwarding.routing import Drop, Forward
 from pebble.launcher.capabilities import capabilities
 from pebble.runtime.addresses import Addresses
 from tests.forwarding.virtual import World
@@ -60,6 +61,19 @@ def test_a_group_passes_whole_and_then_as_copies(start: Start, profile: str) -> 
     world.remote.publish(GROUP, BOTH)
     world.run(0.1)
     assert arrived(world) == [("group", {"drive-values": {"z": 0.5}, "lights-solid": {"r": 1}}), *COPIES]
+
+
+def test_a_bridge_that_ends_behind_the_group_leaves_it_whole(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    world, deliver = start(), Forwarder.deliver
+
+    def deliver_once(*arguments: Any) -> Forward | Drop:
+        monkeypatch.setattr(Forwarder, "deliver", lambda *_: Drop.NO_ROOM)
+        return deliver(*arguments)
+
+    monkeypatch.setattr(Forwarder, "deliver", deliver_once)
+    world.remote.publish(GROUP, BOTH)
+    world.run(0.1)
+    assert arrived(world) == [("group", {"drive-values": {"z": 0.5}, "lights-solid": {"r": 1}})]
 
 
 def test_without_the_key_a_group_is_a_command_like_any_unknown_one(start: Start) -> None:
@@ -155,6 +169,11 @@ def test_lines_whose_wheels_have_other_topics_exclude_groups() -> None:
 @pytest.mark.parametrize(
     ("serial", "on", "listed"),
     [
+        (
+            {"instances": {"arm": {"enabled": True, "protocol": "pebble_serial_v1", "serial": {"port": "/dev/b"}}}},
+            True,
+            ["mcu/{uid}/{name}"],
+        ),
         ({"enabled": True, "serial": {"port": "/dev/a"}}, True, ["drive-values", "lights-solid", "lights-flash"]),
         ({}, True, []),
         ({"enabled": True, "serial": {"port": "/dev/a"}}, False, None),

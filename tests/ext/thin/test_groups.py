@@ -30,11 +30,11 @@ def test_what_is_encoded_is_the_same_group() -> None:
     assert groups.decode(encoded(members)) == members
 
 
-def test_copies_are_marked_where_a_motor_owner_takes_the_group() -> None:
+def test_copies_are_marked_where_the_owner_of_a_line_takes_the_group() -> None:
     copies = {member.metric: copy_of(member) for member in groups.decode(GROUP)}
     marked = {metric for metric, copy in copies.items() if is_marked(copy)}
-    assert marked == {"drive-values", "lights-solid"}
-    assert copies["mcu/abc/arm"] == b'{"angle":3}'
+    assert marked == {"drive-values", "lights-solid", "mcu/abc/arm"}
+    assert copies["outlets/lamp/power"] == b'{"on":true}'
 
 
 def test_the_sender_is_in_each_member_and_no_claim() -> None:

@@ -12,6 +12,7 @@ import pytest
 from pebble.errors import ConfigError, PayloadError
 from pebble.extensions.thin.expander import ANNOUNCE_S, Expander
 from pebble.extensions.thin.packed import MOST_BYTES, joined, packed, unpacked
+from pebble.transports import Message, QoS
 from tests.forwarding.virtual import Connection, World
 from tests.services.mqtt_bridge.bridge_rig import make_config
 
@@ -96,6 +97,26 @@ def test_without_an_expander_streams_are_plain_again_within_six_seconds(start: S
     run(world, 4, first=number)
     assert counted(world, STREAMS) == 0
     assert 3 <= counted(world, TOUCH) <= 5
+
+
+def test_an_expander_that_hung_publishes_nothing_that_is_old(start: Start) -> None:
+    world = start()
+    expander, began = Beside(world), world.now
+    ages: list[float] = []
+
+    def note(message: Message) -> None:
+        ages.append(world.now - began - msgspec.json.decode(message.payload)["value"]["a0"] / 20)
+
+    world.remote.transport.subscribe(f"{world.remote.base}/{TOUCH}", note, direct=True)
+    number = run(world, 6, expander)
+    expander.connection.hold()
+    number = run(world, 30, first=number)
+    expander.expander.announce()  # it goes on, before it reads what has waited
+    expander.connection.let_go()
+    run(world, 10, expander, first=number)
+    assert len(ages) > 50
+    assert max(ages) < 8
+    assert expander.expander.counts["late groups"] > 0
 
 
 def test_of_two_expanders_the_smaller_id_works_and_no_value_comes_twice(start: Start) -> None:
@@ -209,6 +230,53 @@ def test_the_wire_says_how_often_and_has_the_dictionary(start: Start) -> None:
     assert msgspec.json.decode(wire["dict"]).keys() == {"touch-sensors", "wheel-odometry"}
 
 
-def test_groups_at_a_wide_link_are_refused() -> None:
-    with pytest.raises(ConfigError, match="group_hz"):
-        make_config(link={"group_hz": 2})
+@pytest.mark.parametrize("claimed", [False, True], ids=["its own", "another robot's, too"])
+def test_a_short_name_is_used_while_an_expander_hears_it(start: Start, claimed: bool) -> None:
+    world = start(short="3f")
+    shorts: list[bytes] = []
+    world.remote.transport.subscribe("~/+", lambda message: shorts.append(message.payload), direct=True)
+    expander = Beside(world)
+    if claimed:
+        other = Connection("another", world.remote_hub, world)
+        other.open(10)
+        wire = b'{"group_hz": 1, "short": "~/3f"}'
+        other.publish("pebble/robots/another/outgoing/wire", wire, qos=QoS.DELIVERED, retain=True)
+    number = run(world, 6, expander)
+    world.remote.seen.clear()
+    del shorts[:]
+    run(world, 8, expander, first=number)
+    here, there = counted(world, STREAMS), len([raw for raw in shorts if raw != b"{}"])
+    assert (here == 0, there == 0) == (not claimed, claimed)
+    assert 14 <= here + there <= 17
+    assert counted(world, TOUCH) == here + there, "plain at the tools, in any case"
+    assert expander.expander.counts["refused groups"] == 0
+
+
+def test_a_short_name_that_no_expander_hears_is_tried_five_times(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    world = start(short="3f")
+    shorts: list[bytes] = []
+    world.remote.transport.subscribe("~/+", lambda message: shorts.append(message.payload), direct=True)
+    for _ in range(10):
+        world.remote.publish("incoming/expander", b'{"id": "of an earlier version"}')
+        world.run(2.0)
+    assert shorts == [b"{}"] * 5
+    assert caplog.text.count("no expander hears ~/3f") == 1
+
+
+@pytest.mark.parametrize(
+    ("bridge", "why"),
+    [
+        ({"link": {"group_hz": 2}}, "group_hz"),
+        ({"link": {"profile": "thin", "short": "3f"}}, "without group_hz"),
+        ({"link": {"profile": "thin", "group_hz": 2, "short": "a/b"}}, "short"),
+        (
+            {"link": {"profile": "thin", "group_hz": 2, "short": "3f"}, "remote": {"kind": "zenoh"}},
+            "zenoh has no short names",
+        ),
+    ],
+)
+def test_groups_that_have_no_effect_are_refused(bridge: dict[str, Any], why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        make_config(**bridge)

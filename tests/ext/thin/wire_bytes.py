@@ -1,4 +1,6 @@
-"""Measures bytes on the wire, plain and in groups: ``python -m tests.ext.thin.wire_bytes [SECONDS]``.
+"""Measures bytes on the wire, plain and in groups: ``python -m tests.ext.thin.wire_bytes [SECONDS [FOLDER]]``.
+
+With a folder it draws wire-bytes.png there.
 
 Two network namespaces and a real mosquitto; the counters are those of the robot's interface: Ethernet, IP, TCP and
 acknowledgements. Needs root, as `pebble impair` does.
@@ -8,6 +10,7 @@ acknowledgements. Needs root, as `pebble impair` does.
 import itertools
 import json
 import random
+import re
 import subprocess
 import sys
 import tempfile
@@ -16,7 +19,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from pebble.contract import DRIVE, EXPANDER, GROUP, IMU, LIGHTS_SOLID, ONLINE, STREAMS, TOUCH_SENSORS, WHEEL_ODOMETRY
+from pebble.extensions.lab.bench import plots
 from pebble.extensions.lab.bench.impair.network import REMOTE_HOST, NamespaceNetwork
+from pebble.extensions.lab.bench.results import Cell, round_cell
 from pebble.extensions.thin.packed import joined, packed
 from pebble.transports import MqttSettings, QoS, create
 
@@ -79,18 +84,20 @@ def group(dictionary: bytes, topic: str) -> list[Sent]:
     return [(topic, raw, 0, False)]
 
 
-def pair() -> list[Sent]:
-    return [(DRIVE.topic(BASE), text(drive()), 1, False), (LIGHTS_SOLID.topic(BASE), text(lights()), 1, False)]
+def pair(qos: int) -> list[Sent]:
+    return [(DRIVE.topic(BASE), text(drive()), qos, False), (LIGHTS_SOLID.topic(BASE), text(lights()), 1, False)]
 
 
-def company() -> list[Sent]:
-    return [(GROUP.topic(BASE), text({DRIVE.metric: drive(), LIGHTS_SOLID.metric: lights()}), 1, False)]
+def company(qos: int) -> list[Sent]:
+    return [(GROUP.topic(BASE), text({DRIVE.metric: drive(), LIGHTS_SOLID.metric: lights()}), qos, False)]
 
 
 #: By name: the side that sends, and what is sent so often a second.
 FLOWS: dict[str, tuple[str, list[tuple[float, Callable[[], list[Sent]]]]]] = {
-    "drive + lights 10 Hz, two messages": ("remote", [(10, pair)]),
-    "drive + lights 10 Hz, a group": ("remote", [(10, company)]),
+    "drive + lights 10 Hz, two messages": ("remote", [(10, lambda: pair(1))]),
+    "drive + lights 10 Hz, a group": ("remote", [(10, lambda: company(1))]),
+    "drive + lights 10 Hz, drive with QoS 0": ("remote", [(10, lambda: pair(0))]),
+    "drive + lights 10 Hz, a group with QoS 0": ("remote", [(10, lambda: company(0))]),
     "streams at full rate": (
         "robot",
         [
@@ -134,7 +141,8 @@ def end(side: str, flow: str, seconds: float) -> None:
         transport.subscribe(filter_, lambda _message: None, qos=QoS(1), direct=True)
     time.sleep(2.0)
     if side == "remote" and "groups" in flow:  # an expander says that it is there
-        rates = [(0.5, lambda: [(EXPANDER.topic(BASE), text({"id": "0badf00d"}), 1, False)])]
+        sign = {"id": "0badf00d"} | ({"short": SHORT} if "short" in flow else {})
+        rates = [(0.5, lambda: [(EXPANDER.topic(BASE), text(sign), 1, False)])]
         sender = "remote"
     before, began = counters(), time.monotonic()
     for at, messages in due(rates, seconds) if sender == side else ():
@@ -146,9 +154,10 @@ def end(side: str, flow: str, seconds: float) -> None:
     print(json.dumps({"came": came / seconds, "went": went / seconds, "packets": packets / seconds}))
 
 
-def main(seconds: float) -> None:
+def main(seconds: float) -> list[Cell]:
     network = NamespaceNetwork("wire")
     folder = tempfile.TemporaryDirectory(prefix="wire")
+    cells: list[Cell] = []
     config = Path(folder.name, "mosquitto.conf")
     Path(folder.name).chmod(0o755)
     config.write_text(f"listener {PORT} {REMOTE_HOST}\nallow_anonymous true\n")
@@ -166,14 +175,25 @@ def main(seconds: float) -> None:
             both = robot["came"] + robot["went"]
             numbers = f"{robot['came']:>10.0f}{robot['went']:>12.0f}{both:>8.0f}{both * 8 / 1000:>8.1f}"
             print(f"{flow:42}{numbers}{robot['packets']:>11.1f}", flush=True)
+            if hz := re.match(r"streams (\d) Hz, (.*)", flow):
+                cells.append(round_cell(hz[2], "both ways", "bytes a second", [both], {"groups a second": int(hz[1])}))
     finally:
         broker.terminate()
         network.close()
         folder.cleanup()
+    return cells
+
+
+def draw(cells: list[Cell], folder: Path) -> None:
+    caption = "Touch, inertial sensor and odometry at the robot's interface, with a heartbeat a second"
+    for picture in plots.lines("wire-bytes", caption, cells, over="groups a second"):
+        plots.save(picture, folder, quick=False)
 
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--end"]:
         end(sys.argv[2], sys.argv[3], float(sys.argv[4]))
     else:
-        main(float(next(itertools.islice(sys.argv, 1, None), "20")))
+        measured = main(float(next(itertools.islice(sys.argv, 1, None), "20")))
+        if sys.argv[2:]:
+            draw(measured, Path(sys.argv[2]))

@@ -2,7 +2,7 @@
 
 import json
 
-from common.payload import clamp, load, mix
+from common.payload import clamp, drive_of, load, mix
 from common.payload import parse as parse_all
 
 with open(__file__[: max(0, __file__.rfind("/firmware/"))] + "/vectors/commands.json") as file:  # noqa: PTH123
@@ -116,3 +116,25 @@ def test_nothing_beyond_full_speed() -> None:
     assert mix(1.0, 1.0) == (1.0, 0.0)
     assert mix(-1.0, -1.0) == (-1.0, 0.0)
     assert (clamp(7.0), clamp(-7.0), clamp(0.25)) == (1.0, -1.0, 0.25)
+
+
+def test_a_group_has_a_drive_command_and_nothing_else() -> None:
+    for group, axes in (
+        (b'{"drive-values":{"x":0.5,"z":1}}', (0.5, 1.0, 0.0)),
+        (b'{"drive-values": {"z": 0}}', (0.0, 0.0, 0.0)),
+        (b'{"drive-values":{"z":1},"lights-solid":{"r":1}}', None),
+        (b'{"lights-solid":{"r":1},"drive-values":{"z":1}}', None),
+        (b'{"drive-values":{"z":1},"drive-values":{"z":0.5}}', None),
+        (b'{"\\u0064rive-values":{"z":1}}', None),
+        (b'{"drive-values":{"z":1}"estop":{}}', None),
+        (b'{"drive-values":{"z":1}', None),
+        (b'{"drive-values":{"z":1}\0}', None),
+        (b'{"drive-values":{"z":NaN}}', None),
+        (b'{"drive-values":true}', None),
+        (b'{"drive-values":}', None),
+        (b'{"drive-values":[{"z":1}]}', None),
+        (b"{}", None),
+        (b"", None),
+    ):
+        drive = drive_of(group)
+        assert (parse(drive) if drive else None) == axes, group

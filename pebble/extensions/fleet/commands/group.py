@@ -42,7 +42,7 @@ _Roles = Annotated[
     typer.Option(
         "--role",
         help="viewer, driver, maintainer, safety, admin, or several: driver,safety; else page, robot, neighbour, "
-        "gateway, boards, hub.",
+        "gateway, boards, hub, expander.",
         metavar="ROLE[,ROLE]",
     ),
 ]
@@ -396,6 +396,8 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
             f"The file of that gateway, with its password in {name}-password, and what each board grants to add:"
         )
         typer.echo(json.dumps(pieces.boards_file(fleet, name, f"{_shown(place)}/"), indent=2))
+    elif ProgramRole.EXPANDER in account.roles:
+        typer.echo(f"    pebble topic expand {url} --ca-cert {ca} --password-file FILE")
     elif ProgramRole.GATEWAY not in account.roles:
         does = "watch" if account.roles == (Role.VIEWER,) else "drive"
         typer.echo(f"    pebble {does} ROBOT --url {url} --ca-cert {ca} --password-file FILE")

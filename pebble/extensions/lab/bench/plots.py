@@ -90,7 +90,8 @@ _COLOURS: dict[str, str] = {
     "zenoh": "#0072B2", "zenoh-p2p": "#0072B2", "zenoh-shm": "#0072B2", "zenoh h264 opus": "#0072B2",
     "zenoh-hub": "#2AA198", "zenoh original": "#56B4E9", "mqtt": "#D55E00", "mqtt h264 opus": "#D55E00",
     "mqtt-nodelay": "#E69F00", "mqtt original": "#E69F00", "mqtt5": "#A4133C", STAND_IN: "#8C510A", FLOOR: "#000000",
-    "gstreamer-shm": "#8A8A8A", "page": "#8A8A8A",
+    "gstreamer-shm": "#8A8A8A", "page": "#8A8A8A", "each by itself": "#D55E00", "groups": "#E69F00",
+    "groups, deflate": "#56B4E9", "groups, deflate, short name": "#0072B2",
 }  # fmt: skip
 
 

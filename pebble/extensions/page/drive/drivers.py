@@ -2,8 +2,10 @@
 
 from collections.abc import Callable
 from functools import partial
+from math import inf
+from typing import NamedTuple
 
-from pebble.contract import DRIVE
+from pebble.contract import DRIVE, GROUP, Channel
 from pebble.extensions.operator.client.broker import Broker
 from pebble.extensions.operator.client.estop import send
 from pebble.extensions.operator.client.robot_view import RobotView
@@ -11,9 +13,21 @@ from pebble.extensions.page import messages as m
 from pebble.extensions.page.drive.driven_robot import Command, DrivenRobot, Tab
 from pebble.extensions.page.drive.refusals import Refusals
 from pebble.extensions.page.robots import Robots
+from pebble.extensions.thin.packed import joined
+from pebble.transports import Message
 from pebble.transports.clock import since_boot as clock
 
 MOST_WISHES = 16  # of one tab: robots of which it has control, or asks for it
+_ALONE_S = 1.0  # after a group its lights are sent again, by themselves, unless newer ones are there
+
+
+class _Company(NamedTuple):
+    """Lights for the next drive command of a gesture. Sent in a group, they may be lost or refused with it."""
+
+    metric: str
+    message: Message
+    by: str
+    sent_at: float = inf
 
 
 class Drivers:
@@ -23,6 +37,7 @@ class Drivers:
         self._broker, self._robots = broker, robots
         self._driven: dict[str, DrivenRobot] = {}
         self._changed: set[str] = set()
+        self._company: dict[str, _Company] = {}  # by robot
         self.refusals = Refusals(broker, lambda ref: self.robot(ref).moved_by, robots.view)
 
     def robot(self, ref: str) -> DrivenRobot:
@@ -101,6 +116,20 @@ class Drivers:
             return False, "The server cannot reach the broker"
         return bool(commands) and commands[0].drive.moves, ""
 
+    def accompany(self, tab: Tab, ref: str, channel: Channel, message: Message) -> bool:
+        """Keep lights for the next drive command of this page's gesture, and return True; False: send them now.
+
+        They share a message where the robot lists both as members of a group.
+        """
+        listed = self._robots.capabilities(ref).get("groups")
+        joins = isinstance(listed, list) and DRIVE.metric in listed and channel.metric in listed
+        moves = joins and tab.moves is not None and tab.moves.ref == ref
+        if moves:
+            self._company[ref] = _Company(channel.metric, message, tab.user)
+        else:
+            self._company.pop(ref, None)  # these are newer
+        return moves
+
     def stop(self, ref: str, by: str) -> None:
         """Publish a zero for any user, also without control."""
         if self._robots.view(ref) is not None:
@@ -124,6 +153,8 @@ class Drivers:
             self._turn(robot, now)
             if robot.at_rest(now):
                 del self._driven[ref]
+        for ref in [ref for ref, company in self._company.items() if now - company.sent_at >= _ALONE_S]:
+            self._publish_company(ref)
 
     # -- inside
 
@@ -134,12 +165,27 @@ class Drivers:
         send(self._broker.publish, messages)
 
     def _publish(self, commands: list[Command], by: str = "") -> bool:
-        """Publish a person's drive commands to the robot's own topic; return False if one was not accepted."""
+        """Publish a person's drive commands to the robot's own topic; return False if one was not accepted.
+
+        What is to accompany a command shares its message; a zero goes alone, and first.
+        """
         accepted = True
         for ref, drive, qos in commands:
             topic, view = self._robots.topic(ref, DRIVE), self._robots.view(ref) or RobotView(ref)
-            accepted = self._broker.publish(topic, view.encode(drive), qos=qos, by=by) and accepted
+            payload, company = view.encode(drive), self._company.get(ref)
+            if drive.moves and company is not None and company.sent_at == inf:
+                members = {DRIVE.metric: payload, company.metric: company.message.payload}
+                topic, payload = GROUP.topic(ref), joined(members)
+                self._company[ref] = company._replace(sent_at=clock())
+            accepted = self._broker.publish(topic, payload, qos=qos, by=by) and accepted
+            if not drive.moves:
+                self._publish_company(ref)
         if self._changed:
             self._robots.mark_drivers(set(self._changed))
             self._changed.clear()
         return accepted
+
+    def _publish_company(self, ref: str) -> None:
+        if (company := self._company.pop(ref, None)) is not None:
+            lights = company.message
+            self._broker.publish(lights.topic, lights.payload, qos=lights.qos, by=company.by)
