@@ -588,3 +588,9 @@ class TestStops:
     def test_one_without_the_flag_always_passes(self, forwarder: Forwarder) -> None:
         live = Message(self.STOP.topic, b"{}", QoS.DELIVERED, retain_requested=False)
         assert forwarder.receive(REMOTE, live).outcome == Forward(QoS.DELIVERED, retain=False, urgent=True)
+
+    def test_a_flag_that_a_broker_sends_late_is_older_than_what_was_seen(self, forwarder: Forwarder) -> None:
+        transport = forwarder.sides[REMOTE].transport
+        transport.as_published, transport.policy.delivers_late = False, True
+        assert isinstance(forwarder.receive(REMOTE, Message(self.FLAG.topic, b"false", QoS.DELIVERED)).outcome, Forward)
+        assert forwarder.receive(REMOTE, self.FLAG).outcome is Drop.KNOWN

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -20,6 +21,7 @@ from pebble.errors import ConfigError
 from pebble.extension import Stage
 from pebble.launcher.launcher import Launcher
 from pebble.launcher.programs import programs, shared_modules
+from pebble.launcher.run_lock import RunLock
 from tests.fakes.seccomp import CALLS
 from tests.launcher.robot import BASE, CONNECTION, DEVICE, LOCAL_TRANSPORT, Launch, lines_of
 from tests.support import ROOT, gone, until
@@ -115,6 +117,7 @@ def test_a_crash_loop_is_visible_and_not_hot(launch: Launch) -> None:
     assert until(lambda: robot.states().get("serial") == "failed", 20)
     assert robot.ready("bridge")
     assert len(robot.events("serial", "start")) == 5
+    assert "serial ended (exit code 3), 3 times within a minute: starting it again" in robot.stderr()
     errors = [record for record in robot.logs() if record["level"] == "ERROR"]
     assert [error["message"] for error in errors] == [
         "[launcher] serial ended 5 times within 60 s, last: exit code 3. Trying again every 10 s"
@@ -167,6 +170,15 @@ def test_children_of_a_child_end_with_it(launch: Launch) -> None:
 
     assert until(lambda: len(grandchildren()) == 2, 20)
     assert until(lambda: all(gone(pid) for pid in grandchildren()))
+
+
+def test_a_robot_whose_run_directory_another_takes_stops_in_order(launch: Launch, tmp_path: Path) -> None:
+    robot = launch(("bridge", "good", CONNECTION))
+    assert robot.ready("bridge")
+    shutil.rmtree(robot.run_dir)
+    with RunLock(robot.run_dir, "x/y/another", tmp_path / "another.lock"):
+        assert robot.process.wait(20) == 1
+    assert robot.events("bridge", "stop")
 
 
 def test_a_killed_launcher_leaves_no_orphans(launch: Launch) -> None:

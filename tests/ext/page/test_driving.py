@@ -299,8 +299,10 @@ HISTORIES = {
     "a gesture moves and its release stops": """
         ann takes
         ann drives 1: go
+        moved: ann
         wait 0.05
         ann rests 1: zero
+        moved: nobody
         ann drives 1: Let go first""",
     "each gesture has a greater number": """
         ann takes

@@ -79,6 +79,7 @@ HISTORIES = (
     (((0, "hold", ANN), (10, "hold", OTTO), (20, "release", ANN)), "otto", "", 2),
     (((0, "hold", ANN), (10, "hold", OTTO), (2990, "hold", OTTO), (3000, "tick", ANN)), "otto", "", 2),
     (((0, "hold", ANN), (10, "hold", OTTO, 9999), (3000, "tick", ANN), (12998, "tick", ANN)), "otto", "", 2),
+    (((0, "hold", ANN), (10, "hold", OTTO, 9999), (3000, "release", OTTO)), "", "", 2),  # it had got control
     (((0, "release", ANN),), "", "", 0),
 )
 

@@ -32,7 +32,7 @@ class Robot:
     """The bridge's memory of some owners, and their newest states, in histories of words.
 
     ``a`` a stop comes; ``serial+a`` this owner names it and has saved it, ``?`` has not, ``*`` cannot, ``-`` was reset;
-    ``serial0`` it restarts free, ``serial!`` withdraws its state; ``bridge`` restarts; ``fill`` 1,024 other stops come;
+    ``serial0`` it restarts free, ``serial!`` withdraws its state; ``bridge`` restarts; ``fill`` 1,023 other stops come;
     ``3s`` time passes; ``=a>serial,tail`` is what is repeated now, ``:…`` what the last stop was passed to.
     """
 
@@ -53,7 +53,7 @@ class Robot:
         elif word == "bridge":
             self.bridge()
         elif word == "fill":
-            for number in range(NAMES):
+            for number in range(NAMES - 1):
                 self.stops.accept(codec.encode(ESTOP, EstopCommand(stop=f"{number:016x}")))
         elif word[-1] == "s" and word[:-1].isdigit():
             self.now += int(word[:-1])
@@ -117,7 +117,7 @@ MEMBERS: dict[str, tuple[tuple[str, ...], str]] = {
     "a copy that waits passes": (TWO, "a serial?a b serial?b serial-b b :b>tail"),
     "a restart proves no reset": (ONE, "a serial+a serial0 a :a>all =a>serial"),
     "a new stop after a reset": (ONE, "a serial+a serial-a b :b>all =b>serial"),
-    "names have a bound, stops have none": (ONE, "a serial+a serial-a fill a :a>all =0>serial"),
+    "names have a bound, stops have none": (ONE, "a serial+a serial-a fill a : b a :a>all =b>serial"),
 }
 
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import logging
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from pebble.config import Security
-from pebble.contract import CONTROL_STATE, codec
+from pebble.contract import CONTROL_STATE, CONTROL_VOUCHED, codec
 from pebble.contract.payloads import ControlRequest, ControlState
 from pebble.motors.control import Control
-from tests.services.serial_mcu_bridge.motor_rig import Bench
+from tests.services.serial_mcu_bridge.motor_rig import BASE, Bench
 from tests.support import until
 
 ANN, OTTO = {"id": "aaaaaaaa", "by": "ann", "device": "phone"}, {"id": "00000001", "by": "otto"}
@@ -98,3 +100,24 @@ def test_a_stop_that_is_repeated_for_another_listed_owner_is_ignored(
         assert until(lambda: bench.world.newest("estop/left")["latched"] is latches, 5)
     finally:
         bench.close()
+
+
+def test_a_drive_command_that_waited_renews_control_before_the_silence_counts(bench: Bench) -> None:
+    bench.send("control", {**ANN, "for_ms": 1000})
+    key, began = held(bench, "ann"), time.monotonic()
+    assert until(lambda: time.monotonic() > began + 1.1)
+    blocked, go_on, counters = threading.Event(), threading.Event(), bench.service.transport.counters
+
+    def stand_still() -> None:
+        blocked.set()
+        go_on.wait(5)
+
+    bench.service.post(stand_still)
+    assert blocked.wait(5)
+    delivered = counters["delivered"]
+    bench.drive(0.5, key=key)
+    vouched = b'{"from": 0, "to": %d}' % (1000 * time.monotonic())
+    assert bench.operator.publish(CONTROL_VOUCHED.topic(BASE), vouched)
+    assert until(lambda: counters["delivered"] == delivered + 2)
+    go_on.set()
+    assert bench.line("M 0.500 0.500")

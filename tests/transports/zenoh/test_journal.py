@@ -11,17 +11,10 @@ import pytest
 from pebble.transports.zenoh.hub import journal as journal_module
 from pebble.transports.zenoh.hub.journal import Journal
 from tests.small_disk import SmallDisk
-from tests.support import needs_root, until
+from tests.support import Clock, needs_root, until
 
 RECORDS = [("a", b"one"), ("b", b""), ("c", b"\x00" * 5000), ("d", b"four")]
 BYTES = [record for _, record in RECORDS]
-
-
-class Clock:
-    now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 def begun(path: Path, clock: Clock | None = None) -> Journal:

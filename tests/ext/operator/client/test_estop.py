@@ -166,6 +166,15 @@ def test_zeros_and_ends_of_scripts_go_to_no_other_robot() -> None:
     assert topics(stop.tick(0.0)) == [f"{GOOB}/incoming/autonomy-command", f"{GOOB}/incoming/drive-values"]
 
 
+@pytest.mark.parametrize(
+    ("topic", "sent"), [("else/where", False), (f"{GOOB}/incoming/steer", True), (f"{GOOB}/incoming/", False)]
+)
+def test_a_page_sends_zeros_to_incoming_topics_of_that_robot_only(topic: str, *, sent: bool) -> None:
+    stop = StopSender(new_name(), by="ann", why="", now=0.0, robots=[GOOB], own_only=True)
+    receive(stop, capabilities(GOOB, {"drive": {"available": True, "topic": topic}}), now=0.0)
+    assert (topic in topics(stop.tick(0.0))) is sent
+
+
 def test_a_robot_whose_broker_refuses_stops_gets_them_and_zeros_and_is_not_old() -> None:
     stop = sender(GOOB)
     receive(stop, capabilities(GOOB, {"drive": {"available": True}, "estop": {"available": False}}), now=0.0)
