@@ -16,6 +16,6 @@ FREQUENCY = b"\x00\x00\x03\xe8"  # 1 kHz
 
 
 def turn(motor: int, speed: float) -> bytes:
-    """Make the message that turns motor 0 (A) or 1 (B) at ``speed``, -1..1, + = clockwise."""
+    """Return the message that turns motor 0 (A) or 1 (B) at ``speed``, -1..1, + = clockwise."""
     duty = int(abs(speed) * 10_000)
     return bytes((0x10 | motor, _STOP if not duty else _CW if speed > 0.0 else _CCW, duty >> 8, duty & 255))

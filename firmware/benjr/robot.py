@@ -13,7 +13,7 @@ _I2C_TIMEOUT_US = const(2000)  # for a shield that stretches the clock
 
 
 class Body:
-    """Both motors on the shield. Messages that it did not acknowledge are repeated every turn."""
+    """Both motors on the shield. Messages that the shield did not acknowledge are repeated every turn."""
 
     def __init__(self) -> None:
         self._i2c = SoftI2C(scl=Pin(pins.SCL), sda=Pin(pins.SDA), freq=_I2C_HZ, timeout=_I2C_TIMEOUT_US)
@@ -22,7 +22,7 @@ class Body:
         self.stop()
 
     def drive(self, x: float, z: float, _y: float) -> bool:
-        """Drive; both motors are mounted in reverse: throttle negated, sides swapped."""
+        """Drive; return True if anything moves. Both motors are mounted in reverse: throttle negated, sides swapped."""
         b, a = mix(x, -z)
         self._waiting = [motor_shield.FREQUENCY, motor_shield.turn(1, b), motor_shield.turn(0, a)]
         self.refresh()

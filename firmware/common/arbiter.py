@@ -1,10 +1,10 @@
 """The arbiter of drive commands: none while latched, the holder of control, people before scripts. Pure.
 
-Boards share it with Linux.
+Boards and Linux robots share it.
 
 A drive command with all axes 0 is a zero. A person's zero is always judged. Commands of a script carry the number of
 its run, which grows with each start; a run that is barred never moves anything again. The numbers have no end: after
-LAST_RUN comes 1, so whatever number a stranger sends, the next one is newer.
+LAST_RUN comes 1, so whatever number a stranger sends, there is a newer one.
 """
 
 # So long after a person's last command scripts are refused; and after the start, so that their manager first sees that
@@ -19,7 +19,7 @@ REFUSED = -1
 
 
 def newer(run: int, last: int) -> bool:
-    """True if ``run`` began after ``last``: it is ahead by less than half of all numbers. 0, or less, is no run."""
+    """True if ``run`` began after ``last``: it is ahead by less than half of all numbers. 0 and less are no runs."""
     return run > 0 and (last == 0 or 0 < (run - last) & LAST_RUN < 1 << 29)
 
 
@@ -46,9 +46,10 @@ class Arbiter:
     def judge(self, moves: bool, run: int, valid_ms: float, now: int, key: str = "", by: str | None = "") -> int:
         """Return for how many milliseconds the command moves the motors; 0: it stops them, REFUSED: it has no effect.
 
-        ``moves``: any axis is not 0. ``run`` may be PERSON, or UNKNOWN_RUN of a zero. ``valid_ms`` < 0: not given.
-        ``key`` and ``by`` are those of the lease; ``by`` None: a program of the robot, which needs no key, as no script
-        does where names are not checked. A zero of a client without control ends a script, too, but releases nothing.
+        ``moves``: any axis is not 0. ``run`` may be PERSON, or UNKNOWN_RUN for a zero. ``valid_ms`` < 0: not given.
+        ``key`` and ``by`` are as in the lease; ``by`` None: a program of the robot, which needs no key. Where names are
+        not checked, scripts need none either. A zero of a client without control ends a script, too, but releases
+        nothing.
         """
         self.tick(now)
         lease = self.lease
@@ -87,7 +88,7 @@ class Arbiter:
         return True
 
     def tick(self, now: int) -> None:
-        """End holds and scripts that are over; call it at least every few minutes, as clocks of boards wrap."""
+        """End holds and scripts whose time is over. Call it at least every few minutes, as clocks of boards wrap."""
         diff = self._diff
         self.latch.tick(now)
         self.lease.tick(now)
@@ -101,9 +102,9 @@ class Arbiter:
                 self.bar(self._newest)
 
     def _take(self, moves: bool, final: bool, now: int) -> None:
-        """Take a person's command: scripts wait, or end.
+        """Handle a person's command: scripts wait, or end.
 
-        After the first command of a person no script is in effect: a zero then is the end of the person's own driving.
+        After a person's first command no script is in effect: a zero then ends the person's own driving.
         """
         if not moves and (final or self._scripted):
             self.bar(self._newest)

@@ -17,7 +17,7 @@ _CAPABILITIES = const(
 
 
 def describe(epoch_ms: int, root: bytes, name: str, stops, charging: bytes, axes: bytes, groups: bytes) -> bytes:
-    """Make the payload; ``root`` is the base of the topics, ``name`` what people call it; empty: nothing else.
+    """Return the payload; ``root`` is the base of the topics, ``name`` the robot's name for people, or empty.
 
     ``stops`` is the `EmergencyStop`. ``charging``: whether it reports that status, in JSON. ``axes``: those besides
     x and z, likewise. ``groups``: the list of what it takes in a group, with a comma; empty: it takes none.

@@ -1,4 +1,4 @@
-"""The USB serial port of a board whose MicroPython has no select: lines of text only. The driver in place of usb.py.
+"""The USB serial port of a board whose MicroPython has no select: lines of text only. It replaces usb.py. A driver.
 
 Without select, reading always blocks. So the program blocks on input (``listen``), and a timer runs the robot's turns:
 MicroPython runs timer callbacks while it waits (ports/samd/mphalport.c, mp_hal_stdin_rx_chr). Writing blocks up to half
@@ -31,7 +31,7 @@ class Port:
         self._stuck_at: int | None = None
 
     def listen(self, robot, watchdog) -> None:
-        """Receive from the host for ever, while the robot has a turn every 5 ms."""
+        """Receive from the host for ever, while a timer runs the robot's turn every 5 ms."""
         self._robot, self._watchdog = robot, watchdog
         self._timer = machine.Timer(-1, period=_TURN_MS, callback=self._turn)
         byte = bytearray(1)
@@ -61,7 +61,7 @@ class Port:
         return byte
 
     def send(self) -> None:
-        """Send the ring to the host; the port itself makes CR LF of each LF."""
+        """Send the ring to the host; the port itself writes LF as CR LF."""
         out = self._out
         size = len(out.ring)
         while out.used:

@@ -4,7 +4,7 @@ from common.ticks import diff
 
 
 class DeadMan:
-    """Call ``feed`` at every command that moves something, ``rest`` when nothing moves, ``expired`` at every turn."""
+    """A timer. Call ``feed`` at each command that moves something, ``rest`` at rest, ``expired`` every turn."""
 
     def __init__(self, limit_ms: int) -> None:
         self.limit_ms = limit_ms
@@ -20,7 +20,7 @@ class DeadMan:
         self._armed = False
 
     def expired(self, now: int) -> bool:
-        """True if the limit has passed since the last ``feed``, and once only: the motors must stop."""
+        """True, once, when the limit has passed since the last ``feed``: the motors must stop."""
         if not self._armed or diff(now, self._fed) < self.limit_ms:
             return False
         self._armed = False

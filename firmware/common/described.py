@@ -1,4 +1,4 @@
-"""A board that describes itself to the host by pebble_serial_v1: what is the same whatever it measures or switches."""
+"""The common part of boards that describe themselves to the host by pebble_serial_v1."""
 
 import time
 
@@ -30,9 +30,10 @@ _PONG = const(0x32)
 
 
 class Described:
-    """``manifest`` is the payload of DESCRIBE, whose first ``hello`` bytes are those of HELLO; its frame fits ``ring``.
+    """A board that answers the host. ``manifest`` is the payload of DESCRIBE; its frame fits ``ring``.
 
-    Call ``receive`` at the beginning of each turn, ``port.send`` at its end. ``now`` wraps after 2**30 ms.
+    The first ``hello`` bytes of the manifest are the payload of HELLO. Call ``receive`` at the beginning of each turn,
+    ``port.send`` at its end. ``now`` wraps after 2**30 ms.
     """
 
     def __init__(self, manifest: bytes, hello: int, ring: int) -> None:
@@ -50,7 +51,7 @@ class Described:
         self.notify(manifest[:hello], _HELLO)
 
     def receive(self) -> None:
-        """Read and answer what the host has sent."""
+        """Read and answer the host's frames."""
         self.now = time.ticks_ms()
         if not self.out.used:  # the host reads
             if self._lost:
@@ -67,11 +68,11 @@ class Described:
                 self._answer()
 
     def command(self) -> bytes:
-        """Obey the command in ``decoder``. Returns why not; empty: it is obeyed."""
+        """Obey the command in ``decoder``; return why not, or empty bytes if it is obeyed."""
         return b"unknown_interface"
 
     def send(self, kind: int, interface: int, sequence: int, data: bytes | bytearray) -> bool:
-        """Return False if there was no room for the frame."""
+        """Queue a frame; return False if there is no room for it."""
         sent = self.out.send(kind, interface, sequence, self.now, data)
         self._lost += not sent
         return sent

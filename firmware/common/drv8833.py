@@ -7,14 +7,14 @@ from machine import PWM, Pin
 
 
 class Motor:
-    """``pins`` = (in1, in2). Off from the moment it exists."""
+    """A motor on ``pins`` = (in1, in2). It is off from the moment it exists."""
 
     def __init__(self, pins: tuple[int | str, int | str], freq_hz: int = 1000) -> None:
         self._ahead, self._back = [PWM(Pin(pin, Pin.OUT, value=0), freq=freq_hz, duty_u16=0) for pin in pins]
         self._duty = 0
 
     def set(self, speed: float) -> None:
-        """Turn at ``speed``, -1..1, + = in1 driven."""
+        """Turn at ``speed``, -1..1; + drives in1."""
         duty = int(speed * 65535)
         if duty == self._duty:
             return

@@ -27,10 +27,10 @@ _HOLDER = const(
 
 
 class EmergencyStop:
-    """``stop`` and ``reset`` for their messages, then ``save`` while the motors are off; ``tick`` every turn."""
+    """The stop and the control. Pass messages to ``stop``, ``reset``, then ``save`` while motors are off; ``tick``."""
 
     def __init__(self, now: int, watchdog_ms: int, strangers: int, names) -> None:
-        """``strangers``: see `Lease`. ``names``: names.py; None: the accounts of senders are ""."""
+        """Store the arguments; ``strangers``: see `Lease`. ``names``: names.py; None: accounts of senders are ""."""
         self.latch = Latch(_random(4), _NAMES, diff)
         self.lease = Lease(now, diff, _random, strangers)
         self.arbiter = Arbiter(self.latch, self.lease, now, diff, watchdog_ms)
@@ -62,7 +62,7 @@ class EmergencyStop:
     # -- in
 
     def stop(self, raw: memoryview | None, by: str, since: int) -> bool:
-        """Latch; False: this stop is known already. None, like what cannot be parsed, is a stop without a name."""
+        """Latch; return False if this stop is known. None, or what cannot be parsed, is a stop without a name."""
         name = why = ""
         if raw is not None:
             try:
@@ -78,14 +78,14 @@ class EmergencyStop:
         return new
 
     def _load(self, raw: memoryview, by: str):
-        """Parse a command; it names its account, if there is one."""
+        """Return a parsed command; if there is an account, it becomes the sender."""
         body = load(raw)
         if by:
             self.names.sign(body, by)
         return body
 
     def reset(self, raw: memoryview, now: int) -> None:
-        """End the stop, if the sender saw its newest state."""
+        """End the stop, if the sender has seen its newest state."""
         try:
             order = reset_of(load(raw))
         except (ValueError, OverflowError, MemoryError):
@@ -97,7 +97,7 @@ class EmergencyStop:
     # -- the state
 
     def request(self, raw: memoryview, by: str, urgent: bool, now: int) -> None:
-        """Take a request for control, or the end of it; ``urgent``: without asking."""
+        """Handle a request for control, or its end; ``urgent``: take it without asking."""
         try:
             order = request_of(fields(self._load(raw, by)))
         except (ValueError, OverflowError, MemoryError):
@@ -110,7 +110,7 @@ class EmergencyStop:
                 self.lease.release((by, name), now)
 
     def state(self) -> bytes:
-        """Return the payload of what is ``due``, at most 300 bytes: the reason of a stop is cut."""
+        """Return the payload of the state that is ``due``, at most 300 bytes: the reason of a stop is cut."""
         if self.due == _CONTROL:
             lease = self.lease
             _, name, by, device = lease.holder or ("", "", "", "")

@@ -1,15 +1,15 @@
-"""The emergency stop of one motor owner: its latch and the resets. Pure; boards and Linux robots share it.
+"""The emergency stop of one motor owner: its latch, and resets. Pure; boards and Linux robots share it.
 
-Stopped means latched: nothing moves until a reset, also after a power cut. Times are milliseconds of any clock;
+Stopped means latched: nothing moves until a reset, not even after a power cut. Times are milliseconds of any clock;
 ``diff`` subtracts two of them.
 """
 
 
 class Latch:
-    """A latch, and its published state. A restart begins with a new ``boot`` and a ``count`` of 0."""
+    """A latch with its published state. A restart begins with a new ``boot`` and a ``count`` of 0."""
 
     def __init__(self, boot: str, names: int, diff) -> None:
-        """Store the arguments; ``boot`` is random, ``names`` the number of names of stops that are remembered."""
+        """Store the arguments; ``boot`` is random, ``names`` the number of names of stops to remember."""
         self.latched = False
         self.boot = boot
         self.count = 0  # stops since the start
@@ -25,7 +25,7 @@ class Latch:
         self._waits_from = 0
 
     def restore(self, saved: object) -> None:
-        """Continue with ``saved``, a parsed file; anything that ``saved()`` never returns counts as a stop."""
+        """Continue with ``saved``, a parsed file. A value that ``saved()`` never returns counts as a stop."""
         recent = saved.get("recent") if isinstance(saved, dict) else None
         if isinstance(saved, dict) and isinstance(saved.get("latched"), bool) and isinstance(recent, list):
             self.latched = saved["latched"]
@@ -40,7 +40,7 @@ class Latch:
             self.why = "the saved state cannot be read"
 
     def saved(self) -> dict:
-        """Return the state for ``restore``."""
+        """Return the state to save, for ``restore``."""
         return self._fields("latched", "recent", "by", "why", "since")
 
     def state(self, persisted: bool | None) -> dict:
@@ -56,12 +56,12 @@ class Latch:
         return fields
 
     def stop(self, name: str, by: str, why: str, since: int) -> bool:
-        """Latch, unless this stop is known already: then return False.
+        """Latch and return True; return False if this stop is known already.
 
-        A sender that was not checked has a mark; a checked one takes its place when the stop comes again. ``name`` is
-        never empty: the receiver of a stop without a name makes one. If there are too many names, the oldest of the
-        sender with the most is forgotten, so that stops of one account do not keep another's from being confirmed. All
-        senders that were not checked count as one.
+        A sender that was not checked has a mark; a checked one replaces it when the stop comes again. ``name`` is never
+        empty: the receiver of a stop without a name makes one. If there are too many names, the oldest of the sender
+        with the most is forgotten, so that stops of one account do not keep another's from being confirmed. All senders
+        that were not checked count as one.
         """
         sender = "?" if by[-1:] == "?" else by.split("/")[0]
         if name in self.recent:
@@ -87,7 +87,7 @@ class Latch:
         return True
 
     def reset(self, boot: str, count: int, age: int, now: int) -> bool:
-        """End the stop if the sender has seen the newest state, and if the reset was read in the last second.
+        """End the stop if the sender has seen the newest state, and the reset was read in the last second.
 
         Then persons are refused until one sends a zero, or all pause for half a second.
         """
@@ -102,7 +102,7 @@ class Latch:
         return True
 
     def refuses(self, moves: bool, script: bool, now: int) -> bool:
-        """True if a drive command has no effect. While latched a zero passes: it may end the run of a script."""
+        """True if a drive command has no effect. While latched a zero passes: it may end a script's run."""
         if self.latched:
             return moves
         if not self._waits or script:
@@ -113,25 +113,25 @@ class Latch:
         return self._waits
 
     def tick(self, now: int) -> None:
-        """End a pause that is over; call it at least every few minutes, as clocks of boards wrap."""
+        """End a pause whose time is over. Call it at least every few minutes, as clocks of boards wrap."""
         if self._waits and self._diff(now, self._waits_from) >= 500:
             self._waits = False
 
 
 def is_name(name: object) -> bool:
-    """True if this names a stop: 16 hex digits. A stop with any other name has none."""
+    """True if this is the name of a stop: 16 hex digits. A stop with any other name counts as having none."""
     return isinstance(name, str) and len(name) == 16 and not name.strip("0123456789abcdefABCDEF")
 
 
 def stop_of(body: object) -> tuple[str, str, str]:
-    """Return ``(name, by, why)`` of a parsed stop, of whatever shape; the name is "" if it has none."""
+    """Return ``(name, by, why)`` of a parsed stop of any shape; the name is "" if it has none."""
     command = fields(body)
     name = command.get("stop")
     return str(name) if is_name(name) else "", _text(command.get("by"), 32), _text(command.get("why"), 40)
 
 
 def reset_of(body: object) -> tuple[str, int] | None:
-    """Return ``(boot, count)`` of a parsed reset; None if it is none."""
+    """Return ``(boot, count)`` of a parsed reset; None if it is not a reset."""
     command = fields(body)
     boot = command.get("boot")
     count = command.get("count")
@@ -149,7 +149,7 @@ def fields(body: object) -> dict:
 
 
 def _text(value: object, limit: int) -> str:
-    """Return printable ASCII, without characters that JSON would have to escape."""
+    """Return ``value`` as printable ASCII, without characters that JSON has to escape."""
     if not isinstance(value, str):
         return ""
     return "".join([char if " " <= char <= "~" and char not in '"\\' else "?" for char in value[:limit]])

@@ -1,13 +1,13 @@
 """Control of one motor owner: a lease that it gives, renews and ends. Pure; boards and Linux robots share it.
 
-Control orders people; it is no safety function. A stop and a zero need none. A drive command names the control under
-which it is sent by a key, which is new whenever another client gets control: so earlier commands have no effect.
+Control orders people; it is no safety function. A stop and a zero need none. Each drive command carries the key of the
+control under which it is sent. The key is new whenever another client gets control, so earlier commands have no effect.
 A client is ``(account, id, by, device)``; the account is "" where names are not checked.
 """
 
 
 class Lease:
-    """A lease: ``hold`` and ``release`` for requests, ``refuses`` for drive commands, ``tick`` regularly."""
+    """A lease. Pass requests to ``hold`` and ``release``, drive commands to ``refuses``; call ``tick`` regularly."""
 
     def __init__(self, now: int, diff, random, strangers: int) -> None:
         """Store the arguments; ``random(4)`` returns 8 hex digits.
@@ -28,7 +28,7 @@ class Lease:
         self._held = False  # in the last 5 s the holder moved something: others have to ask
 
     def hold(self, client: tuple, ms: int, urgent: bool, now: int) -> None:
-        """Request control, or renew it. ``urgent``: without asking its holder."""
+        """Give control, renew it, or note the request for it. ``urgent``: do not ask its holder."""
         self.tick(now)
         ms = min(max(ms, 1000), 10_000)
         if client[:2] == self.holder[:2]:
@@ -52,13 +52,13 @@ class Lease:
             self.changed = True
 
     def holds(self, key: str, by: str) -> bool:
-        """True if a command of this account is from the holder; ``key`` may have those of several motor owners."""
+        """True if a command of this account is from the holder; ``key`` may list those of several motor owners."""
         if not self.key or self.holder[:1] != (by,):
             return False
         return key == self.key or (len(key) < 80 and self.key in key.split(" "))  # nobody can try many keys at once
 
     def refuses(self, moves: bool, script: bool, key: str, by: str, now: int) -> bool:
-        """True if a drive command has no effect; one of the holder renews control. A zero always has an effect.
+        """True if a drive command has no effect. A command of the holder renews control. A zero always has an effect.
 
         ``script``: this sender needs no key. Call ``tick`` before.
         """
@@ -79,7 +79,7 @@ class Lease:
         return False
 
     def tick(self, now: int) -> None:
-        """End control and requests that are over; call it at least every few minutes, as clocks of boards wrap."""
+        """End control and requests whose time is over. Call it at least every few minutes, as clocks of boards wrap."""
         diff = self._diff
         if self.others and diff(now, self._received) >= 2000:
             self.others = False
@@ -107,7 +107,7 @@ class Lease:
 
 
 def request_of(fields: dict) -> tuple[str, str, str, int] | None:
-    """Return ``(id, by, device, for_ms)``, 0 for a release; None if it is no request."""
+    """Return ``(id, by, device, for_ms)`` of a request, 0 for a release; None if it is not a request."""
     name = fields.get("id")
     want = fields.get("want", "hold")
     by = fields.get("by", "")
@@ -123,6 +123,6 @@ def request_of(fields: dict) -> tuple[str, str, str, int] | None:
 
 
 def shown(text: str, limit: int) -> str:
-    """``text`` in the letters of names; "/" separates a server and its person."""
+    """Return ``text`` in the letters of names; "/" separates a server and its person."""
     letters = "abcdefghijklmnopqrstuvwxyz0123456789_-/"
     return "".join([char if char in letters else "_" for char in text.lower()[:limit]])

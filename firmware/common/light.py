@@ -1,4 +1,4 @@
-"""The present state of a light: a steady colour, or one that fades in and out for ever. Pure."""
+"""The state of a light: a steady colour, or a colour that fades in and out for ever. Pure."""
 
 from micropython import const
 
@@ -10,7 +10,7 @@ _LONGEST_MS = const(3_600_000)
 
 
 class Light:
-    """``colour`` = (blue, green, red), each 0..1. ``period_ms`` = 0 glows, else one fade up and down."""
+    """A light. ``colour`` = (blue, green, red), each 0..1. ``period_ms``: one fade up and down; 0: steady."""
 
     def __init__(self, now: int) -> None:
         self.flash(0.0, 0.0, 1.0, 2.0, now)  # of Goob and Fred before the first command

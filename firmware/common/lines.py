@@ -18,9 +18,11 @@ _MANY = const(100_000_000)  # nine digits are enough, and still a small integer
 
 
 class Lines:
-    """Pass the host's bytes to ``take``, and call ``rest`` when there are none. ``act(letter, numbers)`` is called for
-    each valid command, with the letter's code and five floats. ``length`` is that of the unfinished line.
-    Answers and lines of ``put`` are queued in ``ring``: ``used`` bytes from ``first`` on, wrapping around its end.
+    """The state of the protocol. Pass the host's bytes to ``take``, and call ``rest`` when there are none.
+
+    ``act(letter, numbers)`` is called for each valid command, with the letter's code and five floats. ``length`` is the
+    length of the unfinished line. Answers and lines of ``put`` are queued in ``ring``: ``used`` bytes from ``first``
+    on, wrapping around its end.
     """
 
     def __init__(self, act) -> None:
@@ -95,14 +97,14 @@ class Lines:
 
 
 def _after(line: bytearray, at: int, end: int, blanks: bool) -> int:
-    """Return the end of the run of blanks, or of other bytes, that starts at ``at``."""
+    """Return the end of the blanks, or else of the other bytes, that start at ``at``."""
     while at < end and (line[at] == _BLANK or 9 <= line[at] <= 13) == blanks:
         at += 1
     return at
 
 
 def number(line: bytes | bytearray, at: int, end: int) -> float:
-    """Return the decimal number at ``at``, whatever follows it; 0 for anything else, including nan and inf."""
+    """Return the decimal number at ``at``, without what follows it; 0 for anything else, also nan and inf."""
     negative = line[at] == 45
     if negative or line[at] == 43:
         at += 1

@@ -1,6 +1,6 @@
 """The senders of commands at a broker that checks names. Loaded only there, because it takes memory. Pure.
 
-Each topic is subscribed to a second time there, with the account of its sender: ``by/{account}/{topic}``.
+There each topic is subscribed to a second time, with the account of its sender: ``by/{account}/{topic}``.
 """
 
 from common.latch import fields
@@ -10,9 +10,9 @@ ANY = b"by/+/"
 
 
 def sender(data: memoryview, at: int, stop: int) -> tuple[str, int]:
-    """Return ``(account, place of the topic)`` behind the "by/" that ends at ``at``; "": no account is there.
+    """Return ``(account, place of the topic)`` after the "by/" that ends at ``at``; "": there is no account.
 
-    An account is up to 32 of a-z, 0-9, _ and -, which is none in front.
+    An account is up to 32 of a-z, 0-9, _ and -, and does not begin with a hyphen.
     """
     first = at
     while first < stop and (96 < data[first] < 123 or 47 < data[first] < 58 or data[first] in (45, 95)):
@@ -25,12 +25,12 @@ def sender(data: memoryview, at: int, stop: int) -> tuple[str, int]:
 
 
 def sign(body: object, by: str) -> None:
-    """Put the account ``by`` into a command, instead of its own ``by`` or in front of it; "-": a stranger's."""
+    """Write the account ``by`` into a command, in place of its ``by`` or in front of it; "-": a stranger."""
     found = fields(body)
     person = found.get("by")
     found["by"] = shown(by + "/" + person, 40) if isinstance(person, str) and person and by != "-" else by
 
 
 def claimed(by: str) -> str:
-    """Return a name that was not checked as Linux robots show it."""
+    """Return a name that was not checked, in the form that Linux robots show."""
     return by and by[:31].rstrip("?") + "?"

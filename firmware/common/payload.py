@@ -1,4 +1,4 @@
-"""Drive-values messages and the wheel speeds they ask for (paper A.8.3), in a few hundred bytes. Pure."""
+"""Reads drive-values messages, and computes wheel speeds from them (paper A.8.3), in a few hundred bytes. Pure."""
 
 import json
 
@@ -15,10 +15,10 @@ _WATCHDOG_MS = const(60_000)  # longer than any: larger numbers are cut, because
 
 
 def load(raw: memoryview | bytes):
-    """Parse JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError.
+    """Return parsed JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError.
 
-    Around it may be what programs add: a byte order mark, white space, a C string's NUL and the rest of its buffer. All
-    of UTF-8 but printable ASCII is left out there, by which every JSON text begins and ends.
+    Around it may be what programs add: a byte order mark, white space, a C string's NUL and the rest of its buffer.
+    There everything but printable ASCII is removed, with which every JSON text begins and ends.
     """
     size = len(raw)
     if size > _MAX_BYTES:
@@ -52,11 +52,11 @@ def drive_of(raw: memoryview | bytes) -> memoryview | bytes | None:
 
 
 def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int, str] | None:
-    """Return ``(x, z, y, run, valid_ms, key)`` from bare or wrapped JSON. None: refused.
+    """Return ``(x, z, y, run, valid_ms, key)`` from bare or wrapped JSON; None if the command is refused.
 
-    Axes are within -1..1; missing ones, and those that are no number, are 0; NaN and infinity are refused. The others
-    are as the arbiter needs them. Wrong ones, or a wrong ``source``, refuse a command that moves anything, but never a
-    stop.
+    Axes are limited to -1..1; missing ones, and those that are no number, are 0; NaN and infinity are refused. The
+    other values are as the arbiter needs them. Wrong ones, or a wrong ``source``, refuse a command that moves anything,
+    but never a stop.
     """
     try:
         body = load(raw)
@@ -115,7 +115,7 @@ def _axis(body: dict, name: str) -> float:
 
 
 def _number(text: str) -> float:
-    """Return 0 for what is none, as Linux reads it: a board's float() also accepts 1_0, and "." and "e5" as 0."""
+    """Return the number in ``text``; 0 if Linux would read none: a board's float() also accepts 1_0, "." and "e5"."""
     if "nan" in text or "inf" in text:
         raise ValueError
     if text.strip("0123456789+-.e") or not text.split("e")[0].strip("+-."):
@@ -132,5 +132,5 @@ def clamp(value: float) -> float:
 
 
 def mix(x: float, z: float) -> tuple[float, float]:
-    """Return left and right wheel, -1..1, + = forward, for steering ``x``, + = right, and throttle ``z``, + = ahead."""
+    """Return left and right wheel speed, -1..1, + = forward; ``x`` steers, + = right; ``z`` is the throttle."""
     return clamp(z + x), clamp(z - x)

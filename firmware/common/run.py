@@ -1,4 +1,4 @@
-"""The main loop of a board. The only place that catches every exception: the motors stop first in any case."""
+"""The main loop of a board: the only place that catches every exception. The motors stop first in any case."""
 
 import time
 

@@ -4,7 +4,7 @@ import json
 
 
 def load(path: str = "/private_config.json") -> dict:
-    """Read the file. It raises nothing: the robot must stop its motors before :func:`get` reports what is wrong."""
+    """Return the settings in the file. Raises nothing, as the motors must stop before :func:`get` reports an error."""
     try:
         with open(path) as file:
             if file.read(1) != "\ufeff":  # which some editors write first
@@ -17,7 +17,7 @@ def load(path: str = "/private_config.json") -> dict:
 
 
 def get(settings: dict, section: str, name: str, default=None):
-    """Return one setting. Raises ValueError if it is missing and has no default, or if the file cannot be read."""
+    """Return a setting. Raises ValueError if it is missing and has no default, or if the file could not be read."""
     try:
         value = settings.get(section, {}).get(name, default)
     except AttributeError:
@@ -29,7 +29,7 @@ def get(settings: dict, section: str, name: str, default=None):
 
 
 def host(settings: dict) -> str:
-    """Return the broker's name or IPv4 address. Raises ValueError, which repeats nothing: a login may be in it."""
+    """Return the broker's name or IPv4 address. Raises ValueError that repeats nothing: a login may be in it."""
     name = get(settings, "mqtt", "host")
     for char in name if isinstance(name, str) and name else "/":
         if char in "/:@[]*,%\\" or not " " < char < "\x7f":

@@ -22,9 +22,9 @@ def add(since: int, ms: int) -> int:
 
 
 class Grid:
-    """Times at a fixed period: missed ones are skipped, and a late one does not delay the following ones.
+    """Times at a fixed period. Missed ones are skipped, and a late one does not delay the following ones.
 
-    ``due`` returns True once per ``period``, for the first time one period after ``now``.
+    ``due`` returns True once per ``period``, first one period after ``now``.
     """
 
     def __init__(self, period: int, now: int) -> None:

@@ -1,8 +1,8 @@
 """The USB serial port of a board: non-blocking reads and writes of single bytes. A driver.
 
 MicroPython reads exactly as many bytes as requested and blocks for missing ones; a write blocks half a second for a
-host that has the port open but reads nothing (shared/tinyusb/mp_usbd_cdc.c). So each byte is polled for, and sent by
-itself; a board on which such a wait is harmless may set a larger ``chunk``.
+host that has the port open but reads nothing (shared/tinyusb/mp_usbd_cdc.c). So each byte is polled for and sent alone;
+a board on which such a wait is harmless may set a larger ``chunk``.
 """
 
 import sys

@@ -15,7 +15,7 @@ class Gears:
         self._ahead_at: int | None = None
 
     def limit(self, left: float, right: float, now: int) -> tuple[float, float]:
-        """Return the motor speeds for wheel speeds -1..1. Turning remains possible while reverse is blocked."""
+        """Return the motor speeds for wheel speeds -1..1. The robot can turn even while reverse is blocked."""
         linear, turn = (left + right) / 2, (left - right) / 2
         if linear > abs(turn):
             self._ahead_at = now

@@ -26,9 +26,9 @@ _GLOW = const(76)  # L
 
 
 class Motor:
-    """One half of a DRV8833. ``pins`` = (in1, in2) share a timer channel: only the driven one is connected to it.
+    """One half of a DRV8833. ``pins`` = (in1, in2) share a timer channel; only the driven pin is connected to it.
 
-    The released one is an output at 0 again (ports/samd/machine_pwm.c, mp_machine_pwm_deinit). The class is in this
+    The released pin is an output at 0 again (ports/samd/machine_pwm.c, mp_machine_pwm_deinit). The class is in this
     file because another file costs 350 bytes of RAM.
     """
 
@@ -39,7 +39,7 @@ class Motor:
         self._duty = 0
 
     def set(self, speed: float) -> None:
-        """Turn at ``speed``, -1..1, + = in1 driven."""
+        """Turn at ``speed``, -1..1; + drives in1."""
         duty = int(speed * 65535)
         if duty == self._duty:
             return
@@ -59,7 +59,7 @@ class Motor:
 
 
 class Robot:
-    """Call ``step`` often; every turn checks the failsafe first."""
+    """The board. Call ``step`` often; every turn checks the failsafe first."""
 
     def __init__(self) -> None:
         # before anything else: motors off; their PWM is made last, see pins.py

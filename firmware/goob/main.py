@@ -1,4 +1,4 @@
-"""Installed as /main.py. A robot on a serial line needs no settings."""
+"""Goob's motor board starts here: installed as /main.py. A robot on a serial line needs no settings."""
 
 from common.run import run
 from goob.robot import build

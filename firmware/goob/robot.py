@@ -26,7 +26,7 @@ _GLOW = const(76)  # L
 
 
 class Robot:
-    """Call ``step`` often; every turn checks the failsafe first."""
+    """The board. Call ``step`` often; every turn checks the failsafe first."""
 
     def __init__(self) -> None:
         # before anything else: motors off; the order is that of pins.py
@@ -85,7 +85,7 @@ class Robot:
         self._shine(self._now)
 
     def _shine(self, now: int) -> None:
-        """Set the white headlights to the brightest part of the colour."""
+        """Set the white headlights to the brightest component of the colour."""
         duty = int(max(self.light.colour) * 65535) * self.light.level(now) // 512
         if duty != self._duty:
             self._duty = duty

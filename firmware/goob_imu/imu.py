@@ -30,10 +30,10 @@ _UPRIGHT = const(9000)
 
 
 class Imu:
-    """Call ``read`` at every sample's time. ``device``: see mpu6050.py; ``log(text)`` reports failures and recovery.
+    """The sensor's values. Call ``read`` at every sample's time. ``log(text)`` reports failures and recovery.
 
-    ``values``: ax ay az in mm/s2, gx gy gz in 0.01 degrees/s without ``bias``, 0.01 degrees C, roll and pitch in 0.01
-    degrees. ``calibrated`` is how many of the 200 samples for the bias there are.
+    ``device``: see mpu6050.py. ``values``: ax ay az in mm/s2, gx gy gz in 0.01 degrees/s without ``bias``, 0.01 degrees
+    C, roll and pitch in 0.01 degrees. ``calibrated``: how many of the 200 samples for the bias were taken.
     """
 
     def __init__(self, device, log) -> None:
@@ -51,7 +51,7 @@ class Imu:
         self._roll = self._pitch = 0.0
 
     def read(self, now: int) -> bool:
-        """Read a sample; returns whether there are new values."""
+        """Read a sample; return True if there are new values."""
         try:
             if not self._working:
                 if self._retry_at is None or diff(now, self._retry_at) >= 0:
@@ -103,7 +103,7 @@ class Imu:
             self._learn()
 
     def _learn(self) -> None:
-        """Take the mean of 200 samples at rest as the bias. Motion restarts the count."""
+        """Use the mean of 200 samples at rest as the bias. Motion restarts the count."""
         if self._skip < _INACCURATE:
             self._skip += 1
             return
@@ -123,7 +123,7 @@ class Imu:
                 self.bias[axis] = (self._sums[axis] + _CALIBRATION // 2) // _CALIBRATION
 
     def _tilt(self, ms: int) -> None:
-        """Filter angular rate and gravity, which complement each other; ``ms`` is the time since the last sample."""
+        """Update roll and pitch from angular rate and gravity; ``ms`` is the time since the last sample."""
         values = self.values
         ax, ay, az = values[0], values[1], values[2]
         across = sqrt(ay * ay + az * az)
@@ -140,5 +140,5 @@ class Imu:
 
 
 def _around(value: float) -> float:
-    """Return the same angle within half a turn."""
+    """Return the same angle within half a turn of 0."""
     return value - _TURN if value > _TURN // 2 else value + _TURN if value < -_TURN // 2 else value

@@ -14,14 +14,17 @@ _WHO_AM_I = const(0x75)
 
 
 class Mpu6050:
-    """+-4 g, 8192 LSB/g; +-500 degrees/s, 65.5 LSB per degree/s; 100 Hz. ``pins`` has SCL, SDA and IMU, its address."""
+    """The sensor: +-4 g, 8192 LSB/g; +-500 degrees/s, 65.5 LSB each; 100 Hz.
+
+    ``pins``: SCL, SDA and IMU, its address.
+    """
 
     def __init__(self, pins) -> None:
         self._i2c = SoftI2C(scl=Pin(pins.SCL), sda=Pin(pins.SDA), freq=400_000)
         self._address = pins.IMU
 
     def start(self) -> bool:
-        """Configure the device. False: there is another device at its address."""
+        """Configure the device; return False if another device answers at its address."""
         if self._i2c.readfrom_mem(self._address, _WHO_AM_I, 1) != b"\x68":
             return False
         # no sleep, clock from the X gyroscope as the manual recommends

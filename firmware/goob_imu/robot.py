@@ -26,7 +26,7 @@ _STATE = const(0x11)
 
 
 class Robot(Described):
-    """A board without motors. Call ``step`` at least every 10 ms."""
+    """The board, which has no motors. Call ``step`` at least every 10 ms."""
 
     def __init__(self) -> None:
         super().__init__(MANIFEST, _HELLO_SIZE, _RING)

@@ -15,10 +15,10 @@ _AGAIN_MS = const(3_600_000)  # a crystal that is 20 ppm off loses 72 ms in an h
 
 
 class Clock:
-    """``step`` every turn; ``read`` gives epoch milliseconds, or those since boot until a server answered."""
+    """A clock. Call ``step`` every turn; ``read`` returns epoch ms, or ms since boot until a server has answered."""
 
     def __init__(self, host: str, now: int) -> None:
-        """``host`` is the time server; "": none."""
+        """Store the arguments; ``host`` is the time server; "": none."""
         self.host = host
         self._wall = sntp.WallClock(now)
         self.read = self._wall.read
@@ -27,7 +27,7 @@ class Clock:
         self._due = now
 
     def step(self, now: int, server: str) -> None:
-        """Go on. ``server`` is the DNS server; "": there is no network. Failures are retried later."""
+        """Continue a request. ``server`` is the DNS server; "": there is no network. Failures are retried later."""
         if not server or not self.host:
             self._close(now)
             return
@@ -58,7 +58,7 @@ class Clock:
                 self._close(add(now, _RETRY_MS))
 
     def _close(self, due: int) -> None:
-        """Close the socket until ``due``; while one is open, ``_due`` is when the request began."""
+        """Close the socket until the time ``due``. While one is open, ``_due`` is when its request began."""
         self.read(due)  # regularly, because ticks wrap
         self._due = due
         if self._open:

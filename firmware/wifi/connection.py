@@ -1,4 +1,4 @@
-"""The state of the connection to the broker. Pure: events and the time in, one action at a time out."""
+"""The state of the connection to the broker. Pure: takes events and the time, returns one action at a time."""
 
 from micropython import const
 
@@ -11,7 +11,7 @@ _STABLE_MS = const(5000)  # a connection lost earlier counts as a failed attempt
 
 
 class Connection:
-    """Call ``step`` every turn, and ``move``, ``received`` and ``lost`` at their events.
+    """A state machine. Call ``step`` every turn, and ``move``, ``received`` and ``lost`` at their events.
 
     ``state`` is "offline" (no Wi-Fi), "waiting" (for the next attempt), "resolving" (the broker's name), "connecting"
     (TCP, TLS, CONNACK), "subscribing" (commands may arrive already) or "online".
@@ -26,7 +26,7 @@ class Connection:
         self._next_wait = _FIRST_WAIT_MS
 
     def step(self, now: int, wifi: bool) -> str:
-        """Return the action that is due: "resolve" the broker's name, "drop" the connection; "": none."""
+        """Return the action that is due: "resolve" the broker's name, "drop" the connection, or "" for none."""
         state = self.state
         age = diff(now, self._since)
         if not wifi:
@@ -49,17 +49,17 @@ class Connection:
         return ""
 
     def move(self, state: str, now: int) -> None:
-        """Enter the next state: the address is known, CONNACK or SUBACK was received."""
+        """Enter ``state``: the broker's address is known, or CONNACK or SUBACK was received."""
         self.state = state
         self._since = now
         self.received(now)
 
     def received(self, now: int) -> None:
-        """Note that the broker has answered. Other bytes do not count, because their delay is unknown."""
+        """Note an answer of the broker. Other bytes do not count: they may have been on their way for long."""
         self._received = now
 
     def lost(self, now: int, random: int) -> None:
-        """Note a connection that was lost or not made; ``random`` 0..255 spreads the next attempts of many robots."""
+        """Note that a connection was lost or not made; ``random`` 0..255 spreads the attempts of many robots."""
         self.losses += 1
         if self.state != "offline" and (self.state != "online" or self._next_wait != _FIRST_WAIT_MS):
             self.failures += 1

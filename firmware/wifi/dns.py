@@ -1,8 +1,8 @@
-"""DNS queries for IPv4 addresses (RFC 1035; one-shot mDNS, RFC 6762 section 5.1): bytes out, bytes in. Pure."""
+"""DNS queries for IPv4 addresses (RFC 1035; one-shot mDNS, RFC 6762 section 5.1). Pure: bytes in, bytes out."""
 
 
 def query(host: str, nonce: bytes) -> bytes:
-    """Make the query for ``host``; ``nonce`` is two random bytes. Raises ValueError for an invalid name."""
+    """Return the query for ``host``; ``nonce`` is two random bytes. Raises ValueError for an invalid name."""
     # recursion desired; one question
     data = nonce + b"\1\0\0\1\0\0\0\0\0\0"
     for label in host.lower().encode().rstrip(b".").split(b"."):
@@ -13,10 +13,10 @@ def query(host: str, nonce: bytes) -> bytes:
 
 
 def answer(data: bytes, asked: bytes, skip: int = 0) -> str | None:
-    """Return the address in ``data``, "" if there is none, None if it is not the answer to the query ``asked``.
+    """Return the address in ``data``, "" if there is none, None if it does not answer the query ``asked``.
 
-    Of several it is the first one with ``skip`` 0. With others it goes by their order as numbers, round and round:
-    servers change the order of their answers, and that of all answers would be needed to try each address.
+    Of several addresses it is the first one if ``skip`` is 0. Otherwise they are counted in numeric order, again and
+    again from the smallest: servers change the order of their answers, so only a fixed order tries each address.
     """
     at = len(asked)
     if len(data) < at or data[:2] != asked[:2] or data[12:at].lower() != asked[12:]:

@@ -7,12 +7,12 @@ of the OASIS standard of 2014.
 
 
 class Client:
-    """``space`` and ``take`` are for input; ``send``, ``out``, ``waiting`` and ``sent`` for output."""
+    """The client. ``space`` and ``take`` are for input; ``send``, ``out``, ``waiting`` and ``sent`` for output."""
 
     def __init__(self, incoming: int, outgoing: int, root: bytes, topics: tuple, plain: int, names) -> None:
-        """Sizes in bytes: of the longest packet to read, and of the output buffer.
+        """Store the arguments. ``incoming``: bytes of the longest packet to read; ``outgoing``: of the output buffer.
 
-        ``topics``: of which the first ``plain`` ones are subscribed to, below ``root``; the first is that of stops.
+        ``topics``: the first ``plain`` ones are subscribed to, below ``root``; the first of all is the topic of stops.
         ``names``: names.py, by which all are subscribed to with the sender's account; None: names are not checked.
         """
         self.data = memoryview(bytearray(incoming))
@@ -46,9 +46,9 @@ class Client:
         """Return the kind of the next packet: "welcome", "subscribed", "publication" or "pong"; "": there is none.
 
         ``count`` bytes were received since the last call. A publication is on ``topics[topic]``, ``retained`` or not,
-        of the account ``by``; its payload is ``data[first:last]`` until the next call of ``space``. The kind of one
-        whose payload is too long to be stored is "too long". "subscribed": that range has a byte for each topic of
-        ``subscribe``, above 127 if it is refused.
+        of the account ``by``; its payload is ``data[first:last]`` until the next call of ``space``. If its payload is
+        too long to be stored, the kind is "too long". After "subscribed" that range has a byte for each topic of
+        ``subscribe``, above 127 if the topic is refused.
         """
         data = self.data
         self._end += count
@@ -91,7 +91,7 @@ class Client:
         return ""
 
     def _publication(self, first: int, at: int, stop: int) -> None:
-        """Acknowledge it, even if it is too long to be stored: the broker would hold back the following ones."""
+        """Acknowledge a publication, even one too long to be stored: else the broker holds back the next ones."""
         data = self.data
         topic = at + 2 + (data[at] << 8 | data[at + 1]) if stop - at > 1 else stop + 1
         body = topic + (first & 6)  # behind a packet id of two bytes if its QoS is 1, whose flag is a 2 as well
@@ -128,7 +128,7 @@ class Client:
     # -- out
 
     def send(self, first: int, *parts: bytes) -> bool:
-        """Queue a packet of these parts; False: there is no room for it behind others."""
+        """Queue a packet of these parts; False if there is no room for it."""
         length = sum(map(len, parts))
         size = len(self.out)
         if self._more or size - self.waiting < length + 3 <= size:
@@ -141,8 +141,8 @@ class Client:
     def subscribe(self, count: int) -> None:
         """Subscribe to the first ``count`` topics, those without an account first (packet 1, 3.8).
 
-        With QoS 1 to stops and resets only: of those a broker keeps some for a client that is slow to read, whatever
-        else it is sent, and of what has QoS 0 it drops the newest.
+        Only stops and resets have QoS 1: a broker keeps some of those for a client that is slow to read, whatever else
+        it is sent; of messages with QoS 0 it drops the newest.
         """
         names = self.names
         both = self.topics[: min(count, self.plain)]
@@ -152,11 +152,11 @@ class Client:
         self.send(0x82, b"\x00\x01", *filters)
 
     def publish(self, retain: int, topic: bytes, payload: bytes) -> bool:
-        """Publish with QoS 0; ``retain`` 1: as a retained message. False: there is no room for it now."""
+        """Publish with QoS 0; ``retain`` 1: as a retained message. False if there is no room for it now."""
         return self.send(0x30 | retain, bytes((len(topic) >> 8, len(topic) & 255)), topic, payload)
 
     def sent(self, count: int) -> None:
-        """Remove the first ``count`` bytes of ``out``, which were sent, and refill it."""
+        """Remove the ``count`` bytes of ``out`` that were sent, and refill it."""
         left = self.waiting - count
         if count and left:
             self.out[:left] = bytes(self.out[count : self.waiting])
@@ -173,12 +173,12 @@ class Client:
 
 
 def text(data: bytes) -> bytes:
-    """Encode a string of a packet: its length, then its bytes (1.5.3)."""
+    """Return a string of a packet: its length, then its bytes (1.5.3)."""
     return bytes((len(data) >> 8, len(data) & 255)) + data
 
 
 def login(name: bytes, user: bytes, password: bytes, topic: bytes, will: bytes, alive_s: int) -> tuple:
-    """Return CONNECT for ``send``: a clean session, and a retained ``will`` of QoS 1 on ``topic`` (3.1)."""
+    """Return a CONNECT for ``send``: a clean session, and a retained ``will`` of QoS 1 on ``topic`` (3.1)."""
     # clean session 2, will 4, its QoS 8, its retain flag 32, password 64, user 128
     # a password needs a user, whose name may be empty (3.1.2.9)
     flags = 0x2E | (0xC0 if password else 0x80 if user else 0)

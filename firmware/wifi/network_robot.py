@@ -1,7 +1,7 @@
 """The common part of all robots on Wi-Fi: commands, stops, dead-man's switch, heartbeat and reports.
 
-A robot that loses the broker stops at once, because no operator could stop it. So whatever blocks the processor for
-long (TLS, starting the radio) happens only while the motors are off.
+A robot that loses the broker stops at once, because no operator could stop it. Work that blocks the processor for long
+(TLS, starting the radio) is done only while the motors are off.
 """
 
 import time
@@ -36,10 +36,11 @@ class NetworkRobot:
     """One robot; call ``step`` forever. Status: ``session.connection``, ``stops``, ``deadman.trips``, ``refused``."""
 
     def __init__(self, settings: dict, body, charging: bytes, wrap) -> None:
-        """``body`` has ``drive(x, z, y)``, True if anything moves; ``stop()``; ``report(publish)``; ``refresh()``.
-        ``axes``, if it has the auxiliary one: see `describe`; ``groups``, if its board has room for groups of commands.
+        """Store the arguments. ``wrap`` wraps a socket in TLS; None: no TLS.
 
-        ``charging``: whether it reports a charging status, in JSON. ``wrap`` wraps a socket in TLS; None: no TLS.
+        ``body`` has ``drive(x, z, y)``, True if anything moves; ``stop()``; ``report(publish)``; ``refresh()``. It has
+        ``axes`` if it has the auxiliary one (see `describe`), and ``groups`` if its board has room for groups of
+        commands. ``charging``: whether it reports a charging status, in JSON.
         """
         now = time.ticks_ms()
         name = get(settings, "robot", "id")
@@ -108,7 +109,7 @@ class NetworkRobot:
     # -- in
 
     def _read(self) -> None:
-        """Judge all commands in their order and execute only the newest admitted one; none beside a stop."""
+        """Judge all received commands in order. Execute only the newest admitted one, and none beside a stop."""
         self._next = None
         self._void = False
         now = time.ticks_ms()

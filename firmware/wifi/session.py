@@ -1,4 +1,4 @@
-"""Sessions with the broker, one after another: connecting, what is read and written, and how much may be in flight."""
+"""Sessions with the broker, one after another: they connect, read and write, and limit the bytes in flight."""
 
 import gc
 import os
@@ -26,13 +26,13 @@ _IN_FLIGHT = const(7)
 
 
 class Session:
-    """Each turn ``step``, and if it is True ``read`` and ``write``; ``drop`` it after any OSError or ValueError."""
+    """A session: ``step`` each turn, then ``read`` and ``write`` if it is True; ``drop`` after OSError, ValueError."""
 
     def __init__(self, settings: dict, root: bytes, topics: tuple, plain: int, names, wrap, take) -> None:
-        """``topics``, ``plain``, ``names``: as of `mqtt.Client`. ``wrap`` wraps a socket in TLS; None: no TLS.
+        """Store the arguments. ``wrap`` wraps a socket in TLS; None: no TLS.
 
-        ``take(kind, now)`` is called for the SUBACK and for each publication, see `mqtt.Client.take`; it may raise
-        ValueError.
+        ``topics``, ``plain``, ``names``: see `mqtt.Client`. ``take(kind, now)`` is called for the SUBACK and for each
+        publication, see `mqtt.Client.take`; it may raise ValueError.
         """
         self.settings = settings
         self.host = host(settings)
@@ -58,9 +58,10 @@ class Session:
         self._since = 0  # since when
 
     def step(self, now: int, server: str, clock) -> bool:
-        """Return whether packets can be exchanged; ``server`` is the DNS server, "": there is no network.
+        """Return True if packets can be exchanged; ``server`` is the DNS server, "": there is no network.
 
-        An OSError says why the session is over. Silence ends it before anything is read: queued commands are stale.
+        Raises OSError with the reason if the session is over. Silence ends it before anything is read: queued commands
+        are stale.
         """
         connection = self.connection
         due = connection.step(now, server != "")
@@ -112,7 +113,7 @@ class Session:
         self.connection.lost(now, random.getrandbits(8))
 
     def read(self, now: int) -> None:
-        """Read what there is, at most some kilobytes, and pass on all publications in their order."""
+        """Read what has come, at most some kilobytes, and pass on all publications in order."""
         client = self.client
         assert self._open
         for chunk in range(_CHUNKS):
@@ -147,11 +148,11 @@ class Session:
                 break
 
     def publish(self, topic: bytes, payload: bytes, retain: int = 0) -> bool:
-        """Publish on outgoing/``topic``; False: there is no room, and it is dropped, because it would be stale."""
+        """Publish on outgoing/``topic``. False: there is no room, and the message is dropped, as it would be stale."""
         return self.client.publish(retain, b"%s/outgoing/%s" % (self.root, topic), payload)
 
     def write(self, now: int, urgent: bool) -> None:
-        """Write what waits, if it is ``urgent`` or the last write is long enough ago."""
+        """Write waiting bytes, if that is ``urgent`` or the last write was long enough ago."""
         client = self.client
         if self._paused and self.connection.state == "online" and diff(now, self._since) >= _CALM_MS:
             self._paused = False

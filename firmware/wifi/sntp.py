@@ -11,12 +11,12 @@ _ERA_S = const(1 << 32)  # NTP's seconds start again in 2036
 
 
 def request(nonce: bytes) -> bytes:
-    """Make the 48-byte request, version 4, client; the answer repeats the 8 random bytes, a forged one cannot."""
+    """Return a 48-byte client request, version 4. The answer repeats its 8 random bytes; a forger cannot."""
     return b"\x23" + bytes(39) + nonce
 
 
 def epoch_ms(packet: bytes, nonce: bytes) -> int | None:
-    """Return when the server sent ``packet``, in epoch milliseconds; None for an invalid answer to our request."""
+    """Return the time at which the server sent ``packet``, in epoch ms; None if it does not answer our request."""
     if len(packet) < 48 or packet[24:32] != nonce:
         return None
     first, stratum = packet[0], packet[1]
@@ -31,7 +31,7 @@ def epoch_ms(packet: bytes, nonce: bytes) -> int | None:
 
 
 class WallClock:
-    """The time of day. Before the first ``set`` it counts from 0, which readers treat as an unknown time.
+    """The time of day. Before the first ``set`` it counts from 0, which readers take for an unknown time.
 
     Call ``read`` at least once in six days, because ticks wrap.
     """

@@ -1,7 +1,7 @@
 """A TCP connection, and queries by UDP, all non-blocking. A driver.
 
 MicroPython's streams: ``readinto`` and ``write`` return None when they would block, and ``connect`` raises EINPROGRESS
-(docs.micropython.org, library/socket and library/io). Addresses are numbers, so that no port looks a name up.
+(docs.micropython.org, library/socket and library/io). Addresses are numeric, so that no port looks up a name.
 """
 
 import errno
@@ -19,10 +19,10 @@ _DATAGRAM = const(512)  # more than any answer needed here (RFC 1035 section 2.3
 
 
 class Stream:
-    """A TCP connection that is being made, and is usable once ``ready``; every failure is an OSError."""
+    """A TCP connection. It is usable once ``ready``; every failure is an OSError."""
 
     def __init__(self, host: str, port: int, wrap) -> None:
-        """``wrap`` puts TLS around the connected socket; None: none."""
+        """Start to connect; ``wrap`` puts TLS around the connected socket; None: no TLS."""
         self.wrap = wrap
         self._tried = 0
         self._poll: select.poll | None = select.poll()
@@ -66,7 +66,7 @@ class Stream:
 
 
 class Query:
-    """Sends one datagram every second and receives its answers, from its destination only."""
+    """A query by UDP: it sends a datagram every second, and receives answers from its destination only."""
 
     def __init__(self, host: str, port: int, data: bytes, now: int, skip: int = 0) -> None:
         self.host = host
@@ -78,7 +78,7 @@ class Query:
         self.socket.setblocking(False)
 
     def step(self, now: int) -> bytes:
-        """Return the next answer, b"" if there is none. Any host may answer a multicast query (224.x.x.x)."""
+        """Return the next answer, b"" if there is none. A multicast query (224.x.x.x) may be answered by any host."""
         try:
             if diff(now, self._due) >= 0:
                 self._due = now + _AGAIN_MS
@@ -89,14 +89,14 @@ class Query:
         return data if port == self._port and (host == self.host or self.host.startswith("224.")) else b""
 
     def address(self, now: int) -> str | None:
-        """Return the address of the queried name; "" if there is none; None: not known yet."""
+        """Return the address of the queried name; "" if there is none, None if it is not known yet."""
         return dns.answer(self.step(now), self.data, self._skip) if self.data else self.host
 
 
 def query_name(host: str, server: str, now: int, skip: int = 0) -> Query:
-    """Query the address of ``host`` from ``server``, or by mDNS for names in .local; numbers need no query.
+    """Return a query for the address of ``host``, at ``server`` or by mDNS for .local; numbers need no query.
 
-    ``skip``: which one of several, see `dns.answer`.
+    ``skip``: which of several addresses, see `dns.answer`.
     """
     if host.replace(".", "").isdigit():
         return Query(host, 0, b"", now)

@@ -11,7 +11,7 @@ import machine
 
 
 class Wrapper:
-    """Wraps a socket in TLS. ``options``: true, or {"ca": a DER file on the board, "server_name": ...}."""
+    """A wrapper of sockets in TLS. ``options``: true, or {"ca": a DER file on the board, "server_name": ...}."""
 
     def __init__(self, options: bool | dict) -> None:
         self._ca = None if options is True else options.get("ca")  # type: ignore[union-attr]  # not False
@@ -19,7 +19,7 @@ class Wrapper:
         self.host = ""  # as it is named in the settings, of the next connection
 
     def set_time(self, epoch_ms: int) -> None:
-        """Set the board's clock, if the time is known: certificates have a validity period (docs, library/ssl).
+        """Set the board's clock, if the time is known: certificates are valid for a limited time (docs, library/ssl).
 
         A time server that reports 2065 or later is wrong, and gmtime of some ports fails from 2068 on.
         """

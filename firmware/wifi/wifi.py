@@ -1,4 +1,4 @@
-"""Joins the Wi-Fi, and rejoins it after a loss, without blocking. A driver."""
+"""Connects to the Wi-Fi, and again after a loss, without blocking. A driver."""
 
 import network
 from micropython import const
@@ -21,7 +21,7 @@ class Wifi:
         self._wlan.config(pm=network.WLAN.PM_NONE)  # power save would delay commands by 100 ms and more
 
     def step(self, now: int) -> str:
-        """Return the address of the DNS server; "": not connected to the Wi-Fi."""
+        """Return the address of the DNS server; "" while not connected to the Wi-Fi."""
         if self._wlan.isconnected():
             self._tried = now
             self._server = self._server or self._wlan.ifconfig()[3]
