@@ -58,9 +58,9 @@ class Latch:
     def stop(self, name: str, by: str, why: str, since: int) -> bool:
         """Latch and return True; return False if this stop is known already.
 
-        A sender that was not checked has a mark; a checked one replaces it when the stop comes again. ``name`` is never
-        empty: the receiver of a stop without a name makes one. If there are too many names, the oldest of the sender
-        with the most is forgotten, so that stops of one account do not keep another's from being confirmed. All senders
+        ``name`` is never empty: the receiver of a stop without a name makes one. ``by`` ends in "?" if the sender was
+        not checked; a checked sender replaces it when the same stop comes again. If there are too many names, the
+        sender with the most names loses its oldest, so that stops of one account do not push out another's. All senders
         that were not checked count as one.
         """
         sender = "?" if by[-1:] == "?" else by.split("/")[0]

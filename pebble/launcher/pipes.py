@@ -17,9 +17,10 @@ Taker = Callable[[bytes], None]
 
 
 class Pipes:
-    """A reader of a child's pipes, until :meth:`close`: ``on_line`` and ``on_note`` get each line that is not empty.
+    """A reader of a child's pipes, until :meth:`close`.
 
-    ``rate``: the most lines of output a second; ``on_line`` gets the number of the lines beyond it.
+    ``on_line`` gets each line of the output that is not empty, ``on_note`` each note. ``rate``: the most lines of
+    output a second; of further ones ``on_line`` gets only their number.
     """
 
     def __init__(self, child: Child, reactor: Reactor, on_line: Taker, on_note: Taker, *, rate: float) -> None:

@@ -7,9 +7,9 @@ _IDLE_MS, _OTHERS_MS = 5000, 2000  # as in Lease
 
 
 class VouchedLease(Lease):
-    """A lease that counts its holder as silent only for time for which the bridge vouches.
+    """A lease that does not take its holder for silent because messages were held up.
 
-    The bridge vouches for a time after it has passed on all messages of that time to the motor owner.
+    Silence counts only in periods for which the bridge vouches: those of which it has passed on every message.
     """
 
     vouched: tuple[int, int] | None = None  # None: there is no bridge, and all time counts

@@ -44,7 +44,7 @@ class MaskingFormatter(logging.Formatter):
 
 
 def set_log_level(level: str) -> None:
-    """Log from ``level`` on. Set it only if it differs: this writes into memory that is shared with the launcher."""
+    """Log from ``level`` on. An unchanged level is not set again: that would copy memory shared with the launcher."""
     if logging.getLevelName(logging.getLogger().level) != level:
         logging.getLogger().setLevel(level)
 

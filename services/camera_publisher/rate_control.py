@@ -65,7 +65,7 @@ class RateController:
         return len(self._window) > 0
 
     def may_encode(self, captured_s: float, now: float) -> bool:
-        """True if a frame captured at ``captured_s`` is due and need not wait for another; it uses up its turn."""
+        """True if a frame captured at ``captured_s`` may be encoded now. The frame has then used its turn."""
         if not self._selector.due(captured_s):
             return False
         round_trip_s = self._update(now)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from pebble.extensions.media.in_flight import InFlight
+from pebble.extensions.media.in_flight import InFlight, Sent
 
 #: The other side's TCP may delay an acknowledgement by 40 ms: this much says nothing about the connection.
 SLACK_S = 0.05
@@ -57,22 +57,29 @@ class SendWindow:
         self._frames.sent(size, now)
 
     def poll(self, waiting: int, round_trip_s: float, now: float) -> list[Acknowledged]:
-        """Return the frames acknowledged since the last poll; ``waiting`` bytes are still unacknowledged."""
+        """Return the frames acknowledged since the last poll, and adapt how many may be in flight.
+
+        ``waiting`` bytes are still unacknowledged.
+        """
         self._round_trip_s, since_s, self._polled_at = round_trip_s, now - self._polled_at, now
         frames, slack_s = self._frames.acknowledge(waiting), self._slack_s(now)
         acknowledged = []
         for frame in frames:
             began = max(frame.at + round_trip_s, self._free_at)
             self._free_at = now
-            prompt = now - frame.at - round_trip_s <= _PROMPT_S
+            prompt = now - frame.at - round_trip_s <= _PROMPT_S  # else fewer may be in flight
             self._limit = max(1, min(_MOST, self._limit + (1 if prompt else -1)))
             acknowledged.append(Acknowledged(frame.at, _credible(max(0.0, now - began), slack_s)))
         if len(frames) > 1:
-            sizes = [frame.size for frame in frames]
-            needed_s = since_s * sizes[0] / sum(sizes[1:])  # by the first frame, at the pace of those that came with it
-            if now - frames[0].at - round_trip_s > max(SLACK_S, 2 * needed_s):
-                self._beacon_until = now + _BEACON_S
+            self._note_beacon(frames, since_s, now)
         return acknowledged
+
+    def _note_beacon(self, frames: list[Sent], since_s: float, now: float) -> None:
+        """Note that an access point held acknowledgements back, if they came together, later than the first needed."""
+        sizes = [frame.size for frame in frames]
+        needed_s = since_s * sizes[0] / sum(sizes[1:])  # by the first frame, at the pace of those that came with it
+        if now - frames[0].at - self._round_trip_s > max(SLACK_S, 2 * needed_s):
+            self._beacon_until = now + _BEACON_S
 
     def full(self, round_trip_s: float, now: float) -> bool:
         """True if another frame would have to wait for those in flight."""

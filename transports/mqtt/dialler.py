@@ -168,7 +168,11 @@ class Dialler:
         return self.loses_large
 
     def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
-        """True if the broker has gone: nothing listens, or it hangs up while it ends. Remembers the time."""
+        """True if this loss means that the broker has ended.
+
+        A lost connection does, unless the broker was only silent. A failed attempt keeps the earlier verdict
+        ``was_ended`` while nothing listens, or shortly after.
+        """
         now, silent = time.monotonic(), isinstance(lost, Silent)  # then it may be we who stood still
         if connected:
             self._gone_at = now

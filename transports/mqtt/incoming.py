@@ -119,7 +119,7 @@ class Incoming:
         return unread - bytes_left
 
     def _receive(self, client: Client, now: float) -> int:
-        """Take a piece out of the socket, and note its size for the messages' ages; return its number of bytes."""
+        """Read once from the socket; return the number of bytes, from which the ages of messages are estimated."""
         age, waiting = self.age, self.age.waiting
         age.received_at = now
         if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:

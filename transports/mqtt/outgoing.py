@@ -194,9 +194,9 @@ class InFlightTable:
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
-        """Return the bytes by topic of recent messages that no answer to a ping has confirmed.
+        """Return the size of the largest unconfirmed recent message of each topic.
 
-        Only messages that are the first of their topic on this connection, or larger than those before, are in it.
+        Messages that are neither the first of their topic nor larger than all before are left out.
         """
         sizes: dict[str, int] = {}
         for written in (*(written for _, _, written in self._pings), self._written):

@@ -272,7 +272,7 @@ class MqttTransport(Transport):
             self._refused.note_loss(connection.where, written, time.monotonic())
 
     def _try_withheld(self, connection: Connection) -> None:
-        """Send the retained message of a topic that is tried again."""
+        """Send retained messages that were withheld, where a new attempt is due: the broker may refuse their topics."""
         with self._publishing:
             for message in self._refused.due(self._own, connection.where, time.monotonic()):
                 self._own.remember(message, sent=self._send(message, False))

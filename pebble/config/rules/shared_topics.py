@@ -39,7 +39,7 @@ def renamed_commands(root: Root) -> Iterator[tuple[Path, str]]:
 
 
 def _keys(channel: Channel, root: Root) -> Iterator[tuple[Path, str | None]]:
-    """Yield each key that may rename the channel, with its topic, or None if it is not set; one per serial line."""
+    """Yield each key that may rename the channel, with its topic (None: not set); serial lines have a key each."""
     if channel.override is None:
         yield (), None
         return

@@ -70,7 +70,7 @@ class Sieve:
         return False
 
     def keeps(self, subject: Subject, message: Message, forward: Forward) -> bool:
-        """Keep ``message`` and return True, or drop it for lack of room; return False if it is to be sent now."""
+        """True if the sieve takes ``message``: to send it later, or to drop it for lack of room. False: send it now."""
         rank, topic = rank_of(subject, message), message.topic
         if rank is None:
             return False

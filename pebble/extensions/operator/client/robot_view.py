@@ -42,11 +42,11 @@ class Liveness:
     def heartbeat(self, now: float, latency_s: float, *, online: bool = True, t: int = 1) -> None:
         """Note a heartbeat with the time ``t``, in milliseconds of the component's clock."""
         self._stamps.append(t)
-        is_gap = self.received_at is not None and 0.05 <= now - self.received_at <= 10.0
-        if is_gap and not self.reported_offline and self.online_to_people(now) is False:
-            self._returns.append(now)
-        if self.received_at is not None and is_gap:
-            self._intervals.append(now - self.received_at)
+        interval_s = None if self.received_at is None else now - self.received_at
+        if interval_s is not None and 0.05 <= interval_s <= 10.0:
+            if not self.reported_offline and self.online_to_people(now) is False:  # people had seen it go
+                self._returns.append(now)
+            self._intervals.append(interval_s)
         self.latency_s = max(0.0, latency_s) if -1.0 <= latency_s <= 10.0 else None
         if self.latency_s is not None:
             self._latencies.append(self.latency_s)
@@ -208,7 +208,10 @@ class RobotView:
         return "assumed" in self.capabilities
 
     def assume(self, axes: Collection[str], name: str = "") -> bool:
-        """Assume that a silent board drives along these axes, or not at all; return True if that is a change."""
+        """Assume that a board which has published no capabilities drives along ``axes``; none: it cannot drive.
+
+        Return True if that changes anything.
+        """
         before = self.capabilities
         if self.silent:
             self.capabilities = assumed.assumed(self.base, axes, name)

@@ -108,7 +108,10 @@ def record_of(data: bytes) -> McapRecord:
 
 
 def summary_of(tail: bytes) -> Summary | None:
-    """Return the summary in the end of a file, from its summary on; None if there is none. Raises DamageError."""
+    """Return the summary of a file; None if it has none. ``tail`` is the file's end from its summary on.
+
+    Raises DamageError.
+    """
     from mcap.reader import NonSeekingReader
 
     with _damage():

@@ -11,7 +11,7 @@ from pebble.errors import PayloadError
 
 
 class Activity(IntEnum):
-    """Kinds of activity, as numbers of the index. DRIVE to AUTONOMY belong to a session (paper 4.1)."""
+    """The uses of a robot that a message can show. The numbers are stored in the index of the traffic."""
 
     NONE = 0
     DRIVE = 1

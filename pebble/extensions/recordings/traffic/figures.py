@@ -165,7 +165,7 @@ def _short(value: float) -> str:
 
 
 def _svg(draw: Any, robot: RobotTraffic, name: str) -> str:
-    """Return SVG without ids, which two figures of a page could share, and without names of other hosts."""
+    """Return the figure as SVG for a page: without ids, which could clash with another's, and without foreign URLs."""
     import matplotlib as mpl
     from matplotlib.figure import Figure as Drawing
 

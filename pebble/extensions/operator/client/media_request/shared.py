@@ -25,7 +25,10 @@ _WAITS: Final[dict[Medium, str]] = {"video": "Pictures wait for driving", "audio
 
 
 class SharedRequest:
-    """The request for a robot's medium. Used on the event loop only; its coroutines only in :meth:`run`."""
+    """One request for a robot's pictures or sound, shared by all that show them here.
+
+    Used on the event loop only. Its coroutines are awaited only in a step of :meth:`run`.
+    """
 
     def __init__(self, broker: Broker, ref: str, medium: Medium, receive: Callable[[bytes], None]) -> None:
         """Store the settings. ``receive`` gets each payload."""
