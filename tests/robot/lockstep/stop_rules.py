@@ -1,7 +1,7 @@
 """What must hold of stops beyond a bridge, said of what it had, what it passed on and what the motor owners published.
 
 * A stop that the bridge has passed on latches each owner that runs and is reached, unless a reset that was sent later
-  ended it. Excused: what a killed bridge forgets.
+  ended it, also if a copy of it comes after the reset. Excused: what a killed bridge forgets.
 * A stop with a name passes to all owners as often as it came, and one without a name once, except around a loss of the
   connection of stops, where equal bytes cannot be told apart.
 * An owner that has shown that a stop was reset gets no copy of it while it remembers the stop's name.
@@ -43,6 +43,7 @@ class StopRules:
         self._reset_sent = dict.fromkeys(owners, 0.0)  # when the newest reset was sent that an owner has obeyed
         self._reached_from = dict.fromkeys(owners, 0.0)
         self.repeated_at = 0.0
+        self._stopped: dict[str, float] = {}  # by name: when it passed first, in any life of the bridge
         self.begin()
 
     def begin(self) -> None:
@@ -119,6 +120,7 @@ class StopRules:
             return
         self._passed[name] += 1
         self._first.setdefault(name, now)
+        self._stopped.setdefault(name, now)
         if name in self._came:
             self._check(self._passed[name] <= self._came[name], "a stop passes to all owners more often than it came")
             return
@@ -133,6 +135,7 @@ class StopRules:
             self._scheduler.now - since < _REPEAT_S, "a stop is repeated to an owner that has withdrawn its own"
         )
         self._first.setdefault(name, self._scheduler.now)  # if nothing passed: it had no connection to the robot
+        self._stopped.setdefault(name, self._scheduler.now)
         firsts = self._first | self._came_first
         shown = (first for other, first in firsts.items() if (owner, other) in self._shown)
         newest = max(firsts[name], *shown, 0.0)
@@ -147,7 +150,7 @@ class StopRules:
             reached = owner.connection is not None and owner.connection._present and not owner.frozen
             if not (bridged and owner.alive and reached):
                 self._reached_from[name] = now
-            due = [at for at in self._first.values() if at > self._reset_sent[name]]
+            due = [at for at in (self._stopped[stop] for stop in self._first) if at > self._reset_sent[name]]
             state = self._published.get(name)
             if due and state is not None and not state.latched:
                 late = now - max(max(due), self._reached_from[name]) > _LATCHES_S + owner.slack
