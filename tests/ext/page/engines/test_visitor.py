@@ -26,6 +26,15 @@ _TOUCH = {"dom.w3c_touch_events.enabled": 1}
 _ERRORS = """void (globalThis.complaints = [],
   addEventListener("error", ({ message }) => message.startsWith("ResizeObserver loop") || complaints.push(message)),
   addEventListener("unhandledrejection", (event) => complaints.push(String(event.reason))))"""
+#: What moved by itself, where a browser tells: most of all nothing that stops a robot, or gives control over it.
+_MOVES = """void (globalThis.moved = [],
+  PerformanceObserver.supportedEntryTypes.includes("layout-shift") && new PerformanceObserver((list) => {
+    for (const { hadRecentInput, sources, value } of list.getEntries()) {
+      if (hadRecentInput) continue;
+      for (const { node, previousRect: a, currentRect: b } of sources)
+        moved.push([value, node?.outerHTML?.slice(0, 100) ?? node?.data, [a, b].map((c) => JSON.stringify(c))]);
+    }
+  }).observe({ type: "layout-shift", buffered: true }))"""
 _HAS_CONTROL = "Boolean(document.querySelector('[data-test=release]'))"
 _SHOWN = "document.querySelector('{}')?.getClientRects().length"
 _FOLLOWS = "document.querySelector('[data-test=script-state]').innerText.includes('Follow a tag')"
@@ -64,6 +73,8 @@ class Visitor:
         assert self.header in (None, header), what
         self.header = header
         assert self.engine.evaluate("globalThis.complaints ?? []") == [], what
+        for one in self.engine.evaluate("moved.splice(0)"):
+            sys.stdout.write(f"         moved {one}\n")
         if isinstance(self.engine, Chromium):
             assert self.engine.tab.complaints() == [], what
 
@@ -93,6 +104,7 @@ def test_a_visitor_sees_drives_stops_and_starts_a_script(
         visitor = Visitor(engine)
         engine.open(page_of(demo))
         engine.evaluate(_ERRORS)
+        engine.evaluate(_MOVES)
         visitor.sees("document.querySelectorAll('.fleet-card').length >= 4", START_S)
         visitor.did("all robots are there")
         visitor.sees("document.querySelector('.thumbnail img')", 15)

@@ -104,7 +104,7 @@ class View {
     this.gone = false; // whether the newest pose is an old one
     this.seen = true;
     this.timer = setInterval(() => this.seen && !document.hidden && this.draw(), STEP_MS);
-    this.sizes = more.sizes(() => this.draw());
+    this.sizes = browser.sizes(() => this.draw());
     this.sizes.observe(canvas);
     this.sight = more.sight((seen) => (this.seen = seen));
     this.sight.observe(canvas);

@@ -3,13 +3,12 @@
 import { html, useMetric, useOnline, useValue } from "../parts/hooks.js";
 import { Charge, Live, isGone, useEnded } from "../parts/parts.js";
 import { Board } from "./board.js";
-import { charge, looksOf } from "../parts/looks.js";
+import { LOW_PERCENT, charge, looksOf } from "../parts/looks.js";
 import { charging, plain } from "../parts/more-words.js";
 import { battery, inner, isObject, number, typeOf } from "../parts/words.js";
 
 const STREAM_MS = 1000;
 const LEVEL_DEG = 3;
-const LOW_PERCENT = 20;
 
 export function Telemetry({ at }) {
   const online = useOnline(at);
