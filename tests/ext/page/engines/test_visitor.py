@@ -26,14 +26,14 @@ _TOUCH = {"dom.w3c_touch_events.enabled": 1}
 _ERRORS = """void (globalThis.complaints = [],
   addEventListener("error", ({ message }) => message.startsWith("ResizeObserver loop") || complaints.push(message)),
   addEventListener("unhandledrejection", (event) => complaints.push(String(event.reason))))"""
-#: What moved by itself, where a browser tells: most of all nothing that stops a robot, or gives control over it.
+#: What has moved by itself, where a browser tells, of what stops a robot or gives control over it.
 _MOVES = """void (globalThis.moved = [],
   PerformanceObserver.supportedEntryTypes.includes("layout-shift") && new PerformanceObserver((list) => {
-    for (const { hadRecentInput, sources, value } of list.getEntries()) {
-      if (hadRecentInput) continue;
-      for (const { node, previousRect: a, currentRect: b } of sources)
-        moved.push([value, node?.outerHTML?.slice(0, 100) ?? node?.data, [a, b].map((c) => JSON.stringify(c))]);
-    }
+    const urgent = document.querySelectorAll(
+      ".top .stop, .stops summary, .banner, [data-test^=reset], [data-test^=take], [data-test=ask]");
+    const moves = ({ node }) => [...urgent].some((one) => node?.contains(one));
+    for (const { hadRecentInput, sources } of list.getEntries())
+      if (!hadRecentInput) moved.push(...sources.filter(moves).map(({ node }) => node.outerHTML.slice(0, 200)));
   }).observe({ type: "layout-shift", buffered: true }))"""
 _HAS_CONTROL = "Boolean(document.querySelector('[data-test=release]'))"
 _SHOWN = "document.querySelector('{}')?.getClientRects().length"
@@ -73,8 +73,7 @@ class Visitor:
         assert self.header in (None, header), what
         self.header = header
         assert self.engine.evaluate("globalThis.complaints ?? []") == [], what
-        for one in self.engine.evaluate("moved.splice(0)"):
-            sys.stdout.write(f"         moved {one}\n")
+        assert self.engine.evaluate("moved.splice(0)") == [], what
         if isinstance(self.engine, Chromium):
             assert self.engine.tab.complaints() == [], what
 

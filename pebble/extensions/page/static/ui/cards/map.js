@@ -51,7 +51,6 @@ export function Odometry({ at, offers }) {
   return html`<div class="map">
     ${!series.newest &&
     html`<${Nothing} icon="map" what="No trail yet">It begins with the first position that is received<//>`}
-    ${ended && (gone || !series.newest) && html`<${Ended} at=${at} script=${ended} />`}
     <canvas ref=${canvas} class=${series.newest ? "map-canvas" : "map-canvas unused"} role="img" tabindex="0" data-arrows data-test="map"
       aria-label="Trail of the odometry; arrow keys move it"></canvas>
     <p class="map-words" data-test="map-pose" hidden=${!series.newest}>
@@ -74,6 +73,7 @@ export function Odometry({ at, offers }) {
         onChoose=${choose}
       />`}
     </div>
+    ${ended && (gone || !series.newest) && html`<${Ended} at=${at} script=${ended} />`}
   </div>`;
 }
 

@@ -28,7 +28,7 @@ import { battery, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf }
 
 const STILL_MS = 5000; // between two of a camera that is on
 const LIVE_MS = 10_000; // a still that young is of now
-const MINUTES_MS = 120_000; // from then on its age is told in minutes
+const AGE_MS = 10_000; // the step in which the age of an older one is told: each costs a frame
 const DENSE = 13; // so many components are shown in small cards, and by what they need
 const MANY = 100; // beyond, cards have no pictures, and only those near the screen are drawn
 const NEEDS_MS = 10_000; // so long a card stays among those that need a look
@@ -375,10 +375,10 @@ function Thumbnail({ at, has, looks }) {
   useEffect(() => () => URL.revokeObjectURL(src), [src]);
   const age = performance.now() - takenAt;
   const isLive = useRecent(takenAt, LIVE_MS) && isOn;
-  useTick(!src || isLive ? 0 : age < MINUTES_MS ? 2000 : 20_000);
+  useTick(src && !isLive ? AGE_MS : 0);
   return html`<div class=${`thumbnail ${src ? "" : "faced"}`}>
     ${src ? html`<img alt=${`What ${looks.name} sees`} src=${src} />` : html`<${Drawing} picture=${looks.picture} />`}
-    ${src && html`<span class=${`tag ${isLive ? "live" : ""}`}>${isLive ? "live" : `${roughly(age)} ago`}</span>`}
+    ${src && html`<span class=${`tag ${isLive ? "live" : ""}`}>${isLive ? "live" : `${roughly(age - (age % AGE_MS))} ago`}</span>`}
     <${Stripe} at=${at} />
   </div>`;
 }
