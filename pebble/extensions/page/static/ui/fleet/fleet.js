@@ -252,7 +252,7 @@ function TroubleFact({ at }) {
   const { no, text } = doubtOf(status);
   const { services } = inner(status) ?? {};
   const [ill, { state }] = Object.entries(isObject(services) ? services : {}).find(([, one]) => ILL.includes(one?.state)) ?? ["", {}];
-  const words = text || (ill && `${ill.replaceAll("_", " ")} ${state}`);
+  const words = text || (ill && `${state}: ${ill.replaceAll("_", " ")}`);
   const bad = no || !text;
   return words && html`<li class=${`fact told ${bad ? "bad" : "dim"}`} title=${words}><span aria-hidden="true">${bad ? "▲" : "?"}</span><span>${words}</span></li>`;
 }
