@@ -9,7 +9,8 @@ REACHED = """(() => {
   const middle = (one, { x, y, width, height } = one.getBoundingClientRect()) => [x + width / 2, y + height / 2];
   const top = (one) => document.elementFromPoint(...middle(one));
   const urgent = [...document.querySelectorAll(".top .stop, .banner button, [data-test=take]")];
-  const covered = urgent.filter((one) => top(one) && !one.contains(top(one))).map((one) => one.innerText);
+  const shown = urgent.filter((one) => one.checkVisibility());
+  const covered = shown.filter((one) => top(one) && !one.contains(top(one))).map((one) => one.innerText);
   return [[...document.querySelectorAll(".top .stop")].map((one) => middle(one).map(Math.round)), covered];
 })()"""
 

@@ -144,19 +144,23 @@ def goob(now: int) -> list[Value]:
     ]
 
 
-def thousand(now: int) -> list[Value]:
-    """A thousand robots, of which some are stopped, driven, away or low."""
-    values = []
-    for number in range(1, 1001):
-        ref = f"pebble/robots/robot-{number:04d}"
-        values += robot(now, ref, "mqtt", 7.2 + 0.001 * number, video=False)
-        if number % 97 == 0:
-            values.append((ref, "web/estop", estop(now, "eve on phone"), 0))
-        if number % 53 == 0:
-            values.append((ref, "web/driver", driver("bob", "phone"), 0))
-        if number % 41 == 0:
-            values.append((ref, "web/liveness", liveness(online=False, silent_s=300.0), 0))
-    return values
+def many(count: int, stopped: int, driven: int, away: int, *, video: bool = False) -> Values:
+    """So many robots, of which each ``stopped``-th is stopped, and so on; the later ones have the fuller batteries."""
+
+    def make(now: int) -> list[Value]:
+        values = []
+        for number in range(1, count + 1):
+            ref = f"pebble/robots/robot-{number:04d}"
+            values += robot(now, ref, "mqtt", 7.2 + 0.001 * number, video=video)
+            if number % stopped == 0:
+                values.append((ref, "web/estop", estop(now, "eve on phone"), 0))
+            if number % driven == 0:
+                values.append((ref, "web/driver", driver("bob", "phone"), 0))
+            if number % away == 0:
+                values.append((ref, "web/liveness", liveness(online=False, silent_s=300.0), 0))
+        return values
+
+    return make
 
 
 def fleet(now: int) -> list[Value]:
@@ -384,7 +388,8 @@ STATES: dict[str, State] = {
     "fleet-stopped": of("/", stopped(GOOB, "eve on phone"), stopped(FRED, "eve on phone", why="button, all")),
     "fleet-undriveable": of("/", *UNDRIVEABLE),
     "undriveable": of(GOOB_PATH, MINE, *UNDRIVEABLE),
-    "fleet-thousand": State("/", thousand),
+    "fleet-forty": State("/", many(40, 13, 7, 11, video=True), LIVE),
+    "fleet-thousand": State("/", many(1000, 97, 53, 41)),
     "fleet-empty": State("/", lambda _now: []),
     "fleet-lost": State("/", fleet, silent=True),
     "fleet-watching": of("/?watch"),

@@ -26,6 +26,15 @@ _TOUCH = {"dom.w3c_touch_events.enabled": 1}
 _ERRORS = """void (globalThis.complaints = [],
   addEventListener("error", ({ message }) => message.startsWith("ResizeObserver loop") || complaints.push(message)),
   addEventListener("unhandledrejection", (event) => complaints.push(String(event.reason))))"""
+#: What has moved by itself, where a browser tells, of what stops a robot or gives control over it.
+_MOVES = """void (globalThis.moved = [],
+  PerformanceObserver.supportedEntryTypes.includes("layout-shift") && new PerformanceObserver((list) => {
+    const urgent = document.querySelectorAll(
+      ".top .stop, .stops summary, .banner, [data-test^=reset], [data-test^=take], [data-test=ask]");
+    const moves = ({ node }) => [...urgent].some((one) => node?.contains(one));
+    for (const { hadRecentInput, sources } of list.getEntries())
+      if (!hadRecentInput) moved.push(...sources.filter(moves).map(({ node }) => node.outerHTML.slice(0, 200)));
+  }).observe({ type: "layout-shift", buffered: true }))"""
 _HAS_CONTROL = "Boolean(document.querySelector('[data-test=release]'))"
 _SHOWN = "document.querySelector('{}')?.getClientRects().length"
 _FOLLOWS = "document.querySelector('[data-test=script-state]').innerText.includes('Follow a tag')"
@@ -64,6 +73,7 @@ class Visitor:
         assert self.header in (None, header), what
         self.header = header
         assert self.engine.evaluate("globalThis.complaints ?? []") == [], what
+        assert self.engine.evaluate("moved.splice(0)") == [], what
         if isinstance(self.engine, Chromium):
             assert self.engine.tab.complaints() == [], what
 
@@ -93,6 +103,7 @@ def test_a_visitor_sees_drives_stops_and_starts_a_script(
         visitor = Visitor(engine)
         engine.open(page_of(demo))
         engine.evaluate(_ERRORS)
+        engine.evaluate(_MOVES)
         visitor.sees("document.querySelectorAll('.fleet-card').length >= 4", START_S)
         visitor.did("all robots are there")
         visitor.sees("document.querySelector('.thumbnail img')", 15)

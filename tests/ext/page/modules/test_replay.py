@@ -87,13 +87,17 @@ TIMELINE: Rows = {
         result = [stretchesOf(all, 2, seen(0, 90_000)).map(steps), stretchesOf(all, 2, seen(25_000, 45_000)).map(steps),
           stretchesOf(all, 2, seen(0, 7_000_000)).map(steps)];""",
         [[[0, 2], [3, 4], [5, 6], [8, 9]], [[3, 4]], [[0, 6], [8, 9]]]),
-    "a day begins with the first picture of a session": ("""
+    "a day begins where it has pictures": ("""
         const sessions = [{ since: start + 15_000, until: start + 30_000 }, { since: start + 60_000, until: start +
-          90_000 }];
-        const first = (...all) => (firstOf({ timeline: day(...all), name: "2026-11-22" }) - start) / 10_000;
-        result = [first([1, 1, 65, 1]), first([1, 1, 65, 1], sessions), first([1, 1, 1, 1], sessions),
-          (firstOf({ timeline: day([1], sessions), name: "" }, -1) - start) / 10_000,
-          firstOf({ timeline: null, name: "2026-11-22" }) - start];""", [0, 3, 1.5, 6, 0]),
+          75_000 }];
+        const first = (steps, last) =>
+          (firstOf({ timeline: day(steps, sessions), name: "2026-11-22" }, last) - start) / 10_000;
+        result = [first([1, 1, 65, 1]), first([1, 1, 65, 1], true), first([1, 1, 1, 1]), first([1, 1, 1, 1], true),
+          first([1, 1, 1, 1, 65]), first([1, 1, 65, 1, 1, 1, 65, 65]), first([1, 65, 1, 1, 1, 1, 65, 65], true),
+          first([1, 1, 1, 1, 1, 1, 1, 65]), first([64, 1, 64, 64, 1]),
+          firstOf({ timeline: day([1]), name: "" }) - start,
+          firstOf({ timeline: null, name: "2026-11-22" }) - start];""",
+        [3, 3, 1.5, 6, 5, 3, 7, 7.5, 3, 0, 0]),
     "a gap has the reason that the recorder wrote down": ("""
         const gaps = [{ since: 5, until: 9, why: "disk" }];
         result = [whyOf(gaps, { since: 8, until: 20 }), whyOf(gaps, { since: 9, until: 20 })];""", ["disk", ""]),

@@ -49,6 +49,22 @@ def shown(cards: Locator) -> list[str]:
     return cards.locator("h2").all_inner_texts()
 
 
+def test_small_cards_are_in_the_order_that_was_chosen(show: Show) -> None:
+    with show(STATES["fleet-forty"]) as opened:
+        cards = opened.page.locator("[aria-label=Online] .fleet-card")
+        assert opened.until(lambda: cards.count() == 34)
+        assert shown(cards)[:3] == ["robot-0001", "robot-0002", "robot-0003"]
+        opened.page.evaluate(
+            """pebble.store.set("pebble/robots/robot-0030", "charging-level", { value: 42, unit: "%" });
+            pebble.store.set("pebble/robots/robot-0012", "charging-level", { value: 63, unit: "%" })"""
+        )
+        opened.test("sort").select_option("battery")
+        assert opened.until(lambda: shown(cards)[:3] == ["robot-0030", "robot-0012", "robot-0001"])
+    with show(STATES["fleet"]) as opened:
+        opened.test("filter").wait_for()
+        assert opened.test("sort").count() == 0
+
+
 def test_of_a_thousand_only_those_on_the_screen_are_drawn(show: Show) -> None:
     with show(STATES["fleet-thousand"]) as opened:
         page, cards = opened.page, opened.page.locator(".fleet-card")

@@ -125,6 +125,16 @@ def test_the_cards_show_that_time_and_none_of_them_sends(replay: Tab):
     assert replay.page.evaluate("pebble.store.get('pebble/robots/goob', 'touch-sensors').value.value.a0") == 512  # live
 
 
+def test_the_sound_of_then_is_heard_also_after_a_seek(replay: Tab) -> None:
+    heard = "pebble.replay.sound.link.stats?.received > 10"
+    for name in ("listen", "play"):
+        replay.test(name).click()
+    assert replay.until(heard, 20)
+    seek(replay, AT + 3000)
+    assert replay.until(f"!({heard})")
+    assert replay.until(heard, 20)
+
+
 def test_stop_all_works_here_as_everywhere(show: Show, server: CannedServer) -> None:
     with show(STATES["replay"]) as opened:
         assert shown(opened, AT)

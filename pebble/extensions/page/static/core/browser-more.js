@@ -21,15 +21,9 @@ export const isLoopback = (host) => /^(127\.[\d.]+|0\.0\.0\.0|\[::1?\]|localhost
 
 export const DEMO = "demo"; // what the server of `make demo` calls itself
 
-const nothing = () => {};
-const blind = /** @type {any} */ ({ observe: nothing, disconnect: nothing });
-
-/** @param {ResizeObserverCallback} fn @returns {ResizeObserver} */
-export const sizes = (fn) => attempt(() => new ResizeObserver(fn), blind);
-
 /** @param {(seen: boolean) => void} fn @param {string} [rootMargin] around the screen @returns {IntersectionObserver} */
 export const sight = (fn, rootMargin = "0px") =>
   attempt(
     () => new IntersectionObserver((all) => fn(all[all.length - 1].isIntersecting), { rootMargin }),
-    /** @type {any} */ ({ observe: () => fn(true), disconnect: nothing }),
+    /** @type {any} */ ({ observe: () => fn(true), disconnect() {} }),
   );

@@ -55,6 +55,11 @@ export const onTurn = (fn) => attempt(() => screen.orientation.addEventListener(
 
 const nothing = () => {};
 
+const blind = /** @type {any} */ ({ observe: nothing, disconnect: nothing });
+
+/** @param {ResizeObserverCallback} fn @returns {ResizeObserver} */
+export const sizes = (fn) => attempt(() => new ResizeObserver(fn), blind);
+
 const unknown = /** @type {any} */ ({ matches: false, addEventListener: nothing, removeEventListener: nothing });
 
 /** @param {string} query @returns {MediaQueryList} */

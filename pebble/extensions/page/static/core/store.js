@@ -24,11 +24,6 @@ export class Value {
     return Math.max(0, this.store.clock() - this.receivedAt);
   }
 
-  /** When it was published: epoch ms of the server. */
-  get at() {
-    return this.store.now() - this.age;
-  }
-
   /** @param {V} value @param {number} receivedAt */
   replace(value, receivedAt) {
     const interval = receivedAt - this.receivedAt;

@@ -1,7 +1,7 @@
 // What must not be overlooked, over the picture or a title: stops, lost connections, and what was not done.
 
 import {
-  html, useEffect, useLater, useLayoutEffect, useMetric, useModel, useOnline, usePage, useRefs, useState, useTick, useValue,
+  html, useEffect, useLayoutEffect, useMetric, useModel, useOnline, usePage, useRecent, useRefs, useState, useTick, useValue,
 } from "./parts/hooks.js";
 import { Model } from "./parts/models.js";
 import { nameIn } from "./parts/looks.js";
@@ -339,7 +339,7 @@ function PressBanner() {
 function Notice() {
   const { connection } = usePage();
   const { notice } = connection;
-  const shown = notice && performance.now() - notice.at < NOTICE_MS;
+  const shown = useRecent(notice?.at ?? -Infinity, NOTICE_MS);
   return html`<div role="status" class="pill-place">${shown && html`<p class="pill">${notice.text}</p>`}</div>`;
 }
 
@@ -347,9 +347,7 @@ function Notice() {
 function ControlHint() {
   const { driver } = usePage();
   useModel(driver);
-  const since = performance.now() - driver.hintedAt;
-  const shown = since < HINT_MS && driver.reason()?.action?.kind === "take";
-  useLater(shown ? HINT_MS - since : Infinity);
+  const shown = useRecent(driver.hintedAt, HINT_MS) && driver.reason()?.action?.kind === "take";
   return html`<div role="status" class="pill-place">
     ${shown && html`<p class="pill" data-test="hint">Take control first<kbd>Enter</kbd></p>`}
   </div>`;

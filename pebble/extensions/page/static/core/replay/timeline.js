@@ -56,18 +56,19 @@ export function stretchOf(marked, end, sessions, ms) {
 }
 
 /**
- * Where a session of a day begins to have pictures; its begin if it has none, and the day's first message without sessions.
- * @param {{timeline: Timeline | null, name: string}} day @param {number} [number] of the session; -1: the last one
+ * Where a day begins to have pictures, first within its sessions; without any where its session begins, or the day.
+ * @param {{timeline: Timeline | null, name: string}} day @param {boolean} [last] the last session comes first
  */
-export function firstOf({ timeline, name }, number = 0) {
+export function firstOf({ timeline, name }, last = false) {
   if (!timeline) return startOf(name);
-  const session = timeline.sessions.at(number);
-  if (!session) return extentOf(timeline, name).since;
-  const { from, step, activity } = timeline;
-  const first = Math.max(0, Math.floor((session.since - from) / step));
-  const last = Math.min(activity.length, Math.ceil((session.until - from) / step));
-  for (let index = first; index < last; index++) if (activity[index] & PICTURE_BIT) return from + (index + 1) * step;
-  return session.since;
+  const sessions = last ? timeline.sessions.toReversed() : timeline.sessions;
+  const all = [...sessions, extentOf(timeline, name)];
+  for (const seen of all) {
+    const shown = stretchesOf(timeline, PICTURE_BIT, seen);
+    const first = shown.find(({ since, until }) => until - since > timeline.step) ?? shown[0]; // there are more after it
+    if (first) return Math.min(first.since + timeline.step, seen.until);
+  }
+  return all[0].since;
 }
 
 /** What was said of a stretch without messages. @param {Stretch[]} gaps @param {Stretch} skipped */

@@ -5,13 +5,12 @@ import { useAnswer } from "../parts/asking.js";
 import { handDriven, whyNotStarted } from "./autonomy-model.js";
 import { filled, moreWords, remember, remembered, scripts } from "./form-model.js";
 import { Form } from "./form.js";
-import { html, useEffect, useMetric, useOnline, useState, useValue } from "../parts/hooks.js";
+import { html, useEffect, useMemo, useMetric, useOnline, useState, useValue } from "../parts/hooks.js";
 import { Nothing } from "../parts/nothing.js";
 import { Button, Icon, Why, useName } from "../parts/parts.js";
 import { refuses } from "../parts/typed.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 import { plain, shortTime } from "../parts/more-words.js";
-import { useMemo } from "../../vendor/hooks.mjs";
 
 const LONGEST_CONFIG = 14_000; // characters of JSON: the server reads messages of 16 KB
 

@@ -46,7 +46,7 @@ export const CARDS = [
     title: "Scripts",
     icon: "script",
     tab: "more",
-    height: 211,
+    height: 233,
     wants: (offers) => offers.has("autonomy"),
     part: styled(async (again) => (await import("./autonomy.js" + again)).Autonomy, "commands.css"),
   },

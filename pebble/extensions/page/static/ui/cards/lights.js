@@ -23,31 +23,29 @@ export function Lights({ at }) {
   const noFlash = whyNotLights(page, at, "flash");
   const off = Boolean(noSolid && noFlash);
   const why = off ? noSolid : noSolid || noFlash;
-  const because = why ? "why-lights" : undefined;
   const colour = (value) => lights.ask(page, { colour: value, mode: noSolid ? "flash" : undefined });
   const mode = (value) => lights.ask(page, { mode: value });
   return html`<div class="lights">
     <div class="swatches" role="group" aria-label="Colour">
       ${Object.entries(COLOURS).map(
-        ([name, value]) => html`<button
+        ([name, value]) => html`<${Button}
           key=${name}
-          type="button"
-          class="swatch"
+          className="swatch"
           title=${name}
-          data-test=${`colour-${name}`}
+          test=${`colour-${name}`}
           aria-pressed=${lights.colour === value}
-          aria-describedby=${because}
-          disabled=${off}
-          onClick=${() => colour(value)}
+          why=${off ? why : ""}
+          because="why-lights"
+          onPress=${() => colour(value)}
         >
           <i aria-hidden="true" style=${{ background: value }}></i><span class="sr">${name}</span>
-        </button>`,
+        <//>`,
       )}
       <label class=${`swatch other ${off ? "off" : ""}`}>
         <input
           type="color"
           data-test="colour"
-          aria-describedby=${because}
+          aria-describedby=${why ? "why-lights" : undefined}
           disabled=${off}
           value=${lights.colour}
           onInput=${(event) => colour(event.currentTarget.value)}

@@ -51,7 +51,6 @@ export function Odometry({ at, offers }) {
   return html`<div class="map">
     ${!series.newest &&
     html`<${Nothing} icon="map" what="No trail yet">It begins with the first position that is received<//>`}
-    ${ended && (gone || !series.newest) && html`<${Ended} at=${at} script=${ended} />`}
     <canvas ref=${canvas} class=${series.newest ? "map-canvas" : "map-canvas unused"} role="img" tabindex="0" data-arrows data-test="map"
       aria-label="Trail of the odometry; arrow keys move it"></canvas>
     <p class="map-words" data-test="map-pose" hidden=${!series.newest}>
@@ -74,6 +73,7 @@ export function Odometry({ at, offers }) {
         onChoose=${choose}
       />`}
     </div>
+    ${ended && (gone || !series.newest) && html`<${Ended} at=${at} script=${ended} />`}
   </div>`;
 }
 
@@ -104,7 +104,7 @@ class View {
     this.gone = false; // whether the newest pose is an old one
     this.seen = true;
     this.timer = setInterval(() => this.seen && !document.hidden && this.draw(), STEP_MS);
-    this.sizes = more.sizes(() => this.draw());
+    this.sizes = browser.sizes(() => this.draw());
     this.sizes.observe(canvas);
     this.sight = more.sight((seen) => (this.seen = seen));
     this.sight.observe(canvas);

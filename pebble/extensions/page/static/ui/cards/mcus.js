@@ -3,7 +3,7 @@
 import { isLevel, useAnswer } from "../parts/asking.js";
 import { html, useMetric, useOnline, usePage, useState, useTick, useValue } from "../parts/hooks.js";
 import { command, fieldOf, range, step, unsendable } from "./manifest.js";
-import { Check, Why, isGone } from "../parts/parts.js";
+import { Button, Check, Why, isGone } from "../parts/parts.js";
 import { refuses } from "../parts/typed.js";
 import { useReasons, whyNotMoved } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
@@ -85,15 +85,7 @@ function Form({ at, uid, one, id, whyNot }) {
   return html`<form class="mcu-in" data-test=${`mcu-in-${one.name}`} noValidate onSubmit=${send}>
     <h4>${one.name} ${one.profile && html`<small>${one.profile}</small>`}</h4>
     ${one.encoding.fields.map((field) => html`<${Entry} key=${field.name} field=${field} entered=${entered} change=${change} />`)}
-    <button
-      type="submit"
-      data-test=${`send-${one.name}`}
-      aria-label=${`Send ${one.name}`}
-      aria-describedby=${why ? id : undefined}
-      disabled=${Boolean(why)}
-    >
-      Send
-    </button>
+    <${Button} type="submit" test=${`send-${one.name}`} label=${`Send ${one.name}`} why=${why} because=${id}>Send<//>
     ${why && html`<${Why} id=${id}>${why}<//>`}
     ${asked &&
     html`<span class=${answer.op === "refused" ? "bad" : "dim"} role="status">${askedWords(answer, asked.at)}</span>`}

@@ -2,7 +2,7 @@
 
 import { isLevel, useWish } from "../parts/asking.js";
 import { html, useMetric, useOnline } from "../parts/hooks.js";
-import { Why } from "../parts/parts.js";
+import { Button, Why } from "../parts/parts.js";
 import { useReasons, whyNotEnd, whyNotMoved } from "../parts/why-not.js";
 
 const CONFIRMED_MS = 3000;
@@ -71,19 +71,18 @@ function Outlet({ at, id, name, controls, page }) {
       ${refused && html`<span class="bad" role="status">not done: ${refused}</span>`}
       ${own && html`<${Why} id=${`why-outlet-${id}`}>${own}<//>`}
     </span>
-    <button
-      type="button"
+    <${Button}
       role="switch"
-      class=${`switch ${waits ? "waits" : ""}`}
-      data-test=${`outlet-${name}`}
+      className=${`switch ${waits ? "waits" : ""}`}
+      test=${`outlet-${name}`}
       aria-checked=${String(report.on === true)}
       aria-labelledby=${`outlet-${id}`}
-      aria-describedby=${why || undefined}
-      disabled=${Boolean(common || own)}
-      onClick=${press}
+      why=${why}
+      because=${why}
+      onPress=${press}
     >
       <span aria-hidden="true"></span>
-    </button>
+    <//>
   </li>`;
 }
 

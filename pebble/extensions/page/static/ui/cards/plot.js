@@ -38,7 +38,7 @@ export function Lines({ series, fields, shownMs, least, paused }) {
       drawnAt = now;
       view.draw(series.columns(fields, now - shownMs, now), now - shownMs, now, store.offset);
     };
-    const sizes = more.sizes(() => view.resize(element.clientWidth));
+    const sizes = browser.sizes(() => view.resize(element.clientWidth));
     const sight = more.sight((is) => (seen = is));
     sizes.observe(element);
     sight.observe(element);

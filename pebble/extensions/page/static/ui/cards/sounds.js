@@ -1,11 +1,10 @@
 // The clips that a robot can play.
 
-import { html, useModel, useOnline, useValue } from "../parts/hooks.js";
+import { html, useMemo, useModel, useOnline, useValue } from "../parts/hooks.js";
 import { Button, Check, Why, useName } from "../parts/parts.js";
 import { grouped, play, repeatLast, soundsOf } from "./sounds-model.js";
 import { useReasons, whyNot, whyNotEnd } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
-import { useMemo } from "../../vendor/hooks.mjs";
 
 const MOST = 60; // clips that are listed at a time
 const FEW = 8; // they need no filter

@@ -3,23 +3,22 @@
 import { html, useMetric, useOnline, useValue } from "../parts/hooks.js";
 import { Charge, Live, isGone, useEnded } from "../parts/parts.js";
 import { Board } from "./board.js";
-import { charge, looksOf } from "../parts/looks.js";
+import { LOW_PERCENT, charge, looksOf } from "../parts/looks.js";
 import { charging, plain } from "../parts/more-words.js";
 import { battery, inner, isObject, number, typeOf } from "../parts/words.js";
 
 const STREAM_MS = 1000;
 const LEVEL_DEG = 3;
-const LOW_PERCENT = 20;
 
 export function Telemetry({ at }) {
   const online = useOnline(at);
   return html`<${Battery} at=${at} online=${online} />
   <dl class="values">
     <${Neighbours} at=${at} />
-    <${Row} at=${at} metric="sensors/imu" name="Tilt" online=${online} streams>${attitude}<//>
-    <${Row} at=${at} metric="sensors/imu" name="Turn rate" online=${online} streams>${rate}<//>
-    <${Row} at=${at} metric="sensors/imu" name="Acceleration" online=${online} streams>${acceleration}<//>
-    <${Row} at=${at} metric="touch-sensors" name="Touch" online=${online} streams>${touch}<//>
+    <${Row} at=${at} metric="sensors/imu" name="Tilt" online=${online}>${attitude}<//>
+    <${Row} at=${at} metric="sensors/imu" name="Turn rate" online=${online}>${rate}<//>
+    <${Row} at=${at} metric="sensors/imu" name="Acceleration" online=${online}>${acceleration}<//>
+    <${Row} at=${at} metric="touch-sensors" name="Touch" online=${online}>${touch}<//>
     <${Troubles} at=${at} online=${online} />
   </dl>
   <${Hint} at=${at} />`;
@@ -49,18 +48,15 @@ function Hint({ at }) {
   </p>`;
 }
 
-/**
- * Nothing where there are no words for a value. ``streams``: it comes several times a second. Its period is unknown (0) until four values came, and a value without one
- * is never gone: until then a second is assumed.
- */
-function Row({ at, metric, name, online, streams = false, children: words }) {
+/** Nothing where there are no words for a value. Until its period is known, after four values, a second is assumed. */
+function Row({ at, metric, name, online, children: words }) {
   const received = useMetric(at, metric);
   const ended = Boolean(useEnded(at, metric));
   const text = received && words(received.value);
   if (!text) return null;
   return html`<div>
     <dt>${name}</dt>
-    <dd><${Live} entry=${received} usual=${streams ? STREAM_MS : 0} online=${online} ended=${ended}>${text}<//></dd>
+    <dd><${Live} entry=${received} usual=${STREAM_MS} online=${online} ended=${ended}>${text}<//></dd>
   </div>`;
 }
 

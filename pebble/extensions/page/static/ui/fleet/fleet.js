@@ -9,10 +9,10 @@ import {
   Boundary,
   html,
   useEffect,
-  useLater,
   useMetric,
   useModel,
   usePage,
+  useRecent,
   useRef,
   useRefs,
   useState,
@@ -20,18 +20,20 @@ import {
   useValue,
 } from "../parts/hooks.js";
 import { Offers, Route, WATCHES } from "../parts/models.js";
-import { charge, hasFace, looksOf, nameIn } from "../parts/looks.js";
+import { LOW_PERCENT, charge, hasFace, looksOf, nameIn } from "../parts/looks.js";
 import { plain, shortTime } from "../parts/more-words.js";
-import { Button, Charge, Check, Drawing, Drop, Icon, RouteLink, StopButton, useItself } from "../parts/parts.js";
+import { Button, Charge, Check, Drawing, Drop, Icon, RouteLink, Select, StopButton, useItself } from "../parts/parts.js";
 import { RecordingsLink } from "./recordings-link.js";
 import { battery, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf } from "../parts/words.js";
 
 const STILL_MS = 5000; // between two of a camera that is on
 const LIVE_MS = 10_000; // a still that young is of now
+const AGE_MS = 10_000; // the step in which the age of an older one is told: each costs a frame
 const DENSE = 13; // so many components are shown in small cards, and by what they need
 const MANY = 100; // beyond, cards have no pictures, and only those near the screen are drawn
 const NEEDS_MS = 10_000; // so long a card stays among those that need a look
-const LOW_PERCENT = 20;
+const SORTS = { name: "By name", battery: "By battery" }; // of small cards
+const ILL = ["failed", "restarting"]; // services
 const isRobot = (ref) => typeOf(ref) === "robots";
 
 const kept = { filter: "" }; // while a robot is looked at
@@ -52,13 +54,13 @@ export function Fleet() {
     online.forEach((ref) => settings.forgotten.has(ref) && settings.forget(ref, false));
   }, [online.join()]);
   const matches = matcher(store, filter);
-  const shown = sorted(store, online.filter(matches));
   const shownAway = away.filter(matches).sort();
   const total = online.length + away.length;
   const robots = [...online, ...away].filter(isRobot);
   const there = robots.filter((ref) => present.has(ref));
   const others = total - robots.length;
   const dense = total >= DENSE;
+  const shown = sorted(store, online.filter(matches), dense && settings.sort === "battery");
   const many = total > MANY;
   const needing = useNeeding(store, dense ? shown : []);
   const groups = [
@@ -76,7 +78,7 @@ export function Fleet() {
         </h1>
         <${Bands} at="" />
       </div>
-      ${total > 0 ? html`<${FleetTools} filter=${filter} onFilter=${setFilter} many=${many} />` : html`<${RecordingsLink} />`}
+      ${total > 0 ? html`<${FleetTools} filter=${filter} onFilter=${setFilter} dense=${dense} many=${many} />` : html`<${RecordingsLink} />`}
     </div>
     ${omitted > 0 &&
     html`<p class="dim" data-test="omitted">
@@ -120,11 +122,17 @@ function isPresent(store, ref) {
   return view.value.online === true || (view.value.online === null && view.value.silent_s !== null);
 }
 
-/** Robots first, by name. */
-function sorted(store, refs) {
-  const keyed = refs.map((ref) => [`${isRobot(ref) ? 0 : 1} ${nameIn(store, ref).toLowerCase()} ${ref}`, ref]);
-  return keyed.sort(([a], [b]) => (a < b ? -1 : 1)).map(([, ref]) => ref);
+/** Robots first, by name; or first those with the least in their batteries. */
+function sorted(store, refs, byBattery) {
+  const level = (ref) => byBattery ? percentOf(store, ref) ?? Infinity : 0;
+  const keyed = refs.map((ref) => ({ ref, level: level(ref), name: `${isRobot(ref) ? 0 : 1} ${nameIn(store, ref).toLowerCase()} ${ref}` }));
+  keyed.sort((a, b) => (a.level !== b.level ? a.level - b.level : a.name < b.name ? -1 : 1));
+  return keyed.map(({ ref }) => ref);
 }
+
+/** @returns {number | null} of its battery; null: unknown */
+const percentOf = (store, ref) =>
+  charge(store.get(ref, "charging-level")?.value, looksOf(ref, store.get(ref, "capabilities")?.value).cells);
 
 /** Those which a person should look at: at once, and for a while after the reason is gone. @returns {Set<string>} */
 function useNeeding(store, refs) {
@@ -135,8 +143,7 @@ function useNeeding(store, refs) {
 }
 
 function needs(store, ref) {
-  const { cells } = looksOf(ref, store.get(ref, "capabilities")?.value);
-  const percent = charge(store.get(ref, "charging-level")?.value, cells);
+  const percent = percentOf(store, ref);
   const charges = store.get(ref, "charging-status")?.value?.value === true;
   return (
     store.get(ref, "web/estop")?.value.latched === true ||
@@ -145,7 +152,7 @@ function needs(store, ref) {
   );
 }
 
-function FleetTools({ filter, onFilter, many }) {
+function FleetTools({ filter, onFilter, dense, many }) {
   const { panels, settings } = usePage();
   return html`<div class="fleet-tools">
     <input
@@ -156,6 +163,8 @@ function FleetTools({ filter, onFilter, many }) {
       value=${filter}
       onInput=${(event) => onFilter(event.currentTarget.value)}
     />
+    ${dense &&
+    html`<${Select} test="sort" label="Sort" value=${settings.sort} choices=${Object.entries(SORTS)} onChoose=${(by) => settings.set("sort", by)} />`}
     <${RecordingsLink} />
     <${Drop} test="fleet-more" look="button" summary="More">
         <${Button} test="phone" icon="phone" onPress=${() => panels.show("phone")}>Open on a phone<//>
@@ -237,29 +246,20 @@ const ICONS = { robots: "robot", towers: "tower", satellites: "satellite", peopl
 /** @param {string} ref @returns {string} the icon of its type */
 export const iconOf = (ref) => ICONS[typeOf(ref)] ?? "thing";
 
-/** A service that is not well: its page has the rest. */
-function ServiceFact({ at }) {
-  const services = inner(useValue(at, "status"))?.services;
-  if (!isObject(services)) return null;
-  const ill = Object.keys(services).filter((name) => ["failed", "restarting"].includes(services[name]?.state));
-  if (!ill.length) return null;
-  const words = `${ill[0].replaceAll("_", " ")} ${services[ill[0]].state}`;
-  return html`<${Told} sign="▲" className="bad">${words}<//>`;
+/** Why its motors do not obey, or which service is not well: its page has the rest. */
+function TroubleFact({ at }) {
+  const status = useValue(at, "status");
+  const { no, text } = doubtOf(status);
+  const { services } = inner(status) ?? {};
+  const [ill, { state }] = Object.entries(isObject(services) ? services : {}).find(([, one]) => ILL.includes(one?.state)) ?? ["", {}];
+  const words = text || (ill && `${state}: ${ill.replaceAll("_", " ")}`);
+  const bad = no || !text;
+  return words && html`<li class=${`fact told ${bad ? "bad" : "dim"}`} title=${words}><span aria-hidden="true">${bad ? "▲" : "?"}</span><span>${words}</span></li>`;
 }
-
-/** What is said in a sentence, with its sign before all of its lines. */
-const Told = ({ sign, className, children }) =>
-  html`<li class=${`fact told ${className}`}><span aria-hidden="true">${sign}</span><span>${children}</span></li>`;
 
 /** On one line, which ends with dots where there is more. */
 const Fact = ({ icon = "", className = "dim", children }) =>
   html`<li class=${`fact ${className}`}>${icon && html`<${Icon} name=${icon} />`}<span>${children}</span></li>`;
-
-/** Whether its motors obey. */
-function DoubtFact({ at }) {
-  const { no, text } = doubtOf(useValue(at, "status"));
-  return text ? html`<${Told} sign=${no ? "▲" : "?"} className=${no ? "bad" : "dim"}>${text}<//>` : null;
-}
 
 /** ``plain``: without a picture. @param {{at: string, plain?: boolean}} props */
 function FleetCard({ at, plain }) {
@@ -290,9 +290,9 @@ function FleetCard({ at, plain }) {
     <div class="fleet-card-foot">
       <ul class="facts">
         <${BatteryFact} at=${at} online=${connection.isOpen} />
-        ${connection.isOpen && html`<${DoubtFact} at=${at} />`}
+        ${connection.isOpen && typeOf(at) === "robots" && html`<${TroubleFact} at=${at} />`}
         <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} estop=${estop} pictured=${pictured} />
-        ${typeOf(at) !== "robots" ? html`<${StatusFact} at=${at} />` : html`<${ServiceFact} at=${at} />`}
+        ${typeOf(at) !== "robots" && html`<${StatusFact} at=${at} />`}
       </ul>
       ${estop?.latched
         ? html`<${RouteLink} to=${at} className="button stop-small to-reset" label=${`Open to reset ${looks.name}`}>Open to reset<//>`
@@ -374,12 +374,11 @@ function Thumbnail({ at, has, looks }) {
   }, [at, has, isOn]);
   useEffect(() => () => URL.revokeObjectURL(src), [src]);
   const age = performance.now() - takenAt;
-  const isLive = isOn && age < LIVE_MS;
-  useTick(src && !isLive ? 2000 : 0);
-  useLater(isLive ? LIVE_MS - age : Infinity);
+  const isLive = useRecent(takenAt, LIVE_MS) && isOn;
+  useTick(src && !isLive ? AGE_MS : 0);
   return html`<div class=${`thumbnail ${src ? "" : "faced"}`}>
     ${src ? html`<img alt=${`What ${looks.name} sees`} src=${src} />` : html`<${Drawing} picture=${looks.picture} />`}
-    ${src && html`<span class=${`tag ${isLive ? "live" : ""}`}>${isLive ? "live" : `${roughly(age)} ago`}</span>`}
+    ${src && html`<span class=${`tag ${isLive ? "live" : ""}`}>${isLive ? "live" : `${roughly(age - (age % AGE_MS))} ago`}</span>`}
     <${Stripe} at=${at} />
   </div>`;
 }

@@ -28,22 +28,28 @@ const useRedraw = () => useReducer((n) => n + 1, 0)[1];
 
 /** @typedef {import("../../messages.js").Metrics} Metrics */
 
-/** The store; draw again after its changes. @param {string | null} ref null: any @param {string | null} metric null: any */
-function useStore(ref, metric) {
+/**
+ * The store; draw again after its changes, or only after those of what ``pick``, which never changes, makes of the value.
+ * @param {string | null} ref null: any @param {string | null} metric null: any @param {(value: any) => unknown} [pick]
+ */
+function useStore(ref, metric, pick) {
   const { store } = usePage();
   const redraw = useRedraw();
+  const drawn = useRef(/** @type {unknown} */ (undefined));
+  const picked = () => pick(store.get(ref, metric)?.value);
+  if (pick) drawn.current = picked();
   useEffect(() => {
     redraw(); // it may have changed since it was drawn
-    return store.subscribe(ref, metric, redraw);
+    return store.subscribe(ref, metric, () => (!pick || picked() !== drawn.current) && redraw());
   }, [store, ref, metric]);
   return store;
 }
 
 /**
- * @template {string} M @param {string} ref @param {M} metric
+ * @template {string} M @param {string} ref @param {M} metric @param {(value: any) => unknown} [pick]
  * @returns {import("../../core/store.js").Value<M extends keyof Metrics ? Metrics[M] : any> | undefined}
  */
-export const useMetric = (ref, metric) => useStore(ref, metric).get(ref, metric);
+export const useMetric = (ref, metric, pick) => useStore(ref, metric, pick).get(ref, metric);
 
 /**
  * The payload; undefined until there is one.
@@ -102,6 +108,13 @@ export function useLater(ms) {
     const timer = setTimeout(redraw, Math.min(ms, LONGEST_MS));
     return () => clearTimeout(timer);
   });
+}
+
+/** @param {number} since of performance.now() @param {number} ms @returns {boolean} whether it is not longer ago; draws again then */
+export function useRecent(since, ms) {
+  const left = since + ms - performance.now();
+  useLater(left > 0 ? left : Infinity);
+  return left > 0;
 }
 
 /** @param {string} query @returns {boolean} whether the media query matches */

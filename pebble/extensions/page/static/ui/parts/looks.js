@@ -76,6 +76,8 @@ function hash(id) {
   return sum;
 }
 
+export const LOW_PERCENT = 20;
+
 /** Percent by volts of one lithium cell at rest; between two rows in proportion. */
 const CHARGE = [[3, 0], [3.45, 5], [3.68, 10], [3.74, 20], [3.77, 30], [3.79, 40], [3.82, 50], [3.87, 60], [3.92, 70],
   [3.98, 80], [4.06, 90], [4.2, 100]];

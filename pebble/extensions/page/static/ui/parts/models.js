@@ -82,7 +82,6 @@ export class Connection extends Model {
   show(text) {
     this.notice = { text, at: performance.now() };
     this.changed();
-    setTimeout(() => this.changed(), 6100);
   }
 }
 
@@ -133,6 +132,7 @@ export class Settings extends Model {
     super();
     this.theme = read("theme", "auto");
     this.thumbnails = read("thumbnails", true) === true;
+    this.sort = read("sort", "name");
     this.begun = list(read("begun", [])); // of what is shown to who is here for the first time
     this.name = read("name", "");
     this.side = read("side", "right"); // of the stick, on a phone
@@ -141,7 +141,7 @@ export class Settings extends Model {
     this.apply();
   }
 
-  /** @param {"theme" | "thumbnails" | "name" | "side" | "hints"} name @param {any} value */
+  /** @param {"theme" | "thumbnails" | "sort" | "name" | "side" | "hints"} name @param {any} value */
   set(name, value) {
     Object.assign(this, { [name]: value });
     write(name, value);

@@ -2,7 +2,7 @@
 
 import * as browser from "../../core/browser.js";
 import { drivesItself, inWords, scriptName } from "../../core/reasons.js";
-import { Boundary, html, useEffect, useLater, useOnline, usePage, usePart, useRef, useState, useTick, useValue } from "./hooks.js";
+import { Boundary, html, useEffect, useLater, useOnline, usePage, usePart, useRecent, useRef, useState, useTick, useValue } from "./hooks.js";
 import { Route, read } from "./models.js";
 import { chargeWords, drawing, hasFace, looksOf } from "./looks.js";
 import { reported, roughly } from "./words.js";
@@ -108,7 +108,8 @@ const HINT_MS = 2500;
 /** A button that has to be held for a second, by pointer or key. */
 export function HoldButton({ onHeld, disabled = false, children, className = "", describedBy, test }) {
   const [holds, hold] = useState(false);
-  const [tapped, setTapped] = useState(false);
+  const [tappedAt, tap] = useState(-Infinity);
+  const tapped = useRecent(tappedAt, HINT_MS);
   const done = useRef(onHeld);
   done.current = disabled ? () => {} : onHeld;
   useEffect(() => {
@@ -120,17 +121,12 @@ export function HoldButton({ onHeld, disabled = false, children, className = "",
     }, HOLD_MS);
     return () => clearTimeout(timer);
   }, [holds, disabled]);
-  useEffect(() => {
-    if (!tapped) return undefined;
-    const timer = setTimeout(() => setTapped(false), HINT_MS);
-    return () => clearTimeout(timer);
-  }, [tapped]);
   const end = () => {
-    if (holds) setTapped(true); // too early
+    if (holds) tap(performance.now()); // too early
     hold(false);
   };
   const begin = () => {
-    setTapped(false);
+    tap(-Infinity);
     hold(true);
   };
   return html`<button

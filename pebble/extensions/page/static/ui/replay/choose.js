@@ -9,6 +9,7 @@ import { Button, Icon, RouteLink, Select, Skeleton } from "../parts/parts.js";
 import { recordingsOf } from "../fleet/recordings-link.js";
 import { iconOf } from "../fleet/fleet.js";
 import { nameIn } from "../parts/looks.js";
+import { Offers } from "../parts/models.js";
 import { shortTime } from "../parts/more-words.js";
 import { clockTime, span } from "../parts/words.js";
 
@@ -62,13 +63,13 @@ const ALL_DAYS = `${ROOT}replay?days`;
 
 /** The newest recording, or all days, newest first, where the address asks for them or there is nothing to show. */
 export function Choose() {
-  const { route } = usePage();
+  const { route, store } = usePage();
   const { days, problem, again } = useDays();
   const [newest] = days ?? [];
   const shown = newest?.robots.length && !new URLSearchParams(location.search).has("days") ? newest : null;
   useEffect(() => {
     if (!shown) return;
-    history.replaceState(null, "", recordingsOf(mostDriven(shown)));
+    history.replaceState(null, "", recordingsOf(mostDriven(store, shown)));
     route.changed();
   }, [shown]);
   if (shown || (!days && !problem)) {
@@ -94,8 +95,11 @@ export function Choose() {
   </div>`;
 }
 
-/** @param {import("../../core/replay/archive.js").Day} day @returns {string} */
-const mostDriven = ({ robots, driven = {} }) => [...robots].sort((a, b) => (driven[b] ?? 0) - (driven[a] ?? 0))[0];
+/** Of those with a camera, if there are any. @param {any} store @param {import("../../core/replay/archive.js").Day} day @returns {string} */
+function mostDriven(store, { robots, driven = {} }) {
+  const sees = (ref) => Number(new Offers(ref, store.get(ref, "capabilities")?.value).hasVideo);
+  return [...robots].sort((a, b) => sees(b) - sees(a) || (driven[b] ?? 0) - (driven[a] ?? 0))[0];
+}
 
 function Day({ one }) {
   const { day, robots, bytes, first, last, gaps, unread } = one;

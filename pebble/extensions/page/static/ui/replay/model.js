@@ -18,32 +18,21 @@ const ADDRESS_MS = 400; // browsers limit how often it may change
 const LOADING_MS = 400; // a seek that takes longer is shown
 const OLD_MS = 2000; // as of a live picture
 
-/** The connection of a recording: always there, and nothing is sent by it. */
-class Recorded extends Model {
-  /** @param {any} live where notices are shown */
-  constructor(live) {
-    super();
-    this.live = live;
-    this.isOpen = true;
-    this.state = "open";
-    this.you = null;
-    this.socket = { outdated: false };
-    this.answers = new Map();
-    this.onLogs = null;
-  }
-
+/** The connection of a recording: always there, and nothing is sent by it. @param {any} live where notices are shown */
+const recorded = (live) => ({
+  isOpen: true,
+  state: "open",
+  you: null,
+  socket: { outdated: false },
+  answers: new Map(),
+  onLogs: null,
   get words() {
-    return this.live.words;
-  }
-
-  may() {
-    return false;
-  }
-
-  show(words) {
-    this.live.show(words);
-  }
-}
+    return live.words;
+  },
+  onChange: () => () => {},
+  may: () => false,
+  show: (words) => live.show(words),
+});
 
 /** The picture of a recording: it is always of the same component. */
 class RecordedVideo extends Video {
@@ -64,12 +53,12 @@ class ReplaySound extends Sound {
 
   /** @param {Uint8Array} payload */
   feed(payload) {
-    if (this.listening) this.worker?.postMessage({ op: "take", payload: payload.slice().buffer });
+    if (this.listening) this.link.send({ op: "take", payload: payload.slice().buffer });
   }
 
   /** A seek: what waits at the loudspeaker is not played. */
   restart() {
-    if (!this.worker || !this.listening) return;
+    if (!this.link.worker || !this.listening) return;
     const { port1, port2 } = new MessageChannel();
     this.speaker.attach(port2);
     this.connect("", port1);
@@ -174,7 +163,7 @@ export class Replay extends Model {
       ...live,
       recording: this,
       store: this.store,
-      connection: new Recorded(live.connection),
+      connection: recorded(live.connection),
       video: this.video,
       driver: inertDriver(ref),
       commands: { readLogs: () => 0, stop: (of) => of === "" && live.commands.stop("") },
@@ -206,7 +195,7 @@ export class Replay extends Model {
     if (Number.isFinite(at)) return this.seek(at);
     const asked = query.get("day") ?? "";
     const day = Number.isFinite(startOf(asked)) ? asked : await this.day.newest();
-    if (day) this.day.open(day, () => this.feed.seeks || this.seek(firstOf(this.day, asked ? 0 : -1)));
+    if (day) this.day.open(day, () => this.feed.seeks || this.seek(firstOf(this.day, !asked)));
   }
 
   /** @param {number} ms */

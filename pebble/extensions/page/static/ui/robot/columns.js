@@ -1,6 +1,6 @@
 // Balanced columns: cards are placed so that all columns end alike; later only what is below a card moves.
 
-import * as more from "../../core/browser-more.js";
+import * as browser from "../../core/browser.js";
 import { useLayoutEffect, useRef } from "../parts/hooks.js";
 
 const GAP = 20;
@@ -71,7 +71,7 @@ class Columns {
     this.rests = false;
     this.timer = setTimeout(() => this.rest(), REST_MS);
     this.seen = new Set();
-    this.observer = more.sizes(() => this.place());
+    this.observer = browser.sizes(() => this.place());
     const touched = () => (this.rests = true);
     for (const name of ["pointerdown", "keydown", "wheel"]) addEventListener(name, touched, { passive: true, once: true });
   }

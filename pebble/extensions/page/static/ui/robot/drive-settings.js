@@ -58,14 +58,13 @@ function AuxButton({ driver, value, label, children }) {
   const reason = driver.reason();
   const end = () => driver.hold(`aux ${value}`, 0);
   useEffect(() => end, []);
-  return html`<button
-    type="button"
-    data-test=${`aux${value > 0 ? "+" : "-"}`}
-    aria-label=${label}
-    disabled=${Boolean(reason) && !driver.gestureActive}
-    aria-describedby=${reason ? "why-drive" : undefined}
+  return html`<${Button}
+    test=${`aux${value > 0 ? "+" : "-"}`}
+    label=${label}
+    why=${reason && !driver.gestureActive ? reason.text : ""}
+    because="why-drive"
     ...${held((event) => driver.hold(`aux ${value}`, value, event.timeStamp), end)}
   >
     ${children}
-  </button>`;
+  <//>`;
 }

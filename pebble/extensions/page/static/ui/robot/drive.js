@@ -3,7 +3,7 @@
 import { ROOT } from "../../core/browser.js";
 import { STOP_SCRIPT, scriptName } from "../../core/reasons.js";
 import { DRIVE, KEYS } from "../cards/cards.js";
-import { html, useCalm, useLater, useModel, usePage, useValue } from "../parts/hooks.js";
+import { html, useCalm, useModel, usePage, useRecent, useValue } from "../parts/hooks.js";
 import { Button, Card, HoldButton, Part, Slider, set, useItself, useName } from "../parts/parts.js";
 import { Stick } from "./stick.js";
 import { driverName } from "../parts/words.js";
@@ -104,8 +104,7 @@ const origin = (view) => [view?.device, view?.keeps && `name ${view.checked ? ""
 function ReasonAction({ action }) {
   const { commands, driver } = usePage();
   const { hintedAt } = driver;
-  const hinted = performance.now() - hintedAt < FLASH_MS;
-  useLater(hinted ? FLASH_MS - (performance.now() - hintedAt) : Infinity);
+  const hinted = useRecent(hintedAt, FLASH_MS);
   switch (action?.kind) {
     case "take":
       return html`<${Button}

@@ -1,6 +1,6 @@
 // What belongs to a picture besides it: what robots draw over it, snapshots, and the robot's own stream.
 
-import * as more from "../../core/browser-more.js";
+import * as browser from "../../core/browser.js";
 import { MIXED, refusal } from "../../core/stream.js";
 import { html, useEffect, useMetrics, useModel, usePage, useRef } from "../parts/hooks.js";
 import { read, write } from "../parts/models.js";
@@ -60,7 +60,7 @@ function Overlays({ source }) {
       if (entry) newest.receive(entry.value, entry.receivedAt);
       draw();
     };
-    const sizes = more.sizes(draw);
+    const sizes = browser.sizes(draw);
     sizes.observe(video.canvas);
     const unsubscribe = store.subscribe(source, OVERLAYS, take);
     take(); // of a recording that is paused nothing follows

@@ -1,7 +1,7 @@
 // Listen to a component, and talk to it: in the bar below its picture, or in a card.
 
 import { html, useCalm, useEffect, useModel, usePage, useValue } from "../parts/hooks.js";
-import { Button, Icon, held, useName } from "../parts/parts.js";
+import { Button, held, useName } from "../parts/parts.js";
 import { Sound } from "./sound-model.js";
 
 /** @returns {Sound} the page's */
@@ -75,21 +75,21 @@ function TalkButton({ sound, why, isSame, short }) {
   useEffect(() => {
     if (why) end(); // the end of a press on a button that is off is not reported
   }, [why]);
-  return html`<button
-    type="button"
-    class=${`talk ${sound.talking?.on ? "on" : ""}`}
-    data-test="talk"
-    disabled=${why !== ""}
+  return html`<${Button}
+    className=${`talk ${sound.talking?.on ? "on" : ""}`}
+    test="talk"
+    why=${why}
+    because=${isSame ? "why-listen" : "why-talk"}
+    icon="mic"
     aria-pressed=${Boolean(sound.talking)}
-    aria-describedby=${why ? (isSame ? "why-listen" : "why-talk") : undefined}
     ...${held(() => sound.talk(true), end, true)}
     onContextMenu=${(event) => {
       event.preventDefault(); // a finger that stays
       event.stopPropagation();
     }}
   >
-    <${Icon} name="mic" /><span>${sound.talking ? "Talking" : short ? "Talk" : "Hold to talk"}</span><kbd>T</kbd>
-  </button>`;
+    <span>${sound.talking ? "Talking" : short ? "Talk" : "Hold to talk"}</span><kbd>T</kbd>
+  <//>`;
 }
 
 const LISTENING = "Listening";

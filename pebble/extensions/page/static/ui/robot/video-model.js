@@ -4,6 +4,7 @@ import { PICTURE_OLD_MS } from "../../core/reasons.js";
 import { Model } from "../parts/models.js";
 
 const STALE_MS = 500; // without a new picture, what is shown is no longer live
+const ROUNDED = 0.03; // of width by height
 const WRONG_MS = 1000; // a clock that is so far off is not believed
 
 /** Owner of the canvas and of the connection for pictures. */
@@ -16,6 +17,7 @@ export class Video extends Model {
     this.canvas.width = 640;
     this.canvas.height = 360;
     this.context = this.canvas.getContext("2d");
+    this.ratio = 0; // of its box
     this.ref = ""; // whose picture is shown
     this.pictures = null; // set by main.js
     this.forget();
@@ -45,7 +47,16 @@ export class Video extends Model {
   shape() {
     const { width, height } = this.store.get(this.ref, "capabilities")?.value?.value?.video ?? {};
     const plausible = (size) => Number.isInteger(size) && size >= 16 && size <= 4096;
-    if (plausible(width) && plausible(height)) Object.assign(this.canvas, { width, height });
+    if (plausible(width) && plausible(height)) this.resize(width, height);
+  }
+
+  /** Cameras change the size of their pictures, and round it: what differs by that leaves the box as it is. */
+  resize(width, height) {
+    const ratio = width / height;
+    Object.assign(this.canvas, { width, height });
+    if (Math.abs(ratio - this.ratio) < ROUNDED) return;
+    this.ratio = ratio;
+    this.canvas.style.aspectRatio = String(ratio);
   }
 
   /** @param {any} bitmap a VideoFrame, or an ImageBitmap @param {any} info */
@@ -53,7 +64,7 @@ export class Video extends Model {
     const { canvas } = this;
     const width = bitmap.displayWidth ?? bitmap.width;
     const height = bitmap.displayHeight ?? bitmap.height;
-    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    if (canvas.width !== width || canvas.height !== height) this.resize(width, height);
     this.context.drawImage(bitmap, 0, 0);
     const now = this.store.clock();
     const since = now - this.drawnAt;
