@@ -6,6 +6,7 @@ import json
 import struct
 import threading
 import time
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ TAG_ID = 21  # of the tag that Goob follows, as in the world file
 _BOARDS = {"minilamp": "ESP32-C6", "benjr": "ESP8266"}
 _RESTART = ["sh", "-c", "kill $PPID"]  # the bridge alone, which runs it: the demo would take more for a failure
 _RATE = 16_000
-_POLL_S, _READY_S = 0.02, 30.0
+_POLL_S = 0.02
 HORN = struct.pack("<40h", *[8000] * 20, *[-8000] * 20) * 400  # the clip: 1 s of 400 Hz
 #: After the first round of driving Goob looks at the tag, with Fred in sight, and both have space for further rounds.
 _START = {
@@ -156,10 +157,10 @@ class Testbed(Processes):
     server: PageServer  # the newest
     room: Program | None = None  # once it runs
 
-    def __init__(self, ending: threading.Event) -> None:
+    def __init__(self, ending: threading.Event, names: Sequence[str] = ROBOTS) -> None:
         super().__init__("pebble-demo-")
         self.robots: dict[str, LinuxRobot | McuRobot] = {}
-        self._ending = ending
+        self._ending, self._names = ending, names
         self.world = self.folder / "world"
         self.world.mkdir()
         self.room_file = self.world / "room.json"
@@ -173,7 +174,7 @@ class Testbed(Processes):
         for broker in (self.remote_broker, self.local_broker):
             broker.wait(self._ending)
         self.broker_port = self.remote_broker.port
-        for name in ROBOTS:
+        for name in self._names:
             self.robots[name] = McuRobot(self, name) if name in _BOARDS else LinuxRobot(self, name)
 
     def start_page(self, port: int = 0, **settings: Any) -> PageServer:
@@ -197,9 +198,9 @@ class Testbed(Processes):
         for robot in self.robots.values():
             robot.bring_up(self._ending)
 
-    def wait_until_ready(self) -> None:
-        """Wait until all robots can be driven. Raises PebbleError after 30 s, or if a process ends."""
-        discovery, end = Discovery(), time.monotonic() + _READY_S
+    def wait_until_ready(self, timeout: float = 30.0) -> None:
+        """Wait until all robots can be driven. Raises PebbleError after that time, or if a process ends."""
+        discovery, end = Discovery(), time.monotonic() + timeout
         with create("mqtt", "testbed", MqttSettings(host=HOST, port=self.broker_port)) as transport:
             transport.subscribe(ALL_OUTGOING, lambda one: discovery.receive(one, time.monotonic(), time.time()))
             while sum(robot.ready(time.monotonic()) for robot in discovery.all_robots()) < len(self.robots):
