@@ -155,6 +155,11 @@ class Bridge(ServiceProcess):
             return MqttBridge(config, self._local, clock=self.scheduler.clock)
 
     @property
+    def reaches_owners(self) -> bool:
+        """True if it runs and has its connection to the robot."""
+        return self.alive and not self.frozen and self._local is not None and self._local._present
+
+    @property
     def _connections(self) -> list[Connection]:
         return [one for one in (self._local, self.remote, self.stops) if one is not None]
 

@@ -4,7 +4,8 @@
   ended it, also if a copy of it comes after the reset. Excused: what a killed bridge forgets.
 * A stop with a name passes to all owners as often as it came, and one without a name once, except around a loss of the
   connection of stops, where equal bytes cannot be told apart.
-* An owner that has shown that a stop was reset gets no copy of it while it remembers the stop's name.
+* An owner that has shown that a stop was reset gets no copy of it, unless it has forgotten that stop and latched by it
+  again. Excused: what a killed bridge forgets.
 * What is repeated is the newest stop that its owner has not shown, names its owner, and ends when that has withdrawn
   its emergency stop; in the end nothing is repeated, and a new stop stops every owner.
 """
@@ -19,9 +20,9 @@ from msgspec import UNSET
 from pebble.contract import ESTOP, ESTOP_RESET, ESTOP_STATE, codec
 from pebble.contract.payloads import EstopState
 from pebble.transports import Message
+from tests.robot.lockstep.bridge import Bridge
 from tests.robot.lockstep.drivers import BASE
 from tests.robot.lockstep.owner import Owner
-from tests.robot.lockstep.processes import Process
 from tests.robot.lockstep.scheduler import Scheduler
 
 _LATCHES_S = 2.5  # a state and a repetition each may travel for 0.7 s
@@ -32,7 +33,7 @@ _STOP, _RESET = ESTOP.topic(BASE), ESTOP_RESET.topic(BASE)
 class StopRules:
     """The rules of one bridge and its owners, by name."""
 
-    def __init__(self, scheduler: Scheduler, bridge: Process, owners: Mapping[str, Owner]) -> None:
+    def __init__(self, scheduler: Scheduler, bridge: Bridge, owners: Mapping[str, Owner]) -> None:
         self._scheduler, self._bridge, self._owners = scheduler, bridge, owners
         self._topics = {ESTOP_STATE.topic(BASE, owner=name): name for name in owners}
         self._nameless = 0  # that were pressed
@@ -90,8 +91,9 @@ class StopRules:
         self._seen[owner] = state
         same = before is not None and before.boot == state.boot
         if before is not None and same and not state.latched and (before.latched or state.count > before.count):
-            self._over |= {shown for shown in self._shown if shown[0] == owner}
-        self._over = {over for over in self._over if over[0] != owner or over[1] in state.recent}
+            self._over |= {shown for shown in self._shown if shown[0] == owner and shown[1] in self._first}
+        if before is not None and same and state.latched:
+            self._over -= {(owner, name) for name in state.recent if name not in before.recent}
         self._shown |= {(owner, name) for name in state.recent}
 
     def shows(self, owner: str, payload: bytes) -> None:
@@ -145,7 +147,7 @@ class StopRules:
     # -- what must hold at any time
 
     def check(self) -> None:
-        now, bridged = self._scheduler.now, self._bridge.alive and not self._bridge.frozen
+        now, bridged = self._scheduler.now, self._bridge.reaches_owners
         for name, owner in self._owners.items():
             reached = owner.connection is not None and owner.connection._present and not owner.frozen
             if not (bridged and owner.alive and reached):
