@@ -230,7 +230,7 @@ class TopicPolicy(Struct):
 
 
 class Transport(ABC):
-    """One client of a publish/subscribe network: the shared behaviour; a backend supplies the abstract methods.
+    """A client of a publish/subscribe network: the shared behaviour; a backend supplies the abstract methods.
 
     All methods may be called from any thread, and from inside handlers.
     """
@@ -288,7 +288,7 @@ class Transport(ABC):
 
     @property
     def not_received(self) -> str:
-        """One line about the subscriptions that the other end refuses; empty if it refuses none."""
+        """Return one line about the subscriptions that the other end refuses; empty if it refuses none."""
         refused = [subscription.filter for subscription in self._subscriptions if subscription.refused]
         more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""
         return f"it refuses to deliver {', '.join(refused[:_NAMED])}{more}" if refused else ""

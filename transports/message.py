@@ -15,7 +15,7 @@ class QoS(IntEnum):
 
 
 class Message(msgspec.Struct, frozen=True):
-    """One message, published or received.
+    """A message, published or received.
 
     Published: ``retain`` asks the broker to retain it. Received: ``retain`` marks a retained message, an old value; on
     a connection opened ``as_published`` it means "retained, or published with retain". ``retain_requested`` says

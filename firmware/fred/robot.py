@@ -26,7 +26,7 @@ _GLOW = const(76)  # L
 
 
 class Motor:
-    """One half of a DRV8833. ``pins`` = (in1, in2) share a timer channel; only the driven pin is connected to it.
+    """A half of a DRV8833. ``pins`` = (in1, in2) share a timer channel; only the driven pin is connected to it.
 
     The released pin is an output at 0 again (ports/samd/machine_pwm.c, mp_machine_pwm_deinit). The class is in this
     file because another file costs 350 bytes of RAM.

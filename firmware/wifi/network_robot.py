@@ -33,7 +33,7 @@ _REPORT_EVERY = const(20)  # heartbeats: 5 s
 
 
 class NetworkRobot:
-    """One robot; call ``step`` forever. Status: ``session.connection``, ``stops``, ``deadman.trips``, ``refused``."""
+    """A robot; call ``step`` forever. Status: ``session.connection``, ``stops``, ``deadman.trips``, ``refused``."""
 
     def __init__(self, settings: dict, body, charging: bytes, wrap) -> None:
         """Store the arguments. ``wrap`` wraps a socket in TLS; None: no TLS.

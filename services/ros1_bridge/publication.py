@@ -52,7 +52,7 @@ class Subscriber:
 
 
 class Publication:
-    """One topic. :meth:`send` may be called on any thread; ``close`` is how a connection is closed."""
+    """A topic of ROS. :meth:`send` may be called on any thread; ``close`` is how a connection is closed."""
 
     def __init__(self, topic: str, form: Form, definition: str, close: Callable[[socket.socket], None]) -> None:
         self.topic, self.form, self.definition = topic, form, definition

@@ -59,7 +59,7 @@ def ignore(_messages: list[Message]) -> None:
 
 
 class Connection:
-    """One connection: a client, the backlog of its socket, and the acknowledgements that the broker owes.
+    """A connection: a client, the backlog of its socket, and the acknowledgements that the broker owes.
 
     `as_published` uses bridge mode on 3.1.1, and noLocal and retain-as-published on 5 (T7, T16).
     """

@@ -36,7 +36,7 @@ _IDLE_S = 60.0  # the connection wakes up earlier, for its pings
 
 
 class _Run:
-    """One run of the network thread, with the requests of other threads to it."""
+    """A run of the network thread, with the requests of other threads to it."""
 
     def __init__(self, target: Callable[[_Run], None], name: str) -> None:
         self.stopping = threading.Event()

@@ -41,7 +41,7 @@ class _Opening(NamedTuple):
 
 
 class SerialLine:
-    """One serial port and its reading thread. Any thread may call any method; only :meth:`close` blocks, up to 0.8 s.
+    """A serial port and its reading thread. Any thread may call any method; only :meth:`close` blocks, up to 0.8 s.
 
     Every opening sends a line end, because the device may hold half an earlier line, and then the stop as the first
     line. During ``boot_s`` input is discarded; then the stop is sent again, followed by the lines that were added since

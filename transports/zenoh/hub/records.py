@@ -8,7 +8,7 @@ from pebble.transports.zenoh.wire import Stamp, Will
 
 
 class Retained(msgspec.Struct, frozen=True, array_like=True, tag="kept"):
-    """One retained message, or the removal of one if ``payload`` is empty."""
+    """A retained message, or the removal of one if ``payload`` is empty."""
 
     key: str
     payload: bytes

@@ -9,7 +9,7 @@ from pebble.errors import PebbleError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Board:
-    """One board type, with its names in MicroPython, esptool and mpy-cross."""
+    """A board type, with its names in MicroPython, esptool and mpy-cross."""
 
     title: str  # what is printed on the package
     build: str  # MicroPython's name of the board, and of its download page on micropython.org

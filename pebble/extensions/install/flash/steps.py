@@ -37,7 +37,7 @@ class FlashOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
-    """One step: a dry run shows ``lines``; ``act`` performs it and may return a remark for the user."""
+    """A step: a dry run shows ``lines``; ``act`` performs it and may return a remark for the user."""
 
     title: str
     lines: tuple[str, ...] = ()

@@ -35,7 +35,7 @@ Wheels = tuple[float, float]
 
 
 class Turn(NamedTuple):
-    """One turn of driving. All times are CLOCK_MONOTONIC, ns."""
+    """A turn of driving. All times are CLOCK_MONOTONIC, ns."""
 
     began: int
     ended: int

@@ -97,7 +97,7 @@ def round_cell(
 
 
 class Results(msgspec.Struct, kw_only=True):
-    """One run of one comparison."""
+    """A run of a comparison."""
 
     bench: str
     pebble: str = __version__

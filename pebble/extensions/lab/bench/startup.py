@@ -44,7 +44,7 @@ _EVERYTHING = f"{BASE}/#"
 
 
 class Floor(Robot):
-    """One process that takes the place of the launcher and its services."""
+    """A process that takes the place of the launcher and its services."""
 
     def launch(self) -> None:
         program = [sys.executable, "-P", str(Path(__file__).with_name("floor.py"))]

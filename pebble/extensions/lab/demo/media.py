@@ -22,7 +22,7 @@ _ENCODINGS: dict[Medium, tuple[str, ...]] = {"video": ALL_VIDEO, "audio": ALL_SO
 
 
 class CountedMedia(MediaReceiver):
-    """One robot's pictures and sounds, ``counted`` by encoding. The transport's threads write, another reads."""
+    """The pictures and sounds of a robot, ``counted`` by encoding. The transport's threads write, another reads."""
 
     def __init__(self, transport: Transport, base: str) -> None:
         super().__init__(transport, base)

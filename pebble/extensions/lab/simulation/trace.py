@@ -14,7 +14,7 @@ Event = Literal["plugged", "opened", "line", "closed", "unplugged", "motors", "s
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line from the host or (``said``) to it, or a change of the port or of the motors.
+    """A line from the host or (``said``) to it, or a change of the port or of the motors.
 
     ``ns`` is time.monotonic_ns() when the line's last byte was received, just before it was written, or when the
     outputs changed. The line of ``motors`` is ``<left> <right>`` with three decimals, -1..1, + = forward of the robot,

@@ -29,7 +29,7 @@ Motors = tuple[float, float]
 
 
 class WirelessRobot:
-    """One robot; ``step`` is a turn of its loop. ``on_motors(seconds, (left, right))`` is called when motors change.
+    """A robot; ``step`` is a turn of its loop. ``on_motors(seconds, (left, right))`` is called when motors change.
 
     ``pause_s`` is the longest time until its next turn while its sockets are idle. ``files`` is the folder of its
     board's files, which survive the program; None: they are in memory. ``name``: the robot's name for people; empty:

@@ -27,7 +27,7 @@ _segment = re.compile(r"\bsegment: (\d+),").search
 
 
 class SharedPool:
-    """One segment of shared memory that frames are allocated from. Raises ZError if it cannot be created."""
+    """A segment of shared memory that frames are allocated from. Raises ZError if it cannot be created."""
 
     def __init__(self, size: int) -> None:
         self.size = size

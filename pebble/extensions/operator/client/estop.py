@@ -203,7 +203,7 @@ class RobotStop:
 
 
 class StopSender:
-    """One emergency stop, of named robots or of all, until it is confirmed, ended, or 60 s old.
+    """An emergency stop, of named robots or of all, until it is confirmed, ended, or 60 s old.
 
     Publish what ``tick`` returns, pass every message of the robots' ``outgoing/#`` to ``receive``, and call ``tick``
     again afterwards and at ``due``. Times are seconds of one monotonic clock. A ``hold`` lasts until ``end``.

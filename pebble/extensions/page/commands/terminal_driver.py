@@ -29,7 +29,7 @@ _AXES = {
 
 
 class TerminalDriver:
-    """One person at one terminal. Pass messages to :meth:`receive`, keys to :meth:`press`; publish what is returned.
+    """A person at a terminal. Pass messages to :meth:`receive`, keys to :meth:`press`; publish what is returned.
 
     ``heartbeat``: whether the robot sends one on this connection. ``assume``: it is a board that drives without saying
     so. Times are seconds of a monotonic clock that also counts while the machine is suspended.

@@ -24,7 +24,7 @@ _SHARE_AGREED = 0.7  # of the motion in which two sensors must agree with the co
 
 
 class HallSample(NamedTuple):
-    """One sample of a wheel: ADC values, the power of its motor (−1..1), and the direction in which it can turn.
+    """A sample of a wheel: ADC values, the power of its motor (−1..1), and the direction in which it can turn.
 
     ``quadrature`` is the second sensor's value, if any. ``direction`` 0 means unknown.
     """
@@ -152,7 +152,7 @@ class _Counts:
 
 
 class HallWheel:
-    """One wheel. ``mm_per_step`` is the distance for half a wave."""
+    """A wheel. ``mm_per_step`` is the distance for half a wave."""
 
     def __init__(self, mm_per_step: float) -> None:
         self.mm_per_step = mm_per_step

@@ -46,7 +46,7 @@ class Condition:
 
 
 class NamespaceNetwork(Worker):
-    """One robot's network: a process that holds its namespaces. When it ends, all connections are cut.
+    """The network of a robot: a process that holds its namespaces. When it ends, all connections are cut.
 
     ``on_robot`` and ``on_remote`` wrap a command so that it runs on the robot's or the broker's side. Several
     independent networks may be open at the same time; ``name`` is for messages. Raises PebbleError.

@@ -109,7 +109,7 @@ def shown(results: Results, window_s: float) -> Shown:
 
 @dataclass(frozen=True, slots=True)
 class ImpairedRobot:
-    """One subject: the robot and its local broker on their side of the network, the rest on the other side."""
+    """A subject: the robot and its local broker on their side of the network, the rest on the other side."""
 
     subject: str
     network: NamespaceNetwork

@@ -22,7 +22,7 @@ class Sample(NamedTuple):
 
 
 class Track:
-    """One robot's samples, oldest first; at least one."""
+    """The samples of a robot, oldest first; at least one."""
 
     def __init__(self, samples: Sequence[Sample]) -> None:
         self.samples = samples

@@ -25,7 +25,7 @@ _WAITS: Final[dict[Medium, str]] = {"video": "Pictures wait for driving", "audio
 
 
 class SharedRequest:
-    """One request for a robot's pictures or sound, shared by all that show them here.
+    """A request for a robot's pictures or sound, shared by all that show them here.
 
     Used on the event loop only. Its coroutines are awaited only in a step of :meth:`run`.
     """
