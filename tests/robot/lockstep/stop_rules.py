@@ -4,8 +4,8 @@
   ended it, also if a copy of it comes after the reset. Excused: what a killed bridge forgets.
 * A stop with a name passes to all owners as often as it came, and one without a name once, except around a loss of the
   connection of stops, where equal bytes cannot be told apart.
-* An owner that has shown that a stop was reset gets no copy of it, unless it has forgotten that stop and latched by it
-  again. Excused: what a killed bridge forgets.
+* An owner that has shown that a stop was reset gets no copy of it. Excused: what a killed bridge forgets. To an owner
+  that has forgotten a stop, a copy that passed before its reset was known is a new stop.
 * What is repeated is the newest stop that its owner has not shown, names its owner, and ends when that has withdrawn
   its emergency stop; in the end nothing is repeated, and a new stop stops every owner.
 """
@@ -92,8 +92,6 @@ class StopRules:
         same = before is not None and before.boot == state.boot
         if before is not None and same and not state.latched and (before.latched or state.count > before.count):
             self._over |= {shown for shown in self._shown if shown[0] == owner and shown[1] in self._first}
-        if before is not None and same and state.latched:
-            self._over -= {(owner, name) for name in state.recent if name not in before.recent}
         self._shown |= {(owner, name) for name in state.recent}
 
     def shows(self, owner: str, payload: bytes) -> None:
@@ -120,6 +118,8 @@ class StopRules:
                 self.repeated_at = now
                 self._repeats(owners[0], name)
             return
+        forgetful = (owner for owner in owners if owner in self._seen and name not in self._seen[owner].recent)
+        self._shown -= {(owner, name) for owner in forgetful}
         self._passed[name] += 1
         self._first.setdefault(name, now)
         self._stopped.setdefault(name, now)
