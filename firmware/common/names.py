@@ -1,6 +1,6 @@
 """The senders of commands at a broker that checks names. Loaded only there, because it takes memory. Pure.
 
-There each topic is subscribed to a second time, with the account of its sender: ``by/{account}/{topic}``.
+There topics are subscribed to with the account of the sender, ``by/{account}/{topic}``; the first ones without, too.
 """
 
 from common.latch import fields

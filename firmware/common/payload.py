@@ -8,9 +8,6 @@ from common.arbiter import LAST_RUN, PERSON, UNKNOWN_RUN
 
 _MAX_BYTES = const(512)
 _MAX_BRACKETS = const(32)  # limits the parser's memory, which grows with depth
-
-
-_GROUP = const(b'{"drive-values":')
 _WATCHDOG_MS = const(60_000)  # longer than any: larger numbers are cut, because they would need memory
 
 
@@ -44,22 +41,19 @@ def load(raw: memoryview | bytes):
     return json.loads(raw)  # type: ignore[type-var]  # any buffer will do (extmod/modjson.c)
 
 
-def drive_of(raw: memoryview | bytes) -> memoryview | bytes | None:
-    """Return the drive command in a group of commands. None: the group has other members, which no board takes."""
-    text = bytes(raw)
-    alone = text.startswith(_GROUP) and text.endswith(b"}") and b"\0" not in text
-    return raw[len(_GROUP) : -1] if alone else None
-
-
-def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int, str] | None:
+def parse(raw: memoryview | bytes, grouped: bool = False) -> tuple[float, float, float, int, int, str] | None:
     """Return ``(x, z, y, run, valid_ms, key)`` from bare or wrapped JSON; None if the command is refused.
 
     Axes are limited to -1..1; missing ones, and those that are no number, are 0; NaN and infinity are refused. The
     other values are as the arbiter needs them. Wrong ones, or a wrong ``source``, refuse a command that moves anything,
-    but never a stop.
+    but never a stop; so do further members of a group, which no board takes. ``grouped``: it is in a group of commands.
     """
     try:
         body = load(raw)
+        alone = True
+        if grouped and isinstance(body, dict):
+            alone = len(body) == 1 and bytes(raw).count(b'"drive-values"') == 1
+            body = body.get("drive-values")
         if isinstance(body, dict):
             inner = body.get("value")
             if isinstance(inner, dict):
@@ -68,7 +62,7 @@ def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int, str] 
             stops = x == 0.0 and z == 0.0 and y == 0.0
             run, valid_ms = _run(body, stops), _valid_ms(body, stops)
             key = body.get("key")
-            if not stops and not (key is None or isinstance(key, str)):
+            if not stops and not (alone and (key is None or isinstance(key, str))):
                 raise ValueError
             return x, z, y, run, valid_ms, key if isinstance(key, str) else ""
     except (ValueError, OverflowError, MemoryError):  # not UTF-8, no JSON, no number

@@ -12,7 +12,7 @@ from common.arbiter import PERSON, REFUSED
 from common.capabilities import describe
 from common.deadman import DeadMan
 from common.estop import EmergencyStop
-from common.payload import drive_of, parse
+from common.payload import parse
 from common.settings import base, get
 from common.ticks import add, diff
 from wifi.clock import Clock
@@ -68,6 +68,7 @@ class NetworkRobot:
         self._void = False  # a stop was received in this turn
         self._due = now  # the next heartbeat
         self._heartbeats = 0
+        self._groups = b""  # the members of groups that it takes; none if the broker refuses their topic
 
     def step(self) -> None:
         now = time.ticks_ms()
@@ -133,6 +134,7 @@ class NetworkRobot:
                 raise ValueError("subscription refused")
             self.stops.stoppable = stop <= 127 and granted[_RESET] <= 127
             self.stops.controllable = granted[_CONTROL] <= 127
+            self._groups = getattr(self.body, "groups", b"") if granted[-1] <= 127 else b""
             self._heartbeats = 0
             self._due = now
         elif client.retained:  # stale
@@ -147,7 +149,7 @@ class NetworkRobot:
         by = self.session.client.by
         sender = by or ("-" if stops.names else "")  # as Linux robots show a sender without a name
         if topic == _DRIVE or topic == _GROUP:  # noqa: SIM109 - a tuple would need memory
-            self._judge(raw if topic == _DRIVE or raw is None else drive_of(raw), sender, now)
+            self._judge(raw, sender, now, topic == _GROUP)
         elif raw is not None and not len(raw):  # it removes a retained message
             pass
         elif topic == _CONTROL or topic == _TAKE:  # noqa: SIM109 - a tuple would need memory
@@ -164,8 +166,8 @@ class NetworkRobot:
         elif topic == _RESET and raw is not None:
             stops.reset(raw, now)
 
-    def _judge(self, raw: memoryview | None, by: str, now: int) -> None:
-        command = None if raw is None else parse(raw)
+    def _judge(self, raw: memoryview | None, by: str, now: int, grouped: bool) -> None:
+        command = None if raw is None else parse(raw, grouped)
         if command:
             x, z, y, run, valid_ms, key = command
             moves = x != 0.0 or z != 0.0 or y != 0.0
@@ -195,8 +197,7 @@ class NetworkRobot:
         if not self._heartbeats:
             now_ms = self._clock.read(now)
             axes = getattr(self.body, "axes", b"")
-            groups = getattr(self.body, "groups", b"")
-            text = describe(now_ms, session.root, self.name, stops, self.charging, axes, groups)
+            text = describe(now_ms, session.root, self.name, stops, self.charging, axes, self._groups)
             session.publish(b"capabilities", text, 1)
             stops.changed = stops.lease.changed = True
             self._due = now

@@ -108,6 +108,7 @@ class Forwarder:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.counters, self._steps = Counters(), steps
+        self.stays: Callable[[str], bool] = lambda _topic: False  # True: obeyed only inside the robot
         self.subjects, self._rules, self._names, self._clock = subjects, rules, names, clock
         self._pass_stop = pass_stop
         self.sides = Sides(

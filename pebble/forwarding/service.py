@@ -107,7 +107,7 @@ class ForwardingService(Service, ABC):
 
     @abstractmethod
     def connected(self, side: Side, epoch: int) -> None:
-        """React to a new connection of ``side``, whose number is ``epoch``."""
+        """React to a new connection of ``side``; ``epoch`` counts the outages of the remote side."""
 
     def disconnected(self, side: Side) -> None:
         """React to a lost connection."""
@@ -120,7 +120,7 @@ class ForwardingService(Service, ABC):
 
     @abstractmethod
     def check_again(self, epoch: int) -> None:
-        """Check whether forwarding may start again without a reconnect; ``epoch``: the number of the connection."""
+        """Check whether forwarding may start again without a reconnect; ``epoch`` as in :meth:`connected`."""
 
     @abstractmethod
     def receive_local(self, message: Message) -> None:

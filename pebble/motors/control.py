@@ -39,7 +39,7 @@ class Control:
         """Store the arguments; ``owners``: all motor owners of the robot.
 
         ``show_turn()`` must send the result of :meth:`turn` to the other owners. ``bridged``: a client counts as silent
-        only for the time for which the bridge vouches (:meth:`vouch`) that it has passed on all messages.
+        only for the time for which the bridge vouches (:meth:`vouch`) that it passed on all messages, or after 30 s.
         """
         self.boot = secrets.token_hex(4)  # of this life of the motor owner
         self._named = security.named

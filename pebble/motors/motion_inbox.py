@@ -29,7 +29,7 @@ _HOLDER = -2  # in place of the number of a run: the holder of control
 class ReceivedDrive(Struct, frozen=True):
     """A drive command, with the time at which it was received.
 
-    ``company``: the other members of its group; all are carried out together, or none.
+    ``company``: the members of its group that this motor owner takes, such as lights; all are carried out, or none.
     """
 
     drive: Drive

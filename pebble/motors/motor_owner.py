@@ -167,7 +167,7 @@ class MotorOwner(Service, ABC):
         return self._takes_groups and command.group is True
 
     def _receive_group(self, message: Message, _value: Any, _names: dict[str, str]) -> None:
-        """Handle the members of a group that are meant for motors; other programs receive copies of their members."""
+        """Handle the members of a group that this owner takes; other programs receive copies of their members."""
         try:
             members = groups.decode(message.payload)
         except PayloadError as error:

@@ -81,7 +81,7 @@ class StateFile:
             return Unreadable()
 
     def appeared(self) -> Any:
-        """Return the value of a file that another process wrote; None without such a file, or if it is unreadable."""
+        """Return the value of a file that another process wrote, as :meth:`load` does; None if there is none."""
         try:
             return None if self._own is not None and not self._own.replaced else self.load()
         except OSError:

@@ -91,4 +91,6 @@ def exit_at_the_latest() -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 3:
+        sys.exit("usage: python -m pebble.runtime.process MODULE:CLASS CONFIG")
     sys.exit(run(part(sys.argv[1]), sys.argv[2:]))

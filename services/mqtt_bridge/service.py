@@ -84,6 +84,7 @@ class MqttBridge(ForwardingService):
         self._control_topic = CONTROL_STATE.topic(self.config.base, owner=decides) if decides else ""
         private = next((extension.private for extension in self.config.installed if extension.private), "")
         self._private = (part(private) if private else PrivateTopics)(self.config.base)
+        self.forwarder.stays = self._private.stays
         self._is_thin = section.link.profile != "wide"  # or may become so
         self._uplink = uplink_of(self.config, self.addresses, self.remote, self.forwarder, self.clock)
         self._requests = OwnRequests(self, self.forwarder.mirroring, self._uplink.note_drive)

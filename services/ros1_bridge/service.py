@@ -71,7 +71,7 @@ class Ros1Reader(Service):
 
 
 class Ros1Bridge(Ros1Reader, MotorOwner):
-    """A service that also drives the base. The multiplexer's lock is the latch: zeros do not stop a Husky."""
+    """A service that also drives the base. The multiplexer's lock follows the latch: zeros alone stop no Husky."""
 
     name = "ros1_bridge"
     publishes = (*MotorOwner.publishes, *PUBLISHES)

@@ -49,6 +49,11 @@ GROUPS = {
 }
 
 
+def test_groups_whose_topic_is_refused_are_not_announced() -> None:
+    (capabilities,) = published(online("minilamp", refused={f"{BASE}/incoming/group"}), "capabilities")
+    assert "groups" not in capabilities["value"]
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("group", GROUPS)
 def test_a_group_moves_a_board_that_lists_it_as_its_drive_command_would(kind: str, group: bytes) -> None:

@@ -32,7 +32,7 @@ from pebble.runtime.addresses import Addresses
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports import Message
 
-#: Channels that owners of serial lines take from the group; their copies are marked.
+#: Channels that motor owners and described boards take from the group; their copies are marked.
 MARKED = (DRIVE, LIGHTS_SOLID, LIGHTS_FLASH, MCU_COMMAND)
 _log = RateLimitedLog(logging.getLogger(__name__), period_s=60.0)
 
@@ -73,10 +73,10 @@ class _Part(NamedTuple):
 class GroupGate:
     """A gate before a forwarder, for messages from outside. Messages that are no groups go on to :attr:`pass_on`.
 
-    A group passes if each member would: it is published whole, and then each member by itself. Owners of serial lines
-    obey the whole and ignore the copies, which are marked. A group of which a member may not pass is dropped, but for
-    members that only end something. Marked copies from outside are refused: observers would see motion that is not
-    there.
+    A group passes if each member would: it is published whole, and then each member by itself. Motor owners and
+    described boards obey the whole, and of the copies, which are marked, only zeros. A group of which a member may not
+    pass is dropped, but for members that only end something. Marked copies from outside are refused: observers would
+    see motion that is not there.
     """
 
     def __init__(self, forwarder: Forwarder, addresses: Addresses, note_drive: Callable[[bytes], None]) -> None:
@@ -129,7 +129,8 @@ class GroupGate:
         subject = self._subjects[topic]
         assert subject is not None  # noqa: S101 - its metric is that of a channel
         message = replace(message, topic=topic, payload=member.payload)
-        way = self._forwarder.admit(source, subject, message, topic, True)
+        admitted = self._forwarder.admit(source, subject, message, topic, True)
+        way = Drop.STAYS if self._forwarder.stays(topic) else admitted
         if isinstance(way, Forward):
             passing = self._forwarder.examine(source, subject, message, way, account)
             if isinstance(passing, Drop):

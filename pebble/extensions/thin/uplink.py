@@ -170,7 +170,7 @@ class ThinUplink(Uplink):
         return self.level.heartbeat_s > 0
 
     def note_drive(self, payload: bytes) -> None:
-        """Let media wait while a person drives. Whether a person does is decided by the motor owner."""
+        """Let media wait if a person's command moves the robot and the link is thin."""
         with suppress(PayloadError):
             command: Drive = codec.decode(DRIVE, payload)
             if self._meter.level == "thin" and command.moves and command.source != SCRIPT:

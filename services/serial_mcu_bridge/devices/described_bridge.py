@@ -269,6 +269,7 @@ class DescribedBridge(SerialService):
 
     def _command_group(self, members: tuple[groups.Member, ...]) -> None:
         if self.device is None:
+            self._drop_command("a group of commands")
             return
         interfaces = ((route.generic.metric, route.interface) for route in self.device.routes.values())
         takes = {metric: interface for metric, interface in interfaces if interface.direction is Direction.IN}
@@ -283,10 +284,13 @@ class DescribedBridge(SerialService):
         if self._takes_groups and values.get(groups.MARK) is True:
             return  # the copy of a group's member
         if device is not self.device:
-            self.counters.add("no_device")
-            self.log_limited.warning("no device", "%s: dropped a command, the device is not there", name)
+            self._drop_command(name)
             return
         self._send_commands([(route.interface, values)])
+
+    def _drop_command(self, name: str) -> None:
+        self.counters.add("no_device")
+        self.log_limited.warning("no device", "%s: dropped a command, the device is not there", name)
 
     def _send_commands(self, wanted: list[tuple[Interface, dict[str, Any]]]) -> None:
         try:

@@ -46,7 +46,7 @@ class SerialLine:
     Every opening sends a line end, because the device may hold half an earlier line, and then the stop as the first
     line. During ``boot_s`` input is discarded; then the stop is sent again, followed by the lines that were added since
     the opening. Only the newest of each kind waits (:class:`Outbox`); described commands use up to 8 kinds per
-    interface.
+    interface, and 8 for groups of them.
 
     ``on_bytes(chunk)`` and ``on_state(state, problem)`` run on the reading thread and must return at once. ``stop`` is
     the line that stops the motors, empty if there are none; ``drive_timeout_s`` the age at which a drive line expires.

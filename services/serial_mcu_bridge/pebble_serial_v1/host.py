@@ -41,7 +41,7 @@ ANSWER_S = 10.0  # an outlet controller that switches a power outlet over Wi-Fi 
 _DOUBT_S = 10.0  # between two requests because of readings that do not fit the manifest
 _REMEMBERED = 16  # manifests
 _OPEN_COMMANDS = 64  # that wait for their answers
-WAITING = 8  # kinds per interface: so many commands may wait to be sent; a newer one replaces the oldest
+WAITING = 8  # commands of an interface, and groups of them, that may wait to be sent; a newer one replaces the oldest
 _U32 = 0xFFFFFFFF
 
 
@@ -188,7 +188,7 @@ class Session:
             self._commands[self._sequence] = _Command(interface.name, now + ANSWER_S)
             if len(self._commands) > _OPEN_COMMANDS:
                 self._commands.popitem(last=False)
-        kind = "+".join(str(interface.id) for interface, _ in wanted)
+        kind = str(wanted[0][0].id) if len(wanted) == 1 else "group"
         slot = self._slots[kind] = (self._slots.get(kind, 0) + 1) % WAITING
         return Send(f"command {kind}/{slot}", data)
 

@@ -12,6 +12,7 @@ from pebble.errors import PayloadError
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import (
     ANSWER_S,
     SILENCE_S,
+    WAITING,
     Answer,
     Described,
     Event,
@@ -277,6 +278,18 @@ def test_a_command_becomes_a_frame(host: Host) -> None:
     for values, reason in bad:
         with pytest.raises(PayloadError, match=reason):
             host.command("o1_set", values)
+
+
+def test_groups_wait_in_eight_places_whatever_they_set(host: Host) -> None:
+    host.describe()
+    assert host.session.manifest is not None
+    first, second = (one for one in host.session.manifest.interfaces if one.name in ("o1_set", "o2_set"))
+    kinds = [
+        host.session.commands([(one, {"on": True}) for one in order], host.now, WALL_MS).kind
+        for order in [(first, second), (second, first)] * 20
+    ]
+    assert len(set(kinds)) == WAITING
+    assert host.session.command(first, {"on": True}, host.now, WALL_MS).kind not in kinds
 
 
 def test_answers_find_their_command(host: Host) -> None:

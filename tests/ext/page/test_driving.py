@@ -241,7 +241,8 @@ class World:
             kind = "go" if drive.moves else "final" if drive.valid_ms == 0 else "zero"
             assert drive.valid_ms == {"go": WIDE.valid_ms, "final": 0, "zero": UNSET}[kind] or self.views[base].link
             lost = keyed and kind != "final" and drive.key != self.owners[base].owners[0].lease.key
-            self.happened.append(("fred " if base == FRED else "") + kind + (" without key" if lost else ""))
+            where = ("fred " if base == FRED else "") + "grouped " * (metric == c.GROUP.metric and len(members) == 1)
+            self.happened.append(where + kind + (" without key" if lost else ""))
         return True
 
 
@@ -289,6 +290,16 @@ HISTORIES = {
         wait 0.05
         ann drives 1: go
         ann rests 1: zero""",
+    "after a group a zero goes in the topic of groups, too": """
+        robot takes groups
+        ann takes
+        ann drives 1: go
+        ann shines 2
+        wait 0.05
+        ann drives 1: with light 2, go
+        ann rests 1: zero, grouped zero, light 2
+        ann drives 2: go
+        ann rests 2: zero""",
     "a robot that lists no groups is sent none": """
         ann takes
         ann drives 1: go

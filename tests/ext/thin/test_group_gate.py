@@ -93,6 +93,8 @@ def test_without_the_key_a_group_is_a_command_like_any_unknown_one(start: Start)
         (ZERO, 2.5, ["drive-values"]),
         (QUIET, 0.6, ["soundboard-command"]),
         (SIGNED, 0.0, []),
+        (b'{"mcu/spy-1/tune": {"v": 1}, "drive-values": {"z": 0.5}}', 0.0, []),  # an MCU whose commands may be private
+        (b'{"mcu/spy-1/tune": {"v": 1}, "drive-values": {"z": 0}}', 0.0, ["drive-values"]),
     ],
 )
 def test_of_a_bad_or_late_group_passes_what_ends_something(

@@ -2,16 +2,16 @@
 
 import json
 
-from common.payload import clamp, drive_of, load, mix
+from common.payload import clamp, load, mix
 from common.payload import parse as parse_all
 
 with open(__file__[: max(0, __file__.rfind("/firmware/"))] + "/vectors/commands.json") as file:  # noqa: PTH123
     VECTORS = json.load(file)
 
 
-def parse(raw: bytes) -> "tuple | None":
+def parse(raw: bytes, grouped: bool = False) -> "tuple | None":
     """The axes."""
-    command = parse_all(raw)
+    command = parse_all(raw, grouped)
     return command[:3] if command else None
 
 
@@ -118,11 +118,14 @@ def test_nothing_beyond_full_speed() -> None:
     assert (clamp(7.0), clamp(-7.0), clamp(0.25)) == (1.0, -1.0, 0.25)
 
 
-def test_a_group_has_a_drive_command_and_nothing_else() -> None:
+def test_a_group_moves_with_a_drive_command_and_nothing_else_and_a_zero_always_stops() -> None:
     for group, axes in (
         (b'{"drive-values":{"x":0.5,"z":1}}', (0.5, 1.0, 0.0)),
         (b'{"drive-values": {"z": 0}}', (0.0, 0.0, 0.0)),
+        (b' { "drive-values":{"z":1}}\r\n', (0.0, 1.0, 0.0)),
+        (b'\xef\xbb\xbf{"drive-values":{"z":0}}\0rest', (0.0, 0.0, 0.0)),
         (b'{"drive-values":{"z":1},"lights-solid":{"r":1}}', None),
+        (b'{"lights-solid":{"r":1},"drive-values":{"z":0}}', (0.0, 0.0, 0.0)),
         (b'{"lights-solid":{"r":1},"drive-values":{"z":1}}', None),
         (b'{"drive-values":{"z":1},"drive-values":{"z":0.5}}', None),
         (b'{"\\u0064rive-values":{"z":1}}', None),
@@ -136,5 +139,4 @@ def test_a_group_has_a_drive_command_and_nothing_else() -> None:
         (b"{}", None),
         (b"", None),
     ):
-        drive = drive_of(group)
-        assert (parse(drive) if drive else None) == axes, group
+        assert parse(group, True) == axes, group

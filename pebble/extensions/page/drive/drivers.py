@@ -38,6 +38,7 @@ class Drivers:
         self._driven: dict[str, DrivenRobot] = {}
         self._changed: set[str] = set()
         self._company: dict[str, _Company] = {}  # by robot
+        self._grouped: set[str] = set()  # robots that were sent a group since their last zero
         self.refusals = Refusals(broker, lambda ref: self.robot(ref).moved_by, robots.view)
 
     def robot(self, ref: str) -> DrivenRobot:
@@ -167,7 +168,8 @@ class Drivers:
     def _publish(self, commands: list[Command], by: str = "") -> bool:
         """Publish a person's drive commands to the robot's own topic; return False if one was not accepted.
 
-        What is to accompany a command shares its message; a zero goes alone, and first.
+        What is to accompany a command shares its message; a zero goes alone, and first. After a group a second zero
+        follows in its topic: there it takes the place of a group that still waits for a slow connection.
         """
         accepted = True
         for ref, drive, qos in commands:
@@ -177,8 +179,12 @@ class Drivers:
                 members = {DRIVE.metric: payload, company.metric: company.message.payload}
                 topic, payload = GROUP.topic(ref), joined(members)
                 self._company[ref] = company._replace(sent_at=clock())
+                self._grouped.add(ref)
             accepted = self._broker.publish(topic, payload, qos=qos, by=by) and accepted
             if not drive.moves:
+                if ref in self._grouped:
+                    self._grouped.remove(ref)
+                    self._broker.publish(GROUP.topic(ref), joined({DRIVE.metric: payload}), qos=qos, by=by)
                 self._publish_company(ref)
         if self._changed:
             self._robots.mark_drivers(set(self._changed))

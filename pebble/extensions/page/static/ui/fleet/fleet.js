@@ -58,7 +58,6 @@ export function Fleet() {
   const total = online.length + away.length;
   const robots = [...online, ...away].filter(isRobot);
   const there = robots.filter((ref) => present.has(ref));
-  const others = total - robots.length;
   const dense = total >= DENSE;
   const shown = sorted(store, online.filter(matches), dense && settings.sort === "battery");
   const many = total > MANY;
@@ -74,7 +73,6 @@ export function Fleet() {
         ${total === 0
           ? "Robots"
           : `${robots.length} ${robots.length === 1 ? "robot" : "robots"}${connection.isOpen && away.some(isRobot) ? `, ${there.length} online` : ""}`}
-        ${others > 0 && html`<span class="dim"> and ${others} ${others === 1 ? "other" : "others"}</span>`}
         </h1>
         <${Bands} at="" />
       </div>
