@@ -72,10 +72,14 @@ class Operator:
         if sock is not None:
             sock.close()
 
-    def send(self, suffix: str, body: Any, *, qos: int = 1, retain: bool = False) -> None:
+    @property
+    def is_connected(self) -> bool:
+        return self._client.is_connected()
+
+    def send(self, suffix: str, body: Any, *, qos: int = 1, retain: bool = False) -> paho.MQTTMessageInfo:
         """Publish ``body`` (bytes as they are, anything else as JSON) below the robot's base."""
         raw = body if isinstance(body, bytes) else json.dumps(body).encode()
-        self._client.publish(f"{self.base}/{suffix}", raw, qos=qos, retain=retain)
+        return self._client.publish(f"{self.base}/{suffix}", raw, qos=qos, retain=retain)
 
     def on(self, suffix: str, since: float = 0.0) -> list[ReceivedMessage]:
         """Everything seen on one topic after ``since`` (monotonic), without a bridge's probes."""

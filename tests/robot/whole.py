@@ -41,6 +41,8 @@ _ANSWER_S = 0.5
 _HOLD_S = 2.2  # a person's command holds a script
 _GONE_S = _STOP_TIMEOUT_S + 3.0
 _CONFIRMED_S = 15.0  # after all faults; a killed robot takes some seconds to start
+#: Faults of what the watcher hears the robot through.
+_DEAFENING = ("kill mqtt_mirror", "freeze mqtt_mirror", "kill zenoh_hub", "freeze zenoh_hub", "a broker is away")
 _WAITS_S = (0.02, 0.05, 0.1, 0.1, 0.2, 0.3, 0.5, 1.0)
 _FROZEN_S = (0.1, 0.3, 0.5, 1.0, 1.5, 2.5)
 _FAULTS = (
@@ -373,14 +375,15 @@ class World:
 
     def do_plant_stop(self, _: Person, b: int) -> None:
         """A stop reaches the broker while the robot is away, retained: it receives only the copy."""
-        if (
-            not isinstance(self.rig.remote, Broker) or self.rig.local is None
-        ):  # its programs are not away from their own
-            return
+        operator = self.rig.operator
+        if not isinstance(self.rig.remote, Broker) or self.rig.local is None:
+            return  # its programs are not away from their own
+        if not until(lambda: operator.is_connected, 5.0):
+            return  # what it sent would arrive later, live
         with self._fault("the uplink is cut for a retained stop", 1.0), self._away():
             name = new_name()
+            operator.send("incoming/estop", {"stop": name, "by": "old"}, retain=True).wait_for_publish(5.0)
             self._planted.add(name)
-            self.rig.operator.send("incoming/estop", {"stop": name, "by": "old"}, retain=True)
             time.sleep(0.1 + _WAITS_S[b % 8])
 
     @contextmanager
@@ -402,10 +405,18 @@ class World:
         return [name for name, _ in groupby(names)]
 
     def _out_of_turn(self, since: float) -> Iterator[str]:
-        """Find a line of a sender who had no control then, by order alone: the clocks of two processes differ."""
+        """Find a line of a sender who had no control then, by order alone: the clocks of two processes differ.
+
+        Lines of the time in which the watcher hears nothing of the robot are not judged.
+        """
         turns = iter(self._holders(since))
         speeds = {(speed, speed): name for name, speed in SPEEDS.items()}
-        driven = [speeds[wheels] for _, wheels in self.rig.mcu.drives(since) if wheels in speeds]
+        faults = [fault for fault in self.history.events("fault") if fault.details["which"] in _DEAFENING]
+        driven = [
+            speeds[wheels]
+            for at, wheels in self.rig.mcu.drives(since)
+            if wheels in speeds and not any(fault.at <= at < fault.details["until"] for fault in faults)
+        ]
         for name, _ in groupby(driven):
             if name not in turns:
                 yield f"the wheels obey {name} out of turn: {driven[-5:]}, control of {self._holders(since)}"
@@ -438,7 +449,7 @@ class World:
         if not until(self._ended, _GONE_S, step=0.5):
             return ["a script does not end"]
         time.sleep(_ANSWER_S)  # the state after the last stop may still be on its way
-        if not until(self._is_reset, 5.0, step=0.4):
+        if not until(self._is_reset, 10.0, step=0.4):
             return ["a stop cannot be reset"]
         for person in self.people:
             if problem := self._drives(person):
@@ -508,9 +519,13 @@ class World:
         return seen is not None and now - seen.at < 0.6 and {"autonomy_manager", *_FAULTS[:2]} <= running
 
     def _is_reset(self) -> bool:
-        state = self.watcher.last(STOPPED)
+        """True if the motor owner answers a reset with a state that is not latched; an older state may be stale."""
+        asked = time.monotonic()
         self.do_reset(self.people[0], 1)
-        return state is not None and bool(state.payload) and not state.json["latched"]
+        if not until(lambda: self.watcher.on(STOPPED, asked), 1.0):
+            return False
+        state = self.watcher.on(STOPPED, asked)[-1]
+        return bool(state.payload) and not state.json["latched"]
 
     def _log(self, since: float) -> str:
         events = [(event.at, f"{event.what} {event.details or ''}") for event in self.history.events()]
