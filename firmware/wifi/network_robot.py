@@ -68,7 +68,7 @@ class NetworkRobot:
         self._void = False  # a stop was received in this turn
         self._due = now  # the next heartbeat
         self._heartbeats = 0
-        self._groups = b""  # the members of groups that it takes; none if the broker refuses their topic
+        self.groups = b""  # the members of groups that it takes; none if the broker refuses their topic
 
     def step(self) -> None:
         now = time.ticks_ms()
@@ -134,7 +134,7 @@ class NetworkRobot:
                 raise ValueError("subscription refused")
             self.stops.stoppable = stop <= 127 and granted[_RESET] <= 127
             self.stops.controllable = granted[_CONTROL] <= 127
-            self._groups = getattr(self.body, "groups", b"") if granted[-1] <= 127 else b""
+            self.groups = getattr(self.body, "groups", b"") if granted[-1] <= 127 else b""
             self._heartbeats = 0
             self._due = now
         elif client.retained:  # stale
@@ -197,7 +197,7 @@ class NetworkRobot:
         if not self._heartbeats:
             now_ms = self._clock.read(now)
             axes = getattr(self.body, "axes", b"")
-            text = describe(now_ms, session.root, self.name, stops, self.charging, axes, self._groups)
+            text = describe(now_ms, session.root, self.name, stops, self.charging, axes, self.groups)
             session.publish(b"capabilities", text, 1)
             stops.changed = stops.lease.changed = True
             self._due = now
