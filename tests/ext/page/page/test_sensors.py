@@ -134,7 +134,7 @@ def assert_a_square_in_the_middle(opened: Tab, pixel: float = 1.0) -> None:
         areas[:] = area(pixels, PICTURE), area(pixels, INK)
         return None not in areas
 
-    assert opened.until(are_both_seen)
+    assert opened.until(are_both_seen, 40)  # a busy machine takes seconds for each picture
     (left, top, right, bottom), square = areas
     assert (right - left) / (bottom - top) == pytest.approx(640 / 360, rel=0.01)
     width, height = right - left, bottom - top
