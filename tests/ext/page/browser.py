@@ -109,10 +109,6 @@ class Tab:
                     return found
         raise AssertionError(f"the page shows no {name}")
 
-    def gear(self) -> None:
-        """Open the settings of the picture; on a phone they are a card."""
-        self.test("gear").click()
-
     def test(self, name: str) -> Any:
         """The locator of the elements with this ``data-test``."""
         return self.page.locator(f'[data-test="{name}"]')

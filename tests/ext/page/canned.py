@@ -1,7 +1,6 @@
 """A server that shows the operator page in states given as data: for screenshots, and for tests of what people see.
 
 It speaks the control and media sockets as ``pebble web`` does, but there are no robots and no broker behind it.
-Run it to look at one: ``python -m tests.ext.page.canned driving``.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import time
 import zlib
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager, asynccontextmanager, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any
 
@@ -75,7 +74,6 @@ class State:
     still: bool = False  # cameras show flat colours, and a few pictures only
     at: int = 0  # ms epoch, at which the server's time stands still; 0: it does not
     logs: Callable[[int], list[Any]] = field(default=lambda _now: [])  # lines of the component that is open
-    refused: str = ""  # why nothing that is asked of a robot is done
     recordings: bool = False  # those of tests.ext.page.recorded are offered
     days: tuple[int, str] | None = None  # status and text that a list of recorded days is answered with; status 0: none
     audit: list[Any] = field(default_factory=list)  # of a robot, as it is read
@@ -223,10 +221,8 @@ class CannedServer:
                     logs = {"op": "logs", "ref": message["ref"], "origin": "canned", "first": 213, "lines": lines}
                     await self._send(websocket, logs)
                 if message["op"] != "echo" and "n" in message:
-                    answer = {"op": "refused", "why": state.refused, "g": -1} if state.refused else {"op": "done"}
-                    await self._send(
-                        websocket, answer | {"cmd": message["op"], "ref": message["ref"], "n": message["n"]}
-                    )
+                    done = {"op": "done", "cmd": message["op"], "ref": message["ref"], "n": message["n"]}
+                    await self._send(websocket, done)
         except (WebSocketDisconnect, RuntimeError):
             pass
         finally:
@@ -345,12 +341,10 @@ def flat() -> bytes:
 
 
 @contextmanager
-def serving(state: State | None = None) -> Iterator[CannedServer]:
+def serving() -> Iterator[CannedServer]:
     """A server that ends with the block."""
     server = CannedServer()
     server.start()
-    if state is not None:
-        server.show(state)
     try:
         yield server
     finally:
@@ -370,16 +364,3 @@ def showing(
     with tab(browser, server.url + state.path, size, **options) as opened:
         assert opened.until(when)
         yield opened
-
-
-def main() -> None:
-    from tests.ext.page.states import STATES
-
-    with serving(replace(STATES[sys.argv[1]])) as server:
-        sys.stdout.write(f"{server.url}{server.state.path}\n")
-        sys.stdout.flush()
-        threading.Event().wait()
-
-
-if __name__ == "__main__":
-    main()

@@ -55,14 +55,20 @@ _REPLAYED = "Boolean(pebble.replay?.video.info && pebble.replay.day.timeline)"
 Pixels = npt.NDArray[np.uint8]
 
 
-def _nothing(_page: Page) -> None:
+#: What a person does with a page.
+Act = Callable[[Page], None]
+
+
+def nothing(_page: Page) -> None:
     pass
 
 
-def _press(*names: str) -> Callable[[Page], None]:
+def press(*selectors: str) -> Act:
+    """Return an act that presses these, one after another."""
+
     def act(page: Page) -> None:
-        for name in names:
-            page.locator(f"[data-test={name}]").first.click()
+        for selector in selectors:
+            page.locator(selector).first.click()
 
     return act
 
@@ -74,7 +80,7 @@ class Look:
     state: State
     size: str = "desktop"
     theme: Theme = "light"
-    act: Callable[[Page], None] = _nothing
+    act: Act = nothing
     here: str = _HERE
     script: str = ""
 
@@ -82,7 +88,7 @@ class Look:
 LOOKS: dict[str, Look] = {
     "fleet": Look(STATES["fleet"]),
     "fleet-stopped": Look(STATES["fleet-stopped"], theme="dark"),
-    "fleet-stops": Look(STATES["fleet-stopped"], size="phone", act=_press("stopped")),
+    "fleet-stops": Look(STATES["fleet-stopped"], size="phone", act=press("[data-test=stopped]")),
     "fleet-phone": Look(STATES["fleet"], size="phone", theme="dark"),
     "fleet-empty": Look(STATES["fleet-empty"]),
     "connecting": Look(
@@ -93,16 +99,16 @@ LOOKS: dict[str, Look] = {
     "robot": Look(STATES["full"], size="tall"),
     "free": Look(STATES["free"], theme="dark"),
     "hint": Look(STATES["free"], act=lambda page: page.locator("[data-test=stick]").click(force=True)),
-    "gear": Look(STATES["driving"], act=_press("gear")),
-    "script": Look(STATES["asked"], act=_press("script-apriltag-follow"), size="tall", theme="dark"),
+    "gear": Look(STATES["driving"], act=press("[data-test=gear]")),
+    "script": Look(STATES["asked"], act=press("[data-test=script-apriltag-follow]"), size="tall", theme="dark"),
     "stopped": Look(STATES["stopped"], theme="dark"),
-    "reset": Look(STATES["stopped"], size="phone", act=_press("reset")),
+    "reset": Look(STATES["stopped"], size="phone", act=press("[data-test=reset]")),
     "taken": Look(STATES["taken"], size="phone", theme="dark"),
     "no-broker": Look(STATES["no-broker"]),
     "no-camera": Look(STATES["no-camera"], theme="dark"),
     "phone": Look(STATES["driving"], size="phone"),
     "landscape": Look(STATES["odometry"], size="landscape", theme="dark"),
-    "settings": Look(STATES["driving"], act=_press("settings"), theme="dark"),
+    "settings": Look(STATES["driving"], act=press("[data-test=settings]"), theme="dark"),
     "recordings": Look(STATES["recordings"], size="phone"),
     "replay": Look(STATES["replay"], here=_REPLAYED),
 }

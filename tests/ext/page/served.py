@@ -16,6 +16,7 @@ from websockets.sync.client import ClientConnection, connect
 from pebble.extensions.page.serve import listen, server_config
 from pebble.extensions.page.setting import WebSettings
 from pebble.transports import MqttSettings
+from tests.kit.played_robot import RecordingRobot
 from tests.support import until
 
 #: The state of a motor owner that is not stopped.
@@ -77,7 +78,6 @@ class Page:
         *,
         device: str = "test",
         name: str = "",
-        token: str = "",
         version: str | None = None,
         cookie: str = "",
     ) -> None:
@@ -90,14 +90,13 @@ class Page:
         self.bye: dict[str, Any] = {}
         self.closed = False
         self.answers = True  # False: as a page that stands still
-        self.echo_offset_ms = 0.0
         self._socket: ClientConnection = connect(
             f"ws://127.0.0.1:{served.port}/ws/control", origin=served.origin, additional_headers=headers, max_size=None
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         version = served.version if version is None else version
-        self.send("hello", version=version, device=device, name=name, token=token)
+        self.send("hello", version=version, device=device, name=name)
         assert until(lambda: self.welcome or self.closed, 30)
 
     def send(self, op: str, **fields: Any) -> None:
@@ -112,6 +111,17 @@ class Page:
     def take(self, ref: str, *, over: bool = False) -> bool:
         self.send("lease", ref=ref, take=True, over=over)
         return until(lambda: self.value(ref, "web/driver", "you") is True, 3)
+
+    def moves(self, robot: RecordingRobot) -> bool:
+        """Take control and move the robot; each call is a new gesture."""
+        gesture, since = int(now_ms()), time.monotonic()
+        self.send("lease", ref=robot.base, take=True)
+
+        def moved() -> bool:
+            self.drive(robot.base, gesture, z=0.5)
+            return any(one["z"] for one in robot.drives(since))
+
+        return until(moved, 2, step=0.05)
 
     def value(self, ref: str, metric: str, field: str | None = None) -> Any:
         value = self.state.get((ref, metric))
@@ -147,7 +157,7 @@ class Page:
             case "ping":
                 self.state["", "round trip"] = message["round_trip_ms"]
                 if self.answers:
-                    self.send("echo", n=message["n"], t=now_ms() + self.echo_offset_ms)
+                    self.send("echo", n=message["n"], t=now_ms())
             case "state":
                 self.state |= {(ref, metric): value for ref, metric, value, _ in message["set"]}
                 for ref in message["gone"]:

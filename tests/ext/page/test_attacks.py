@@ -68,13 +68,6 @@ def raw(hall: Hall, request: bytes) -> bytes:
         return b"".join(iter(lambda: client.recv(65536), b""))
 
 
-def works(hall: Hall) -> bool:
-    """Whether it still serves, quickly."""
-    with hall.client("viewer") as client:
-        start = time.monotonic()
-        return client.get("/").status_code == 200 and time.monotonic() - start < 5
-
-
 # -- other sites
 
 
@@ -143,20 +136,6 @@ def test_without_a_session_there_is_nothing(hall: Hall, driver: Page, everything
     assert not {topic for topic in everything.incoming() if topic.endswith("/estop")}
 
 
-def moving(page: Page, robot: RecordingRobot) -> bool:
-    """Take the lease and move; each call is a new gesture."""
-    gesture = int(now_ms())
-    page.send("lease", ref=robot.base, take=True)
-    end = time.monotonic() + 2
-    since = time.monotonic()
-    while time.monotonic() < end and not page.closed:
-        page.drive(robot.base, gesture, z=0.5)
-        if any(one["z"] for one in robot.drives(since)):
-            return True
-        time.sleep(0.05)
-    return False
-
-
 @pytest.mark.parametrize("how", ["removed", "role", "logout"])
 def test_a_session_that_is_revoked_while_driving_ends(hall: Hall, broker: Broker, how: str) -> None:
     base = f"pebble/robots/revoked-{how}"
@@ -166,7 +145,7 @@ def test_a_session_that_is_revoked_while_driving_ends(hall: Hall, broker: Broker
         assert page.knows(base)
         assert page.ready()
         pictures = hall.socket(f"/ws/media?ref={base}&can=json", cookie=cookie)
-        assert moving(page, robot)
+        assert page.moves(robot)
         if how == "removed":
             hall.people.remove("mallory-removed")
         elif how == "role":
@@ -221,15 +200,12 @@ def ops(ref: str) -> dict[str, dict[str, Any]]:
 FOR_VIEWERS = {"hello", "echo", "watch", "read-logs", "stop", "estop", "estop-end"}
 
 
-def test_every_op_is_attacked() -> None:
-    assert set(ops(GOOB)) == {kind.__struct_config__.tag for kind in get_args(m.FromPage)}
-
-
 @pytest.mark.parametrize(("role", "may"), [("viewer", FOR_VIEWERS), ("driver", set(ops("")) - {"action", "board"})])
 def test_what_a_role_may_not(
     hall: Hall, broker: Broker, driver: Page, everything: Everything, role: str, may: set[str]
 ) -> None:
     base, asked = f"pebble/robots/seen-by-{role}", sorted(set(ops(GOOB)) - may)
+    assert set(ops(GOOB)) == {kind.__struct_config__.tag for kind in get_args(m.FromPage)}
     with RecordingRobot(broker.port, base) as robot, hall.page(role) as page:
         assert page.knows(base)
         assert page.ready()
@@ -239,6 +215,8 @@ def test_what_a_role_may_not(
         why = f"The role {role} may not do this"
         assert [(one["cmd"], one["why"]) for one in page.refused] == [(op, why) for op in asked]
         assert not page.closed
+        with hall.client(role) as client:
+            assert client.get("/api/audit", params={"ref": base}).status_code == 403
         time.sleep(0.2)
         assert robot.received == []
         assert everything.incoming(base) == set()
@@ -268,17 +246,20 @@ TRAVERSALS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("path", TRAVERSALS)
-def test_nothing_but_the_pages_files_is_served(hall: Hall, path: str) -> None:
-    secret = (HERE / "server.py").read_bytes()[:60]
-    versions = (hall.served.version, "..", "%2e%2e", "x")
-    for place in [f"/static/{version}/{path}" for version in versions] + [f"/static/{path}", f"/r/{path}", f"/{path}"]:
-        request = f"GET {place} HTTP/1.1\r\nHost: 127.0.0.1:{hall.served.port}\r\nConnection: close\r\n\r\n"
-        answer = raw(hall, request.encode("latin-1", "replace"))
-        assert answer.split(b" ", 2)[1] in (b"303", b"307", b"400", b"404"), (place, answer[:100])
-        assert secret not in answer
-        assert b"root:" not in answer
-        assert b"Traceback" not in answer
+def test_nothing_but_the_pages_files_is_served(hall: Hall) -> None:
+    secrets = (HERE / "server.py").read_bytes()[:60], b"root:", b"Traceback"
+    for path in TRAVERSALS:
+        versions = (hall.served.version, "..", "%2e%2e", "x")
+        for place in (
+            *(f"/static/{version}/{path}" for version in versions),
+            f"/static/{path}",
+            f"/r/{path}",
+            f"/{path}",
+        ):
+            request = f"GET {place} HTTP/1.1\r\nHost: 127.0.0.1:{hall.served.port}\r\nConnection: close\r\n\r\n"
+            answer = raw(hall, request.encode("latin-1", "replace"))
+            assert answer.split(b" ", 2)[1] in (b"303", b"307", b"400", b"404"), (place, answer[:100])
+            assert [secret for secret in secrets if secret in answer] == [], place
 
 
 # -- the control socket
@@ -319,7 +300,6 @@ def test_what_is_not_understood_ends_the_connection_and_moves_nothing(
         assert page.bye["why"]
         assert "Traceback" not in page.bye["why"]
         assert not [one for one in goob.drives(since) if one["x"] or one["z"]]
-    assert works(hall)
     assert not driver.closed
 
 
@@ -349,7 +329,6 @@ def test_names_of_robots_are_no_topics(hall: Hall, goob: RecordingRobot, everyth
             assert sent <= {f"{one}/incoming/{metric}" for one in named for metric in ("estop", "drive-values")}, ref
             page.send("estop-end", stop="0123456789abcdef")
             assert hall.refusal(f"/ws/media?ref={quote(ref)}", cookie=cookie) == 403, ref
-    assert works(hall)
 
 
 def test_a_viewer_does_not_talk(hall: Hall, driver: Page) -> None:
@@ -389,9 +368,8 @@ def test_a_socket_without_hello_is_closed(hall: Hall, monkeypatch: pytest.Monkey
 
 
 def test_a_viewer_ends_no_other_persons_stop(hall: Hall, everything: Everything) -> None:
-    def count() -> int:
-        return len([one for one in everything.messages if one.topic == "pebble/robots/off/incoming/estop"])
-
+    topic = "pebble/robots/off/incoming/estop"
+    count = lambda: len([one for one in everything.messages if one.topic == topic])
     with hall.page("driver") as page, hall.page("viewer") as mallory:
         page.send("estop", ref="pebble/robots/off", stop="00000000000000ff")
         assert until(count)
@@ -400,10 +378,6 @@ def test_a_viewer_ends_no_other_persons_stop(hall: Hall, everything: Everything)
         before = count()
         assert until(lambda: count() >= before + 2, 3), "it is no longer sent"
         page.send("estop-end", stop="00000000000000ff")
-        time.sleep(0.7)
-        before = count()
-        time.sleep(0.7)
-        assert count() == before
 
 
 # -- guessing
@@ -446,15 +420,11 @@ def test_no_secret_leaves_the_server(
             body = {"user": user, "password": password}
             answer = client.post("/api/login", json=body, headers={"origin": hall.served.origin})
             seen.append(answer.content)
-        with hall.socket("/ws/control", cookie=hall.cookie("admin")) as control_socket:
-            control_socket.send(json.dumps({"op": "hello", "version": hall.served.version}))
-            control_socket.send(json.dumps({"op": "watch", "ref": GOOB}))
-            end = time.monotonic() + 1.5
-            while time.monotonic() < end:
-                with suppress(TimeoutError):
-                    seen.append(str(control_socket.recv(timeout=0.3)).encode())
-        assert any(b'"welcome"' in one for one in seen)
-        assert any(GOOB.encode() in one for one in seen)
+        with hall.page("admin") as page:
+            page.send("watch", ref=GOOB)
+            assert page.knows(GOOB)
+            assert until(lambda: page.value(GOOB, "web/flags"))
+            seen.append(repr((page.welcome, page.state)).encode())
         audit = repr(hall.served.app.state.audit.read(1000)).encode()
         everything = b"\n".join([*seen, audit, repr(hall.served.settings).encode(), caplog.text.encode()])
         assert everything.count(b"sentinel-broker-password") == 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from itertools import count
 
 from pebble.extensions.fleet.roles import Role, page_rights
 from tests.ext.page.attacker import Hall
@@ -50,62 +49,12 @@ def test_a_silent_page_is_stopped_and_its_gesture_is_over(page, robot):
     assert until(lambda: last(robot)["z"] == 0.5)
 
 
-def test_lights_of_who_drives_share_a_message_where_the_robot_lists_them(served, page, robot):
-    robot.publish_capabilities(robot.motors.value | {"groups": ["drive-values", "lights-solid"]})
-    assert until(lambda: "groups" in served.app.state.robots.capabilities(robot.base))
-    assert page.take(robot.base)
-    gestures = count(1)
-
-    def groups():
-        return [payload for _, topic, payload in list(robot.received) if topic == f"{robot.base}/incoming/group"]
-
-    def shared():
-        gesture = next(gestures)
-        page.drive(robot.base, gesture, z=0.5)
-        page.send("lights", ref=robot.base, r=1)
-        until(groups, 0.03)  # commands closer to one another count as one
-        page.drive(robot.base, gesture, z=0.5)
-        page.drive(robot.base, gesture)
-        return until(groups, 0.3)
-
-    assert until(shared)
-    drive, lights = {"x": 0.0, "z": 0.5, "y": 0.0, "valid_ms": 400}, {"r": 1.0, "g": 0.0, "b": 0.0}
-    assert groups()[0] == {"drive-values": drive, "lights-solid": lights}
-    assert until(lambda: [topic for _, topic, _ in list(robot.received)][-1].endswith("lights-solid")), (
-        "behind the zero"
-    )
-
-
 def test_a_clock_that_jumps_ends_the_connection(page, robot):
     assert page.take(robot.base)
     page.drive(robot.base, 2, z=0.5, age_ms=-5000)
     assert until(lambda: page.closed)
     assert "jumped" in page.bye["why"]
     assert until(lambda: not robot.drives() or last(robot) == FINAL)
-
-
-def test_a_broker_that_does_not_answer_ends_the_gesture(broker, page, robot):
-    assert page.take(robot.base)
-    page.drive(robot.base, 1, z=0.5)
-    assert until(lambda: robot.drives())
-    broker.freeze()
-
-    def refused() -> bool:
-        page.drive(robot.base, 1, z=0.5)
-        time.sleep(0.05)
-        return bool(page.refused)
-
-    assert until(refused, 3)
-    assert page.refused[0]["why"] == "The server cannot reach the broker: it does not answer"
-    page.drive(robot.base, 2, z=0.7)
-    assert until(lambda: any(one["g"] == 2 for one in page.refused))
-    broker.thaw()
-    assert until(lambda: last(robot) == FINAL)
-    assert until(lambda: page.value("", "web/broker", "connected") is True)
-    assert all(one["z"] != 0.7 for one in robot.drives())
-    assert last(robot) == FINAL
-    page.drive(robot.base, 3, z=0.5)
-    assert until(lambda: last(robot)["z"] == 0.5)
 
 
 def test_an_emergency_stop_is_repeated_until_the_robot_confirms_and_a_reset_names_what_was_shown(page, robot):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -11,27 +10,13 @@ import pytest
 from pebble.extensions.page.robots import MAX_ALIASES, Interest, Robots
 from pebble.transports import Message
 from tests.ext.boards import mcu_wire as wire
-from tests.ext.page.served import Page, Served
+from tests.ext.page.served import Page
 from tests.ext.page.states import described, sample
 from tests.kit.played_robot import RecordingRobot
-from tests.support import Broker, until
+from tests.support import until
 
 BASE = "pebble/robots/lampy"
 DESCRIBE = "mcu/lamp-1/describe"
-
-
-@pytest.fixture
-def robot(broker: Broker) -> Iterator[RecordingRobot]:
-    with RecordingRobot(broker.port, BASE) as made:
-        yield made
-
-
-@pytest.fixture
-def page(served: Served, robot: RecordingRobot) -> Iterator[Page]:
-    with served.page() as opened:
-        assert opened.knows(BASE)
-        opened.send("watch", ref=BASE)
-        yield opened
 
 
 def manifest(*channels: Any) -> dict[str, Any]:
@@ -40,16 +25,15 @@ def manifest(*channels: Any) -> dict[str, Any]:
 
 
 def test_what_an_mcu_publishes_under_an_alias_arrives(page: Page, robot: RecordingRobot) -> None:
+    page.send("watch", ref=robot.base)
     robot.publish(DESCRIBE, described(wire.LAMP), retain=True)
     robot.publish("lights/lamp", sample("lamp-1", "lamp", {"level": 62.5}), retain=True)
-    assert until(lambda: page.value(BASE, "lights/lamp", "value") == {"level": 62.5})
-    assert page.value(BASE, DESCRIBE, "device_uid") == "lamp-1"
+    assert until(lambda: page.value(robot.base, "lights/lamp", "value") == {"level": 62.5})
+    assert page.value(robot.base, DESCRIBE, "device_uid") == "lamp-1"
     robot.publish("lights/other", {"value": 1}, retain=True)
     robot.publish("mcu/lamp-1/glow", sample("lamp-1", "glow", {"lux": 1.5}))
-    assert until(lambda: page.value(BASE, "mcu/lamp-1/glow", "value") == {"lux": 1.5})
-    assert page.value(BASE, "lights/other") is None
-    robot.remove(DESCRIBE)
-    robot.remove("lights/lamp")
+    assert until(lambda: page.value(robot.base, "mcu/lamp-1/glow", "value") == {"lux": 1.5})
+    assert page.value(robot.base, "lights/other") is None
 
 
 # -- without a broker

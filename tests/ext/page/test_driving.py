@@ -732,23 +732,18 @@ def test_a_link_thins_out_what_moves_and_nothing_that_stops(world: World, level:
 def test_a_page_has_sixteen_robots_at_most(world: World) -> None:
     bases = [f"pebble/robots/r{number}" for number in range(MOST_WISHES + 1)]
     refused: list[str] = []
-    for base in bases:
-        world.views[base] = RobotView(base)
-        world.owners[base] = KeepingRobot(base)
-        world.publish_capabilities(base, keeps=world.views[GOOB].controlled)
-    world.connect("ann")
+    tab = world.connect("ann")
 
     def take(base: str) -> None:
-        world.drivers.take(world.tabs["ann"], world.views[base], lambda: None, refused.append, over=False)
+        world.drivers.take(tab, world.views[base], lambda: None, refused.append, over=False)
         world.settle()
 
-    for base in bases[:-1]:
+    for base in bases:
+        world.views[base], world.owners[base] = RobotView(base), KeepingRobot(base)
+        world.publish_capabilities(base, keeps=world.views[GOOB].controlled)
         take(base)
-    take(bases[0])
-    assert refused == []
-    take(bases[-1])
     assert refused == ["This page has control of 16 robots: release one"]
-    world.drivers.release(world.tabs["ann"], bases[0])
+    world.drivers.release(tab, bases[0])
     world.wait(0.2)
     take(bases[-1])
     assert len(refused) == 1

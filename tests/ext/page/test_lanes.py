@@ -38,13 +38,13 @@ def robot(broker: Broker) -> Iterator[RecordingRobot]:
 
 
 @contextmanager
-def filming(port: int, **login: str) -> Iterator[None]:
+def filming(port: int) -> Iterator[None]:
     """Pictures of goob, all the time, many times as much as the server's connection carries."""
     noise = np.random.default_rng(1).integers(0, 255, (120, 160, 3), np.uint8)
     picture = make_encoder("json", fps=PICTURE_HZ, quality=90).encode(noise, int(1000 * time.time()), keyframe=True)
     assert len(picture) * 8 * PICTURE_HZ > 4000 * KBITS
     ending = threading.Event()
-    with create("mqtt", "camera", MqttSettings(host="127.0.0.1", port=port, **login)) as camera:
+    with create("mqtt", "camera", MqttSettings(host="127.0.0.1", port=port)) as camera:
 
         def film() -> None:
             while not ending.wait(1 / PICTURE_HZ):

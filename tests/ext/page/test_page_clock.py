@@ -62,18 +62,17 @@ def test_before_the_first_echo_nothing_may_move() -> None:
     assert clock.problem(1.0) == STALLED
 
 
-def test_a_page_without_answers_for_a_second_may_not_drive() -> None:
+#: Whether a further ping is sent, the seconds after the newest echo, and what is wrong then.
+@pytest.mark.parametrize(
+    ("pings", "seconds", "problem"),
+    [(False, 0.99, ""), (False, 1.01, STALLED), (True, 0.59, ""), (True, 0.61, "commands are late (610 ms)")],
+)
+def test_a_page_without_answers_may_not_drive(pings: bool, seconds: float, problem: str) -> None:
     page = Page(0.003, 0.003).ping(5)
     newest = page.now - 0.494
-    assert [page.clock.problem(newest + seconds) for seconds in (0.99, 1.01)] == ["", STALLED]
-
-
-def test_a_ping_that_is_not_answered_is_a_round_trip_that_lasts() -> None:
-    page = Page(0.003, 0.003).ping(5)
-    newest = page.now - 0.494
-    page.clock.ping(newest)
-    assert page.clock.problem(newest + 0.59) == ""
-    assert page.clock.problem(newest + 0.61) == "commands are late (610 ms)"
+    if pings:
+        page.clock.ping(newest)
+    assert page.clock.problem(newest + seconds) == problem
 
 
 def test_a_round_trip_that_was_refused_counts_until_the_next_one() -> None:

@@ -7,6 +7,7 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
+import httpx
 import msgspec
 import pytest
 
@@ -271,7 +272,8 @@ def test_every_command_reaches_the_robot_in_its_order_and_is_in_the_audit(
     """The broker remembers flags and nothing else; the audit has no lights and sounds."""
 
     def noted() -> list[str]:
-        return [f"{one.what}: {one.detail}" for one in served.app.state.audit.read(100) if one.ref == robot.base]
+        rows = httpx.get(f"{served.origin}/api/audit", params={"ref": robot.base}).json()
+        return [f"{row['what']}: {row['detail']}" for row in rows]
 
     for fields, *_ in PUBLISHED:
         ask(page, robot.base, **fields)

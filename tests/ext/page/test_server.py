@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import pytest
 
@@ -91,21 +90,6 @@ def test_no_crowd_takes_the_place_of_a_robot_that_a_page_uses(
         robots.receive(published(ref, "online", {"t": 1}), 1.0)
     assert set(robots.components) == {*opened, *[GOOB] * stays}
     assert robots.omitted
-
-
-def test_pages_get_what_a_stranger_subscribes_to_until_it_publishes_what_it_can_do() -> None:
-    robots = Robots()
-    robots.receive(published(GOOB, "online", {"t": 1, "subscribes": ["incoming/drive-values"]}), 1.0)
-
-    def shown() -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(bytes(robots.components[GOOB].values["capabilities"].raw))["value"]
-        return found
-
-    assert (shown()["drive"]["available"], shown()["announced"]) == (True, True)
-    assert robots.components[GOOB].robot.drives
-    robots.receive(published(GOOB, "capabilities", _CAPABILITIES), 2.0)
-    robots.receive(published(GOOB, "online", {"t": 2, "subscribes": ["incoming/drive-values"]}), 3.0)
-    assert "announced" not in shown()
 
 
 def test_many_are_refreshed_rarely_and_the_open_one_and_the_dead_one_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

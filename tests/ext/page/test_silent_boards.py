@@ -78,25 +78,21 @@ def test_a_maintainer_lets_it_be_driven_over_a_restart_until_it_says_what_it_can
 
 
 @pytest.mark.parametrize(
-    ("listed", "level", "offered", "allowed", "why"),
+    ("listed", "level", "allowed", "why"),
     [
-        ({"drive": True, "axes": ("x", "z", "y")}, "open", True, True, "decides that: change it there"),
-        ({"drive": False}, "open", True, False, "decides that: change it there"),
-        ({"name": "The lamp"}, "open", True, True, ""),
-        ({"drive": True}, "named", True, False, 'only with "plain": true'),
-        ({"drive": True, "plain": True}, "named", True, True, "decides that"),
+        ({"drive": True, "axes": ("x", "z", "y")}, "open", True, "decides that: change it there"),
+        ({"drive": False}, "open", False, "decides that: change it there"),
+        ({"name": "The lamp"}, "open", True, ""),
+        ({"drive": True}, "named", False, 'only with "plain": true'),
+        ({"drive": True, "plain": True}, "named", True, "decides that"),
     ],
 )
 def test_the_config_allows_forbids_or_leaves_it_to_people(
-    broker: Broker, board: RecordingRobot, tmp_path: Path, listed: dict[str, Any], level: Any, offered: bool,
-    allowed: bool, why: str
-) -> None:  # fmt: skip
+    broker: Broker, board: RecordingRobot, listed: dict[str, Any], level: Any, allowed: bool, why: str
+) -> None:
     ref = board.base
-    with (
-        Hall(broker.port, tmp_path, level=level, listed={ref: ListedRobot(**listed)}) as hall,
-        hall.page("admin") as page,
-    ):
-        assert until(lambda: view(page, ref).get("silent") is offered)
+    with Served(broker.port, level=level, listed={ref: ListedRobot(**listed)}) as served, served.page() as page:
+        assert until(lambda: view(page, ref).get("silent") is True)
         page.send("board", ref=ref, do="allow")
         assert until(lambda: page.refused or page.done)
         assert why in "".join(refusals(page))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import http.client
 import itertools
 import json
@@ -46,10 +45,6 @@ class Engine(ABC):
     @abstractmethod
     def perform(self, actions: list[dict[str, Any]]) -> None:
         """Perform input as WebDriver's actions describe it, then release everything that is pressed."""
-
-    @abstractmethod
-    def picture(self) -> bytes:
-        """Return the window as PNG."""
 
     def until(self, expression: str, timeout: float = _WAIT_S) -> bool:
         """Wait until an expression is true; assert on the result."""
@@ -123,9 +118,6 @@ class Firefox(Engine):
         self._send("input.performActions", context=self._context, actions=actions)
         self._send("input.releaseActions", context=self._context)
 
-    def picture(self) -> bytes:
-        return base64.b64decode(self._send("browsingContext.captureScreenshot", context=self._context)["data"])
-
     def _send(self, method: str, **parameters: Any) -> Any:
         """Return the result of a command."""
         number = next(self._numbers)
@@ -163,9 +155,6 @@ class WebKit(Engine):
     def perform(self, actions: list[dict[str, Any]]) -> None:
         self._send("POST", "/actions", actions=actions)
         self._send("DELETE", "/actions")
-
-    def picture(self) -> bytes:
-        return base64.b64decode(self._send("GET", "/screenshot"))
 
     def close(self) -> None:
         self._send("DELETE", "")
@@ -210,9 +199,6 @@ class Chromium(Engine):
                     self._finger.down(0, *place)
                 case "pointerUp":
                     self._finger.lift()
-
-    def picture(self) -> bytes:
-        return self._page.screenshot()
 
 
 @contextmanager

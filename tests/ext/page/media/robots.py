@@ -269,7 +269,7 @@ class SoundPage(Page):
     def end(self, talk: int) -> None:
         self.send(struct.pack(">BI", 2, talk))
 
-    async def speak(self, talk: int, pieces: int, *, until_refused: bool = True) -> bytes:
+    async def speak(self, talk: int, pieces: int) -> bytes:
         """Speak so long in real time; returns the samples."""
         speech, sent, began = Speech(RATE), b"", time.monotonic()
         for number in range(pieces):
@@ -277,7 +277,7 @@ class SoundPage(Page):
             self.send_piece(talk, number, pcm)
             sent += pcm
             await asyncio.sleep(max(0.0, began + (number + 1) * PIECE / RATE - time.monotonic()))
-            if until_refused and any(one["talk"] == talk and not one["on"] for one in self.talks):
+            if any(one["talk"] == talk and not one["on"] for one in self.talks):
                 break
         return sent
 

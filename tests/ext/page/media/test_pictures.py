@@ -13,7 +13,6 @@ from pebble.extensions.media.decode import VideoDecoder
 from pebble.extensions.media.picture_header import read_header
 from pebble.extensions.operator.client.media_request.queue import NO_FRAME
 from pebble.extensions.page.media import rescue
-from pebble.transports import Message, QoS
 from tests.ext.page.media.robots import (
     EVERYTHING,
     REF,
@@ -38,18 +37,6 @@ def robot() -> PictureRobot:
 def encoding_of(payload: bytes) -> str | None:
     header = read_header(payload)
     return header and header.encoding
-
-
-async def test_another_operators_encoding_is_forwarded_as_it_is(robot: PictureRobot, server: Server) -> None:
-    page = server.open(PicturePage())
-    await until(lambda: len(page.frames) > 3)
-    other = robot.hub
-    with type(robot.transport)("other", other) as operator:
-        operator.publish(VIDEO["command_topic"], b'{"enabled":true,"encoding":"pbvd"}', qos=QoS.DELIVERED)
-        await until(lambda: encoding_of(page.direct()[-1]) == "pbvd")
-        await asyncio.sleep(1.5)
-    assert encoding_of(page.direct()[-1]) == "pbvd"
-    assert [request.get("encoding") for request in robot.requests if "keyframe" not in request].count("h264") == 1
 
 
 # -- forwarding
@@ -105,13 +92,6 @@ async def test_a_page_that_decodes_nothing_gets_jpegs(encoding: str) -> None:
         assert 0 <= time.time() * 1000 - captured < 5000
 
 
-async def test_a_page_that_fails_to_decode_is_rescued(robot: PictureRobot, server: Server) -> None:
-    page, other = server.open(PicturePage(answer=2)), server.open(PicturePage())
-    await until(lambda: len(page.rescued()) > 2)
-    await until(lambda: len(other.direct()) > 10)
-    assert len(page.direct()) <= 8
-
-
 async def test_without_pyav_there_is_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rescue.pyav, "installed", lambda: False)
     robot = PictureRobot({**VIDEO, "encodings": ["h264"]})
@@ -137,19 +117,3 @@ async def test_a_still_is_the_newest_key_frame_and_the_last_one_of_a_camera_that
     robot.mute = True
     await until(lambda: server.view.state == "silent")
     assert await server.media.snapshot(REF) is not None
-
-
-async def test_a_camera_that_is_on_for_others_gives_a_still_and_stays_theirs(
-    robot: PictureRobot, server: Server
-) -> None:
-    with type(robot.transport)("other", robot.hub) as operator:
-        status = Message(f"{REF}/outgoing/media-status", b'{"value":{"camera_publisher":{"running":true}}}')
-        server.robots.receive(status, time.monotonic())
-        operator.publish(VIDEO["flag_topic"], b'{"value":true}', retain=True, qos=QoS.DELIVERED)
-        operator.publish(VIDEO["command_topic"], b'{"enabled":true,"encoding":"pbvd"}', qos=QoS.DELIVERED)
-        await until(lambda: len(robot.sent) > 5)
-        before = len(robot.requests)
-        assert await server.media.snapshot(REF) is None
-        await asyncio.sleep(6.0)
-        assert not [one for one in robot.requests[before:] if not one.get("keyframe")]
-        assert await server.media.snapshot(REF) is not None

@@ -9,8 +9,6 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from pebble.transports import QoS
-from pebble.transports.memory import MemoryTransport
 from tests.ext.page.media.robots import (
     MediaRobot,
     Page,
@@ -35,7 +33,6 @@ class Kind(NamedTuple):
     nonsense: tuple[bytes, ...]
     lacking: str
     fixed: str
-    silent: str
 
 
 PICTURE = Kind(
@@ -45,7 +42,6 @@ PICTURE = Kind(
     (b"", b"123", bytes(1000)),
     "it has no camera",
     "its camera cannot be switched on from here",
-    "no picture for",
 )
 VOICE = Kind(
     SoundRobot,
@@ -54,7 +50,6 @@ VOICE = Kind(
     (b"", b"\0", b"\x07\0\0\0\1", b"\1" * 50, bytes(2000)),
     "it has no sound",
     "its sound cannot be switched on from here",
-    "no sound for",
 )
 OTHER = "pebble/robots/victim"
 #: Topics that capabilities may not name, by their key; test_robot_commands has more.
@@ -100,41 +95,6 @@ async def test_the_first_page_requests_and_the_last_one_withdraws(kind: Kind, ro
     await until(lambda: server.shows("rest"))
     await until(lambda: robot.encodings == [robot.best, None])
     await until(lambda: robot.flags == [True, False])
-
-
-async def test_a_page_that_reloads_does_not_restart_the_request(kind: Kind, robot: Any, server: Server) -> None:
-    for _ in range(3):
-        page = await opened(server, kind, 4)
-        page.leave()
-        await asyncio.sleep(0.1)
-    assert robot.encodings == [robot.best]
-
-
-async def test_others_who_come_later_have_their_encoding_and_keep_the_stream(kind: Kind, robot: Any) -> None:
-    """As a page of the original; test_viewer_request has what else others do."""
-    original = MemoryTransport("original", robot.hub).open()
-    async with serving(robot) as server:
-        first = await opened(server, kind, 4)
-        await until(lambda: server.view.encoding == robot.best)
-        original.publish(robot.request, b'{"enabled":true}', qos=QoS.DELIVERED)
-        await until(lambda: server.view.encoding == robot.default)
-        second = await opened(server, kind, 4)
-        for page in (first, second):
-            page.leave()
-        await until(lambda: server.shows("rest"))
-        count = len(robot.sent)
-        await until(lambda: len(robot.sent) > count + 3)
-    assert (robot.encodings, robot.flags) == ([robot.best, ""], [True])
-
-
-async def test_it_is_requested_again_while_nothing_comes(kind: Kind, robot: Any, server: Server) -> None:
-    await opened(server, kind)
-    robot.mute = True
-    count = len(robot.requests)
-    await until(lambda: server.shows("silent") and server.view.why.startswith(kind.silent))
-    await until(lambda: len(robot.requests) > count)
-    robot.mute = False
-    await until(lambda: server.shows("flowing"))
 
 
 async def _is_asked_for_nothing(kind: Kind, change: dict[str, Any] | None, why: str) -> None:

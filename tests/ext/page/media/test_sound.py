@@ -11,7 +11,7 @@ import pytest
 
 from pebble.contract import LINK, codec
 from pebble.contract.payloads import LinkState
-from pebble.extensions.media.packets import Codec, Sound
+from pebble.extensions.media.packets import Sound
 from pebble.extensions.page.media.sound import MAX_PACKETS, WINDOW, SoundQueue
 from pebble.extensions.page.media.talk import LATE_S, PIECE_BYTES, PIECES_PER_S, SILENT_S, Talk, Voice
 from pebble.transports import Message
@@ -34,16 +34,6 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # -- listening
-
-
-async def test_one_listener_without_opus_is_enough_for_pcm(robot: SoundRobot, server: Server) -> None:
-    page = server.open(SoundPage())
-    await until(lambda: page.received)
-    plain = server.open(SoundPage(), PLAIN)
-    await until(lambda: len(plain.received) > 3)
-    assert {Sound.unpack(packet).codec for packet in plain.received} == {Codec.PCM16LE}
-    plain.leave()
-    await until(lambda: robot.encodings == ["opus", "pcm", "opus"])
 
 
 async def test_a_page_that_cannot_play_what_comes_gets_a_reason() -> None:
@@ -173,18 +163,6 @@ async def test_a_talk_ends_with_its_socket_and_after_a_second_without_sound(
     assert eve.talks == [{"talk": 1, "on": True, "why": ""}]
 
 
-@pytest.mark.usefixtures("patient")
-async def test_a_talk_ends_when_the_robots_sound_is_refused(robot: SoundRobot, server: Server) -> None:
-    page = server.open(SoundPage(), NOTHING)
-    talking = asyncio.create_task(page.speak(1, 250))
-    await until(lambda: server.view and server.view.talker == "alice")
-    robot.announce({**AUDIO, "controls": False})
-    await talking
-    await until(lambda: len(page.talks) > 1)
-    assert page.talks[1:] == [{"talk": 1, "on": False, "why": "its sound cannot be switched on from here"}]
-    await until(lambda: server.view.talker == "")
-
-
 async def test_the_voice_goes_to_the_robots_own_topic_only() -> None:
     for named, topic in [
         (f"{REF}/incoming/voice", f"{REF}/incoming/voice"),
@@ -224,17 +202,6 @@ def test_a_talk_of_which_everything_is_late_is_over() -> None:
 def test_a_microphone_whose_clock_is_slow_works_for_an_hour() -> None:
     talk = Talk(1, 0.0)
     assert all(talk.takes(number, number / PIECES_PER_S * 1.0005) for number in range(3600 * PIECES_PER_S))
-
-
-def test_the_numbers_of_packets_only_grow_also_of_another_server() -> None:
-    piece, numbers = bytes(PIECE_BYTES), []
-    for server in range(3):
-        voice = Voice()
-        for talk in range(3):
-            now = 1.7e9 + 100 * server + 10 * talk
-            voice.begin(now)
-            numbers += [Sound.unpack(voice.packet(piece, now)).sequence for _ in range(400)]
-    assert all(a < b for a, b in pairwise(numbers))
 
 
 def test_after_the_last_number_comes_1() -> None:

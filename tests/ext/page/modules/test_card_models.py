@@ -316,6 +316,28 @@ AUTONOMY: Rows = {
 # fmt: on
 
 
-@rows((lights, LIGHTS), (sounds, SOUNDS), (forms, FORMS), (may, MAY), (autonomy, AUTONOMY))
+stream = Script({"core/stream.js": "refusal"})
+PAGE = "{ protocol: 'https:', hostname: 'lab.local' }"
+#: Addresses of a robot's own stream, and why they are not shown in a page that came by https from lab.local.
+STREAMS = {
+    "https://goob.local:8443/stream": "",
+    "http://localhost:8080": "",
+    "http://goob.local": "This page came by https",
+    "https://LAB.local:9": "This address is on the page's own host",
+    **dict.fromkeys(
+        ("javascript:parent.ran = 1", "https://me:secret@goob.local", "https://goob.local:0", "https://x/" + "y" * 500),
+        "This address is not shown",
+    ),
+}
+# fmt: off
+STREAM: Rows = {
+    f"why no stream is shown of {address[:40]}": (
+        f"result = refusal({json.dumps(address)}, {PAGE}).slice(0, {len(why) or 99});", why)
+    for address, why in STREAMS.items()
+}
+# fmt: on
+
+
+@rows((stream, STREAM), (lights, LIGHTS), (sounds, SOUNDS), (forms, FORMS), (may, MAY), (autonomy, AUTONOMY))
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected

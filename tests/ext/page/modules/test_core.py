@@ -6,8 +6,6 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-import pytest
-
 from pebble.extensions.operator.client.drive_reasons import WORDS
 from tests.ext.page.in_node import STATIC, Rows, Script, evaluate, rows
 
@@ -211,64 +209,54 @@ def test_the_first_reason_counts() -> None:
     assert actions == expected | {"script": "stop-script"}
 
 
-@pytest.mark.parametrize(
-    ("change", "rights", "expected"),
-    [
-        ("{}", "[]", ["lease", "bob (phone) has control", "ask", None]),
-        ("{}", "['take']", ["lease", "bob (phone) has control", "ask", "take-over"]),
-        ("{ asking: true }", "['take']", ["asked", "bob (phone) is asked for control", "give-up", "take-over"]),
-        ("{ by: '', device: '', asking: true }", "['take']", ["free", "Take control to drive", "take", None]),
-    ],
-)
-def test_who_drives_a_robot_that_keeps_control_is_asked(change: str, rights: str, expected: list[str | None]) -> None:
-    steps = f"""{_GOOD}
-      const driver = {{ by: "bob", device: "phone", you: false, keeps: true, ...{change} }};
-      const found = driveReason({{ ...situation, driver, rights: ["drive", ...{rights}] }});
-      result = [found.code, found.text, found.action.kind, found.also?.kind ?? null];"""
-    assert reasons(steps) == expected
-
-
-def test_without_server_or_broker_everything_is_off() -> None:
-    steps = "result = mends.map((mend) => offReason(Object.assign(situation, mend))?.code ?? null).slice(0, 4);"
-    assert reasons(steps) == ["server", "broker", None, None]
-
-
-@pytest.mark.parametrize(
-    ("script", "text"),
-    [
-        ({"file": "april-follow"}, "april-follow is driving: stop it first"),
-        ({"file": "april-follow", "label": "Follow a tag"}, "Follow a tag is driving: stop it first"),
-        ({"file": "x" * 1000}, f"{'x' * 40} is driving: stop it first"),
-        ({"file": None}, "A script is driving: stop it first"),
-        ({"file": "wheel-odometry", "drives": False}, None),
-    ],
-)
-def test_a_script_that_drives_can_be_stopped(script: dict[str, Any], text: str | None) -> None:
-    steps = f"{_GOOD} result = driveReason({{ ...situation, script: {{ running: true, ...{json.dumps(script)} }} }});"
-    action = {"label": "Stop script", "kind": "stop-script"}
-    assert reasons(steps) == (text and {"code": "script", "text": text, "action": action})
-
-
 _GOOD = "mends.forEach((mend) => Object.assign(situation, mend));"
-
-
-@pytest.mark.parametrize(
-    ("change", "code"),
-    [
-        ("{ liveness: { online: null, silent_s: null } }", None),
-        ("{ liveness: undefined }", "silent"),
-        ("{ capabilities: { drive: { available: true, controls: false } } }", "no-drive"),
-        ("{ loading: true }", "loading"),
-        ("{ pictureAgeMs: 1900, inSight: false }", None),
-        ("{ pictureAgeMs: null, inSight: false }", None),
-        ("{ pictureAgeMs: Infinity, inSight: false }", "picture"),
-        ("{ pictureAgeMs: -1, inSight: false }", "picture"),
-        ("{ pictureAgeMs: -1, inSight: true }", None),
-        ("{ focus: false, fromKeys: false }", None),
-    ],
-)
-def test_limits_of_reasons(change: str, code: str | None) -> None:
-    assert reasons(f"{_GOOD} result = driveReason({{ ...situation, ...{change} }})?.code ?? null;") == code
+#: What is different while all is well, and why it is off then.
+LIMITS = {
+    "{ liveness: { online: null, silent_s: null } }": None,
+    "{ liveness: undefined }": "silent",
+    "{ capabilities: { drive: { available: true, controls: false } } }": "no-drive",
+    "{ loading: true }": "loading",
+    "{ pictureAgeMs: 1900, inSight: false }": None,
+    "{ pictureAgeMs: null, inSight: false }": None,
+    "{ pictureAgeMs: Infinity, inSight: false }": "picture",
+    "{ pictureAgeMs: -1, inSight: false }": "picture",
+    "{ pictureAgeMs: -1, inSight: true }": None,
+    "{ focus: false, fromKeys: false }": None,
+}
+#: Of a driver and of further rights: why it is off, and what is offered.
+KEPT = {
+    ("{}", "[]"): ["lease", "bob (phone) has control", "ask", None],
+    ("{}", "['take']"): ["lease", "bob (phone) has control", "ask", "take-over"],
+    ("{ asking: true }", "['take']"): ["asked", "bob (phone) is asked for control", "give-up", "take-over"],
+    ("{ by: '', device: '', asking: true }", "['take']"): ["free", "Take control to drive", "take", None],
+}
+#: Of a script that runs.
+DRIVES = {
+    "file: 'april-follow'": "april-follow is driving: stop it first",
+    "file: 'april-follow', label: 'Follow a tag'": "Follow a tag is driving: stop it first",
+    "file: 'x'.repeat(1000)": f"{'x' * 40} is driving: stop it first",
+    "file: null": "A script is driving: stop it first",
+    "file: 'wheel-odometry', drives: false": None,
+}
+STOPS = {"label": "Stop script", "kind": "stop-script"}
+# fmt: off
+REASONS: Rows = {
+    **{f"limits of reasons: {change}": (
+        f"{_GOOD} result = driveReason({{ ...situation, ...{change} }})?.code ?? null;", code)
+        for change, code in LIMITS.items()},
+    **{f"who drives a robot that keeps control is asked: {change} {rights}": (f"""{_GOOD}
+        const driver = {{ by: "bob", device: "phone", you: false, keeps: true, ...{change} }};
+        const found = driveReason({{ ...situation, driver, rights: ["drive", ...{rights}] }});
+        result = [found.code, found.text, found.action.kind, found.also?.kind ?? null];""", expected)
+        for (change, rights), expected in KEPT.items()},
+    **{f"a script that drives can be stopped: {script}": (
+        f"{_GOOD} result = driveReason({{ ...situation, script: {{ running: true, {script} }} }});",
+        text and {"code": "script", "text": text, "action": STOPS}) for script, text in DRIVES.items()},
+    "without server or broker everything is off": (
+        "result = mends.map((mend) => offReason(Object.assign(situation, mend))?.code ?? null).slice(0, 4);",
+        ["server", "broker", None, None]),
+}
+# fmt: on
 
 
 # -- whose it is
@@ -302,6 +290,6 @@ def test_what_rounds_to_zero_has_no_sign() -> None:
     assert evaluate({"ui/parts/words.js": "number"}, steps) == ["0.0", "-0.1", "0.00", "0", "-10", "–"]
 
 
-@rows((gesture, GESTURE), (inputs, INPUTS))
+@rows((gesture, GESTURE), (inputs, INPUTS), (reasons, REASONS))
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected

@@ -25,13 +25,7 @@ def of(expression: str, *values: Any) -> str:
     return f"const v = {json.dumps(values)}; result = {expression};"
 
 
-def run(expression: str, *values: Any) -> Any:
-    return script(of(expression, *values))
-
-
-def test_an_interface_that_stays_on_the_robot_takes_no_commands() -> None:
-    private = wire.M("m", (wire.I(1, "a", wire.IN, wire.KIND_COMMAND, (wire.F("x", wire.U8),), flags=wire.LOCAL_ONLY),))
-    assert run("unsendable(v[0].interfaces[0])", described(private)).startswith("it takes commands from")
+PRIVATE = wire.M("m", (wire.I(1, "a", wire.IN, wire.KIND_COMMAND, (wire.F("x", wire.U8),), flags=wire.LOCAL_ONLY),))
 
 
 def interface(*fields: dict[str, Any]) -> dict[str, Any]:
@@ -60,38 +54,20 @@ RANGES: list[tuple[dict[str, Any], Any, str]] = [
 # -- what a robot offers
 
 #: What its capabilities list of *drive*, and whether there are controls for an axis besides turning and going.
-AXES: Rows = {
-    json.dumps(value): (of("new Offers('pebble/robots/a', v[0]).hasExtraAxis", value and {"value": value}), expected)
-    for value, expected in [
-        ({"drive": {"available": True, "axes": ["x", "z"]}}, False),
-        ({"drive": {"available": True, "axes": ["x", "y", "z"]}}, True),
-        ({"drive": {"available": True, "axes": []}}, False),
-        ({"drive": {"available": True}}, True),  # it does not list them: it may have any
-        ({"drive": {"available": True, "axes": "xz"}}, True),
-        (None, True),  # no capabilities
-    ]
-}
-
-
-@rows((script, AXES))
-def test_an_extra_axis_has_its_controls_unless_the_robot_lists_others(found: Callable[[], Any], expected: bool) -> None:
-    assert found() is expected
-
-
-# -- outlets
-
-
-def outlets(capabilities: Any, *metrics: str) -> dict[str, bool]:
-    made = run("outletsOf(new Offers('pebble/robots/a', v[0], v[1]))", capabilities, metrics)
-    return {one["name"]: one["controls"] for one in made}
-
-
-def test_outlets_are_those_that_are_listed_and_those_that_report() -> None:
-    listed = {"value": {"outlets": {"available": True, "outlets": [{"name": "o1", "controls": False}, {"name": "o2"}]}}}
-    assert outlets(listed, "outlets/o1/status", "outlets/o9/status") == {"o1": False, "o2": True, "o9": False}
-    assert outlets(None, "outlets/o1/status", "outlets/o1/other", "outlets/x") == {"o1": True}
-
-
+AXES: list[tuple[Any, bool]] = [
+    ({"drive": {"available": True, "axes": ["x", "z"]}}, False),
+    ({"drive": {"available": True, "axes": ["x", "y", "z"]}}, True),
+    ({"drive": {"available": True, "axes": []}}, False),
+    ({"drive": {"available": True}}, True),  # it does not list them: it may have any
+    ({"drive": {"available": True, "axes": "xz"}}, True),
+    (None, True),  # no capabilities
+]
+LISTED = {"value": {"outlets": {"available": True, "outlets": [{"name": "o1", "controls": False}, {"name": "o2"}]}}}
+#: Capabilities, metrics, and the outlets, and whether each can be switched.
+OUTLETS: list[tuple[Any, list[str], dict[str, bool]]] = [
+    (LISTED, ["outlets/o1/status", "outlets/o9/status"], {"o1": False, "o2": True, "o9": False}),
+    (None, ["outlets/o1/status", "outlets/o1/other", "outlets/x"], {"o1": True}),
+]
 NOT_TOPIC = "its name cannot be part of a topic"
 #: Names of outlets, whether they can be switched, what they report, and why they cannot be switched on.
 OBSTACLES: list[tuple[str, bool, dict[str, Any], str]] = [
@@ -106,6 +82,14 @@ OBSTACLES: list[tuple[str, bool, dict[str, Any], str]] = [
 ]
 # fmt: off
 ROWS: Rows = {
+    "an interface that stays on the robot takes no commands": (
+        of("unsendable(v[0].interfaces[0]).slice(0, 22)", described(PRIVATE)), "it takes commands from"),
+    **{f"controls for an extra axis: {value}": (
+        of("new Offers('pebble/robots/a', v[0]).hasExtraAxis", value and {"value": value}), expected)
+        for value, expected in AXES},
+    **{f"outlets are those that are listed and those that report: {metrics}": (of("""Object.fromEntries(
+        outletsOf(new Offers('pebble/robots/a', v[0], v[1])).map(({ name, controls }) => [name, controls]))""",
+        capabilities, metrics), expected) for capabilities, metrics, expected in OUTLETS},
     **{f"what is entered becomes JSON of the field's type: {field} {entered}": (of(
         COMMAND, interface({"name": "x", **field}), [["x", entered], ["y", "7"]]), {"x": value})
         for field, entered, value in ENTERED},

@@ -6,9 +6,7 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-import pytest
-
-from tests.ext.page.in_node import Rows, Script, evaluate, rows
+from tests.ext.page.in_node import Rows, Script, rows
 
 # -- log lines
 
@@ -55,24 +53,24 @@ BOOK: Rows = {
 NOT_OFFERED, NO_COMMAND = "This robot does not offer it", "Not set up on this robot"
 
 
-@pytest.mark.parametrize(
-    ("action", "capabilities", "why"),
-    [
-        ("reboot", None, ""),
-        ("reboot", {}, NOT_OFFERED),
-        ("reboot", {"system": 3}, NOT_OFFERED),
-        ("reboot", {"system": {"reboot": {"available": True, "controls": True}}}, ""),
-        ("reboot", {"system": {"reboot": {"available": True, "controls": False}}}, NO_COMMAND),
-        ("reboot", {"system": {"reboot": {"available": False, "controls": False}}}, NOT_OFFERED),
-        ("reboot", {"reboot": {"controls": False}}, NO_COMMAND),
-        ("reboot", {"reboot": True}, ""),
-        ("service-restart", {"system": {"service-restart": {"topic": "x"}}}, ""),
-        ("git-pull", {"system": {"git_pull": {"controls": False}}}, NO_COMMAND),
-    ],
-)
-def test_what_a_robot_lacks_in_every_spelling(action: str, capabilities: object, why: str) -> None:
-    value = "undefined" if capabilities is None else json.dumps(capabilities)
-    assert evaluate({"ui/cards/system.js": "lacks"}, f"result = lacks({json.dumps(action)}, {value});") == why
+lacks = Script({"ui/cards/system.js": "lacks"})
+#: What is asked of a robot, its capabilities, and what it lacks.
+LACKS: list[tuple[str, Any, str]] = [
+    ("reboot", None, ""),
+    ("reboot", {}, NOT_OFFERED),
+    ("reboot", {"system": 3}, NOT_OFFERED),
+    ("reboot", {"system": {"reboot": {"available": True, "controls": True}}}, ""),
+    ("reboot", {"system": {"reboot": {"available": True, "controls": False}}}, NO_COMMAND),
+    ("reboot", {"system": {"reboot": {"available": False, "controls": False}}}, NOT_OFFERED),
+    ("reboot", {"reboot": {"controls": False}}, NO_COMMAND),
+    ("reboot", {"reboot": True}, ""),
+    ("service-restart", {"system": {"service-restart": {"topic": "x"}}}, ""),
+    ("git-pull", {"system": {"git_pull": {"controls": False}}}, NO_COMMAND),
+]
+LACKING: Rows = {
+    f"{action} with {json.dumps(value)}": (f"result = lacks('{action}', {json.dumps(value)} ?? undefined);", why)
+    for action, value, why in LACKS
+}
 
 
 # -- notices
@@ -165,6 +163,6 @@ NOTICES: Rows = {
 # fmt: on
 
 
-@rows((book, BOOK), (notices, NOTICES))
+@rows((book, BOOK), (lacks, LACKING), (notices, NOTICES))
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected

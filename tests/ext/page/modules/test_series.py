@@ -73,6 +73,10 @@ RUN: Rows = {
         result = shown(one);""", [[3000, 3]]),
     "a slow metric has longer gaps":
         ("for (let at = 0; at < 60_000; at += 5000) one.push(at, 1); result = one.gapMs;", 17_500),
+    "gaps are gaps": ("""
+        for (const at of [0, 500, 1000, 1500, 6000, 6500]) one.push(at, at);
+        result = [one.columns(["value"], 600, 6400), one.gapMs];""",
+        [[[500, 1000, 1500, 1501, 6000], [500, 1000, 1500, None, 6000]], 2000]),
     "a line ends where a payload lacks it": ("""
         one.push(0, { value: { a: 1, b: 2 } }); one.push(100, { value: { a: 3, b: "x" } });
         result = one.columns(["a", "b"], 0, 1000);""", [[0, 100], [1, 3], [2, None]]),
@@ -100,14 +104,6 @@ RUN: Rows = {
         for what, (times, poses, pieces) in TRAILS.items()},
 }
 # fmt: on
-
-
-def test_gaps_are_gaps() -> None:
-    steps = """
-    for (const at of [0, 500, 1000, 1500, 6000, 6500]) one.push(at, at);
-    result = [one.columns(["value"], 600, 6400), one.gapMs];"""
-    columns = [[500, 1000, 1500, 1501, 6000], [500, 1000, 1500, None, 6000]]
-    assert run(steps) == [columns, 2000]
 
 
 @rows((run, RUN))

@@ -60,20 +60,6 @@ def test_what_is_safety_or_media_needs_no_framework() -> None:
     assert found(imports, ((path, path.read_text()) for path in sources)) == {}
 
 
-#: What browsers may lack, deny or take away.
-DENIABLE = r"""\b(?:sessionStorage|localStorage|indexedDB|getGamepads|navigator\.\w|matchMedia|setPointerCapture
-  |requestFullscreen|exitFullscreen|fullscreenE\w+|orientation\.|getRandomValues|randomUUID|createImageBitmap\(
-  |new\ (?:WebSocket|Worker|\w+Observer|AudioContext|AudioWorkletNode|\w+Decoder|Encoded\w+Chunk|OffscreenCanvas
-    |\w+Stream)\b)"""
-OWN = r"new (?:MutationObserver|\w*(?:Picture|H264|Opus|Text)Decoder)\b"  # ours, and what every browser has
-
-
-def test_what_a_browser_may_deny_is_tried_in_one_place() -> None:
-    modules = [one for one in OURS if one.suffix == ".js" and not one.match("core/browser*.js")]
-    sources = ((path, re.sub(OWN, "", stripped(path.read_bytes(), "js").decode())) for path in modules)
-    assert found(DENIABLE, sources, re.VERBOSE) == {}
-
-
 def test_pages_ask_not_to_be_translated() -> None:
     """Else a browser would say in other words, and late, what is so now."""
     for path in STATIC.glob("*.html"):
@@ -113,19 +99,6 @@ def test_a_load_of_the_page_is_small(screen: str) -> None:
     assert size <= 1000 * MOST_KB, f"{size} bytes in {len(names)} files"
 
 
-def test_the_font_is_sent_as_it_is_and_early() -> None:
-    static = StaticFiles(files("pebble.extensions.page") / "static")
-    assert static.files[FONT] == (STATIC / FONT).read_bytes()
-    assert len(static.files[FONT]) < 40_000
-    request = Request({"type": "http", "headers": [(b"accept-encoding", b"gzip")]})
-    answer = static.answer(request, FONT, {})
-    assert (answer.headers["content-type"], answer.headers.get("content-encoding")) == ("font/woff2", None)
-    preloaded = rb'rel="preload" as="font" type="font/woff2" crossorigin href="[^"]*figtree'
-    for page in ("fleet.html", "robot.html"):
-        assert re.search(preloaded, static.files[page])
-    assert f'url("{FONT}")' in (STATIC / "app.css").read_text()
-
-
 def test_markup_has_no_style_of_its_own_and_one_script_whose_hash_the_policy_names() -> None:
     static = StaticFiles(files("pebble.extensions.page") / "static")
     answer = static.page(Request({"type": "http", "path": "/", "raw_path": b"/", "headers": []}))
@@ -148,14 +121,6 @@ def test_style_sheets_that_are_fetched_later_do_not_restyle_each_other() -> None
             if name := re.fullmatch(r"\s*[a-z]*\.([\w-]+)\s*", selector):
                 found.setdefault(name[1], set()).add(path.name)
     assert {name: sheets for name, sheets in found.items() if len(sheets) > 1} == {}
-
-
-def test_comments_and_indentation_are_left_out() -> None:
-    code = ['const a = "// no"; // it\'s kept: a quote follows', "b = 1 /* in */ + 2;", "c = `// ${a}`;"]
-    source = f"/** What.\n * @param {{string}} a */\n  {code[0]}\n  // gone\n{code[1]} // gone\n{code[2]}\n"
-    cast = "d = /** @type {string} */ (e);\n"
-    assert stripped((source + cast).encode(), "js").decode() == f"{code[0]}\n{code[1]}\n{code[2]}\nd = (e);\n"
-    assert stripped(b"a {\n  b: url(//c); /* d */\n\n}\n", "css") == b"a{b:url(//c); /* d */\n}"
 
 
 def test_what_is_sent_is_the_same_program(tmp_path: Path) -> None:

@@ -9,13 +9,28 @@ import pytest
 
 from tests.ext.page.browser import Tab
 from tests.ext.page.canned import CannedServer, Show, State
-from tests.ext.page.states import ASKED, FRED, GOOB, MINE, STATES, at, changed, devices, outlet, setting
+from tests.ext.page.states import (
+    ASKED,
+    FRED,
+    GOOB,
+    GOOB_PATH,
+    LAMP,
+    MAY_TAKE,
+    MINE,
+    STATES,
+    at,
+    changed,
+    devices,
+    of,
+    outlet,
+    setting,
+)
 
 pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
 
 FORM = {"tag_id": 7, "search": False, "family": "APRILTAG_36H11"}
-#: State, what is done with controls by their names ("name=text" is filled in, "name!" is held), what is sent: an op of
-#: this kind, each time with these fields.
+#: State, what is done with controls by their names ("name=text" is filled in, "name!" is held, "name_" is pressed and
+#: not released), what is sent: an op of this kind, each time with these fields.
 SENDS: dict[str, tuple[str, str, str, list[dict[str, Any]]]] = {
     "lights": (
         "asked", "colour-blue lights-flash lights-off", "lights",
@@ -35,6 +50,12 @@ SENDS: dict[str, tuple[str, str, str, list[dict[str, Any]]]] = {
         [{"uid": "lamp-1", "name": "lamp", "value": {"level": 62.5, "on": False}},
          {"uid": "lamp-1", "name": "arm", "value": {"angle": -12, "k": 0.001}}],
     ),
+    "allowing driving of a silent board": (
+        "a silent board", "board-extra board-allow", "board", [{"do": "allow", "extra": True}],
+    ),
+    "a silent board that is driven": (
+        "a driven board", "board-clear board-withdraw", "board", [{"do": "clear"}, {"do": "withdraw"}],
+    ),
     "a restart": ("operating", "service-restart ask-hold!", "action", [{"name": "service-restart"}]),
     "taking control": ("free", "take", "lease", [{"take": True}]),
     "releasing it": ("driving", "release", "lease", [{"take": False}]),
@@ -43,22 +64,35 @@ SENDS: dict[str, tuple[str, str, str, list[dict[str, Any]]]] = {
     "letting another drive": ("others-ask", "let", "lease", [{"take": False}]),
     "taking over": ("kept", "take-over!", "lease", [{"take": True, "over": True}]),
     "a stop": ("driving", "stop-one", "estop", [{"ref": GOOB}]),
+    "a stop, as soon as it is touched": ("driving", "stop-one_", "estop", [{"ref": GOOB}]),
     "a stop of all": ("driving", "stop-all", "estop", [{"ref": ""}]),
     "a stop in the fleet": ("fleet", "stop-goob", "estop", [{"ref": GOOB}]),
+    "a stop of all in a recording": ("replay", "stop-all", "estop", [{"ref": ""}]),
     "a reset": ("stopped", "reset reset-hold!", "estop-reset", [{"ref": GOOB}]),
     "a reset of all": ("fleet-stopped", "stopped reset-all!", "estop-reset", [{"ref": GOOB}, {"ref": FRED}]),
 }  # fmt: skip
 
 
+_BOARD = {"silent": True, "by": "", "refused": "", "parked": "", "risk": "It may roll on."}
+BOARDS = {
+    name: of(
+        GOOB_PATH, at(GOOB, "capabilities", {"t": 1, "value": {"announced": True, "assumed": True}}),
+        at(GOOB, "web/board", _BOARD | more), welcome=MAY_TAKE,
+    )
+    for name, more in (("a silent board", {}), ("a driven board", {"by": "ann", "parked": "Clear it first"}))
+}  # fmt: skip
+
+
 def do(opened: Tab, what: str) -> None:
     """Use one control."""
-    name, filled, text = what.rstrip("!").partition("=")
+    name, filled, text = what.rstrip("!_").partition("=")
     control = opened.uncover(name).first
-    if what.endswith("!"):
+    if what.endswith(("!", "_")):
         control.hover()
         opened.page.mouse.down()
-        opened.page.wait_for_timeout(1200)
-        opened.page.mouse.up()
+        if what.endswith("!"):
+            opened.page.wait_for_timeout(1200)
+            opened.page.mouse.up()
     elif not filled:
         control.click()
     elif control.evaluate("(one) => one.localName") == "select":
@@ -70,7 +104,7 @@ def do(opened: Tab, what: str) -> None:
 @pytest.mark.parametrize("name", SENDS)
 def test_a_control_sends_what_it_is_for(show: Show, server: CannedServer, name: str) -> None:
     state, steps, op, expected = SENDS[name]
-    with show(STATES[state]) as opened:
+    with show((STATES | BOARDS)[state]) as opened:
         for step in steps.split():
             do(opened, step)
         assert opened.until(lambda: len(server.sent(op)) == len(expected), 5), server.received
@@ -117,6 +151,36 @@ def test_what_was_asked_is_shown_until_the_outlet_reports_it(show: Show, server:
         assert opened.test("outlet-asked-o2").count() == 0
         do(opened, "outlet-o2")
         assert opened.until(lambda: [one["on"] for one in server.sent("outlet")] == [True, False])
+
+
+STOPPED = """(refs) => refs.forEach((ref) => pebble.store.set(
+  ref, "web/estop", { ...pebble.store.get(ref, "web/estop").value, latched: true, by: "eve" }))"""
+
+
+def test_stops_are_read_aloud_whatever_comes_right_after_them(show: Show) -> None:
+    with show(STATES["fleet"]) as opened:
+        opened.test("bell").wait_for()
+        opened.page.evaluate(STOPPED, [FRED, LAMP])
+        opened.page.evaluate("(ref) => pebble.store.set(ref, 'web/liveness', { online: false })", GOOB)
+        announced = opened.test("announcement")
+        stops = "fred was stopped by eve. minilamp was stopped by eve"
+        assert opened.until(lambda: stops in announced.inner_text()), announced.inner_text()
+        opened.test("bell").click()
+        assert opened.until(lambda: announced.inner_text() == "")
+
+
+def test_a_button_that_is_switched_off_while_it_is_held_does_nothing(show: Show, server: CannedServer) -> None:
+    with show(STATES["stopped"]) as opened:
+        opened.test("reset").click()
+        opened.test("reset-hold").hover()
+        opened.page.evaluate("pebble.pressedAt = performance.now()")
+        opened.page.mouse.down()
+        opened.page.locator(".held").wait_for()
+        opened.page.evaluate("pebble.connection.may = () => false; pebble.connection.changed()")
+        assert opened.until(lambda: opened.page.locator(".held").count() == 0, 0.9)
+        opened.page.evaluate("delete pebble.connection.may; pebble.connection.changed()")
+        assert opened.until("performance.now() - pebble.pressedAt > 1500")
+        assert server.sent("estop-reset") == []
 
 
 # -- robots that write anything

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import pytest
@@ -12,6 +11,7 @@ from playwright.sync_api import Page
 
 from tests.ext.page.browser import Size, Tab, Theme
 from tests.ext.page.canned import Show
+from tests.ext.page.looks import Act, nothing, press
 from tests.ext.page.states import STATES
 from tests.kit.npm import package
 from tests.support import ROOT
@@ -27,14 +27,6 @@ WIDTHS: dict[Size, tuple[int, ...]] = {
 pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
 
 
-#: What a person does with a page.
-Act = Callable[[Page], None]
-
-
-def _nothing(_page: Page) -> None:
-    pass
-
-
 def _all(*acts: Act) -> Act:
     """One after another."""
 
@@ -45,14 +37,14 @@ def _all(*acts: Act) -> Act:
     return act
 
 
-def _press(*selectors: str) -> Act:
-    return _all(*(lambda page, selector=selector: page.locator(selector).first.click() for selector in selectors))  # type: ignore[misc]
-
-
 def _at(place: str, *pressed: str) -> Act:
     """Show this place below the header, once these were pressed."""
-    top = "(place) => scrollBy(0, document.querySelector(place).getBoundingClientRect().top - 90)"
-    return _all(_press(*pressed), lambda page: page.evaluate(top, place))
+    top = "(place) => scrollBy(0, place.getBoundingClientRect().top - 90)"
+    return _all(press(*pressed), lambda page: page.locator(place).first.evaluate(top))
+
+
+def _until(place: str) -> Act:
+    return lambda page: page.locator(place).first.wait_for()
 
 
 def _trouble(page: Page) -> None:
@@ -76,31 +68,14 @@ def _trouble(page: Page) -> None:
     )
 
 
-def _trouble_and_press(*selectors: str) -> Act:
-    return _all(_trouble, _press(*selectors))
-
-
-def _do(script: str, *selectors: str) -> Act:
-    done = lambda page: page.evaluate(f"() => {{ {script} }}")
-    return _all(done, lambda page: page.wait_for_timeout(200), _press(*selectors))
+def _do(script: str) -> Act:
+    return _all(lambda page: page.evaluate(f"() => {{ {script} }}"), lambda page: page.wait_for_timeout(200))
 
 
 def _timeline(page: Page) -> None:
     """The day is here. Playwright's own waiting for it is stopped by the page's policy."""
     while not page.evaluate("Boolean(pebble.replay?.day.timeline)"):
         page.wait_for_timeout(50)
-
-
-def _recordings_link(page: Page) -> None:
-    page.get_by_role("link", name="Recordings").wait_for()
-
-
-def _audit(page: Page) -> None:
-    page.locator("[data-test=audit-line]").first.wait_for()
-
-
-def _scroll_to(selector: str) -> Act:
-    return lambda page: page.locator(selector).first.scroll_into_view_if_needed()
 
 
 #: The help with a gamepad in use.
@@ -116,12 +91,6 @@ def _drive(page: Page) -> None:
     page.keyboard.down("KeyD")
 
 
-def _at_card(name: str) -> Act:
-    """Scroll to a card."""
-    centre = "(card) => card.scrollIntoView({ block: 'center' })"
-    return lambda page: page.locator(f'[data-card="{name}"]').evaluate(centre)
-
-
 def _mistaken(page: Page) -> None:
     """Fill a form in, with two mistakes."""
     page.locator('[data-test="script-apriltag-follow"]').click()
@@ -130,18 +99,8 @@ def _mistaken(page: Page) -> None:
     page.locator('[data-test="set-search"]').uncheck()
 
 
-def _on_phone(tab_: str, then: Act = _nothing) -> Act:
-    return _all(_press(f'[data-test="tab-{tab_}"]'), lambda page: page.locator(".card button").first.wait_for(), then)
-
-
-def _show_card(name: str) -> Act:
-    def act(page: Page) -> None:
-        card = page.locator(f"[data-card={name}]")
-        card.scroll_into_view_if_needed()
-        card.evaluate("(card) => scrollTo(0, card.getBoundingClientRect().top + scrollY - 90)")
-        page.wait_for_timeout(1200)  # drawn once a second where less motion is wanted
-
-    return act
+def _on_phone(tab_: str, then: Act = nothing) -> Act:
+    return _all(press(f'[data-test="tab-{tab_}"]'), lambda page: page.locator(".card button").first.wait_for(), then)
 
 
 def _listen(page: Page) -> None:
@@ -157,9 +116,9 @@ class Screen(NamedTuple):
 
     name: str
     state: str
-    act: Act = _nothing
+    act: Act = nothing
     sizes: tuple[Size, ...] = ("desktop", "phone")
-    hold: Act = _nothing  # after the measurements, which change the window's size
+    hold: Act = nothing  # after the measurements, which change the window's size
 
 
 ALL: tuple[Size, ...] = ("desktop", "phone", "landscape")
@@ -212,8 +171,10 @@ WHEN = {
 }
 #: What browsers complain of where the server is meant to fail.
 MEANT = {"recordings-failed": "422"}
-_OUTLETS, _VALUES = (f'[data-card="{card}"]' for card in ("outlets", "values"))
-_SENSORS, _MORE = _press("[data-test=tab-sensors]"), _press("[data-test=tab-more]")
+_CARD = '[data-card="{}"]'.format
+_OUTLETS, _VALUES = map(_CARD, ("outlets", "values"))
+_SENSORS, _MORE = press("[data-test=tab-sensors]"), press("[data-test=tab-more]")
+_AUDIT = _until("[data-test=audit-line]")
 _LAMP = '[data-test="mcu-lamp-1"]'
 SCREENS = [
     *(
@@ -221,26 +182,26 @@ SCREENS = [
         for name in STATES
         if not name.startswith(("asked", "full", "map"))  # below the picture
     ),
-    Screen("plots", "odometry", hold=_show_card("plots"), sizes=("desktop",)),
-    Screen("plots", "odometry", _press(".tabs button:nth-child(2)"), ("phone",), hold=_show_card("plots")),
-    Screen("map", "odometry", _press(".tabs button:nth-child(2)"), ("phone",), hold=_show_card("map")),
-    *(Screen(name, name, hold=_show_card("map"), sizes=("desktop",)) for name in ("map-empty", "map-silent")),
-    Screen("stream-open", "own-stream", _press("[data-test=gear]", "[data-test=open-stream]")),
-    Screen("gear", "driving", _press("[data-test=gear]"), ("desktop",)),
+    Screen("plots", "odometry", hold=_at(_CARD("plots")), sizes=("desktop",)),
+    Screen("plots", "odometry", press(".tabs button:nth-child(2)"), ("phone",), hold=_at(_CARD("plots"))),
+    Screen("map", "odometry", press(".tabs button:nth-child(2)"), ("phone",), hold=_at(_CARD("map"))),
+    *(Screen(name, name, hold=_at(_CARD("map")), sizes=("desktop",)) for name in ("map-empty", "map-silent")),
+    Screen("stream-open", "own-stream", press("[data-test=gear]", "[data-test=open-stream]")),
+    Screen("gear", "driving", press("[data-test=gear]"), ("desktop",)),
     Screen("listening-now", "listening", _listen),
-    Screen("sound", "no-sound", _press("[data-test=tab-sound]"), ("phone",)),
+    Screen("sound", "no-sound", press("[data-test=tab-sound]"), ("phone",)),
     Screen("driving-now", "driving", sizes=("desktop",), hold=_drive),
-    Screen("fleet-more", "fleet", _press("[data-test=fleet-more]")),
-    Screen("settings", "driving", _press(".me"), ("desktop",)),
+    Screen("fleet-more", "fleet", press("[data-test=fleet-more]")),
+    Screen("settings", "driving", press(".me"), ("desktop",)),
     Screen("help", "driving", _do("pebble.panels.show('help')")),
     Screen("gamepad", "driving", _do(_PAD)),
     Screen("open-on-phone", "fleet", _do("pebble.panels.show('phone')")),
     Screen("left-handed", "driving", _do("pebble.settings.set('side', 'left')"), ("landscape",)),
-    Screen("reset-asked", "stopped", _press(".banner-actions button")),
+    Screen("reset-asked", "stopped", press(".banner-actions button")),
     Screen("sensors", "driving", _SENSORS, ("phone",)),
     Screen("more", "driving", _MORE, ("phone",)),
-    Screen("settings", "driving", _press("[data-test=tab-more]", ".wide"), ("phone",)),
-    Screen("drawer", "driving", _press(".round"), ("landscape",)),
+    Screen("settings", "driving", press("[data-test=tab-more]", ".wide"), ("phone",)),
+    Screen("drawer", "driving", press(".round"), ("landscape",)),
     Screen("outlets", "devices", sizes=("desktop",), hold=_at(_OUTLETS)),
     Screen("outlets", "devices", _MORE, ("phone",), _at(_OUTLETS)),
     Screen("outlets-viewer", "devices-viewer", _MORE, ("phone",), _at(_OUTLETS)),
@@ -248,37 +209,37 @@ SCREENS = [
     Screen("mcus", "devices", _MORE, ("phone",), _at(_LAMP)),
     Screen("values", "devices", sizes=("desktop",), hold=_at(_VALUES, f"{_VALUES} summary")),
     Screen("small", "driving", sizes=("small",)),
-    Screen("lights", "asked", _press('[data-test="colour-blue"]'), ("desktop",), _at_card("lights")),
-    Screen("sounds", "asked-busy", sizes=("desktop",), hold=_at_card("sounds")),
-    Screen("scripts", "asked-busy", sizes=("desktop",), hold=_at_card("autonomy")),
-    Screen("form", "asked", _mistaken, ("desktop",), _at_card("autonomy")),
-    Screen("failed", "asked-failed", sizes=("desktop",), hold=_at_card("autonomy")),
-    Screen("not-asked", "asked-viewer", sizes=("desktop",), hold=_at_card("autonomy")),
-    Screen("lights", "asked", _on_phone("more"), ("phone",), _at_card("lights")),
+    Screen("lights", "asked", press('[data-test="colour-blue"]'), ("desktop",), _at(_CARD("lights"))),
+    Screen("sounds", "asked-busy", sizes=("desktop",), hold=_at(_CARD("sounds"))),
+    Screen("scripts", "asked-busy", sizes=("desktop",), hold=_at(_CARD("autonomy"))),
+    Screen("form", "asked", _mistaken, ("desktop",), _at(_CARD("autonomy"))),
+    Screen("failed", "asked-failed", sizes=("desktop",), hold=_at(_CARD("autonomy"))),
+    Screen("not-asked", "asked-viewer", sizes=("desktop",), hold=_at(_CARD("autonomy"))),
+    Screen("lights", "asked", _on_phone("more"), ("phone",), _at(_CARD("lights"))),
     Screen("sounds", "asked-busy", _on_phone("sound"), ("phone",)),
-    Screen("scripts", "asked-busy", _on_phone("more"), ("phone",), _at_card("autonomy")),
-    Screen("form", "asked", _on_phone("more", _mistaken), ("phone",), _at_card("autonomy")),
-    Screen("logs", "operating", sizes=("desktop",), hold=_scroll_to(".log-foot")),
-    Screen("logs", "operating", _MORE, ("phone",), _scroll_to(".log-foot")),
-    Screen("system", "operating", sizes=("desktop",), hold=_scroll_to(".system .flag:last-child")),
-    Screen("system", "operating", _MORE, ("phone",), _scroll_to(".system .flag:last-child")),
-    Screen("services", "operating", _MORE, ("phone",), _scroll_to(".services-list li:last-child")),
-    Screen("boards", "undriveable", _MORE, ("phone",), _scroll_to("[data-test=mcu-line-relays]")),
-    Screen("system-ask", "operating", _press("[data-test=service-restart]"), ("desktop",)),
-    Screen("system-ask", "operating", _press("[data-test=tab-more]", "[data-test=service-restart]"), ("phone",)),
-    Screen("audit", "operating", _press("[data-test=audit]"), ("desktop",), _audit),
-    Screen("audit", "operating", _all(_MORE, _press("[data-test=audit]")), ("phone",), _audit),
-    Screen("audit", "operating", _press(".round"), ("landscape",), _all(_press("[data-test=audit]"), _audit)),
-    Screen("notices", "driving", _trouble_and_press("[data-test=bell]"), ("desktop",)),
-    Screen("notices", "driving", _trouble_and_press("[data-test=tab-more]", ".wide"), ("phone",)),
-    Screen("fleet-notices", "fleet", sizes=("desktop",), hold=_trouble_and_press("[data-test=bell]")),
-    Screen("fleet-notices", "fleet", sizes=("phone",), hold=_trouble_and_press(".me")),
+    Screen("scripts", "asked-busy", _on_phone("more"), ("phone",), _at(_CARD("autonomy"))),
+    Screen("form", "asked", _on_phone("more", _mistaken), ("phone",), _at(_CARD("autonomy"))),
+    Screen("logs", "operating", sizes=("desktop",), hold=_at(".log-foot")),
+    Screen("logs", "operating", _MORE, ("phone",), _at(".log-foot")),
+    Screen("system", "operating", sizes=("desktop",), hold=_at(".system .flag:last-child")),
+    Screen("system", "operating", _MORE, ("phone",), _at(".system .flag:last-child")),
+    Screen("services", "operating", _MORE, ("phone",), _at(".services-list li:last-child")),
+    Screen("boards", "undriveable", _MORE, ("phone",), _at("[data-test=mcu-line-relays]")),
+    Screen("system-ask", "operating", press("[data-test=service-restart]"), ("desktop",)),
+    Screen("system-ask", "operating", press("[data-test=tab-more]", "[data-test=service-restart]"), ("phone",)),
+    Screen("audit", "operating", press("[data-test=audit]"), ("desktop",), _AUDIT),
+    Screen("audit", "operating", _all(_MORE, press("[data-test=audit]")), ("phone",), _AUDIT),
+    Screen("audit", "operating", press(".round"), ("landscape",), _all(press("[data-test=audit]"), _AUDIT)),
+    Screen("notices", "driving", _all(_trouble, press("[data-test=bell]")), ("desktop",)),
+    Screen("notices", "driving", _all(_trouble, press("[data-test=tab-more]", ".wide")), ("phone",)),
+    Screen("fleet-notices", "fleet", sizes=("desktop",), hold=_all(_trouble, press("[data-test=bell]"))),
+    Screen("fleet-notices", "fleet", sizes=("phone",), hold=_all(_trouble, press(".me"))),
     Screen("bell", "driving", _trouble, ("desktop", "phone")),
-    Screen("own-name", "operating", _press(".me"), ("desktop",)),
+    Screen("own-name", "operating", press(".me"), ("desktop",)),
     Screen("replay-timeline", "replay", _timeline, ("desktop", "phone", "landscape", "small")),
-    Screen("replay-days", "replay", _timeline, hold=_press("[data-test=open-days]")),
-    Screen("replay-marked", "replay-gap", _timeline, hold=_press("[data-test=open-download]", "[data-test=mark-in]")),
-    Screen("recordings-link", "driving-recorded", _recordings_link, ("desktop",)),
+    Screen("replay-days", "replay", _timeline, hold=press("[data-test=open-days]")),
+    Screen("replay-marked", "replay-gap", _timeline, hold=press("[data-test=open-download]", "[data-test=mark-in]")),
+    Screen("recordings-link", "driving-recorded", _until("a:text-is('Recordings')"), ("desktop",)),
 ]
 CASES = [(screen, size) for screen in SCREENS for size in screen.sizes]
 
@@ -348,38 +309,23 @@ _NEAR = """([selector, offset]) => {
   }
   return [...found];
 }"""
-#: Without scrolling, nothing that can be tapped is even drawn there.
-_DRAWN_NEAR = """(selector) => {
+#: Without scrolling, nothing that can be tapped is even drawn there; and nothing that scrolls within itself can bring
+#: what it has to edges that lie there.
+_CLOSE = """(selector) => {
   scrollTo(0, 0);
   const found = [];
-  for (const stop of document.querySelectorAll(".stop")) {
-    if (!stop.checkVisibility({ visibilityProperty: true })) continue;
-    const a = stop.getBoundingClientRect();
-    for (const other of document.querySelectorAll(selector)) {
-      const b = other.getBoundingClientRect();
-      if (other === stop || !other.checkVisibility() || b.bottom <= 0) continue;
-      const x = Math.max(b.left - a.right, a.left - b.right, 0);
-      const y = Math.max(b.top - a.bottom, a.top - b.bottom, 0);
-      const text = `${Math.hypot(x, y).toFixed(0)} px from ${stop.textContent}: ${other.outerHTML.slice(0, 120)}`;
-      if (Math.hypot(x, y) < 23.9) found.push(text);
-    }
-  }
-  return found;
-}"""
-#: What scrolls within itself can bring anything that it has to its edges.
-_SCROLLS_NEAR = """(selector) => {
-  const found = [];
+  const scrolls = (one) => one.scrollHeight > one.clientHeight && /auto|scroll/.test(getComputedStyle(one).overflowY) &&
+    one.querySelector(selector);
   for (const stop of document.querySelectorAll(".stop")) {
     if (!stop.checkVisibility({ visibilityProperty: true })) continue;
     const a = stop.getBoundingClientRect();
     for (const other of document.querySelectorAll("body *")) {
-      if (other.scrollHeight <= other.clientHeight || !other.checkVisibility()) continue;
-      if (!/auto|scroll/.test(getComputedStyle(other).overflowY) || !other.querySelector(selector)) continue;
+      if (other.contains(stop) || !other.checkVisibility() || !(other.matches(selector) || scrolls(other))) continue;
       const b = other.getBoundingClientRect();
       const x = Math.max(b.left - a.right, a.left - b.right, 0);
       const y = Math.max(b.top - a.bottom, a.top - b.bottom, 0);
-      if (other.contains(stop) || Math.hypot(x, y) >= 23.9) continue;
-      found.push(`scrolls near ${stop.textContent}: ${other.outerHTML.slice(0, 120)}`);
+      const text = `${Math.hypot(x, y).toFixed(0)} px from ${stop.textContent}: ${other.outerHTML.slice(0, 120)}`;
+      if (b.bottom > 0 && Math.hypot(x, y) < 23.9) found.push(text);
     }
   }
   return found;
@@ -415,7 +361,6 @@ def _measured(page: Page, size: Size) -> list[str]:
 
 def _wrong(page: Page) -> list[str]:
     found = ["scrolls sideways"] * page.evaluate(_TOO_WIDE)
-    found += page.evaluate(_SMALL, TAPPABLE) + page.evaluate(_DRAWN_NEAR, TAPPABLE)
-    found += page.evaluate(_SCROLLS_NEAR, TAPPABLE)
+    found += page.evaluate(_SMALL, TAPPABLE) + page.evaluate(_CLOSE, TAPPABLE)
     found += [text for script in (_OUT_OF_BAR, _CUT) for text in page.evaluate(script)]
     return found + [text for offset in (0, 40, 90, 150, 230) for text in page.evaluate(_NEAR, [TAPPABLE, offset])]

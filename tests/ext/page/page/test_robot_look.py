@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -10,12 +9,10 @@ import pytest
 from playwright.sync_api import Page
 
 from tests.ext.page.browser import Size, Tab
-from tests.ext.page.canned import CannedServer, Show
-from tests.ext.page.looks import AT, FROZEN
+from tests.ext.page.canned import Show
 from tests.ext.page.states import (
     FRED,
     GOOB,
-    GOOB_PATH,
     LAMP,
     MAY_TAKE,
     STATES,
@@ -60,52 +57,6 @@ def _ready(opened: Tab) -> None:
     opened.page.wait_for_timeout(1800)  # cards have settled
 
 
-def _stopped(page: Page) -> None:
-    page.evaluate(SET, [GOOB, "web/estop", estop(1_700_000_000_000, "eve on phone")])
-
-
-def _asks_to_reset(page: Page) -> None:
-    _stopped(page)
-    page.locator("[data-test=reset]").click()
-
-
-def _silent(page: Page) -> None:
-    page.evaluate(SET, [GOOB, "web/liveness", {"online": False, "silent_s": 4, "latency_ms": None}])
-
-
-def _other_stopped(page: Page) -> None:
-    page.evaluate(SET, [FRED, "web/estop", estop(1_700_000_000_000, "eve on phone")])
-
-
-def _notice(page: Page) -> None:
-    page.evaluate("pebble.connection.show('Saved as goob.png')")
-
-
-TROUBLE: dict[str, Callable[[Page], None]] = {
-    "a stop": _stopped,
-    "a question before the reset": _asks_to_reset,
-    "silence": _silent,
-    "another's stop": _other_stopped,
-    "a notice": _notice,
-}
-QUIET = replace(STATES["driving"], repeated={"online": 1.0})
-
-
-@pytest.mark.parametrize("size", ["desktop", "phone", "landscape"])
-@pytest.mark.parametrize("what", TROUBLE)
-def test_trouble_moves_nothing_that_works_a_robot(show: Show, size: Size, what: str) -> None:
-    with show(QUIET, size) as opened:
-        _ready(opened)
-        before = opened.page.evaluate(PLACES)
-        TROUBLE[what](opened.page)
-        opened.page.wait_for_timeout(400)
-        after = opened.page.evaluate(PLACES)
-        assert {name: place for name, place in after.items() if before.get(name, place) != place} == {}
-        assert len(before) >= 5
-        if size != "landscape":  # there a band may lie over what is off meanwhile, which is hidden
-            assert opened.page.evaluate(COVERED) == []
-
-
 def test_cards_stay_in_their_places(show: Show) -> None:
     with show(CALM, viewport={"width": 1440, "height": 900}, engineers=False, script=SHIFT) as opened:
         for _ in ("as they come", "as they are remembered"):
@@ -114,54 +65,6 @@ def test_cards_stay_in_their_places(show: Show) -> None:
             assert opened.page.evaluate("window.shifted") <= 0.02
             assert opened.page.evaluate(COVERED) == []
             opened.page.reload()
-
-
-#: The lower ends of the columns, and how many cards there are besides the picture and Drive.
-ENDS = """() => {
-  const cards = [...document.querySelectorAll(".bench > *")].filter((one) => one.offsetHeight);
-  const usual = cards.filter(({ dataset }) => !dataset.span && dataset.at !== "side");
-  const ends = {};
-  for (const card of cards.filter(({ dataset }) => dataset.span !== "all")) {
-    const [, column, , span] = card.style.gridArea.split("/").map((part) => parseInt(part.replace("span", ""), 10));
-    for (let n = column; n < column + span; n++) ends[n] = Math.max(ends[n] ?? 0, card.getBoundingClientRect().bottom);
-  }
-  return [Object.values(ends).map(Math.round), usual.length];
-}"""
-#: Every state of the page of a robot that has a picture and is driven.
-BALANCED = [name for name, state in STATES.items() if state.path == GOOB_PATH]
-
-
-@pytest.mark.parametrize("name", BALANCED)
-def test_columns_end_alike(show: Show, name: str) -> None:
-    options = {"engineers": False, "reduced_motion": "reduce", "script": FROZEN}
-    state = replace(STATES[name], at=AT, still=True, repeated={})
-    with show(state, viewport={"width": 1440, "height": 900}, **options) as opened:
-        assert opened.until("Boolean(document.querySelector('.bench[data-rests]'))", 60)
-        for width, height in ((1440, 900), (1920, 1080)):
-            opened.page.set_viewport_size({"width": width, "height": height})
-            opened.page.wait_for_timeout(300)
-            ends, cards = opened.page.evaluate(ENDS)
-            allowed = 400 if cards < len(ends) else 200  # fewer cards than columns cannot end alike
-            assert max(ends) - min(ends) <= allowed, ends
-
-
-def test_driving_of_a_board_that_says_nothing_is_allowed_and_withdrawn_on_its_page(
-    show: Show, server: CannedServer
-) -> None:
-    view = {"silent": True, "by": "", "refused": "", "parked": "", "risk": "It may roll on."}
-    with show(replace(STATES["free"], welcome=MAY_TAKE)) as opened:
-        _ready(opened)
-        opened.page.evaluate(SET, [GOOB, "capabilities", {"value": {"announced": True, "assumed": True}}])
-        opened.page.evaluate(SET, [GOOB, "web/board", view])
-        opened.test("board-extra").click()
-        opened.test("board-allow").click()
-        opened.page.evaluate(SET, [GOOB, "web/board", {**view, "by": "ann", "parked": "Clear it first"}])
-        opened.test("board-clear").click()
-        opened.test("board-withdraw").click()
-        asked = [(one["do"], one["extra"]) for one in server.received if one.get("op") == "board"]
-        assert asked == [("allow", True), ("clear", True), ("withdraw", True)]
-        opened.page.evaluate(SET, [GOOB, "web/board", {**view, "refused": "The config decides that"}])
-        opened.page.locator("[data-test=board-allow]:disabled").wait_for()
 
 
 #: Whatever happens to a robot, as values of it.
@@ -183,11 +86,38 @@ REST = {"web/driver": driver(), "autonomy-status": {}, "web/estop": estop(0), "w
 STILL = replace(STATES["free"], repeated={"online": 1.0}, welcome=MAY_TAKE)
 
 
-def _happens(page: Page, ref: str, what: str) -> None:
-    for metric, value in (REST | HAPPENS[what]).items():
+def _happens(page: Page, ref: str, what: str, **more: Any) -> None:
+    for metric, value in (REST | HAPPENS[what] | more).items():
         page.evaluate(SET, [ref, metric, value])
     page.wait_for_timeout(150)
     page.evaluate("(asks) => asks && document.querySelector('[data-test=reset]')?.click()", what is ASKED)
+
+
+#: What goes wrong while a robot is driven.
+TROUBLE = (
+    (GOOB, "nothing"),
+    (GOOB, "it is stopped"),
+    (GOOB, ASKED),
+    (GOOB, "it is stopped and silent"),
+    (FRED, "it is stopped"),
+)
+
+
+@pytest.mark.parametrize("size", ["desktop", "phone", "landscape"])
+def test_trouble_moves_nothing_that_works_a_robot(show: Show, size: Size) -> None:
+    with show(replace(STATES["driving"], repeated={"online": 1.0}), size) as opened:
+        _ready(opened)
+        before = opened.page.evaluate(PLACES)
+        assert len(before) >= 5
+        opened.page.evaluate("pebble.connection.show('Saved as goob.png')")
+        for ref, what in TROUBLE:
+            _happens(opened.page, ref, what, **{"web/driver": driver("alice", "laptop", you=True)})
+            opened.page.wait_for_timeout(400)
+            after = opened.page.evaluate(PLACES)
+            assert {name: place for name, place in after.items() if before.get(name, place) != place} == {}, what
+            if size != "landscape":  # there a band may lie over what is off meanwhile, which is hidden
+                assert opened.page.evaluate(COVERED) == [], what
+            _happens(opened.page, ref, "nothing", **{"web/driver": driver("alice", "laptop", you=True)})
 
 
 #: Places of all that the header has on each screen, and whether the robot's name is read whole.

@@ -6,7 +6,6 @@ import io
 import re
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,12 +17,8 @@ from playwright.sync_api import Browser
 from tests.ext.page.browser import Tab
 from tests.ext.page.canned import CannedServer, Show, showing
 from tests.ext.page.states import (
-    MINE,
     SENSORS,
     STATES,
-    changed,
-    fleet,
-    with_stream,
 )
 
 pytestmark = pytest.mark.page
@@ -47,39 +42,28 @@ def sensors(_sensors: Tab) -> Iterator[Tab]:
     assert _sensors.complaints() == []
 
 
-def see(opened: Tab, name: str) -> None:
-    opened.test(name).first.scroll_into_view_if_needed()
+def seen(place: Any) -> Any:
+    """Return the pixels of a page, or of an element."""
+    return np.asarray(Image.open(io.BytesIO(place.screenshot())).convert("RGB")).astype(int)
 
 
-#: How many pixels of a canvas have a colour of its style: all, in the last fifth, and in the middle.
-#: Of a copy: Chromium complains of a canvas that is drawn on and often read.
-_INKED = """([place, ink]) => {
-  const canvas = document.querySelector(place);
-  const wanted = getComputedStyle(canvas).getPropertyValue(ink).trim();
-  const [r, g, b] = [1, 3, 5].map((at) => parseInt(wanted.slice(at, at + 2), 16));
-  const { width, height } = canvas;
-  const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
-  copy.drawImage(canvas, 0, 0);
-  const { data } = copy.getImageData(0, 0, width, height);
-  const found = { all: 0, late: 0, middle: 0 };
-  for (let i = 0; i < data.length; i += 4) {
-    const away = Math.abs(data[i] - r) + Math.abs(data[i + 1] - g) + Math.abs(data[i + 2] - b);
-    if (away > 60 || data[i + 3] < 128) continue;
-    const [x, y] = [(i / 4) % width, Math.floor(i / 4 / width)];
-    found.all++;
-    found.late += x > 0.8 * width;
-    found.middle += Math.hypot(x - width / 2, y - height / 2) < 14;
-  }
-  return found;
-}"""
+def like(pixels: Any, colour: tuple[int, ...]) -> Any:
+    """Return which pixels have this colour."""
+    return np.abs(pixels - np.array(colour)).sum(axis=2) < 60
 
 
-def inked(opened: Tab, place: str, ink: str, part: str) -> int:
-    return int(opened.page.evaluate(_INKED, [place, ink])[part])
+def inked(opened: Tab, canvas: str, ink: str) -> Any:
+    """Return which pixels of a canvas have a colour of its style."""
+    place = opened.page.locator(canvas)
+    colour = place.evaluate("(canvas, ink) => getComputedStyle(canvas).getPropertyValue(ink).trim()", ink)
+    return like(seen(place), tuple(int(colour[at : at + 2], 16) for at in (1, 3, 5)))
 
 
-def trail(opened: Tab, part: str) -> int:
-    return inked(opened, "[data-test=map]", "--accent", part)
+def trail(opened: Tab) -> tuple[int, int]:
+    """Return how much of the map is drawn: all, and around its middle."""
+    drawn = inked(opened, "[data-test=map]", "--accent")
+    height, width = (size // 2 for size in drawn.shape)
+    return int(drawn.sum()), int(drawn[height - 12 : height + 12, width - 12 : width + 12].sum())
 
 
 # -- plots and map
@@ -87,9 +71,9 @@ def trail(opened: Tab, part: str) -> int:
 
 def test_a_plot_is_drawn_up_to_now_and_its_newest_value_is_text(sensors: Tab) -> None:
     for name in ("battery", "attitude", "touch"):
-        see(sensors, f"plot-{name}")
         canvas = f"[data-test=plot-{name}] canvas"
-        assert sensors.until(lambda canvas=canvas: inked(sensors, canvas, "--line-0", "late") > 5)  # type: ignore[misc]
+        late = lambda canvas=canvas: np.array_split(inked(sensors, canvas, "--line-0"), 5, axis=1)[-1]
+        assert sensors.until(lambda: late().sum() > 5)  # noqa: B023
     texts = sensors.test("plot-battery").locator("li").all_inner_texts()
     assert [" ".join(text.split()) for text in texts] == ["battery 7.92 V"]
 
@@ -98,20 +82,19 @@ def test_a_plot_is_drawn_up_to_now_and_its_newest_value_is_text(sensors: Tab) ->
 def test_plots_are_drawn_where_the_language_has_a_name_that_browsers_do_not_know(show: Show, language: str) -> None:
     named = f"Object.defineProperty(Navigator.prototype, 'language', {{ get: () => {language!r} }})"
     with show(SENSORS, script=named) as opened:
-        see(opened, "plot-battery")
+        opened.test("plot-battery").scroll_into_view_if_needed()
         assert opened.until("document.querySelector('[data-test=plot-battery] canvas') !== null")
         assert opened.complaints() == []
 
 
 def test_the_map_has_the_trail_and_the_component_in_its_middle(sensors: Tab) -> None:
-    see(sensors, "map")
-    assert sensors.until(lambda: trail(sensors, "middle") > 30)
-    assert sensors.until(lambda: trail(sensors, "all") > 300)
+    assert sensors.until(lambda: trail(sensors)[0] > 300)
+    assert trail(sensors)[1] > 30
     words = sensors.test("map-pose").inner_text()
     assert re.fullmatch(r"x -?\d\.\d\d m · y -?\d\.\d\d m · heading -?\d+°", words)
     sensors.test("map-clear").click()
-    assert sensors.until(lambda: trail(sensors, "all") < 250)
-    assert trail(sensors, "middle") > 30
+    assert sensors.until(lambda: trail(sensors)[0] < 250)
+    assert trail(sensors)[1] > 30
 
 
 # -- over the picture
@@ -131,13 +114,9 @@ _PLAIN = """() => {
 }"""
 
 
-def seen(opened: Tab) -> Any:
-    return np.asarray(Image.open(io.BytesIO(opened.page.screenshot())).convert("RGB")).astype(int)
-
-
-def area(pixels: Any, colour: tuple[int, int, int], tolerance: int = 60) -> tuple[int, int, int, int] | None:
-    """Left, top, right and bottom of what has this colour; None if nothing has."""
-    rows, columns = np.where(np.abs(pixels - np.array(colour)).sum(axis=2) < tolerance)
+def area(pixels: Any, colour: tuple[int, int, int]) -> tuple[int, int, int, int] | None:
+    """Return left, top, right and bottom of what has this colour; None if nothing has."""
+    rows, columns = np.where(like(pixels, colour))
     if not len(rows):
         return None
     return int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1
@@ -151,11 +130,11 @@ def assert_a_square_in_the_middle(opened: Tab, pixel: float = 1.0) -> None:
     areas: list[Any] = []
 
     def are_both_seen() -> bool:
-        pixels = seen(opened)
+        pixels = seen(opened.page)
         areas[:] = area(pixels, PICTURE), area(pixels, INK)
         return None not in areas
 
-    assert opened.until(are_both_seen)
+    assert opened.until(are_both_seen, 40)  # a busy machine takes seconds for each picture
     (left, top, right, bottom), square = areas
     assert (right - left) / (bottom - top) == pytest.approx(640 / 360, rel=0.01)
     width, height = right - left, bottom - top
@@ -194,7 +173,7 @@ def test_overlays_in_full_screen_where_stop_and_the_reason_remain_and_overlays_t
         opened.test("stop-one").click()
         assert opened.until(lambda: server.sent("estop"))
         opened.page.get_by_label("Leave full screen").click()
-        opened.gear()
+        opened.test("gear").click()
         opened.test("overlays").click()
         assert opened.until("!document.querySelector('[data-test=overlays-canvas]')")
 
@@ -230,7 +209,7 @@ def test_a_robots_own_stream_is_shown_in_a_frame_and_never_called_live(show: Sho
     reason = "pebble.driver.reason()?.code ?? ''"
     with show(OWN) as opened:
         assert opened.until(f"{reason} === ''")
-        opened.gear()
+        opened.test("gear").click()
         opened.test("open-stream").click()
         frame = opened.test("stream")
         assert frame.get_attribute("sandbox") == "allow-scripts allow-same-origin"
@@ -248,11 +227,3 @@ def test_a_robots_own_stream_is_shown_in_a_frame_and_never_called_live(show: Sho
         opened.test("close-stream").click()
         assert frame.count() == 0
         assert opened.complaints() == []
-
-
-def test_what_may_not_be_shown_is_not(show: Show) -> None:
-    with show(replace(OWN, values=changed(fleet, MINE, with_stream("javascript:parent.ran = 1")))) as opened:
-        opened.gear()
-        assert opened.test("open-stream").is_disabled()
-        assert opened.page.locator("#why-stream").inner_text()
-        assert opened.page.evaluate("document.querySelectorAll('iframe').length") == 0

@@ -7,14 +7,10 @@ import unicodedata
 from functools import cache
 
 import pytest
-from playwright.sync_api import Browser
 
 from pebble.config.visible import shown
-from tests.ext.page.browser import tab
 from tests.ext.page.in_node import evaluate
-from tests.ext.page.served import Served
-from tests.kit.played_robot import RecordingRobot
-from tests.support import Broker, some, until
+from tests.support import some
 
 #: Texts, and how they are shown.
 TEXTS = {
@@ -60,22 +56,3 @@ def test_the_rule_is_the_same_for_every_character(around: str, together: int) ->
     each = [around.format(one) for one in some(characters(), 1 if together > 1 else 7)]
     texts = ["".join(each[first : first + together]) for first in range(0, len(each), together)]
     assert [pair for pair in zip(texts, in_page(texts), strict=True) if pair[1] != shown(pair[0])] == []
-
-
-@pytest.mark.page
-def test_a_robot_cannot_look_like_another_one_and_is_stopped_all_the_same(
-    broker: Broker, served: Served, browser: Browser
-) -> None:
-    ref = "pebble/robots/go\u202eob"
-    with RecordingRobot(broker.port, ref) as robot, tab(browser, served.origin) as opened:
-        text, name = "document.body.innerText", "go\\u202eob"
-        assert opened.until(lambda: name in opened.page.evaluate(text))
-        opened.page.evaluate("(ref) => window.pebble.route.go(ref)", ref)
-        robot.publish("status", {"t": 1, "value": {"\u2067state": "dri\u200bving"}}, retain=True)
-        opened.page.get_by_role("button", name="Open All values").click()
-        assert opened.until(lambda: "dri\\u200bving" in opened.page.evaluate(text))
-        assert opened.page.title() == f"{name} – Pebble"
-        opened.page.get_by_role("button", name=f"STOP: emergency stop of {name}").click()
-        assert until(lambda: robot.latched, 10)
-        assert opened.until(lambda: f"{name} is stopped" in opened.page.evaluate(text))
-        assert not set(opened.page.evaluate(text)) & set("\u202e\u2067\u200b")
