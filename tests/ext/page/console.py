@@ -18,11 +18,23 @@ from tests.ext.page.stage import Stage
 Wheels = tuple[int, int]
 
 FORWARD, BACK, LEFT, RIGHT, REST = (1, 1), (-1, -1), (-1, 1), (1, -1), (0, 0)
+#: Key, and what the wheels do: their signs, left and right.
+KEYS: dict[str, Wheels] = {
+    "KeyW": FORWARD,
+    "KeyS": BACK,
+    "KeyA": LEFT,
+    "KeyD": RIGHT,
+    "ArrowUp": FORWARD,
+    "ArrowDown": BACK,
+    "ArrowLeft": LEFT,
+    "ArrowRight": RIGHT,
+}
 REST_S = 1.0  # to come to rest after a release, on a busy machine; 20 ms on an idle one
 QUIET_S = 0.4  # so long nothing may turn where nothing may turn: eight commands of a gesture
 _READY_S = 20.0  # for picture, echoes and lease, on a busy machine
 _PRESSES = 6
 _MOVES_S = 0.7
+_PADS = "window.__pads = []; navigator.getGamepads = () => window.__pads;"
 
 
 @dataclass
@@ -162,6 +174,23 @@ class Console:
         self.page.wait_for_timeout(1000 * seconds)
         return not self.stage.wheels_turning(self.name, since_ns=began)
 
+    # -- gamepads
+
+    def pads(self, *pads: dict[str, Any] | None) -> None:
+        """What the browser shows of gamepads from now on."""
+        self.page.evaluate("(pads) => { window.__pads = pads }", list(pads))
+
+
+def pad(x: float = 0.0, z: float = 0.0, *buttons: int, stamp: float = 0.0, name: str = "Gamepad") -> dict[str, Any]:
+    """A gamepad as a browser shows it; ``buttons`` are pressed. ``stamp`` 0: newer than all before."""
+    return {
+        "id": name,
+        "axes": [x, -z],
+        "buttons": [{"pressed": index in buttons} for index in range(12)],
+        "timestamp": stamp or time.monotonic_ns() / 1e6,
+        "connected": True,
+    }
+
 
 @contextmanager
 def console(
@@ -171,14 +200,16 @@ def console(
     size: Size = "desktop",
     theme: Theme = "light",
     *,
+    url: str = "",
+    script: str = "",
     engineers: bool = True,
 ) -> Iterator[Console]:
-    """Open the page of a robot.
+    """Open the page of a robot. ``url`` with a slash at the end: by another way than the server's own address.
 
     Without ``engineers`` none of its cards for them is open: drawing plots takes most of what a page needs.
     """
-    address = f"{stage.url}r/{stage.ref(name)}"
-    with tab(browser, address, size, theme, engineers=engineers) as opened:
+    address = f"{url or stage.url}r/{stage.ref(name)}"
+    with tab(browser, address, size, theme, script=_PADS + script, engineers=engineers) as opened:
         yield Console(opened, stage, name)
 
 
@@ -193,6 +224,7 @@ def used(opened: Console, *, complaints: bool = True) -> Iterator[Console]:
     before = len(opened.tab.complaints())
     yield opened
     opened.let_go()
+    opened.pads()
     opened.page.mouse.up()
     assert opened.rests(), opened.speeds
     found = opened.tab.complaints()[before:]

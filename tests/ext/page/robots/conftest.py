@@ -7,9 +7,15 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Browser
 
+from tests.ext.page.browser import chromium
 from tests.ext.page.console import Console, Wire, console, used
-from tests.ext.page.page.conftest import browser as browser
 from tests.ext.page.stage import Stage
+
+
+@pytest.fixture(scope="package")
+def browser() -> Iterator[Browser]:
+    with chromium() as running:
+        yield running
 
 
 @pytest.fixture(scope="package")

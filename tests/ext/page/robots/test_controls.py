@@ -1,17 +1,29 @@
-"""Stops, control and the keyboard of a robot's page, used in a browser; what they do is asserted at the robot."""
+"""Every control of the fleet and of a robot's page, used in a browser; what it does is asserted at the robot."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, Locator
 
 from tests.ext.page.browser import tab
 from tests.ext.page.canned import CannedServer
-from tests.ext.page.console import Console, Wire, console
+from tests.ext.page.console import FORWARD, KEYS, Console, Wire, console, pad
 from tests.ext.page.stage import Stage
 from tests.ext.page.states import STATES
 
 pytestmark = pytest.mark.alone  # deadlines are checked
+
+
+# -- keys
+
+
+def test_each_key_turns_the_wheels_while_it_is_held(at_lamp: Console) -> None:
+    for key, wheels in KEYS.items():
+        assert at_lamp.drive(key, wheels=wheels), (key, at_lamp.wheels, at_lamp.reason)
+        at_lamp.let_go()
+        assert at_lamp.rests(), key
 
 
 # -- stops
@@ -26,12 +38,47 @@ def test_the_space_bar_ends_the_gesture_and_latches_nothing(at_lamp: Console, wi
     assert at_lamp.press_anew()
 
 
+def _in_help(robot: Console) -> None:
+    """It ends a gesture, moves nothing, and leaves STOP in reach."""
+    robot.page.keyboard.press("?")
+    assert robot.rests()
+    robot.let_go()
+    robot.down("KeyW")
+    assert robot.stays_at_rest()
+    robot.test("stop-one").click()
+    robot.page.keyboard.press("?")
+
+
+def _touch(element: Locator) -> None:
+    element.hover()
+    element.page.mouse.down()
+
+
+STOPS: dict[str, Callable[[Console], None]] = {
+    "Ctrl+Space": lambda robot: robot.page.keyboard.press("Control+Space"),
+    "STOP": lambda robot: robot.test("stop-one").click(),
+    "STOP beside the help": lambda robot: _in_help(robot),
+    "STOP, as soon as it is touched": lambda robot: _touch(robot.test("stop-one")),
+}
+
+
+@pytest.mark.parametrize("how", STOPS)
+def test_a_stop_latches_the_robot_which_stays_at_rest(at_lamp: Console, wire: Wire, how: str) -> None:
+    assert at_lamp.drive()
+    STOPS[how](at_lamp)
+    assert at_lamp.tab.until(lambda: wire.latched("minilamp"), 2)
+    assert at_lamp.rests()
+    assert at_lamp.because("stopped", within=2)
+    at_lamp.let_go()
+    at_lamp.down("KeyW")
+    assert at_lamp.stays_at_rest()
+
+
 def test_stop_all_latches_every_robot_and_each_is_reset_by_itself(stage: Stage, at_lamp: Console, wire: Wire) -> None:
     assert at_lamp.drive()
     at_lamp.test("stop-all").click()
     assert at_lamp.tab.until(lambda: all(wire.latched(name) for name in stage.robots), 3)
     assert at_lamp.rests()
-    assert at_lamp.stays_at_rest()  # its key is still held
     at_lamp.let_go()
     at_lamp.test("reset").click()
     at_lamp.test("leave-stopped").click()
@@ -45,6 +92,29 @@ def test_stop_all_latches_every_robot_and_each_is_reset_by_itself(stage: Stage, 
     assert at_lamp.press_anew()
     at_lamp.reset("benjr")
     assert at_lamp.tab.until(lambda: not wire.latched("benjr"), 3)
+
+
+def test_a_gamepad_drives_and_its_buttons_stop(at_lamp: Console, wire: Wire) -> None:
+    def drives() -> bool:
+        """Show it in neutral, then pushed."""
+
+        def neutral() -> None:
+            at_lamp.pads(pad())
+            at_lamp.page.wait_for_timeout(120)
+
+        neutral()
+        return at_lamp.persists(lambda: at_lamp.pads(pad(z=1)), lambda: at_lamp.wheels == FORWARD, neutral)
+
+    assert drives()
+    at_lamp.pads(pad(0, 1, 0))
+    assert at_lamp.rests()
+    assert at_lamp.stays_at_rest()
+    assert not wire.latched("minilamp")
+    assert drives()
+    at_lamp.pads(pad(0, 1, 8, 9))
+    assert at_lamp.tab.until(lambda: wire.latched("minilamp"), 2)
+    assert at_lamp.rests()
+    assert at_lamp.because("stopped", within=2)  # else the next test would not see what it has to reset
 
 
 # -- control
@@ -81,6 +151,17 @@ def test_a_second_tab_stops_by_the_space_bar_and_takes_over_by_a_hold(
 
 
 # -- the fleet
+
+
+def test_the_fleet_stops_robots(browser: Browser, stage: Stage, wire: Wire) -> None:
+    with tab(browser, stage.url) as fleet:
+        assert fleet.until(lambda: fleet.page.locator(".fleet-card").count() == 2)
+        fleet.test("stop-benjr").click()
+        assert fleet.until(lambda: wire.latched("benjr"), 2)
+        assert not wire.latched("minilamp")
+        fleet.test("card-minilamp").click(position={"x": 4, "y": 4})  # the whole card is the link, but for its Stop
+        assert fleet.until("window.pebble.driver.ref === 'pebble/robots/minilamp'", 2)
+        assert fleet.complaints() == []
 
 
 # -- without a mouse

@@ -105,6 +105,8 @@ def _rotate(robot: Phone, width: int, height: int, kind: str, angle: int) -> Non
 LOSSES: dict[str, Callable[[Phone], None]] = {
     "the system takes the finger": lambda robot: robot.fingers.cancel(),
     "rotation": lambda robot: _rotate(robot, 844, 390, "landscapePrimary", 90),
+    "the screen is switched off": lambda robot: robot.tab.hide(),
+    "another application": lambda robot: robot.tab.blur(),
 }
 
 
@@ -113,6 +115,8 @@ def test_what_takes_the_finger_away_stops(at_lamp: Phone, what: str) -> None:
     assert at_lamp.drive_by_stick()
     LOSSES[what](at_lamp)
     assert at_lamp.rests()
+    assert at_lamp.stays_at_rest()
+    at_lamp.tab.hide(hidden=False)
     assert at_lamp.stays_at_rest()
     at_lamp.fingers.lift()
     assert at_lamp.test("stop-one").is_visible()
