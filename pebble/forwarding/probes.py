@@ -22,9 +22,9 @@ PROBE_REQUEST: Final = codec.encode(BRIDGE_PROBE, {"question": True})
 NO_PROBE: Final = codec.encode(BRIDGE_PROBE, {"question": False})
 
 
-def new_probe(now_ms: int, nonce_bytes: int = 8) -> bytes:
+def new_probe(now_ms: int) -> bytes:
     """Return a payload that no other client can have published before."""
-    return codec.encode(BRIDGE_PROBE, {"t": now_ms, "nonce": secrets.token_hex(nonce_bytes)})
+    return codec.encode(BRIDGE_PROBE, {"t": now_ms, "nonce": secrets.token_hex(8)})
 
 
 class Probes:

@@ -62,7 +62,7 @@ class Bench:
             self.body.end_turn()
 
     def send(self, line: bytes) -> None:
-        self.board.type(line + b"\n")
+        self.board.console.type(line + b"\n")
 
     def read(self, data: bytes) -> list[Frame]:
         """The whole frames in what the host has received by now; ``damaged`` counts what is none."""
@@ -78,10 +78,10 @@ class Bench:
     def frames(self, seconds: float = 0.2) -> list[Frame]:
         """What the host reads during that time."""
         self.turn(seconds)
-        return self.read(self.board.take_output())
+        return self.read(self.board.console.take_output())
 
     def asked(self, kind: Type, payload: bytes = b"", *, interface: int = 0, sequence: int = 1) -> list[Frame]:
-        self.board.type(encode(Frame(kind, payload, interface=interface, sequence=sequence)))
+        self.board.console.type(encode(Frame(kind, payload, interface=interface, sequence=sequence)))
         return self.frames()
 
     def manifest(self) -> Manifest:

@@ -141,7 +141,7 @@ class Drill:
         pins = self.board.firmware.module(f"{self.kind}.pins")
         if self.kind == "benjr":
             self._shield_address = pins.MOTOR_SHIELD
-            self.board.attach_i2c(self._shield_address, self.shield)
+            self.board.bus.attach(self._shield_address, self.shield)
         self._pairs = [getattr(pins, name, None) for name in ("LEFT", "RIGHT", "GROUSERS")]
         host = self.random.choice(("10.0.0.2", "broker.test", "broker.local"))
         settings = {"robot": {"id": "rover"}, "wifi": {"ssid": "home", "password": "secret"}, "mqtt": {"host": host}}

@@ -70,7 +70,7 @@ def play(robot: str, script: list[Entry]) -> list[Entry]:
             act(board, entry)
         firmware.step()
         body.end_turn()
-        transcript += [Entry(now, "<", line.decode()) for line in board.take_output().split(b"\r\n")[:-1]]
+        transcript += [Entry(now, "<", line.decode()) for line in board.console.take_output().split(b"\r\n")[:-1]]
     return transcript
 
 
@@ -78,7 +78,7 @@ def act(board: Board, entry: Entry) -> None:
     if entry.sign == "=":
         wire(board, entry.what)
     elif entry.sign == ">":
-        board.type(entry.what.encode() + b"\n")
+        board.console.type(entry.what.encode() + b"\n")
 
 
 def wire(board: Board, what: str) -> None:

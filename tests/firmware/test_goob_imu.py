@@ -26,13 +26,13 @@ def test_it_sends_hello_when_it_boots(bench: Bench) -> None:
 def test_half_a_frame_from_before_a_reset_does_not_swallow_its_hello(bench: Bench) -> None:
     """On a serial port without USB, the host has no other sign that the firmware has changed."""
     bench.turn(0.002)
-    frames = (encode(Frame(Type.SAMPLE, b"\1" * 18, 1))[:20] + bench.board.take_output()).split(b"\0")
+    frames = (encode(Frame(Type.SAMPLE, b"\1" * 18, 1))[:20] + bench.board.console.take_output()).split(b"\0")
     assert Type.HELLO in [decode(one).type for one in frames[1:] if one]
 
 
 def test_it_describes_itself_when_asked(bench: Bench) -> None:
     bench.frames(0.5)
-    bench.board.type(ASK)
+    bench.board.console.type(ASK)
     frames = bench.frames(0.05)
     assert [frame.type for frame in frames if frame.type in (Type.HELLO, Type.DESCRIBE)] == [Type.HELLO, Type.DESCRIBE]
     manifest = parse_describe(of(frames, Type.DESCRIBE)[0].payload)
@@ -100,7 +100,7 @@ def test_a_lost_mpu_is_reported_and_found_again(bench: Bench) -> None:
 def test_it_describes_itself_though_its_loop_is_slow() -> None:
     """Every turn brings a sample then."""
     bench = Bench("goob_imu", turn_ms=12)
-    bench.board.type(ASK)
+    bench.board.console.type(ASK)
     frames = bench.frames(0.24)
     assert len(of(frames, Type.DESCRIBE)) == 1
     assert len(of(frames, Type.SAMPLE)) >= 18
@@ -122,5 +122,5 @@ def test_a_host_that_did_not_read_gets_the_number_of_lost_frames(bench: Bench) -
 
 
 def test_ctrl_c_is_a_byte_like_any_other(bench: Bench) -> None:
-    bench.board.type(b"\x03\x03\x00" + ASK)
+    bench.board.console.type(b"\x03\x03\x00" + ASK)
     assert of(bench.frames(0.1), Type.DESCRIBE)

@@ -12,13 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 
 from pebble.commands import app
 from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.lab.simulation.fleet import members
-from pebble.extensions.lab.simulation.mcu import Snapshot
 from pebble.extensions.lab.simulation.trace import read_trace
 from pebble.extensions.lab.simulation.wireless import KINDS
 from tests.firmware.wireless_rig import Operator
@@ -48,13 +46,6 @@ class Program:
     def err(self) -> str:
         return self._files[1].read_text()
 
-    def snapshots(self) -> list[Snapshot]:
-        return [
-            msgspec.json.decode(line, type=Snapshot)
-            for line in self.out.splitlines(keepends=True)
-            if line[-1:] == b"\n"
-        ]
-
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Any]:
@@ -77,13 +68,13 @@ def retained(port: int, topic: str) -> Any:
     return json.loads(raw) if raw else None
 
 
-def test_both_are_driven_report_their_state_and_end_at_once_by_a_signal_with_motors_off(
+def test_both_are_driven_and_end_at_once_by_a_signal_with_motors_off(
     start: Any, broker: Broker, tmp_path: Path
 ) -> None:
     address = f"127.0.0.1:{broker.port}"
     url = f"mqtt://{address}"
     traces = {kind: tmp_path / f"{kind}.jsonl" for kind in KINDS}
-    programs = {kind: start(kind, url, "--name", NAME, "--report", "--trace", str(traces[kind])) for kind in KINDS}
+    programs = {kind: start(kind, url, "--name", NAME, "--trace", str(traces[kind])) for kind in KINDS}
 
     def motors(kind: str) -> list[Any]:
         return [entry.motors for entry in read_trace(traces[kind])]
@@ -94,10 +85,6 @@ def test_both_are_driven_report_their_state_and_end_at_once_by_a_signal_with_mot
             operator.drive(kind, 0.0, 1.0)
         assert until(lambda: all(motors(kind) == [(1.0, 1.0), (0.0, 0.0)] for kind in KINDS), 5)
         for (kind, program), number in zip(programs.items(), (signal.SIGTERM, signal.SIGINT), strict=True):
-            moving, *_, last = program.snapshots()
-            assert (last.board.kind, last.plugged, last.host) == (kind, True, True)
-            assert any(one.board.motors != (0.0, 0.0) for one in program.snapshots())
-            assert last.board.pose.x_mm > 50 > moving.board.pose.x_mm
             began, ended = read_trace(traces[kind])
             assert 0.8 <= (ended.ns - began.ns) / 1e9 <= 1.2  # after the last command
             assert f"connected to the broker at {address}" in program.err

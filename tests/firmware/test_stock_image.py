@@ -30,7 +30,7 @@ class Endless(Bench):
         self.board.timers.on_wait = self._check
 
     def type(self, typed: dict[float, bytes]) -> None:
-        self.plan += [(at, lambda data=data: self.board.type(data)) for at, data in typed.items()]  # type: ignore[misc]
+        self.plan += [(at, lambda data=data: self.board.console.type(data)) for at, data in typed.items()]  # type: ignore[misc]
 
     def run(self, seconds: float, *, main: bool = False) -> None:
         """From switching on, for so long; ``main``: by main.py, with a robot of its own."""
@@ -52,7 +52,7 @@ class Endless(Bench):
     def _check(self) -> None:
         now = self.clock.now()
         self.body.end_turn()
-        if self.board.console.reading and (output := self.board.take_output()):
+        if self.board.console.reading and (output := self.board.console.take_output()):
             self.output.append((now, output))
         for entry in [entry for entry in self.plan if entry[0] <= now]:
             self.plan.remove(entry)
@@ -124,7 +124,7 @@ def test_the_imu_speaks_on_its_two_pins_and_keeps_up_with_its_slow_line() -> Non
     (line,) = lines
     assert bench.robot.ctrl_c, "USB is free there, so Ctrl-C may be let in"
     assert line.baudrate == 115200
-    bench.board.type(ASK)
+    bench.board.console.type(ASK)
     for _ in range(3000):
         bench.turn(0.001)
         line.room = min(64.0, line.room + 11.5)

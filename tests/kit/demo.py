@@ -86,8 +86,7 @@ def demos(temporary: Path) -> Iterator[list[Demo]]:
 
 
 def start(demos: list[Demo], folder: Path, arguments: str, terminal: int | None = None) -> Demo:
-    lab = "pebble.extensions.lab.demo"
-    imports = f"import sys; from {lab}.brokers import BrokerKind; from {lab}.main import run"
+    imports = "import sys; from pebble.extensions.lab.demo.main import run"
     demos.append(Demo(folder, f"{imports}; sys.exit(run({arguments}))", terminal))
     return demos[-1]
 

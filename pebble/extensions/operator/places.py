@@ -29,11 +29,6 @@ class Places:
         return self.etc / "setup.new"
 
     @cached_property
-    def manifest(self) -> Path:
-        """Path of an earlier setup's list, which is no longer read."""
-        return self.etc / "setup.json"
-
-    @cached_property
     def state(self) -> Path:
         """Folder of the stop and all that survives a power cut: ``pebble:pebble``, 0700; ``$STATE_DIRECTORY``."""
         return self.root / "var/lib/pebble"

@@ -2,7 +2,7 @@
 
 from pebble.config.problems import Path
 from pebble.config.reader import Reader, Rule
-from pebble.config.tree import Link, MqttBridge, Root
+from pebble.config.tree import MqttBridge, Root
 
 _LINK: Path = ("services", "mqtt_bridge", "link")
 
@@ -17,18 +17,15 @@ def _check(reader: Reader, root: Root, _: Path) -> Root:
     return root
 
 
-def _check_link(reader: Reader, link: Link, path: Path) -> Link:
-    if link.group_hz and link.profile == "wide":
-        reader.notes.problem((*path, "group_hz"), 'has no effect at profile "wide": write "thin" or "auto"')
-    if link.short and not link.group_hz:
-        reader.notes.problem((*path, "short"), "has no effect without group_hz")
-    return link
-
-
 def _check_bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
-    if bridge.link.short and bridge.remote is not None and bridge.remote.kind != "mqtt":
-        reader.notes.problem((*path, "link", "short"), f"{bridge.remote.kind} has no short names: leave it out")
+    link, remote = bridge.link, bridge.remote
+    if link.group_hz and link.profile == "wide":
+        reader.notes.problem((*path, "link", "group_hz"), 'has no effect at profile "wide": write "thin" or "auto"')
+    if link.short and not link.group_hz:
+        reader.notes.problem((*path, "link", "short"), "has no effect without group_hz")
+    if link.short and remote is not None and remote.kind != "mqtt":
+        reader.notes.problem((*path, "link", "short"), f"{remote.kind} has no short names: leave it out")
     return bridge
 
 
-RULES: tuple[Rule, ...] = ((Root, _check), (Link, _check_link), (MqttBridge, _check_bridge))
+RULES: tuple[Rule, ...] = ((Root, _check), (MqttBridge, _check_bridge))

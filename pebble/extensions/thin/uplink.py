@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from math import inf
 
@@ -13,7 +13,6 @@ from pebble.contract.payloads import SCRIPT, Drive, LinkState
 from pebble.errors import PayloadError
 from pebble.extensions.thin.group_gate import gate_of
 from pebble.extensions.thin.link import LateRun, LinkMeter, Room
-from pebble.extensions.thin.media_hold import MediaHold
 from pebble.extensions.thin.sieve import Rank, Sieve
 from pebble.extensions.thin.sifter import Sifter
 from pebble.extensions.thin.stream_groups import StreamGroups
@@ -35,6 +34,8 @@ _PAUSE = 25  # so much longer on a thin link what can wait is spread
 _HEARTBEAT_BYTES = 80  # about
 _LATE, _LATE_S = 8, 1.5  # commands, and since when all of them were late: the broker holds more of the kind
 _FLOODED_S = 60.0  # after what was done about it
+_HELD = ("camera_publisher", "video_stream", "audio_publisher")
+_HOLD_S = 5.0  # after the newest command that moves something: each beginning costs 2 KB of states and logs
 RENEW_S = 30.0  # between two connections that are renewed for it, at least: who floods must not keep the robot away
 
 
@@ -72,6 +73,29 @@ class LinkReport:
         state = LinkState(level=meter.level, drive_hz=drive_hz, rtt_ms=trip_ms, queue_ms=queue_ms, t=now_ms())
         address = self._address
         self._remote.publish(address.topic, codec.encode(LINK, state), qos=QoS(address.qos), retain=address.retain)
+
+
+class MediaHold:
+    """Requests to the launcher that programs with pictures or sound wait while a person drives over the same modem.
+
+    ``send_one`` returns False if the launcher is busy.
+    """
+
+    def __init__(self, programs: Collection[str], send_one: Callable[[str, bool], bool]) -> None:
+        self._sent = dict.fromkeys((name for name in _HELD if name in programs), False)
+        self._send_one = send_one
+        self._driven_at = -inf
+
+    def note_drive(self, now: float) -> None:
+        """Note a command over a thin link that moves something. Any thread may call this."""
+        self._driven_at = now
+
+    def send(self, now: float) -> None:
+        """Send the requests that have changed with time, and again those that the launcher has not accepted."""
+        on = now - self._driven_at < _HOLD_S
+        for program, sent in self._sent.items():
+            if sent is not on and self._send_one(program, on):
+                self._sent[program] = on
 
 
 def make_uplink(

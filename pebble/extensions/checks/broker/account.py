@@ -13,7 +13,6 @@ from pebble.contract import BRIDGE_PROBE, ONLINE
 from pebble.contract.identity import SERVERS, Identity
 from pebble.contract.levels import LEVELS
 from pebble.errors import TransportError
-from pebble.extensions.checks.broker.login import SMALLER_PACKETS
 from pebble.extensions.checks.broker.login_attempt import reached
 from pebble.extensions.checks.broker.messages import REFUSED, held_back
 from pebble.extensions.checks.broker.peer import BrokerTrial, Peer
@@ -21,7 +20,6 @@ from pebble.forwarding.probes import new_probe
 from pebble.transports import MqttSettings
 from pebble.transports.mqtt import reasons
 
-_LARGE = 1000  # bytes of a nonce, written as 2 kB: more than a packet carries
 _MATTERS_S = 0.02  # a shorter round trip delays nothing that people notice: our own programs acknowledge at once
 
 
@@ -63,9 +61,6 @@ def robot_account(
                 yield _rules(what, trial, peer, topic)
             if is_back and trial.round_trip_s >= _MATTERS_S:
                 yield replace(held_back(trial, peer, peer, topic), what=f"small messages at {what}")
-            if is_back and not _echo(trial, peer, topic, _LARGE)[0]:
-                text = "a message of 2 kB does not come back, small ones do: the way there seems to lose large packets"
-                yield warn(text, SMALLER_PACKETS, what)
     except TransportError as error:
         yield warn(f"cannot be published to: {error}", what=what)
 
@@ -76,9 +71,9 @@ def page_account(what: str, settings: MqttSettings, level: SecurityLevel = "open
     return robot_account(what, settings, base, level=level, reads=states)
 
 
-def _echo(trial: BrokerTrial, peer: Peer, topic: str, nonce_bytes: int = 8) -> tuple[bool, str]:
+def _echo(trial: BrokerTrial, peer: Peer, topic: str) -> tuple[bool, str]:
     """Publish a probe; return whether it came back, and the broker's reason if it refused the probe."""
-    payload, began = new_probe(time.time_ns() // 1_000_000, nonce_bytes), time.monotonic()
+    payload, began = new_probe(time.time_ns() // 1_000_000), time.monotonic()
     mid = peer.publish(topic, payload, qos=1)
 
     def refusal() -> str:

@@ -12,10 +12,8 @@ from pebble.extensions.checks.broker import MOSQUITTO
 from pebble.extensions.checks.broker.login_attempt import TIMEOUT_S, LoginAttempt, attempt
 from pebble.extensions.checks.check import SOON_DAYS
 from pebble.extensions.checks.machine import printed
-from pebble.transports.hosts import SMALL_SEGMENT
 from pebble.transports.settings import MqttSettings
 
-SMALLER_PACKETS = "set a smaller MTU at its network card, or let ICMP pass"  # the way loses large ones
 _REFUSED_ID = 2  # a return code of CONNACK (MQTT 3.1.1, table 3.1)
 _UNKNOWN = "does not tell whether it lets in who has no login"
 _HERE_S = 1.0  # within which an address of this machine answers
@@ -31,14 +29,6 @@ def broker(
     what, is_here = f"{name} {settings.host}:{settings.port}", is_loopback(settings.host)
     answer = attempt(settings, login=True, timeout_s=answer_s)
     if answer.code is None:
-        small = replace(settings, max_segment=SMALL_SEGMENT)  # a certificate is the first that is large
-        if settings.tls is not None and attempt(small, login=True, timeout_s=answer_s).code is not None:
-            yield failed(
-                f"lets in small packets only: the way there seems to lose large packets ({answer.problem})",
-                SMALLER_PACKETS,
-                what,
-            )
-            return
         start = "sudo systemctl start mosquitto" if is_here else f"nc -vz {settings.host} {settings.port}"
         yield failed(f"cannot be reached: {answer.problem}", start, what)
         return

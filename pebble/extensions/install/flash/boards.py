@@ -1,10 +1,10 @@
 """The boards for which firmware exists, and the board of each robot."""
 
-from binascii import crc_hqx
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from pebble.errors import PebbleError
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import FrameError, decode
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,8 +30,6 @@ class Board:
         file = "-".join(filter(None, (self.build, self.variant)))
         return f"{file} at https://micropython.org/download/{self.build}"
 
-
-_HEADER = 13  # bytes before the payload of a frame
 
 SAMD21 = Board(title="Seeed XIAO SAMD21", build="SEEED_XIAO_SAMD21", machine="SAMD21", port="samd", arch="armv6m")
 ESP32_C6 = Board(
@@ -73,19 +71,17 @@ def _lines(beginning: bytes) -> Callable[[bytes], bool]:
     return lambda received: any(line.startswith(beginning) for line in received.split(b"\n")[1:-1])
 
 
-def _frames(received: bytes) -> bool:
-    """True if a complete frame of pebble_serial_v1 was received: COBS(body, CRC-16/CCITT-FALSE), then a zero."""
-    return any(_is_frame(frame) for frame in received.split(b"\0")[1:-1])
+def has_frame(received: bytes) -> bool:
+    """True if a whole frame of pebble_serial_v1 was received."""
+    return any(map(_is_frame, received.split(b"\0")))
 
 
-def _is_frame(cobs: bytes) -> bool:
-    plain, at = b"", 0
-    while at < len(cobs):
-        run = cobs[at]
-        plain += cobs[at + 1 : at + run] + b"\0" * (run < 255)
-        at += run
-    body, check = plain[:-3], plain[-3:-1]  # the last zero is COBS's own
-    return len(body) >= _HEADER and crc_hqx(body, 0xFFFF).to_bytes(2, "little") == check
+def _is_frame(stuffed: bytes) -> bool:
+    try:
+        decode(stuffed)
+    except FrameError:
+        return False
+    return True
 
 
 FIRMWARE = {
@@ -95,7 +91,7 @@ FIRMWARE = {
         Firmware(name="benjr", board=ESP8266),
         Firmware(name="goob", board=SAMD21, baud=460800, is_report=_lines(b"T a0=")),
         Firmware(name="fred", board=SAMD21, is_report=_lines(b"T t0=")),
-        Firmware(name="goob_imu", board=SAMD21, is_report=_frames, fallback_port="D6 and D7, 115200 baud"),
+        Firmware(name="goob_imu", board=SAMD21, is_report=has_frame, fallback_port="D6 and D7, 115200 baud"),
     )
 }
 

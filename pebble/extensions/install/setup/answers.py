@@ -164,32 +164,6 @@ def _broker_mistake(text: str) -> str:
     return ""
 
 
-def require(answers: Answers, secrets: Secrets, *, has_login: bool, has_people: bool, has_user: bool) -> None:
-    """Raise AnswersError with the keys that have no answer.
-
-    ``has_login``: the robot already logs in at this broker; ``has_people``: the page has users; ``has_user``: this one.
-    """
-    is_there = {
-        "id": answers.id is not None,
-        "port": answers.port is not None,
-        "protocol": answers.protocol is not None or answers.port in (None, NONE),
-        "camera": answers.camera is not None,
-        "broker": answers.broker is not None,
-        "broker_user": answers.broker_user is not None or not answers.is_far or has_login,
-        "broker_password_file": secrets.broker_password is not None or not needs_login(answers) or has_login,
-        "page": answers.page is not None,
-        "user": answers.user is not None or not needs_user(answers, has_people=has_people),
-        "password_file": secrets.password is not None or not needs_user(answers, has_people=has_people) or has_user,
-    }
-    if missing := [key for key, has_answer in is_there.items() if not has_answer]:
-        raise AnswersError("\n".join(f"{key} is missing: {KEYS[key]}" for key in missing))
-
-
 def needs_login(answers: Answers) -> bool:
     """True if the robot logs in at a broker of others."""
     return answers.is_far or (answers.remote is not None and answers.broker_user is not None)
-
-
-def needs_user(answers: Answers, *, has_people: bool) -> bool:
-    """True if the page gets a user."""
-    return bool(answers.page) and (answers.user is not None or not has_people)

@@ -5,7 +5,7 @@ import shutil
 import socket
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,11 +15,11 @@ from pebble.check_result import State
 from pebble.extensions.checks.machine import clock, synchronised
 from pebble.extensions.checks.program import run
 from pebble.extensions.fleet.folder import PLAIN_PORT, PORT
+from pebble.extensions.install.flash.boards import has_frame
 from pebble.extensions.operator.places import Places
-from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import FrameError, decode
 
 DEVICES, SERIAL_PORTS = Path("/dev"), Path("/dev/serial/by-id")
-BAUDS = (460800, 115200)
+_BAUDS = (460800, 115200)
 LISTEN_S = 1.2
 _MOST = 65536  # bytes that are looked at
 _ENOUGH = 0.8  # of the lines must be readable; the first one is cut off
@@ -50,19 +50,19 @@ class Board:
     protocol: str | None = None  # None: it does not show
 
 
-def boards(folder: Path, bauds: Sequence[int] = BAUDS, seconds: float = LISTEN_S) -> Iterator[Board]:
+def boards(folder: Path, seconds: float = LISTEN_S) -> Iterator[Board]:
     """Listen on each serial port that has a lasting name."""
     for path in sorted(folder.glob("*")):
-        yield listen(str(path), bauds, seconds)
+        yield listen(str(path), seconds)
 
 
-def listen(port: str, bauds: Sequence[int] = BAUDS, seconds: float = LISTEN_S) -> Board:
+def listen(port: str, seconds: float) -> Board:
     """Return the board at a port, by what the port sends by itself.
 
     Nothing is written to it, and its reset lines are not changed.
     """
     try:
-        for baud in bauds:
+        for baud in _BAUDS:
             received = _received(port, baud, seconds)
             if (understood := _understood(received)) is not None:
                 protocol, what = understood
@@ -85,7 +85,7 @@ def _received(port: str, baud: int, seconds: float) -> bytes:
 def _understood(received: bytes) -> tuple[str | None, str] | None:
     """Return the protocol, and what was received in words; None if nothing makes sense at this speed."""
     if b"\0" in received:
-        return ("pebble_serial_v1", "frames") if any(map(_is_frame, received.split(b"\0"))) else None
+        return ("pebble_serial_v1", "frames") if has_frame(received) else None
     lines = [line.strip() for line in received.split(b"\n") if line.strip()]
     readable = [line for line in lines if line.isascii() and line.decode().isprintable()]
     if not readable or len(readable) < _ENOUGH * len(lines):
@@ -95,14 +95,6 @@ def _understood(received: bytes) -> tuple[str | None, str] | None:
     if not known_kinds:
         return None, f"{len(readable)} lines"
     return _KINDS[known_kinds[0]], f"`{'`, `'.join(kind.decode() for kind in known_kinds)}` lines"
-
-
-def _is_frame(stuffed: bytes) -> bool:
-    try:
-        decode(stuffed)
-    except FrameError:
-        return False
-    return True
 
 
 def cameras(devices: Path) -> Iterator[str]:

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.extensions.fleet.people import has_user, usable
 from pebble.extensions.install.setup import detect
-from pebble.extensions.install.setup.answers import HERE, NONE, AnswersError, needs_login, needs_user
+from pebble.extensions.install.setup.answers import HERE, NONE, AnswersError, needs_login
 from pebble.extensions.install.setup.steps import Job
 
 _Given = dict[str, Any]
@@ -130,7 +130,7 @@ def _with_passwords(job: Job) -> Job:
             text, default = f"{text} (empty: as before)", ""
         typed = str(typer.prompt(text, default=default, show_default=False, hide_input=True))
         secrets = replace(secrets, broker_password=typed or None)
-    if needs_user(answers, has_people=bool(answers.page) and has_user(job.people)):
+    if job.needs_user:
         text = f"   Password of {answers.user}"
         typed = str(typer.prompt(text, hide_input=True, confirmation_prompt="   Again"))
         secrets = replace(secrets, password=usable(typed))

@@ -42,8 +42,8 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
     runs, the files beyond its own, and its scripts; it raises to prevent the restore.
     """
     backup, places = backups.read(file), system.places
-    config, manifest = (str(file.relative_to(places.root)) for file in (places.config, places.manifest))
-    files = {name: saved for name, saved in _allowed(backup.files, places).items() if name not in (config, manifest)}
+    config = str(places.config.relative_to(places.root))
+    files = {name: saved for name, saved in _allowed(backup.files, places).items() if name != config}
     if config not in backup.files:
         raise SetupError(f"{file}: has no {config}: it is no backup of a robot that is installed")
     files[config] = backup.files[config]

@@ -20,13 +20,14 @@ from pebble.extensions.fleet.roles import Role
 from pebble.extensions.install.setup import own_broker
 from pebble.extensions.install.setup.answers import (
     HERE,
+    KEYS,
+    NONE,
     PAGE,
     Answers,
     AnswersError,
     Secrets,
     combined,
-    needs_user,
-    require,
+    needs_login,
 )
 from pebble.extensions.install.setup.detect import no_broker
 from pebble.extensions.install.setup.robot_config import (
@@ -96,6 +97,11 @@ class Job:
     def people(self) -> Path:
         return self.places.people if self.page is None else people_of(self.page)
 
+    @property
+    def needs_user(self) -> bool:
+        """True if the page gets a user."""
+        return bool(self.answers.page) and (self.answers.user is not None or not has_user(self.people))
+
     def with_answers(self, given: Mapping[str, Any], secrets: Secrets | None = None) -> "Job":
         """Return the job with further answers. Raises AnswersError with a line for each mistake."""
         answers = combined(self.answers, given)
@@ -105,9 +111,22 @@ class Job:
 
     def require(self) -> None:
         """Raise AnswersError with the keys that still need an answer."""
-        has_people = bool(self.answers.page) and has_user(self.people)
-        is_known = self.answers.user is not None and has_user(self.people, self.answers.user)
-        require(self.answers, self.secrets, has_login=self.has_login, has_people=has_people, has_user=is_known)
+        answers, secrets = self.answers, self.secrets
+        is_known = answers.user is not None and has_user(self.people, answers.user)
+        is_there = {
+            "id": answers.id is not None,
+            "port": answers.port is not None,
+            "protocol": answers.protocol is not None or answers.port in (None, NONE),
+            "camera": answers.camera is not None,
+            "broker": answers.broker is not None,
+            "broker_user": answers.broker_user is not None or not answers.is_far or self.has_login,
+            "broker_password_file": secrets.broker_password is not None or not needs_login(answers) or self.has_login,
+            "page": answers.page is not None,
+            "user": answers.user is not None or not self.needs_user,
+            "password_file": secrets.password is not None or not self.needs_user or is_known,
+        }
+        if missing := [key for key, has_answer in is_there.items() if not has_answer]:
+            raise AnswersError("\n".join(f"{key} is missing: {KEYS[key]}" for key in missing))
 
     # -- the steps
 
@@ -119,9 +138,6 @@ class Job:
         steps.append(self._config())
         if self.system.has_systemd:
             steps.append(self._enabled())
-        if self.places.manifest.exists():
-            what = f"remove {self.places.named(self.places.manifest)}, which an earlier version needed"
-            steps.append(Step(what, lambda: False, self.places.manifest.unlink, ()))
         return steps
 
     def _passwords(self) -> Iterator[Step]:
@@ -202,7 +218,7 @@ class Job:
 
     def _first_user(self) -> Iterator[Step]:
         file, name = self.people, self.answers.user
-        if not needs_user(self.answers, has_people=has_user(file)):
+        if not self.needs_user:
             return
 
         def add() -> None:

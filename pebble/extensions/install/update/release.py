@@ -145,7 +145,7 @@ def _numbers(version: str) -> tuple[int, ...]:
     return tuple(int(number) for number in re.findall(r"\d+", version)[:3])
 
 
-def main(arguments: Sequence[str], *, test_key: bool = False) -> int:
+def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m pebble.update.release", description="Verify a release.")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--trusted", type=Path, required=True, help="folder of the release whose keys count")
@@ -154,7 +154,7 @@ def main(arguments: Sequence[str], *, test_key: bool = False) -> int:
     try:
         keys = msgspec.json.decode(_read(options.trusted / MANIFEST), type=Release).keys
         above = int(_read(options.above)) if options.above.exists() else 0
-        release = verify(options.folder, keys, above=above, test_key=test_key)
+        release = verify(options.folder, keys, above=above)
     except (PebbleError, ValueError) as error:
         sys.stderr.write(f"pebble: refused: {error}\n")
         return 1

@@ -17,7 +17,6 @@ from paho.mqtt.enums import CallbackAPIVersion
 from pebble import contract
 from pebble.contract.payloads import Drive
 from pebble.errors import PayloadError, PebbleError
-from pebble.extensions.lab.rig.robot import BASE, MEDIA, Robot, one_robot
 from pebble.extensions.lab.rig.scripted_operator import ScriptedOperator
 from pebble.extensions.media.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.operator.client.robot_view import RobotView
@@ -148,16 +147,6 @@ class RobotSubscriber(StockClient):
             and all_ready(json.loads(message.payload)["value"])
         ):
             self.ready_ns = now
-
-
-@contextmanager
-def ready_robot(kind: str) -> Iterator[tuple[Robot, RobotSubscriber]]:
-    """Yield a robot with camera and microphone whose services are ready. Raises PebbleError with its log."""
-    with one_robot(kind, services=MEDIA) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
-        subscriber.wait()
-        robot.launch()
-        robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", UP_S)
-        yield robot, subscriber
 
 
 def encoding_of(raw: bytes) -> str:

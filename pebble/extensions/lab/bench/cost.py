@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -19,12 +20,12 @@ from rich.console import Console
 from rich.table import Table
 
 from pebble.errors import PebbleError
-from pebble.extensions.lab.bench.clients import RobotSubscriber, driving, ready_robot
+from pebble.extensions.lab.bench.clients import UP_S, RobotSubscriber, driving
 from pebble.extensions.lab.bench.results import Cell, Results, begin, grouped, round_cell
 from pebble.extensions.lab.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.extensions.lab.bench.show import RATIOS, Shown, compared, middle, plain_table
 from pebble.extensions.lab.bench.usage import cpu_s, pss_mb, threads
-from pebble.extensions.lab.rig.robot import BASE, KINDS, Robot
+from pebble.extensions.lab.rig.robot import BASE, KINDS, MEDIA, Robot, one_robot
 
 ALL: Final = "all"  # the processes of a robot together
 MEMORY, CPU, THREADS = "PSS", "CPU", "threads"
@@ -66,7 +67,10 @@ def run(settings: Settings, console: Console) -> Shown:
 
 def measure(variant: str, seconds: float) -> Iterator[Cell]:
     """Yield the results of all phases of a fresh robot. Raises PebbleError with its log if a phase does not start."""
-    with ready_robot(variant) as (robot, subscriber):
+    with one_robot(variant, services=MEDIA) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
+        subscriber.wait()
+        robot.launch()
+        robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", UP_S)
         yield from _phase(robot, IDLE, seconds)
         with driving(robot.remote_port, BASE):
             yield from _phase(robot, DRIVING, seconds)

@@ -203,11 +203,7 @@ def capabilities(identity: Identity) -> bytes:
     """Return the payload of the capabilities of a board that drives."""
     drive = {"available": True, "controls": True, "axes": ["x", "z", "y"], "topic": DRIVE.topic(identity.base)}
     value = {"identity": msgspec.to_builtins(identity), "transport": {"kind": "mqtt"}, "drive": drive}
-    return json.dumps({"schema": "pebble-capabilities/v1", "t": _epoch_ms(), "value": value}).encode()
-
-
-def _epoch_ms() -> int:
-    return int(1000 * time.time())
+    return json.dumps({"schema": "pebble-capabilities/v1", "t": int(1000 * time.time()), "value": value}).encode()
 
 
 def main(port: int, count: int) -> None:
@@ -224,7 +220,7 @@ def main(port: int, count: int) -> None:
         for topic, publish in boards:
             due = max(due + HEARTBEAT_S / count, time.monotonic() - HEARTBEAT_S)
             time.sleep(max(0.0, due - time.monotonic()))
-            publish(topic, b'{"t": %d, "online": true}' % _epoch_ms())
+            publish(topic, b'{"t": %d, "online": true}' % int(1000 * time.time()))
 
 
 if __name__ == "__main__":

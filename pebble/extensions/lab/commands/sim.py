@@ -30,11 +30,10 @@ _OF = {
     "folder": ("world",),
     "trace": (*_SERIAL, *_WIFI, "world"),
     "trace_output": _SERIAL,
-    "report": (*_SERIAL, *_WIFI, "world"),
     "control": (*_SERIAL, "world"),
 }
 
-Kind = Literal["goob", "fred", "goob_imu", "minilamp", "benjr", "fleet", "world", "loudspeaker"]
+Kind = Literal["goob", "fred", "goob_imu", "minilamp", "benjr", "fleet", "world"]
 
 
 def sim(
@@ -66,7 +65,6 @@ def sim(
         typer.Option(help="File for what boards receive and motors do; of a world the folder.", metavar="PATH"),
     ] = None,
     trace_output: Annotated[bool, typer.Option("--trace-said", help="Also trace what the board sends.")] = False,
-    report: Annotated[bool, typer.Option("--report", help="Print the state as JSON, ten times a second.")] = False,
     control: Annotated[bool, typer.Option("--control", help="Read commands, such as unplug, from stdin.")] = False,
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
@@ -76,8 +74,7 @@ def sim(
     goob, fred and goob_imu are boards on a pseudo terminal: set serial.port in a robot's config to its link.
     minilamp and benjr are whole robots on a real broker; fleet is many of them, minilamp-001, benjr-001 and so on, and
     exits 0 only if all were online at the end. world is a room with walls and AprilTags, which robots' cameras see; it
-    prints what belongs in their configs. loudspeaker takes aplay's arguments, and with --record FOLDER records what is
-    played.
+    prints what belongs in their configs.
 
     \b
         pebble sim goob --link /tmp/goob
@@ -85,26 +82,21 @@ def sim(
         pebble sim minilamp --broker minilamp.json
         pebble sim fleet --robots 200 --broker mqtt://127.0.0.1
         pebble sim world world.json
-        pebble sim loudspeaker --record /tmp/played clip.wav
     """
     _check_options(context, kind)
-    if kind == "loudspeaker":
-        from pebble.extensions.lab.simulation.loudspeaker import main
-
-        return main([word for word in (name, *context.args) if word is not None])
-    _check_words(kind, [word for word in (name, *context.args) if word is not None])
+    if name is not None and kind not in _NAMED:
+        raise typer.BadParameter(f"{kind} takes no {name}")
     if kind == "world":
         from pebble.extensions.lab.simulation.world.program import ROOM
         from pebble.extensions.lab.simulation.world.program import run as run_world
 
-        return run_world(Path(name or ROOM), folder, trace=trace, report=report, control=control)
+        return run_world(Path(name or ROOM), folder, trace=trace, control=control)
     if kind in _SERIAL:
         from pebble.extensions.lab.simulation.mcu import run as run_mcu
 
         path = link or Path(tempfile.gettempdir(), f"pebble-{kind}")
-        if not report:
-            typer.echo(f"{kind} is at {path}; Ctrl-C ends it")
-        return run_mcu(kind, path, trace=trace, trace_output=trace_output, report=report, control=control)
+        typer.echo(f"{kind} is at {path}; Ctrl-C ends it")
+        return run_mcu(kind, path, trace=trace, trace_output=trace_output, control=control)
     if broker is None:
         raise typer.BadParameter(f"{kind} needs --broker URL")
     address, config = _broker(broker, password_file, ca_cert)
@@ -112,7 +104,7 @@ def sim(
         from pebble.extensions.lab.simulation.networked import run_fleet
 
         return run_fleet(address, robots)
-    return _wireless(kind, name, address, config, called, trace=trace, report=report, files=files)
+    return _wireless(kind, name, address, config, called, trace=trace, files=files)
 
 
 def demo(
@@ -146,15 +138,6 @@ def _check_options(context: typer.Context, kind: str) -> None:
             raise typer.BadParameter(f"{kind} takes no {parameter.opts[0]}")
 
 
-def _check_words(kind: str, words: list[str]) -> None:
-    """Raise BadParameter for an unknown option, and for more words than this kind takes."""
-    for word in words:
-        if word.startswith("-"):
-            raise typer.BadParameter(f"there is no option {word}")
-    if len(words) > (kind in _NAMED):
-        raise typer.BadParameter(f"{kind} takes no {words[-1]}")
-
-
 def _wireless(
     kind: str,
     id_: str | None,
@@ -163,7 +146,6 @@ def _wireless(
     called: str,
     *,
     trace: Path | None,
-    report: bool,
     files: Path | None,
 ) -> int:
     from pebble.contract.identity import Identity
@@ -173,9 +155,8 @@ def _wireless(
     if config is not None:
         identity, security = Identity(config.robot.system, config.robot.type, id_ or config.robot.id), config.security
         called = called or config.robot.name or ""
-    if not report:
-        typer.echo(f"{identity} connects to the broker at {broker.host}:{broker.port}; Ctrl-C ends it")
-    return run(kind, identity, broker, name=called, security=security, trace=trace, report=report, files=files)
+    typer.echo(f"{identity} connects to the broker at {broker.host}:{broker.port}; Ctrl-C ends it")
+    return run(kind, identity, broker, name=called, security=security, trace=trace, files=files)
 
 
 def _broker(broker: str, password_file: Path | None, ca_cert: Path | None) -> tuple[MqttSettings, Config | None]:
@@ -190,6 +171,5 @@ def _broker(broker: str, password_file: Path | None, ca_cert: Path | None) -> tu
 
 
 def register(app: typer.Typer) -> None:
-    others = {"ignore_unknown_options": True, "allow_extra_args": True}  # those of a loudspeaker
-    app.command("sim", context_settings=others)(sim)
+    app.command("sim")(sim)
     app.command("demo")(demo)

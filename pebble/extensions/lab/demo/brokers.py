@@ -6,7 +6,6 @@
 import asyncio
 import sys
 from collections.abc import Iterator
-from enum import StrEnum
 from importlib.util import find_spec
 from typing import Any
 
@@ -14,23 +13,15 @@ from pebble.errors import PebbleError
 from pebble.extensions.lab.rig.processes import HOST
 from pebble.extensions.operator.places import mosquitto_path
 
-
-class BrokerKind(StrEnum):
-    MOSQUITTO = "mosquitto"
-    EMBEDDED = "embedded"
-
-    @property
-    def program(self) -> str | None:
-        """Module that runs as the broker; None: the broker is mosquitto."""
-        return "pebble.extensions.lab.demo.brokers" if self is BrokerKind.EMBEDDED else None
+EMBEDDED = "pebble.extensions.lab.demo.brokers"  # the module that runs amqtt
 
 
-def best_kind() -> BrokerKind:
-    """Return the best kind of broker on this machine. If there is none, raise PebbleError with both remedies."""
+def broker_program() -> str | None:
+    """Return the module that runs as the broker; None: mosquitto. Raises PebbleError if neither is installed."""
     if mosquitto_path() is not None:
-        return BrokerKind.MOSQUITTO
+        return None
     if find_spec("amqtt") is not None:
-        return BrokerKind.EMBEDDED
+        return EMBEDDED
     raise PebbleError(
         "no broker: install mosquitto (apt install mosquitto) or amqtt (pip install 'pebble-robot[demo]')"
     )

@@ -9,11 +9,9 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
 from typing import Any
-from urllib.request import urlopen
 
 from rich.console import Console
 
@@ -21,12 +19,11 @@ from pebble.contract import DRIVE
 from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
 from pebble.extensions.lab.demo import phone
-from pebble.extensions.lab.demo.brokers import BrokerKind, best_kind
-from pebble.extensions.lab.demo.media import MediaViewer
+from pebble.extensions.lab.demo.brokers import EMBEDDED, broker_program
 from pebble.extensions.lab.demo.operator import FIRST_ROUND_S, STEPS, TAKE_OVER, Operator
 from pebble.extensions.lab.demo.outcome import Outcomes, outcome_of
 from pebble.extensions.lab.demo.phone import Phone
-from pebble.extensions.lab.demo.view import View, show_media, show_outcomes
+from pebble.extensions.lab.demo.view import View, show_outcomes
 from pebble.extensions.lab.rig.processes import HOST
 from pebble.extensions.lab.rig.robot import SimulatedRobot
 from pebble.extensions.lab.rig.testbed import ROBOTS, PageServer, Testbed
@@ -44,33 +41,26 @@ Goob also with inertial sensor, loudspeaker and scripts, in a room with tags.
 MiniLAMP and BenJr are MCUs that use MQTT themselves: their firmware, on
 simulated pins."""
 _GOOB = Identity("pebble", "robots", "goob")
-_INDEX_S = 40.0
 _RECORDED = ("--keep", "256M", "--rotate", "5min")
 
 
-def run(
-    seconds: float | None = None,
-    *,
-    broker: BrokerKind | None = None,
-    console: Console | None = None,
-    for_phones: bool = False,
-) -> int:
+def run(seconds: float | None = None, *, embedded: bool = False, for_phones: bool = False) -> int:
     """Run the demo until Ctrl-C, or for ``seconds`` of driving; return 0 if every robot moved and stopped as commanded.
 
-    With ``seconds`` at least one whole round of the script must have been driven. ``broker`` selects a kind instead of
-    the best one available. ``for_phones``: other machines reach the page, see Phone. Every process ends with the demo;
-    its folder of logs stays only after a failure. Raises PebbleError if the demo cannot be set up.
+    With ``seconds`` at least one whole round of the script must have been driven. ``embedded``: with the brokers that
+    are used where mosquitto is not installed. ``for_phones``: other machines reach the page, see Phone. Every process
+    ends with the demo; its folder of logs stays only after a failure. Raises PebbleError if the demo cannot be set up.
     """
-    console = console or Console()
+    console = Console()
     if seconds is not None and seconds < SHORTEST_S:
         raise PebbleError(f"one round of driving takes {SHORTEST_S:.0f} s: give it at least that many seconds")
     require_packages()
     if for_phones:
         phone.require_terminal()
-    kind = broker or best_kind()
+    program = EMBEDDED if embedded else broker_program()
     with ending_on_signals() as ending, Testbed(ending) as testbed:
         demo = Demo(testbed, console, ending, seconds)
-        demo.start(kind, Phone(testbed.folder) if for_phones else None)
+        demo.start(program, Phone(testbed.folder) if for_phones else None)
         problems = demo.play()
         testbed.keep = bool(problems)
         demo.show_results(problems)
@@ -84,21 +74,19 @@ class Demo:
         self._testbed, self._console, self._ending, self._seconds = testbed, console, ending, seconds
         self._outcomes = Outcomes()
 
-    def start(self, kind: BrokerKind, opened: Phone | None) -> None:
+    def start(self, broker: str | None, opened: Phone | None) -> None:
         """Start every process, and connect to the broker."""
         console, testbed = self._console, self._testbed
-        console.print(f"Two brokers ({kind}): a remote one, and the one that Fred carries.")
-        testbed.start_brokers(kind.program)
+        name = "mosquitto" if broker is None else "amqtt"
+        console.print(f"Two brokers ({name}): a remote one, and the one that Fred carries.")
+        testbed.start_brokers(broker)
         console.print(_ROBOTS)
         self._start_page(opened)
-        if opened is None and self._seconds is None:
-            threading.Thread(target=self._index, name="pebble-demo-index", daemon=True).start()
         self._broker_url = f"mqtt://{HOST}:{testbed.broker_port}"
         self._invite()
         testbed.start_robots()
         self._operator = Operator(testbed.broker_port)
         self._operator.connect()
-        self._media = MediaViewer(testbed.broker_port)
 
     def play(self) -> list[str]:
         """Drive until the end; return a line for each robot and each process that failed."""
@@ -110,14 +98,12 @@ class Demo:
                 self._drive(view)
             problems = self._testbed.unexpected_exits()
         finally:
-            self._media.end()
             self._operator.close()
         if missing and not self._ending.is_set():
             return problems + [f"{name} did not become ready to drive within {_DISCOVERY_S:.0f} s" for name in missing]
         return problems + [f"{robot.name}: {'; '.join(wrong)}" for robot in robots if (wrong := self._wrong(robot))]
 
     def show_results(self, problems: list[str]) -> None:
-        show_media(self._console, self._media.received)
         show_outcomes(self._console, ROBOTS, self._outcomes)
         for problem in problems:
             self._console.print(problem, style="red", highlight=False, markup=False, soft_wrap=True)
@@ -140,13 +126,6 @@ class Demo:
         print_line(console, f"Its Recordings show what they do, from {recordings}, which the demo deletes at its end.")
         if opened is not None:
             opened.show(self._page_url, console)
-
-    def _index(self) -> None:
-        """Request the data that Recordings shows first, now and then, so that the server has it ready for visitors."""
-        while not self._ending.wait(_INDEX_S):
-            path = f"archive/timeline?day={datetime.now(UTC):%Y-%m-%d}&robot={_GOOB.base}"
-            with suppress(OSError), urlopen(self._page_url + path, timeout=_INDEX_S):  # noqa: S310 - its own page
-                pass
 
     def _invite(self) -> None:
         """Print the broker's address, and commands to paste into another terminal in this folder."""
@@ -174,10 +153,7 @@ class Demo:
 
     def _drive(self, view: View) -> None:
         """Drive for the given time, but at least one round. Without a time drive one round, then wait."""
-        for_visitors = self._seconds is None
-        self._operator.begin(f"the robots are yours: {self._page_url}" if for_visitors else "")
-        if not for_visitors:  # a robot has one encoding for everybody: people choose theirs in the page
-            self._media.begin([robot.base for robot in self._testbed.robots.values() if robot.has_media])
+        self._operator.begin(f"the robots are yours: {self._page_url}" if self._seconds is None else "")
         end = math.inf if self._seconds is None else time.monotonic() + self._seconds
         while not self._ending.wait(_POLL_S) and not self._testbed.unexpected_exits():
             if time.monotonic() > (end if self._operator.rounds else end + _SLOW_S):
@@ -195,13 +171,10 @@ class Demo:
     def _wrong(self, robot: SimulatedRobot) -> list[str]:
         """Return what a robot did wrong, and with a time also what it did not do, unless a person took it."""
         wrong = self._outcomes.problems(robot.name)
-        if self._seconds is None:
+        if self._seconds is None or robot.name in self._operator.visitors.left_alone:
             return wrong
-        if robot.name not in self._operator.visitors.left_alone:
-            steps = (*STEPS, TAKE_OVER) if robot.has_scripts else STEPS
-            wrong += [f"{step}: not done" for step in steps if self._outcomes.of(robot.name, step) is None]
-        missing = self._media.received[robot.name].missing() if robot.name in self._media.received else []
-        return wrong + [f"nothing arrived as {encoding}" for encoding in missing]
+        steps = (*STEPS, TAKE_OVER) if robot.has_scripts else STEPS
+        return wrong + [f"{step}: not done" for step in steps if self._outcomes.of(robot.name, step) is None]
 
 
 def _pebble() -> str:

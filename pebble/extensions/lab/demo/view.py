@@ -3,13 +3,12 @@
 import math
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from rich.console import Console
 from rich.table import Table
 
-from pebble.extensions.lab.demo.media import CountedMedia
 from pebble.extensions.lab.demo.operator import Operator
 from pebble.extensions.lab.demo.outcome import Outcome, Outcomes
 from pebble.extensions.lab.rig.robot import SimulatedRobot
@@ -83,10 +82,3 @@ def _cell(outcome: Outcome | None) -> str:
         return "–"
     off = "never off" if math.isinf(outcome.off_s) else f"{outcome.off_s * 1000:.0f} ms"
     return f"{'FAILED' if outcome.wrong else 'ok'}  {off}"
-
-
-def show_media(console: Console, received: Mapping[str, CountedMedia]) -> None:
-    """Print a line for each robot with the number of its pictures and sounds."""
-    for name, media in received.items():
-        counts = ", ".join(f"{encoding} {number}" for encoding, number in media.counted.items())
-        console.print(f"Pictures and sounds from {name}: {counts or 'none'}", highlight=False, soft_wrap=True)

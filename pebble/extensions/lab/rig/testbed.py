@@ -30,7 +30,7 @@ TAG_ID = 21  # of the tag that Goob follows, as in the world file
 _BOARDS = {"minilamp": "ESP32-C6", "benjr": "ESP8266"}
 _RESTART = ["sh", "-c", "kill $PPID"]  # the bridge alone, which runs it: the demo would take more for a failure
 _RATE = 16_000
-_POLL_S = 0.02
+_READY_S, _POLL_S = 30.0, 0.02
 HORN = struct.pack("<40h", *[8000] * 20, *[-8000] * 20) * 400  # the clip: 1 s of 400 Hz
 #: After the first round of driving Goob looks at the tag, with Fred in sight, and both have space for further rounds.
 _START = {
@@ -198,9 +198,9 @@ class Testbed(Processes):
         for robot in self.robots.values():
             robot.bring_up(self._ending)
 
-    def wait_until_ready(self, timeout: float = 30.0) -> None:
-        """Wait until all robots can be driven. Raises PebbleError after that time, or if a process ends."""
-        discovery, end = Discovery(), time.monotonic() + timeout
+    def wait_until_ready(self) -> None:
+        """Wait until all robots can be driven. Raises PebbleError after half a minute, or if a process ends."""
+        discovery, end = Discovery(), time.monotonic() + _READY_S
         with create("mqtt", "testbed", MqttSettings(host=HOST, port=self.broker_port)) as transport:
             transport.subscribe(ALL_OUTGOING, lambda one: discovery.receive(one, time.monotonic(), time.time()))
             while sum(robot.ready(time.monotonic()) for robot in discovery.all_robots()) < len(self.robots):

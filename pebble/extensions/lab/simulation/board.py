@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from pebble.errors import ConfigError
-from pebble.extensions.lab.simulation.bodies import BoardState, Light, Pair, body_of
+from pebble.extensions.lab.simulation.bodies import Pair, body_of
 from pebble.extensions.lab.simulation.micropython.board import Board
 from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
 from pebble.extensions.lab.simulation.micropython.runner import Runner
 from pebble.extensions.lab.simulation.motion import RobotMotion
-
-__all__ = ["KINDS", "BoardState", "Light", "Profile", "SimulatedMcu"]
 
 _REPLAYED_S = 0.5  # a pause up to this is replayed turn by turn; output during a longer one is discarded
 _DEADLINES_S = 2.0  # simulated part of a longer pause: all deadlines of the firmware are over by then
@@ -82,11 +80,11 @@ class SimulatedMcu:
     def receive(self, data: bytes, now: float) -> bytes:
         """Process ``data``, which may end in the middle of a line; return the board's output."""
         output = self._advance(now, self.profile.tick_s)
-        self.board.type(data)
+        self.board.console.type(data)
         output += self._turn(now)
-        while (unread := self.board.unread) and self._clock.now() <= now:
+        while (unread := self.board.console.unread) and self._clock.now() <= now:
             output += self._turn(now)
-            if self.board.unread == unread:  # the firmware reads nothing now
+            if self.board.console.unread == unread:  # the firmware reads nothing now
                 break
         return output
 
@@ -94,9 +92,6 @@ class SimulatedMcu:
         """Advance to ``now``; return the board's output until then."""
         first, self._boot_output = self._boot_output, b""
         return first + self._advance(now, self.profile.turn_s) + self._turn(now)
-
-    def state(self) -> BoardState:
-        return self.body.state()
 
     # -- time
 
@@ -120,9 +115,9 @@ class SimulatedMcu:
         self._clock.until(now)
         self._runner.step()
         self.body.end_turn()
-        return self.board.take_output()
+        return self.board.console.take_output()
 
     def _start(self) -> None:
         """Run the first turn. Its output belongs to the boot, and answers no command."""
         self._runner.step()
-        self._boot_output = self.board.take_output()
+        self._boot_output = self.board.console.take_output()

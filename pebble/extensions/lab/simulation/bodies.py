@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
@@ -10,45 +9,13 @@ from pebble.errors import ConfigError
 from pebble.extensions.lab.simulation.i2c_devices import MotorShield, Mpu6050
 from pebble.extensions.lab.simulation.micropython.board import Board
 from pebble.extensions.lab.simulation.micropython.pins import PinName
-from pebble.extensions.lab.simulation.motion import Battery, Pose, RobotMotion, hall
+from pebble.extensions.lab.simulation.motion import Battery, RobotMotion, hall
 
 _SLICE_S = 0.02  # step of the integration of motion
 _MOST_SLICES = 1_000
 _ONE_TURN_S = 0.001  # changes of outputs within this time count as one
 
 Pair = tuple[float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Light:
-    """The present colour of a light; parts 0..1."""
-
-    blue: float
-    green: float
-    red: float
-
-
-DARK = Light(0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True, slots=True)
-class BoardState:
-    """State of a robot: wheel speeds in mm/s, and how far the wheels have turned in mm.
-
-    ``drive`` is −1..1, + = forward of the robot, ``motors`` as the pins drive them.
-    """
-
-    kind: str
-    pose: Pose
-    left_mm_s: float
-    right_mm_s: float
-    left_mm: float
-    right_mm: float
-    drive: tuple[float, float]
-    motors: tuple[float, float]
-    light: Light
-    volts: float
-    charging: bool
 
 
 class Body:
@@ -109,23 +76,6 @@ class Body:
             self._stale = False
             self._motors = self.forward(*self.outputs())
 
-    def state(self) -> BoardState:
-        self.advance()
-        self._read_outputs()
-        return BoardState(
-            kind=self.kind,
-            pose=self.motion.pose,
-            left_mm_s=self.motion.left_mm_s,
-            right_mm_s=self.motion.right_mm_s,
-            left_mm=self.motion.left_mm,
-            right_mm=self.motion.right_mm,
-            drive=self._motors,
-            motors=self.outputs(),
-            light=self.light(),
-            volts=self.battery.volts,
-            charging=self.battery.charging,
-        )
-
     def outputs(self) -> Pair:
         """Return the inputs of the left and the right motor driver, −1..1; + is forward for the driver."""
         return 0.0, 0.0
@@ -133,9 +83,6 @@ class Body:
     def forward(self, left: float, right: float) -> Pair:
         """Convert ``outputs`` to speeds of the robot's sides: + = forward."""
         return left, right
-
-    def light(self) -> Light:
-        return DARK
 
     def half_bridge(self, pins: tuple[PinName, PinName]) -> float:
         """Return the speed of a motor on half a DRV8833: the first pin high turns it forward."""
@@ -181,9 +128,9 @@ class Goob(TwoWheeled):
     def forward(self, left: float, right: float) -> Pair:
         return left, 0.0 - right  # the right motor is mounted in reverse
 
-    def light(self) -> Light:
-        level = round(self.board.duty(self.pins.LED), 3)
-        return Light(level, level, level)
+    def light(self) -> list[float]:
+        """Return the brightness of blue, green and red, 0..1."""
+        return [round(self.board.duty(self.pins.LED), 3)] * 3
 
 
 class Fred(TwoWheeled):
@@ -196,8 +143,9 @@ class Fred(TwoWheeled):
         self.measure_wheels()
         board.set_pin(self.pins.CHARGE, lambda: self.battery.charging)
 
-    def light(self) -> Light:
-        return Light(*(round(self.board.duty(pin), 3) for pin in self.pins.LED))
+    def light(self) -> list[float]:
+        """Return the brightness of blue, green and red, 0..1."""
+        return [round(self.board.duty(pin), 3) for pin in self.pins.LED]
 
 
 class Minilamp(TwoWheeled):
@@ -221,7 +169,7 @@ class Benjr(Body):
         super().__init__(board, motion)
         self.shield = MotorShield()
         self.shield.before_change = self.before_output_change
-        board.attach_i2c(self.pins.MOTOR_SHIELD, self.shield)
+        board.bus.attach(self.pins.MOTOR_SHIELD, self.shield)
         self.measure_battery()
 
     def outputs(self) -> Pair:
@@ -239,7 +187,7 @@ class GoobImu(Body):
     def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
         super().__init__(board)
         self.imu = Mpu6050(board.clock.now, motion)
-        board.attach_i2c(self.pins.IMU, self.imu)
+        board.bus.attach(self.pins.IMU, self.imu)
 
 
 BODIES: Final[dict[str, type[Body]]] = {kind.kind: kind for kind in (Goob, Fred, Minilamp, Benjr, GoobImu)}

@@ -14,7 +14,6 @@ from typing import Any, Self
 
 from pebble.contract.identity import Identity
 from pebble.errors import ConfigError
-from pebble.extensions.lab.simulation.micropython.servers import LoopbackServers
 from pebble.extensions.lab.simulation.wireless import KINDS, WirelessRobot
 from pebble.transports import MqttSettings
 
@@ -33,17 +32,13 @@ class Fleet:
     def __init__(self, broker: MqttSettings) -> None:
         self.broker = broker
         self.robots: list[WirelessRobot] = []
-        self._servers = LoopbackServers()
         self._epoll = select.epoll()
         self._due: list[float] = []  # by the robots' numbers
         self._of: dict[int, int] = {}  # file descriptor to the number of its robot
-        self._servers_of = {sock.fileno(): sock for sock in self._servers.sockets}
-        for sock in self._servers.sockets:
-            self._epoll.register(sock, select.EPOLLIN)
 
     def add(self, kind: str, identity: Identity, *, moving_s: float = _MOVING_S, **options: Any) -> WirelessRobot:
         """Add a robot. Its first turn comes when the fleet runs."""
-        robot = WirelessRobot(kind, identity, self.broker, self._servers, moving_s=moving_s, **options)
+        robot = WirelessRobot(kind, identity, self.broker, moving_s=moving_s, **options)
         self.robots.append(robot)
         self._due.append(0.0)
         return robot
@@ -61,7 +56,6 @@ class Fleet:
         for robot in self.robots:
             robot.stop()
         self._epoll.close()
-        self._servers.close()
 
     def __enter__(self) -> Self:
         return self
@@ -73,10 +67,7 @@ class Fleet:
         """Wait for a ready socket or for the next robot that is due; run a turn of those robots."""
         wait = min(self._due, default=0.0) - time.monotonic()
         for descriptor, _ in self._epoll.poll(min(_LONGEST_S, max(0.0, wait))):
-            if descriptor in self._servers_of:
-                self._servers.serve(self._servers_of[descriptor])
-            elif descriptor in self._of:
-                self._due[self._of[descriptor]] = 0.0
+            self._due[self._of[descriptor]] = 0.0
         now = time.monotonic() + _GRAIN_S
         for number, due in enumerate(self._due):
             if due <= now:

@@ -162,7 +162,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="pebble sim loudspeaker", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m pebble.simulation.loudspeaker", description=__doc__)
     parser.add_argument("file", help="a WAV file, or - for standard input")
     parser.add_argument("--record", type=Path, metavar="FOLDER", help="for events.jsonl, and a WAV file of each sound")
     parser.add_argument("--exclusive", action="store_true", help="play one sound at a time, as without a mixer")

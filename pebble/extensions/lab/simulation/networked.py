@@ -9,7 +9,6 @@ from pathlib import Path
 from pebble.config.security import Security
 from pebble.contract.identity import Identity
 from pebble.extensions.lab.simulation.fleet import ConnectionReporter, Fleet, members
-from pebble.extensions.lab.simulation.mcu import Snapshot, write_line
 from pebble.extensions.lab.simulation.trace import Trace, motors_entry
 from pebble.extensions.lab.simulation.wireless import Motors
 from pebble.runtime.signals import EndSignal
@@ -27,10 +26,9 @@ def run(
     name: str = "",
     security: Security | None = None,
     trace: Path | None = None,
-    report: bool = False,
     files: Path | None = None,
 ) -> int:
-    """Run a robot until a signal, or until the reader of its report closes the pipe. Raises PebbleError.
+    """Run a robot until a signal. Raises PebbleError.
 
     ``name``: the robot's name for people. ``security``: the level in its config; None: open.
     """
@@ -43,14 +41,7 @@ def run(
         options = {"name": name, "security": security or Security(), "files": files}
         robot = fleet.add(kind, identity, moving_s=_MOVING_S, on_motors=on_motors, **options)
         reporter = ConnectionReporter([robot], lambda line: print(line, file=sys.stderr, flush=True))  # noqa: T201
-
-        def job() -> None:
-            reporter.poll()
-            where = robot.network.radio.connected, robot.online
-            if report and not write_line(Snapshot(time.monotonic_ns(), *where, robot.state())):
-                end.set()
-
-        fleet.run(lambda: not end.wait(0.0), job)
+        fleet.run(lambda: not end.wait(0.0), reporter.poll)
     record.close()
     return 0
 

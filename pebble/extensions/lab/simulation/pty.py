@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Self
 
 from pebble.errors import DeviceError
-from pebble.extensions.lab.simulation.board import BoardState, SimulatedMcu
+from pebble.extensions.lab.simulation.board import SimulatedMcu
 from pebble.extensions.lab.simulation.bodies import Pair
 from pebble.extensions.lab.simulation.motion import Pose, RobotMotion
 from pebble.extensions.lab.simulation.trace import Entry, Event, Trace, motors_entry
@@ -152,13 +152,12 @@ class PtyMcu:
         with self._lock:
             self._mcu.motion.place(pose)
 
-    def state(self) -> BoardState:
-        with self._lock:
-            return self._mcu.state()
-
     @property
-    def plugged(self) -> bool:
-        return self._master is not None
+    def pose(self) -> Pose:
+        """The true pose of the robot."""
+        with self._lock:
+            self._mcu.body.advance()
+            return self._mcu.motion.pose
 
     @property
     def host(self) -> bool:

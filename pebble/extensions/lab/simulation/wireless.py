@@ -9,14 +9,13 @@ from typing import Any, Final
 from pebble.config.security import Security
 from pebble.contract.identity import Identity
 from pebble.errors import ConfigError
-from pebble.extensions.lab.simulation.bodies import BoardState, body_of
+from pebble.extensions.lab.simulation.bodies import body_of
 from pebble.extensions.lab.simulation.micropython.board import Board
 from pebble.extensions.lab.simulation.micropython.clock import RealClock
 from pebble.extensions.lab.simulation.micropython.files import Files
 from pebble.extensions.lab.simulation.micropython.modules.sockets import HostNetwork
 from pebble.extensions.lab.simulation.micropython.ports import OF_ROBOT
 from pebble.extensions.lab.simulation.micropython.runner import Runner
-from pebble.extensions.lab.simulation.micropython.servers import LoopbackServers
 from pebble.transports import MqttSettings
 
 KINDS: Final = ("minilamp", "benjr")
@@ -41,7 +40,6 @@ class WirelessRobot:
         kind: str,
         identity: Identity,
         broker: MqttSettings,
-        servers: LoopbackServers,
         *,
         name: str = "",
         security: Security = _OPEN,
@@ -53,7 +51,7 @@ class WirelessRobot:
         self._security = security.on_board()
         clock = RealClock()
         uid = hashlib.sha256(identity.base.encode()).digest()[:6]
-        self.network = HostNetwork(clock, platform=OF_ROBOT[kind].platform, routes=servers.routes)
+        self.network = HostNetwork(clock, platform=OF_ROBOT[kind].platform)
         self.board = Board(clock, self.network, uid, seed=secrets.randbits(64))  # another one at each start
         self.board.files = Files(files)
         self.body = body_of(kind, self.board)
@@ -101,9 +99,6 @@ class WirelessRobot:
         self.firmware.stop()
         self.network.power_off()
         self.body.end_turn()
-
-    def state(self) -> BoardState:
-        return self.body.state()
 
     def _settings(self) -> dict[str, Any]:
         robot = {"system": self.identity.system, "type": self.identity.type, "id": self.identity.id, "name": self.name}

@@ -149,7 +149,6 @@ def test_a_backup_on_a_blank_machine_is_the_same_robot(
     places.config.write_text(places.config.read_text().replace("synthetic", "libcamera"))
     (places.state / "estop-serial-pebble+robots+goob.json").write_text('{"stopped": true}')
     wanted = tree(root)
-    places.manifest.write_text("{}")  # of an earlier setup: it is not needed
     backup = tmp_path / "goob.tar"
     assert run("setup", "--backup", backup) == 0
     other = machine_root(tmp_path / "other")

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from pebble.config import load
 from pebble.extensions.install.setup.robot_config import changed
 from pebble.extensions.install.setup.system import SetupError
 from pebble.extensions.operator.places import Places
@@ -116,15 +115,6 @@ def test_the_own_broker_ends_with_another_answer_and_comes_back(root: Path) -> N
     assert Places(root).broker.exists()
     assert (Places(root).etc / "broker.password").read_text() != password
     assert set_up(root) == []
-
-
-def test_what_an_earlier_setup_had_written_is_removed_with_one_line(root: Path) -> None:
-    set_up(root)
-    places = Places(root)
-    places.manifest.write_text('{"format": 1, "answers": {"id": "goob"}}')
-    assert set_up(root) == ["remove /etc/pebble/setup.json, which an earlier version needed"]
-    assert not places.manifest.exists()
-    assert load(places.config).robot.id == "goob"
 
 
 def test_a_disk_that_takes_nothing_is_one_line(root: Path) -> None:

@@ -37,7 +37,7 @@ def test_the_code_is_read_as_the_address(url: str) -> None:
 
 def test_without_a_terminal_nothing_is_started(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(PebbleError, match="prints a password, to a terminal only"):
-        run(for_phones=True, console=Console(force_terminal=True))
+        run(for_phones=True)
     assert capsys.readouterr().out == ""
 
 

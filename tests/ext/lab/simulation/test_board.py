@@ -40,10 +40,10 @@ def test_an_error_in_the_firmware_stops_the_motors_and_starts_it_anew(monkeypatc
     mcu.receive(b"M 1 1\n", 0.0)
     monkeypatch.setattr(mcu.robot.port, "read", lambda: 1 / 0)
     assert mcu.tick(0.1).startswith(b"Starting setup...")
-    assert mcu.state().motors == (0.0, 0.0)
+    assert mcu.body.outputs() == (0.0, 0.0)
     assert mcu.resets == 1
     assert b"OK M\r\n" in mcu.receive(b"M 1 1\n", 0.3)
-    assert mcu.state().motors == (1.0, -1.0)
+    assert mcu.body.outputs() == (1.0, -1.0)
 
 
 def test_a_host_that_was_away_for_a_while_misses_no_sample() -> None:

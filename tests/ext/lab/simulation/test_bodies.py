@@ -32,11 +32,12 @@ def test_half_bridges_turn_the_wheels(clock: VirtualClock, kind: str, forward: t
     body = body_of(kind, Board(clock))
     drive(body, *forward)
     clock.advance(1.0)
-    state = body.state()
-    assert state.motors == pytest.approx(forward, abs=1e-3)
-    assert state.drive == pytest.approx((1.0, 0.5), abs=1e-3)
-    assert (state.left_mm_s, state.right_mm_s) == pytest.approx((FULL_SPEED_MM_S, FULL_SPEED_MM_S / 2), rel=0.01)
-    assert state.pose.x_mm > 100
+    body.advance()
+    assert body.outputs() == pytest.approx(forward, abs=1e-3)
+    assert body.forward(*body.outputs()) == pytest.approx((1.0, 0.5), abs=1e-3)
+    speeds = body.motion.left_mm_s, body.motion.right_mm_s
+    assert speeds == pytest.approx((FULL_SPEED_MM_S, FULL_SPEED_MM_S / 2), rel=0.01)
+    assert body.motion.pose.x_mm > 100
 
 
 def test_a_long_turn_reports_each_change_within_it(clock: VirtualClock) -> None:
@@ -49,7 +50,8 @@ def test_a_long_turn_reports_each_change_within_it(clock: VirtualClock) -> None:
     clock.advance(3.0)
     body.end_turn()
     assert changes == [(50.0, (1.0, 1.0)), (52.0, (0.0, 0.0))]
-    assert body.state().pose.x_mm == pytest.approx(2.0 * FULL_SPEED_MM_S, rel=0.01), "it rolled two seconds, not five"
+    body.advance()
+    assert body.motion.pose.x_mm == pytest.approx(2.0 * FULL_SPEED_MM_S, rel=0.01), "it rolled two seconds, not five"
 
 
 def test_benjrs_shield(clock: VirtualClock) -> None:
@@ -62,7 +64,7 @@ def test_benjrs_shield(clock: VirtualClock) -> None:
     assert body.outputs() == (0.5, 0.0), "clockwise"
     i2c.writeto(body.pins.MOTOR_SHIELD, b"\x11\x01\xff\xff")
     assert body.outputs() == (0.5, -1.0), "counter-clockwise, and not more than full"
-    assert body.state().drive == (-0.5, 1.0), "both motors are mounted backwards"
+    assert body.forward(*body.outputs()) == (-0.5, 1.0), "both motors are mounted backwards"
     for direction in (b"\x00", b"\x03", b"\x04"):
         i2c.writeto(body.pins.MOTOR_SHIELD, b"\x10" + direction + b"\x27\x10")
         assert body.outputs() == (0.0, -1.0)

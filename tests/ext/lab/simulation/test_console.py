@@ -18,7 +18,7 @@ def machine(board: Board) -> Any:
 
 def test_reading_more_than_there_is_would_hang(board: Board) -> None:
     sys = board.firmware.module("sys")
-    board.type(b"ab")
+    board.console.type(b"ab")
     with pytest.raises(WouldHang, match="waits for input"):
         sys.stdin.buffer.read(3)
     with pytest.raises(WouldHang):
@@ -37,12 +37,12 @@ def test_ctrl_c_stops_firmware_that_does_not_forbid_it(board: Board) -> None:
     sys, select = board.firmware.module("sys"), board.firmware.module("select")
     poll = select.poll()
     poll.register(sys.stdin, select.POLLIN)
-    board.type(b"M\x03X")
+    board.console.type(b"M\x03X")
     with pytest.raises(KeyboardInterrupt):
         poll.poll(0)
     assert sys.stdin.buffer.read(1) == b"X"
     board.firmware.module("micropython").kbd_intr(-1)
-    board.type(b"\x03")
+    board.console.type(b"\x03")
     assert sys.stdin.buffer.read(1) == b"\x03"
 
 
@@ -54,5 +54,5 @@ def test_a_host_that_does_not_read_costs_half_a_second_per_write(board: Board, c
     assert sys.stdout.buffer.write(bytes(300)) == 256
     assert (clock.now(), board.console.lost) == (1000.5, 44)
     assert poll.poll(0) == []
-    assert board.take_output() == bytes(256)
+    assert board.console.take_output() == bytes(256)
     assert poll.poll(0) == [(sys.stdout, select.POLLOUT)]

@@ -11,8 +11,14 @@ from typing import Any, Final, Literal
 
 from pebble.extensions.lab.simulation.micropython.answers import name_answer, time_answer
 from pebble.extensions.lab.simulation.micropython.clock import Clock
-from pebble.extensions.lab.simulation.micropython.faults import WouldHang, failure
-from pebble.extensions.lab.simulation.micropython.modules.sockets import MAX_SOCKETS, Address, numeric, socket_module
+from pebble.extensions.lab.simulation.micropython.faults import failure
+from pebble.extensions.lab.simulation.micropython.modules.servers import Address
+from pebble.extensions.lab.simulation.micropython.modules.sockets import (
+    MAX_SOCKETS,
+    BoardSocket,
+    numeric,
+    socket_module,
+)
 from pebble.extensions.lab.simulation.micropython.modules.streams import POLLERR, POLLHUP, POLLIN, POLLOUT, Stream
 from pebble.extensions.lab.simulation.micropython.modules.tls import ssl_module
 from pebble.extensions.lab.simulation.micropython.modules.wlan import ADDRESS, Platform, Radio, network_module
@@ -127,24 +133,7 @@ class VirtualNetwork:
         return made
 
 
-class _Virtual:
-    def __init__(self, network: VirtualNetwork) -> None:
-        self._network = network
-
-    def setblocking(self, blocking: bool) -> None:
-        if blocking:
-            raise WouldHang("a socket that waits: setblocking(False)")
-
-    def close(self) -> None:
-        if self in self._network.open:
-            self._network.open.remove(self)
-
-    def _need_wifi(self) -> None:
-        if not self._network.radio.connected:
-            raise failure(errno.EHOSTUNREACH)
-
-
-class VirtualTcp(_Virtual, Stream):
+class VirtualTcp(BoardSocket, Stream):
     """A TCP connection of the board."""
 
     def __init__(self, network: VirtualNetwork) -> None:
@@ -199,7 +188,7 @@ class VirtualTcp(_Virtual, Stream):
             raise failure(errno.ECONNREFUSED if wire.state is State.REFUSED else errno.ECONNRESET)
 
 
-class VirtualUdp(_Virtual):
+class VirtualUdp(BoardSocket):
     """A UDP socket of the board."""
 
     def __init__(self, network: VirtualNetwork) -> None:

@@ -1,17 +1,13 @@
 """Networks between a robot and its broker that can be impaired and restored while they are in use.
 
-Two network namespaces with a veth pair between them: rate by TBF and loss by nftables, all of it in the kernel.
-``python -m pebble.extensions.lab.bench.impair.network`` is a process that holds them. When it ends, the devices
-disappear, and so do the namespaces once they are empty.
+Two network namespaces with a veth pair between them: rate by TBF and loss by nftables, all of it in the kernel. A shell
+holds them. When it ends, the devices disappear, and so do the namespaces once they are empty.
 """
 
 from __future__ import annotations
 
-import ctypes
 import os
-import signal
 import subprocess
-import sys
 import weakref
 from collections.abc import Sequence
 from contextlib import closing
@@ -20,8 +16,7 @@ from functools import cache
 from pathlib import Path
 
 from pebble.errors import PebbleError
-from pebble.extensions.lab.rig.processes import Worker, end_all, python
-from pebble.extensions.lab.rig.worker_end import answer
+from pebble.extensions.lab.rig.processes import Worker, end_all
 from pebble.extensions.operator.places import SBIN
 
 ROBOT_HOST, REMOTE_HOST = "10.77.0.1", "10.77.0.2"
@@ -32,7 +27,8 @@ _QUEUE_S = 0.3  # the queue of a home router's modem, with tail drop
 _QUEUE_PACKETS = 4  # at least; at 64 kbit/s 0.3 s hold fewer than two
 _COMMAND_S = _ANSWER_S = 10.0
 
-CLONE_NEWNET = 0x40000000
+#: Opens each new namespace as a file, says when, and ends with its standard input.
+_HOLDER = "exec 3</proc/self/ns/net; exec unshare --net sh -c 'exec 4</proc/self/ns/net; echo {}; read _'"
 _TABLE = "table ip impair { chain arriving { type filter hook prerouting priority raw; }; }"
 
 
@@ -55,13 +51,11 @@ class NamespaceNetwork(Worker):
     def __init__(self, name: str = "") -> None:
         file = os.memfd_create("link")  # unnamed: nothing is left behind if we are killed
         weakref.finalize(self, os.close, file)
-        command, log = python("pebble.extensions.lab.bench.impair.network"), Path(f"/proc/self/fd/{file}")
-        super().__init__(f"network {name}".strip(), command, log)
+        command = ["unshare", "--net", "sh", "-c", _HOLDER]
+        super().__init__(f"network {name}".strip(), command, Path(f"/proc/self/fd/{file}"))
         try:
-            spaces = self.answer(_ANSWER_S)
-            if "unavailable" in spaces:
-                raise PebbleError(spaces["unavailable"])
-            robot, remote = (f"/proc/{self.pid}/fd/{spaces[side]}" for side in ("robot", "remote"))
+            self.answer(_ANSWER_S)
+            robot, remote = (f"/proc/{self.pid}/fd/{number}" for number in (3, 4))
             self._robot, self._remote = _Side(robot, ROBOT_HOST), _Side(remote, REMOTE_HOST)
             self.on_robot, self.on_remote = self._robot.inside, self._remote.inside
             self._robot.batch("ip", f"link add {_WIRE} type veth peer name {_WIRE} netns {remote}")
@@ -134,39 +128,6 @@ def why_no_namespaces() -> str | None:
     try:
         with closing(NamespaceNetwork("on trial")) as network:
             network.apply(Condition("trial", kbit=1000, loss=0.01))
-    except PebbleError as error:
+    except (PebbleError, OSError) as error:
         return str(error)
     return None
-
-
-def require_namespaces() -> None:
-    """Raise PebbleError if such networks cannot be made here."""
-    if why := why_no_namespaces():
-        raise PebbleError(f"no network namespaces: {why}")
-
-
-# -- its process
-
-
-def main() -> int:
-    try:
-        spaces = {"robot": _namespace(), "remote": _namespace()}
-    except OSError as error:
-        answer({"unavailable": f"new namespaces: {error.strerror}: run it as root, or in `unshare --map-root-user`"})
-        return 1
-    answer(spaces)
-    sys.stdin.read()  # until it closes
-    return 0
-
-
-def _namespace() -> int:
-    """Enter a new network namespace; return its descriptor. Raises OSError."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.unshare(CLONE_NEWNET):
-        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
-    return os.open("/proc/thread-self/ns/net", os.O_RDONLY)
-
-
-if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    sys.exit(main())

@@ -11,7 +11,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from itertools import chain
 from typing import Final
@@ -24,7 +23,7 @@ from pebble.config.raw import deep_merge
 from pebble.errors import PebbleError
 from pebble.extensions.lab.bench.impair import metrics
 from pebble.extensions.lab.bench.impair.metrics import Plan, Report, cells_of, value_of
-from pebble.extensions.lab.bench.impair.network import REMOTE_HOST, Condition, NamespaceNetwork, require_namespaces
+from pebble.extensions.lab.bench.impair.network import REMOTE_HOST, Condition, NamespaceNetwork, why_no_namespaces
 from pebble.extensions.lab.bench.impair.pictures import over_trials
 from pebble.extensions.lab.bench.results import STAND_IN, Cell, Results, begin, grouped
 from pebble.extensions.lab.bench.rounds import Progress, in_turn, measure_rounds, paired
@@ -89,7 +88,8 @@ QUICK: Final = Settings(
 
 def run(settings: Settings, console: Console) -> Shown:
     """Run all trials with all subjects. Raises PebbleError."""
-    require_namespaces()
+    if why := why_no_namespaces():
+        raise PebbleError(f"no network namespaces: {why}; run it as root, or in `unshare --map-root-user`")
     results = begin("impair", settings)
     ended: list[str] = []
     measure_rounds(results, 1, lambda _number, progress: measure(settings, progress, ended), console)
@@ -163,13 +163,6 @@ def start(subject: str, settings: Settings, processes: Processes) -> ImpairedRob
     return ImpairedRobot(subject, network, robot, remote, operator, limit_s=_UP_S + 2 * settings.window_s)
 
 
-@contextmanager
-def robots(settings: Settings) -> Iterator[list[ImpairedRobot]]:
-    """Start all robots, and yield them, not yet ready. Raises PebbleError if something does not start."""
-    with Processes() as processes:
-        yield [start(subject, settings, processes) for subject in SUBJECTS if subject in settings.subjects]
-
-
 # -- the course of the trials
 
 
@@ -180,7 +173,8 @@ def measure(settings: Settings, progress: Progress, ended: list[str]) -> Iterato
     no results.
     """
     progress("starting the robots")
-    with robots(settings) as every:
+    with Processes() as processes:
+        every = [start(subject, settings, processes) for subject in SUBJECTS if subject in settings.subjects]
         yield from _trials(settings, every, progress, ended)
 
 

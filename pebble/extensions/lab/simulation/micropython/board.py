@@ -13,7 +13,7 @@ from pebble.extensions.lab.simulation.micropython.clock import Clock
 from pebble.extensions.lab.simulation.micropython.console import Console
 from pebble.extensions.lab.simulation.micropython.faults import WouldHang
 from pebble.extensions.lab.simulation.micropython.files import Files
-from pebble.extensions.lab.simulation.micropython.i2c import Bus, Device
+from pebble.extensions.lab.simulation.micropython.i2c import Bus
 from pebble.extensions.lab.simulation.micropython.loader import FirmwareModules
 from pebble.extensions.lab.simulation.micropython.modules import machine, select, system
 from pebble.extensions.lab.simulation.micropython.modules.timing import BoardTime
@@ -160,22 +160,6 @@ class Board:
     def set_pin(self, pin: PinName, high: Level) -> None:
         """Drive an input high or low, or by a function called at each read; None leaves it to its pull resistor."""
         self.pins.set_input(self.port.pin(pin), high)
-
-    def attach_i2c(self, address: int, device: Device) -> None:
-        self.bus.attach(address, device)
-
-    def type(self, data: bytes) -> None:
-        """Send data from the host to the board's serial port."""
-        self.console.type(data)
-
-    @property
-    def unread(self) -> int:
-        """Bytes from the host that the firmware has not read yet."""
-        return self.console.unread
-
-    def take_output(self) -> bytes:
-        """Return the board's output on its serial port since the last call."""
-        return self.console.take_output()
 
     # -- from the firmware
 

@@ -33,6 +33,7 @@ class Console:
         self.is_interrupted = False
 
     def type(self, data: bytes) -> None:
+        """Send data from the host to the board."""
         if self.interrupt >= 0 and self.interrupt in data:
             self.is_interrupted = True
             data = data[data.rindex(self.interrupt) + 1 :]

@@ -2,7 +2,7 @@
 
 import math
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 
@@ -44,7 +44,3 @@ class Track:
             earlier.y + part * (later.y - earlier.y),
             earlier.heading + part * turn,
         )
-
-
-def poses_at(tracks: Mapping[str, Track], ns: int) -> dict[str, RobotPose]:
-    return {name: track.at(ns) for name, track in tracks.items()}

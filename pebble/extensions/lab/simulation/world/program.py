@@ -14,8 +14,7 @@ from typing import Any, Final
 import msgspec
 
 from pebble.errors import DeviceError
-from pebble.extensions.lab.simulation.board import BoardState
-from pebble.extensions.lab.simulation.mcu import actions, write_line
+from pebble.extensions.lab.simulation.mcu import actions
 from pebble.extensions.lab.simulation.motion import Pose, RobotMotion
 from pebble.extensions.lab.simulation.pty import PtyMcu
 from pebble.extensions.lab.simulation.world.pose_page import PERIOD_S, PosePage, page_path
@@ -24,27 +23,15 @@ from pebble.extensions.lab.simulation.world.walls import Floor, motion_of
 from pebble.extensions.lab.simulation.world.world_file import World, read_world
 from pebble.runtime.signals import EndSignal
 
-_SAMPLES_PER_REPORT = round(0.1 / PERIOD_S)
-
 ROOM: Final = Path(__file__).with_name("room.json")  # 4 m wide, four tags, Goob and Fred
 
 Mcus = dict[str, PtyMcu]
 
 
-class Snapshot(msgspec.Struct, frozen=True):
-    """A line of a report: a JSON object, ten times a second. ``ns`` is time.monotonic_ns()."""
-
-    ns: int
-    robots: dict[str, BoardState]
-
-
-def run(
-    file: Path, folder: Path | None = None, *, trace: Path | None = None, report: bool = False, control: bool = False
-) -> int:
+def run(file: Path, folder: Path | None = None, *, trace: Path | None = None, control: bool = False) -> int:
     """Run until a signal, or with ``control`` until standard input ends. Raises PebbleError.
 
-    ``folder`` is for serial ports, ``trace`` for files ROBOT.trace.jsonl of the lines that MCUs receive. ``report``:
-    write a :class:`Snapshot` to standard output ten times a second.
+    ``folder`` is for serial ports, ``trace`` for files ROBOT.trace.jsonl of the lines that MCUs receive.
     """
     end, path = EndSignal(), file.absolute()
     world = read_world(path)
@@ -63,11 +50,10 @@ def run(
         motions = {name: motion_of(world, name, floor) for name in world.robots}
         mcus = {name: stack.enter_context(mcu) for name, mcu in _mcus(world, motions, folder, trace).items()}
         imus = {name: stack.enter_context(imu) for name, imu in _imus(world, motions, folder).items()}
-        if not report:
-            print(_introduction(path, mcus, imus), flush=True)  # noqa: T201
+        print(_introduction(path, mcus, imus), flush=True)  # noqa: T201
         if control:
             threading.Thread(target=_run_commands, args=(mcus, end), name="pebble-world control", daemon=True).start()
-        _publish_poses(page, mcus, end, report=report)
+        _publish_poses(page, mcus, end)
     return 0
 
 
@@ -114,18 +100,14 @@ def _imus(world: World, motions: Mapping[str, RobotMotion], folder: Path) -> Mcu
     }
 
 
-def _publish_poses(page: PosePage, mcus: Mcus, end: EndSignal, *, report: bool) -> None:
+def _publish_poses(page: PosePage, mcus: Mcus, end: EndSignal) -> None:
     """Write the robots' poses to the page until the end is requested."""
-    due, count = time.monotonic(), 0
+    due = time.monotonic()
     while not end.wait(max(0.0, due - time.monotonic())):
         due = max(due + PERIOD_S, time.monotonic())
-        states = {name: mcu.state() for name, mcu in mcus.items()}
-        ns = time.monotonic_ns()
-        poses = (state.pose for state in states.values())
-        page.write(ns, [RobotPose(pose.x_mm / 1000, pose.y_mm / 1000, pose.heading_rad) for pose in poses])
-        count += 1
-        if report and count % _SAMPLES_PER_REPORT == 0 and not write_line(Snapshot(ns, states)):
-            return
+        poses = [mcu.pose for mcu in mcus.values()]
+        metres = [RobotPose(pose.x_mm / 1000, pose.y_mm / 1000, pose.heading_rad) for pose in poses]
+        page.write(time.monotonic_ns(), metres)
 
 
 def _introduction(path: Path, mcus: Mcus, imus: Mcus) -> str:

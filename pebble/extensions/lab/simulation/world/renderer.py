@@ -10,7 +10,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pebble.extensions.lab.simulation.world.poses import RobotPose, Track, poses_at
+from pebble.extensions.lab.simulation.world.poses import RobotPose, Track
 from pebble.extensions.lab.simulation.world.surfaces import Image, Surface, Surfaces
 from pebble.extensions.lab.simulation.world.world_file import World
 from pebble.extensions.media.scene import noise
@@ -67,8 +67,8 @@ class Renderer:
     def _expose(self, tracks: Mapping[str, Track], ns: int, out: Image) -> None:
         """Draw the average of the scene during the exposure, which ends at ``ns``."""
         exposure_ns = self._lens.motion_blur_ms * 1e6
-        times = [ns - round(exposure_ns * part / (_EXPOSURES - 1)) for part in range(_EXPOSURES)]
-        views = [poses_at(tracks, moment) for moment in (times if exposure_ns else [ns])]
+        times = [ns - round(exposure_ns * part / (_EXPOSURES - 1)) for part in range(_EXPOSURES if exposure_ns else 1)]
+        views = [{name: track.at(moment) for name, track in tracks.items()} for moment in times]
         if all(view == views[0] for view in views):
             self.draw(views[0], out)
             return

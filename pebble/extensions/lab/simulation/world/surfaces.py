@@ -46,11 +46,7 @@ class Surfaces:
         self._margin = _modules(world) + 2  # modules with the white around them
         self._textures: dict[int, tuple[Image, ...]] = {}
         self._fixed = [
-            *(
-                surface
-                for index, wall in enumerate(world.room.walls if world.room else ())
-                for surface in [_left_side(wall, index)]
-            ),
+            *(_left_side(wall, index) for index, wall in enumerate(world.room.walls if world.room else ())),
             *(surface for index, wall in enumerate(world.walls) for surface in _both_sides(wall, index)),
             *map(_drawn, world.drawings),
             *(self._tag(tag.id, tag.size_m, tag.x, tag.y, tag.z, math.radians(tag.yaw_deg)) for tag in world.tags),

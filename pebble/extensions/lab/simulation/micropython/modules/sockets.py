@@ -1,4 +1,4 @@
-"""The network of a simulated board: real, non-blocking TCP and UDP of this machine behind a simulated Wi-Fi."""
+"""The network of a simulated board: real, non-blocking TCP of this machine behind a simulated Wi-Fi."""
 
 from __future__ import annotations
 
@@ -6,17 +6,16 @@ import errno
 import select
 import socket
 import ssl
-from collections.abc import Mapping
+from collections import deque
 from types import SimpleNamespace
 from typing import Any
 
 from pebble.extensions.lab.simulation.micropython.clock import Clock
 from pebble.extensions.lab.simulation.micropython.faults import WouldHang, failure
+from pebble.extensions.lab.simulation.micropython.modules.servers import Address, Servers
 from pebble.extensions.lab.simulation.micropython.modules.streams import POLLERR, POLLHUP, POLLIN, POLLOUT, Stream
 from pebble.extensions.lab.simulation.micropython.modules.tls import as_on_a_board, ssl_module
 from pebble.extensions.lab.simulation.micropython.modules.wlan import Platform, Radio, network_module
-
-Address = tuple[str, int]
 
 _LATER = (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
 MAX_SOCKETS = 5  # TCP connections of the ESP8266's lwIP; the ESP32 has a few more
@@ -25,26 +24,19 @@ _CONSTANTS = {name: int(getattr(socket, name)) for name in ("AF_INET", "SOCK_STR
 
 
 class HostNetwork:
-    """The network of one board. ``routes``: other addresses to use in place of those that the board uses.
+    """The network of one board.
 
     The scheduler reads ``new_sockets``, which it then watches, and ``unread``, whether more can be read at once.
     """
 
-    def __init__(
-        self,
-        clock: Clock,
-        *,
-        platform: Platform = "esp32",
-        routes: Mapping[Address, Address] | None = None,
-    ) -> None:
+    def __init__(self, clock: Clock, *, platform: Platform = "esp32") -> None:
         self.clock = clock
         self.radio = Radio(clock.now, platform)
         self.new_sockets: list[socket.socket] = []
         self.unread = False
         self.problem = ""  # of the last connection, as text
-        self.open: list[HostTcp | HostUdp] = []
-        self._to = dict(routes or {})
-        self._from = {there: here for here, there in self._to.items()}
+        self.open: list[BoardSocket] = []
+        self.servers = Servers()
 
     def modules(self) -> dict[str, Any]:
         """Return the modules for a board that has just booted."""
@@ -60,13 +52,6 @@ class HostNetwork:
         for sock in list(self.open):
             sock.close()
         self.radio.activate(False)
-
-    def route(self, address: Address) -> Address:
-        return self._to.get(address, address)
-
-    def board_address(self, address: Address) -> Address:
-        """Return the address by which the board knows the host's ``address``."""
-        return self._from.get(address, address)
 
     def _socket(self, kind: int) -> HostTcp | HostUdp:
         if len(self.open) >= MAX_SOCKETS:
@@ -97,16 +82,11 @@ def numeric(address: Address) -> Address:
     return address
 
 
-class _HostSocket:
-    """The base class of both sockets: they never block, and receive nothing without Wi-Fi."""
+class BoardSocket:
+    """The base class of all sockets: they never block, and receive nothing without Wi-Fi."""
 
-    def __init__(self, network: HostNetwork, kind: socket.SocketKind) -> None:
+    def __init__(self, network: Any) -> None:
         self._network = network
-        self._sock = socket.socket(socket.AF_INET, kind)
-        self._sock.setblocking(False)
-        self._poll = select.poll()
-        self._poll.register(self._sock, 0)
-        network.new_sockets.append(self._sock)
 
     def setblocking(self, blocking: bool) -> None:
         if blocking:
@@ -115,6 +95,26 @@ class _HostSocket:
     def close(self) -> None:
         if self in self._network.open:
             self._network.open.remove(self)
+
+    def _need_wifi(self) -> None:
+        if not self._network.radio.connected:
+            raise failure(errno.EHOSTUNREACH)
+
+
+class HostTcp(BoardSocket, Stream):
+    """A TCP connection of the board."""
+
+    def __init__(self, network: HostNetwork) -> None:
+        super().__init__(network)
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self._sock.setblocking(False)
+        self._poll = select.poll()
+        self._poll.register(self._sock, 0)
+        self._established = False
+        network.new_sockets.append(self._sock)
+
+    def close(self) -> None:
+        super().close()
         self._sock.close()
 
     def ready(self, mask: int) -> int:
@@ -127,22 +127,10 @@ class _HostSocket:
         events = self._poll.poll(0)
         return events[0][1] & (mask | POLLERR | POLLHUP) if events else 0
 
-    def _need_wifi(self) -> None:
-        if not self._network.radio.connected:
-            raise failure(errno.EHOSTUNREACH)
-
-
-class HostTcp(_HostSocket, Stream):
-    """A TCP connection of the board."""
-
-    def __init__(self, network: HostNetwork) -> None:
-        super().__init__(network, socket.SOCK_STREAM)
-        self._established = False
-
     def connect(self, address: Address) -> None:
         """Start to connect. Raises OSError in any case: EINPROGRESS on success."""
         self._need_wifi()
-        code = self._sock.connect_ex(self._network.route(numeric(address)))
+        code = self._sock.connect_ex(numeric(address))
         raise failure(code or errno.EINPROGRESS)
 
     def secure(self, context: ssl.SSLContext, server_hostname: str | None) -> None:
@@ -179,21 +167,21 @@ class HostTcp(_HostSocket, Stream):
             raise as_on_a_board(error) from None
 
 
-class HostUdp(_HostSocket):
-    """A UDP socket of the board."""
+class HostUdp(BoardSocket):
+    """A UDP socket of the board, which reaches the servers of its network only."""
 
     def __init__(self, network: HostNetwork) -> None:
-        super().__init__(network, socket.SOCK_DGRAM)
+        super().__init__(network)
+        self._answers: deque[tuple[bytes, Address]] = deque()
 
     def sendto(self, data: bytes, address: Address) -> int:
         self._need_wifi()
-        return self._sock.sendto(data, self._network.route(numeric(address)))
+        if (answer := self._network.servers.answer(bytes(data), numeric(address))) is not None:
+            self._answers.append((answer, address))
+        return len(data)
 
     def recvfrom(self, size: int) -> tuple[bytes, Address]:
-        if not self._network.radio.connected:
+        if not self._answers or not self._network.radio.connected:
             raise failure(errno.EAGAIN)
-        try:
-            data, address = self._sock.recvfrom(size)
-        except BlockingIOError:
-            raise failure(errno.EAGAIN) from None
-        return data, self._network.board_address(address)
+        data, address = self._answers.popleft()
+        return data[:size], address
