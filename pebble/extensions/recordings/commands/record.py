@@ -138,7 +138,6 @@ def _line(recorder: Recorder, source: Source, seconds_: float) -> str:
         f"{show.duration(seconds_)}",
         f"{counters['messages']:,} messages",
         show.size(counters["bytes"]),
-        f"{len(recorder.robots)} robots",
     ]
     if counters["dropped"]:
         parts.append(f"{counters['dropped']:,} dropped")
@@ -158,8 +157,8 @@ def _print_end(recorder: Recorder, into: Path) -> None:
     counters = recorder.counters
     lost = f", {counters['dropped']:,} dropped" if counters["dropped"] else ""
     typer.echo(
-        f"Recorded {counters['messages']:,} messages ({show.size(counters['bytes'])}) of "
-        f"{len(recorder.robots)} robots{lost}; `pebble recordings info {into}` shows them",
+        f"Recorded {counters['messages']:,} messages ({show.size(counters['bytes'])}){lost}; "
+        f"`pebble recordings info {into}` shows them",
         err=True,
     )
 
