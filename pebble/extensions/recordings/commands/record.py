@@ -122,14 +122,8 @@ def _serve(recorder: Recorder, source: Source, ends_at: float | None) -> None:
                 sys.stderr.flush()
         if now - written >= _METRICS_S:
             written = now
-            _write_metrics(recorder, source)
-
-
-def _write_metrics(recorder: Recorder, source: Source) -> None:
-    try:
-        metrics.write(recorder, [source])
-    except OSError:  # a full disk: the recorder says so
-        return
+            with suppress(OSError):  # a full disk: the recorder says so
+                metrics.write(recorder, [source])
 
 
 def _line(recorder: Recorder, source: Source, seconds_: float) -> str:
