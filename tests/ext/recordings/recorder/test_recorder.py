@@ -349,6 +349,7 @@ class TestDisk:
         for number in range(1, 4):
             path = root / "2026" / f"20260101T000000Z-{number:06d}.media.pebble.robots.goob.mcap"
             path.write_bytes(b"")
+            path.with_suffix(".parquet").write_bytes(b"")
             os.utime(path, (0, 0))
 
         def boot_ns() -> int:
@@ -363,6 +364,7 @@ class TestDisk:
             gone.append(running.recorder.counters["event_pruned"])
         running.stop()
         assert gone[-1] == 2
+        assert [path.stem[17:23] for path in root.rglob("*.parquet")] == ["000003"]  # an index goes with its recording
         assert all(two - one <= 1 for one, two in pairwise(gone))
 
     @needs_root
