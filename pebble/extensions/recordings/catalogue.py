@@ -1,7 +1,7 @@
 """The contents of recordings, read from their summaries if they have one."""
 
 import json
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,7 +33,6 @@ class FileInfo:
     readable: bool = True
     problem: str = ""  # what could not be read of it now
     topics: Counter[str] = field(default_factory=Counter)  # messages by topic
-    encodings: dict[str, str] = field(default_factory=dict)  # by topic
     robots: set[str] = field(default_factory=set)
 
     @property
@@ -91,7 +90,6 @@ def _read_all(info: FileInfo, file: RecordingFile, since_ns: int, until_ns: int)
 
 def _count(info: FileInfo, channel: Channel, count: int) -> None:
     info.topics[channel.topic] += count
-    info.encodings[channel.topic] = channel.encoding
     robot = robot_of(channel)
     if robot is not None:
         info.robots.add(robot)
@@ -137,8 +135,6 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
     for path in paths:
         try:
             with RecordingFile(path) as file:
-                if file.statistics is None:  # the channels are known once all of it was read
-                    deque(file.read(chooses=lambda _channel: False), maxlen=0)
                 channels += file.channels.values()
                 if file.problem:
                     return

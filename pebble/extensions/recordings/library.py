@@ -42,12 +42,6 @@ def recordings_in(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:
-    """True if a file may hold messages of a period. Raises RecordingError."""
-    with RecordingFile(path) as file:
-        return file.reaches_into(since_ns, until_ns)
-
-
 def merged(
     paths: Iterable[Path],
     *,

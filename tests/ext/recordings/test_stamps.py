@@ -11,7 +11,6 @@ from pebble.extensions.recordings.stamps import is_keyframe, is_media, is_pictur
 
 T_MS = 1_732_300_000_123
 T_NS = T_MS * 10**6
-LONG = "x" * 2000
 
 SOUND = Sound(Codec.PCM16LE, 1, 16000, 320, 7, T_MS, b"\0" * 640)
 PICTURE = Picture(PictureKind.JPEG, 3, T_MS, b"\xff\xd8picture")
@@ -24,31 +23,20 @@ def json_picture(keyframe: bool = True) -> bytes:
 @pytest.mark.parametrize(
     "payload",
     [
-        b'{"online":true,"t":1732300000123}',
         b'{"t": 1732300000123, "online": true}',
-        b'{ "t" : 1732300000123 }',
         b'{"t":1732300000.123,"mcu":5}',
-        b'{"t":1732300000123,"message":"a brace } in it"}',
-        b'{"t":1732300000123,"message":"a brace { in it"}',
         b'{"value":{"t":5},"t":1732300000123}',
         b'{"t":1732300000123,"value":{"t":5,"timestamp":7}}',
-        b'{"say \\"t":5,"t":1732300000123}',
         b'{"timestamp":1732300000.123}',
-        b'{"t":1732300000123.0}',
         b'{"timestamp":1732300000123}',
         b'{"t":1.732300000123e+12}',
-        b'{"t":1732300000123,"value":"' + LONG.encode() + b'"}',
-        b'{"value":"' + LONG.encode() + b'","t":1732300000123}',
         SOUND.pack(),
         PICTURE.pack(),
+        json_picture(),
     ],
 )
 def test_the_own_stamp_is_found(payload):
     assert abs(stamp_ns(payload) - T_NS) < 1000
-
-
-def test_a_json_picture_is_found_by_its_end():
-    assert stamp_ns(json_picture()) == T_NS
 
 
 @pytest.mark.parametrize(
@@ -57,23 +45,15 @@ def test_a_json_picture_is_found_by_its_end():
         b"",
         b"{",
         b"P",
-        b"true",
         b"12",
         b'{"x":0.5}',
-        b'{"t":NaN}',
-        b'{"t":-5}',
         b'{"t":-1732300000123}',
         b'{"t":1e300}',
-        b'{"t":1e999}',
         b'{"t":99999999999999999999}',
         b'{"t":10000000000}',
         b'{"t":"1732300000123"}',
-        b'{"t":0}',
         b'{"t":null}',
         b'{"value":{"t":1732300000123}}',
-        b'{"value":{"t":1732300000123},"x":1}',
-        b'{"rate":1732300000123,"at":1732300000123}',
-        b'["t",1732300000123]',
         SOUND.pack()[:23],
         PICTURE.pack()[:18],
         b"PBAT" + b"\xff" * 40,
@@ -94,17 +74,14 @@ def test_a_stamp_of_a_board_counts_from_its_start():
     [
         (b'{"online":true,"t":1732300000123}', b'{"online":true,"t":1732300002623}'),
         (b'{"timestamp": 1732300000.1234567 }', b'{"timestamp":1732300002.6234567}'),
-        (b'{"timestamp":1732300000}', b'{"timestamp":1732300002}'),
         (b'{"t":1732300000123.25}', b'{"t":1732300002623.25}'),
         (b'{"t":1732300000123,"value":{"t":1732300000123}}', b'{"t":1732300002623,"value":{"t":1732300000123}}'),
         (
             b'{"t":1732300000123,"x":1,"timestamp":1732300000.5}',
             b'{"t":1732300002623,"x":1,"timestamp":1732300003.0}',
         ),
-        (b'{"t":1.732300000123e12}', b'{"t":1732300002623.0}'),
         (b'{"t":1732300000123', b'{"t":1732300000123'),
         (b'{"t":1234}', b'{"t":1234}'),
-        (b'{"t":0}', b'{"t":0}'),
         (b'{"x":0.25}', b'{"x":0.25}'),
         (b"", b""),
         (b"PBAT", b"PBAT"),

@@ -69,11 +69,10 @@ def export(
     if query.robot is None and form in (Form.MKV, Form.MP4, Form.WAV):
         query = replace(query, robot=_only_robot(paths))
     damages = Damages()
-    beside = damages if query == Query() else ()  # those that were read
     try:
         with progress_of_time(paths, since_ns, until_ns) as on_time:
             read = partial(merged, paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages)
-            typer.echo(_export(form, read, target, query.robot or "", on_time, beside))
+            typer.echo(_export(form, read, target, query.robot or "", on_time))
     finally:
         code = report_unread(problems(damages))
     return code
@@ -103,12 +102,7 @@ def import_(
 
 
 def _export(
-    form: Form,
-    read: Callable[[], Iterable[Recorded]],
-    target: Path,
-    robot: str,
-    on_time: Callable[[int], None],
-    beside: Iterable[Path],
+    form: Form, read: Callable[[], Iterable[Recorded]], target: Path, robot: str, on_time: Callable[[int], None]
 ) -> str:
     if form is Form.FOXGLOVE:
         counts = write_foxglove(read(), target, on_time=on_time)
@@ -124,7 +118,7 @@ def _export(
         if form is Form.LINES:
             count = write_lines(read(), out, on_time=on_time)
         else:
-            count = write_copy(read(), out, on_time=on_time, beside=beside)
+            count = write_copy(read(), out, on_time=on_time)
     return f"{target}: {count:,} messages"
 
 

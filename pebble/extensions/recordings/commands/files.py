@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated
 
@@ -23,8 +22,6 @@ from pebble.extensions.recordings.recorder.finisher import mend as mend_leftover
 from pebble.extensions.recordings.recorder.folder import DAMAGED, Folder, finished_path
 from pebble.extensions.recordings.traffic.index import index_path
 from pebble.runtime.as_owner import as_owner
-
-_DATE = re.compile(r"\d{2}|\d{4}", re.ASCII)
 
 
 def mend(
@@ -91,18 +88,14 @@ def _rm(owner: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keep
     with progress("deleting", len(due)) as advance:
         for number, path in enumerate(due, 1):
             try:
-                names = path.stat().st_nlink
                 copy = rewrite(path, path, keeps=keeps)
             except (PebbleError, OSError) as error:
                 unsure += report_left(error)
                 continue
             if copy.left_out:
                 deleted += copy.left_out
-                if names > 1:
-                    unsure += 1
-                    typer.echo(f"pebble: {path}: has other names (hard links), which keep all of it", err=True)
                 index_path(path).unlink(missing_ok=True)
-                if copy.is_empty:
+                if not copy.messages:
                     path.unlink()
             advance(number)
     typer.echo(f"{deleted:,} messages deleted")
@@ -123,13 +116,13 @@ def _reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:
 
 
 def _delete_whole(path: Path, *, yes: bool) -> int:
-    """Delete whole files. Raises PebbleError for a file that no recorder wrote, or that is being written."""
+    """Delete a whole file. Raises PebbleError for a file that no recorder wrote, or that is not finished."""
     if path.is_symlink():
         raise PebbleError(f"{path} is a link: name the file itself")
-    if not path.is_file() or not path.name.endswith((SUFFIX, ACTIVE, DAMAGED)):
+    if path.name.endswith(ACTIVE):
+        raise PebbleError(f"{path}: is being written, or left by a recorder: pebble recordings mend DIR finishes it")
+    if not path.is_file() or not path.name.endswith((SUFFIX, DAMAGED)):
         raise PebbleError(f"{path}: there is no such folder or recording")
-    if path.name.endswith(ACTIVE) and Folder.is_in_use(_archive_of(path)):
-        raise PebbleError(f"{path}: is being written: stop the recorder first; what one has left, mend finishes")
     if not yes and not typer.confirm(f"Delete {path}?"):
         return 1
     path.unlink()
@@ -164,14 +157,6 @@ def _mend_all(folder: Folder) -> int:
     if not unfinished:
         typer.echo("nothing to mend")
     return 1 if failed else 0
-
-
-def _archive_of(path: Path) -> Path:
-    """Return the recorder's folder above a file, whose folders are years, months and days."""
-    folder = path.resolve().parent
-    while _DATE.fullmatch(folder.name):
-        folder = folder.parent
-    return folder
 
 
 def _existing(folder: Path) -> Path:

@@ -17,6 +17,7 @@ from pebble.extensions.recordings.commands.progress import progress
 from pebble.extensions.recordings.commands.report import local_time, one_line, report_unread
 from pebble.extensions.recordings.files.recorded import RecordingError
 from pebble.extensions.recordings.library import Damages, files, merged, problems, robot_in
+from pebble.extensions.recordings.recorder.folder import MEDIA, NAME
 
 _SHOWN_TOPICS = 30  # of one recording; the rest is counted
 _ONE_LINE = 1 << 20  # columns
@@ -58,9 +59,8 @@ def info(places: RecordingsArgument, since: Since = None, until: Until = None, c
         counts = Counter({topic[len(robot) + 1 :]: n for topic, n in topics.items() if robot_in(topic) == robot})
         typer.echo(f"\n{one_line(shown(robot))}: {counts.total():,} messages")
         _print_topics(counts)
-    encodings = {topic: name for info in looked for topic, name in info.encodings.items() if robot_in(topic) is None}
-    named = ((topic, name) for topic, name in encodings.items() if not topic.startswith("$recorder/"))
-    others = Counter({f"{topic} {name}": topics[topic] for topic, name in named})
+    noted = (topic for topic in topics if robot_in(topic) is None and not topic.startswith("$recorder/"))
+    others = Counter({topic: topics[topic] for topic in noted})
     if others:
         typer.echo(f"\nTopics that are of no robot: {others.total():,} messages")
     _print_topics(others)
@@ -137,10 +137,9 @@ def _looked_at(
 
 def _lane(path: Path) -> str:
     """Return ``state`` or ``media of goob`` from the name of a recorder's file; any other name unchanged."""
-    parts = path.name.removesuffix(".active").removesuffix(".mcap").split(".", 1)
-    if len(parts) == 1:
-        return shown(path.name)
-    return shown(f"media of {parts[1].rpartition('.')[2]}" if parts[1].startswith("media.") else parts[1])
+    match = NAME.fullmatch(path.name)
+    lane = match["lane"] if match else path.name
+    return shown(f"media of {lane.rpartition('.')[2]}" if lane.startswith(MEDIA) else lane)
 
 
 def _state(info: FileInfo) -> str:

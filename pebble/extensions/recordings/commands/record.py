@@ -122,14 +122,8 @@ def _serve(recorder: Recorder, source: Source, ends_at: float | None) -> None:
                 sys.stderr.flush()
         if now - written >= _METRICS_S:
             written = now
-            _write_metrics(recorder, source)
-
-
-def _write_metrics(recorder: Recorder, source: Source) -> None:
-    try:
-        metrics.write(recorder, [source])
-    except OSError:  # a full disk: the recorder says so
-        return
+            with suppress(OSError):  # a full disk: the recorder says so
+                metrics.write(recorder, [source])
 
 
 def _line(recorder: Recorder, source: Source, seconds_: float) -> str:
@@ -138,7 +132,6 @@ def _line(recorder: Recorder, source: Source, seconds_: float) -> str:
         f"{show.duration(seconds_)}",
         f"{counters['messages']:,} messages",
         show.size(counters["bytes"]),
-        f"{len(recorder.robots)} robots",
     ]
     if counters["dropped"]:
         parts.append(f"{counters['dropped']:,} dropped")
@@ -158,8 +151,8 @@ def _print_end(recorder: Recorder, into: Path) -> None:
     counters = recorder.counters
     lost = f", {counters['dropped']:,} dropped" if counters["dropped"] else ""
     typer.echo(
-        f"Recorded {counters['messages']:,} messages ({show.size(counters['bytes'])}) of "
-        f"{len(recorder.robots)} robots{lost}; `pebble recordings info {into}` shows them",
+        f"Recorded {counters['messages']:,} messages ({show.size(counters['bytes'])}){lost}; "
+        f"`pebble recordings info {into}` shows them",
         err=True,
     )
 

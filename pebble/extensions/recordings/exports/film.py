@@ -1,9 +1,7 @@
 """A robot's pictures and sound as a film, or its sound alone, timed by their arrival at the recorder."""
 
 import heapq
-import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -56,7 +54,8 @@ def write_film(
         raise RecordingError(f"{target}: a film ends in {' or '.join(_FORMATS)}")
     av = pyav.load("film")
     container, codec = _FORMATS[target.suffix]
-    with unfinished(target) as path, _file_beside(target) as wav:
+    with unfinished(target) as path:
+        wav = path.with_name("sound.wav")  # it may become as large as the film
         try:
             with SoundTrack(wav) as sound:
                 for at_ms, payload in _media(read(), robot, lambda _log_ns: on_time(0)):
@@ -96,16 +95,6 @@ def write_wav(
         if not track.result.packets:
             raise RecordingError(f"{robot}: no sound" + ("" if pyav.installed() else f"; Opus {pyav.INSTALL}"))
     return track.result
-
-
-@contextmanager
-def _file_beside(target: Path) -> Iterator[Path]:
-    """Yield a path in a temporary folder beside ``target``.
-
-    The file may become as large as the film, and the usual folder for temporary files is often in memory.
-    """
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as name:
-        yield Path(name, "sound.wav")
 
 
 def _media(messages: Iterable[Recorded], robot: str, on_time: Progress) -> Iterator[tuple[int, bytes]]:

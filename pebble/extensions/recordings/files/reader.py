@@ -11,7 +11,7 @@ import os
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from functools import partial
+from functools import lru_cache, partial
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
@@ -20,19 +20,17 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from pebble.extensions.recordings.files.recorded import (
     ACTIVE,
     FOREVER_NS,
+    UNNAMED,
     Channel,
     Damage,
     DamageError,
     Recorded,
     RecordingError,
     Schema,
-    number_in,
     require_package,
-    unnamed,
 )
 from pebble.extensions.recordings.files.records import (
     CHUNK,
-    FOOTER,
     HEAD,
     INDEX,
     LARGEST_RECORD,
@@ -43,23 +41,20 @@ from pebble.extensions.recordings.files.records import (
     records,
     summary_of,
     unpack_chunk,
-    with_own_topic,
 )
-from pebble.extensions.recordings.files.scan import Found, Scan
+from pebble.extensions.recordings.files.scan import INDEX_ENTRY, Scan
 from pebble.ownership import open_plain
 
 if TYPE_CHECKING:
-    from mcap.records import Attachment, ChunkIndex, McapRecord, Metadata, Statistics
+    from mcap.records import ChunkIndex, McapRecord, Statistics
     from mcap.summary import Summary
 
-DAMAGE, MISSING = "pebble.damage", "missing_messages"  # metadata of a copy of a file of which a part was missing
-#: Names of the last version: of that metadata, and of the channel of topics for which a file had no room.
-OLD_COPY, OLD_OTHER = "pebble.rewritten", "$recorder/other"
+DAMAGE: Final = "pebble.damage"  # metadata of a copy of a file of which a part was missing
+MISSING: Final = "missing_messages"  # an item of it
 
-_INDEX_ENTRY: Final = 16  # bytes
-_LARGEST_HEADER: Final = 1 << 16
 _LARGEST_SUMMARY: Final = 256 << 20
-_MOST_OPEN: Final = 512 << 20  # bytes of chunks that are sorted at the same time
+_TAIL, _CHECKSUM = 37, 4  # bytes: of a footer and what follows it, of the checksum in it
+_KEPT: Final = 4  # unpacked chunks: the next question is mostly about the same time
 _time = attrgetter("log_ns")
 
 Chooses = Callable[[Channel], bool]
@@ -87,15 +82,14 @@ class RecordingFile:
         self.is_ours = True  # and its messages are numbered
         self.statistics: Statistics | None = None  # None: it is not finished, or does not say all
         self._schemas: dict[int, Schema] = {}
-        self._names: dict[int, Channel] = {}  # channels that are named beside chunks, where no checksum protects them
-        self._beside: list[int] = []  # where metadata and attachments are
-        self._indexed: dict[int, int] | None = None  # messages by channel of the last chunk, while its indexes may come
-        self._indexed_to = 0  # where these end
-        self._looked_everywhere = False
+        self._metadata: list[int] = []  # where they are
+        self._scan = Scan(self._read, self.damage)
+        self._recent = lru_cache(_KEPT)(partial(self._unpacked, chooses=lambda _channel: True))
         try:
             self._file = open_plain(path)
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror or error}") from None
+        self._opened_size = self.size
         try:
             self._open()
         except BaseException:
@@ -123,6 +117,12 @@ class RecordingFile:
     @property
     def size(self) -> int:
         return os.fstat(self._file.fileno()).st_size
+
+    def is_replaced(self) -> bool:
+        """True if the file's name leads to another file now, or if a finished file has grown. Raises OSError."""
+        now = self.path.stat()
+        has_grown = now.st_size != self._opened_size and not self.path.name.endswith(ACTIVE)
+        return has_grown or not os.path.samestat(now, os.fstat(self._file.fileno()))
 
     @property
     def is_cut_off(self) -> bool:
@@ -153,85 +153,75 @@ class RecordingFile:
         """
         chunks = [chunk for chunk in self.chunks if chunk.end_ns >= since_ns and chunk.start_ns < until_ns]
         if any(chunk.end_ns > next_.start_ns for chunk, next_ in pairwise(chunks)):  # other programs write in any order
-            opened = [0]
-            yield from in_time_order(
-                (chunk.start_ns, partial(self._opened, chunk, chooses, opened)) for chunk in chunks
-            )
+            streams = ((chunk.start_ns, partial(self._unpacked_later, chunk, chooses)) for chunk in chunks)
+            yield from in_time_order(streams)
             return
         due = 0 if len(chunks) == len(self.chunks) else None
         for chunk in chunks:
             messages, numbers = self._unpacked(chunk, chooses)
-            if numbers is not None and self.is_ours and self.statistics is None:
+            if numbers is not None and self.statistics is None:
                 self.damage.missing += 0 if due is None else max(0, numbers[0] - due)
                 due = numbers[1] + 1
             elif due is not None:
                 due += chunk.messages  # they are counted as damaged
             yield from messages
 
-    def messages(self, chunk: Chunk, chooses: Chooses = lambda _channel: True) -> list[Recorded]:
+    def messages(self, chunk: Chunk) -> list[Recorded]:
         """Return the messages of one chunk in the order of time; empty if the chunk is damaged."""
-        return self._unpacked(chunk, chooses)[0]
+        return self._recent(chunk)[0]
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """Return the file's metadata by name; of several with one name the last."""
         from mcap.records import Metadata
 
-        return {record.name: record.metadata for record in self.beside() if isinstance(record, Metadata)}
-
-    def beside(self) -> Iterator[Metadata | Attachment]:
-        """Yield the file's metadata and attachments."""
-        from mcap.records import Attachment, Metadata
-
-        for at in self._beside:
-            head = self._read(at, HEAD.size)
-            length = HEAD.unpack(head)[1] if len(head) == HEAD.size else LARGEST_RECORD
+        found: dict[str, dict[str, str]] = {}
+        for at in self._metadata:
             try:
-                if length >= LARGEST_RECORD:
-                    raise DamageError("metadata, or an attachment, of a size that cannot be")
-                record = record_of(self._read(at, HEAD.size + length))
+                record = self._record(at)
             except DamageError as error:
                 self.damage.add(at, error)
                 continue
-            if isinstance(record, Metadata | Attachment):
-                yield record
+            if isinstance(record, Metadata):
+                found[record.name] = record.metadata
+        return found
 
     # -- a finished file
 
     def _open(self) -> None:
         from mcap.records import Header
 
-        begin = self._read(0, _LARGEST_HEADER)
+        begin = self._read(0, len(MAGIC))
         if not begin:
             self.damage.why = "it is empty"
-        elif not begin.startswith(MAGIC):
+        elif begin != MAGIC:
             self.damage.add(0, "it does not begin as MCAP does")
         with suppress(DamageError):
-            header = record_of(begin[len(MAGIC) :])
+            header = self._record(len(MAGIC))
             self.is_ours = not isinstance(header, Header) or header.library.startswith("pebble")
-        self._scan = Scan(self.path, self._read, self.damage, is_ours=self.is_ours)
         summary = self._summary()
-        if summary is None or not self._take_over(summary):
-            self._look_through()
+        if summary is not None and self._take_over(summary):
+            return
+        if not self.is_ours:
+            raise RecordingError(
+                f"{self.path}: another program wrote it, and its end is missing, or has no index of its messages: "
+                "`mcap recover` makes a copy that has"
+            )
+        self._look_through()
 
     def _summary(self) -> Summary | None:
         """Return the summary; None if the file is unfinished, its end is damaged, or it has none."""
-        tail = FOOTER.size + len(MAGIC)
-        file_size = self.size
-        footer = self._read(max(0, file_size - tail), tail)
-        if len(footer) < tail or footer[FOOTER.size :] != MAGIC:
-            return None
-        op, length, start, _, checksum = FOOTER.unpack_from(footer)
-        size = file_size - start if start else tail
-        if op != Op.FOOTER or length != FOOTER.size - HEAD.size or not tail <= size <= _LARGEST_SUMMARY:
-            return None
-        end = self._read(file_size - size, size)
-        if checksum and zlib.crc32(end[: -len(MAGIC) - 4]) != checksum:
-            return None
-        self.damage.finished = True
-        try:
-            return summary_of(end)
-        except DamageError:
-            return None
+        from mcap.records import Footer
+
+        tail = self._read(max(0, self.size - _TAIL), _TAIL)
+        with suppress(DamageError):
+            footer = record_of(tail[: -len(MAGIC)])
+            if not isinstance(footer, Footer) or not tail.endswith(MAGIC):
+                return None
+            end = self._read(footer.summary_start or self.size - _TAIL, _LARGEST_SUMMARY)
+            if not footer.summary_crc or zlib.crc32(end[: -len(MAGIC) - _CHECKSUM]) == footer.summary_crc:
+                self.damage.finished = True
+                return summary_of(end)
+        return None
 
     def _take_over(self, summary: Summary) -> bool:
         """Use the summary; False if it does not cover all messages, as in files of other programs."""
@@ -242,9 +232,8 @@ class RecordingFile:
         if not counted.channel_message_counts.keys() <= summary.channels.keys():
             return False
         for record in (*summary.schemas.values(), *summary.channels.values()):
-            self._name(record, self.channels)
-        self._beside = [index.offset for index in summary.metadata_indexes]
-        self._beside += [index.offset for index in summary.attachment_indexes]
+            self._name(record)
+        self._metadata = [index.offset for index in summary.metadata_indexes]
         self.chunks, self.statistics = chunks, counted
         return True
 
@@ -252,58 +241,25 @@ class RecordingFile:
 
     def _look_through(self) -> None:
         """Find chunks and channels, from where the last scan ended."""
-        for record in self._scan.records(self.size):
-            if record.op == Op.MESSAGE_INDEX:
-                self._take_index(record)
-                continue
-            self._take_indexes(are_all=record.at == self._indexed_to)
-            self._indexed = None
-            at, begin = record.at, record.at + HEAD.size
-            if record.op == Op.CHUNK:
-                start_ns, end_ns, *_ = CHUNK.unpack(self._read(begin, CHUNK.size))
-                self.chunks.append(Chunk(start_ns, end_ns, at, record.end - at))
-                self._indexed, self._indexed_to = {}, record.end
-            elif record.op in (Op.METADATA, Op.ATTACHMENT):
-                self._beside.append(at)
-            elif record.op in (Op.SCHEMA, Op.CHANNEL):
-                try:
-                    self._declare(self._read(at, record.end - at), self._names)
-                except DamageError as error:
-                    self.damage.add(at, error)
-
-        self._take_indexes(are_all=False)
-
-    def _take_index(self, record: Found) -> None:
-        """Count the messages of a channel in the last chunk, unless damage lies between."""
-        entries = record.end - record.at - INDEX.size
-        if self._indexed is not None and record.at == self._indexed_to and entries >= 0:
-            channel = INDEX.unpack(self._read(record.at, INDEX.size))[2]
-            self._indexed[channel] = entries // _INDEX_ENTRY
-            self._indexed_to = record.end
-
-    def _take_indexes(self, *, are_all: bool) -> None:
-        """Note the contents of the last chunk. ``are_all``: no index of it is damaged or still unwritten."""
-        indexed = self._indexed
-        if indexed is None:
-            return
-        channels = frozenset(indexed if are_all else ())
-        chunk = self.chunks[-1] = self.chunks[-1]._replace(channels=channels, messages=sum(indexed.values()))
-        if not indexed or not indexed.keys() <= self.channels.keys():
-            self._learn(chunk)
+        for op, at, end, channels, messages in self._scan.records(self.size):
+            if op == Op.CHUNK:
+                start_ns, end_ns, *_ = CHUNK.unpack(self._read(at + HEAD.size, CHUNK.size))
+                chunk = Chunk(start_ns, end_ns, at, end - at, channels, messages)
+                self.chunks.append(chunk)
+                if not channels or not channels <= self.channels.keys():
+                    self._learn(chunk)
+            elif op == Op.METADATA:
+                self._metadata.append(at)
+            elif op == Op.CHANNEL:
+                self._name(self._record(at), is_certain=False)
 
     def _learn(self, chunk: Chunk) -> None:
-        """Read the channels that a chunk declares."""
+        """Take the channels that a chunk declares."""
         try:
-            data = self._records(chunk)
-            for op, begin, end in records(data):
-                if op != Op.MESSAGE:
-                    self._declare(data[begin - HEAD.size : end], self.channels)
+            for _ in self._message_records(chunk):
+                pass
         except DamageError as error:
             self.damage.add(chunk.at, error, chunk.messages)
-            return
-        for number in self._names.keys() - self.channels.keys():
-            if not chunk.channels or number in chunk.channels:
-                self.channels[number] = self._names[number]
 
     # -- both
 
@@ -312,77 +268,54 @@ class RecordingFile:
         messages: list[Recorded] = []
         first, last = -1, -1
         chosen: dict[int, Channel | None] = {}  # by channel number; None: not chosen
-        unnamed: set[int] = set()
         try:
-            data = self._records(chunk)
-            for op, begin, end in records(data):
-                if op != Op.MESSAGE:
-                    self._declare(data[begin - HEAD.size : end], self.channels)
-                    continue
-                channel_number, sequence, log_ns, publish_ns = MESSAGE.unpack_from(data, begin)
+            for data, begin, end in self._message_records(chunk):
+                number, sequence, log_ns, publish_ns = MESSAGE.unpack_from(data, begin)
                 first, last = sequence if first < 0 else first, sequence
-                if channel_number not in chosen:
-                    channel = self._channel(channel_number)
-                    if channel_number not in self.channels:
-                        unnamed.add(channel_number)
-                    chosen[channel_number] = channel if channel.topic == OLD_OTHER or chooses(channel) else None
-                if channel_number in unnamed:
-                    self.damage.unnamed += 1
-                channel_or_none = chosen[channel_number]
-                if channel_or_none is not None:
-                    messages.append(
-                        Recorded(channel_or_none, sequence, log_ns, publish_ns, data[begin + MESSAGE.size : end])
-                    )
-            # Old files have all topics without a channel on one: they are chosen by the topic inside the message.
-            if any(channel is not None and channel.topic == OLD_OTHER for channel in chosen.values()):
-                messages = [message for message in map(_with_own_topic, messages) if chooses(message.channel)]
+                if number not in chosen:
+                    channel = self.channels.get(number) or Channel(number, f"{UNNAMED}{number}", "")
+                    chosen[number] = channel if chooses(channel) else None
+                self.damage.unnamed += number not in self.channels
+                if (chosen_channel := chosen[number]) is not None:
+                    payload = data[begin + MESSAGE.size : end]
+                    messages.append(Recorded(chosen_channel, sequence, log_ns, publish_ns, payload))
         except DamageError as error:
             self.damage.add(chunk.at, error, chunk.messages)
             return [], None
         messages.sort(key=_time)
         return messages, (first, last) if first >= 0 else None
 
-    def _opened(self, chunk: Chunk, chooses: Chooses, opened: list[int]) -> Iterator[Recorded]:
-        opened[0] += chunk.length
-        if opened[0] > _MOST_OPEN:
-            raise RecordingError(
-                f"{self.path}: over {_MOST_OPEN >> 20} MB of it are not in the order of time: `mcap sort` puts them so"
-            )
-        yield from self.messages(chunk, chooses)
-        opened[0] -= chunk.length
+    def _message_records(self, chunk: Chunk) -> Iterator[tuple[bytes, int, int]]:
+        """Yield the data of a chunk with the begin and end of each message; take its channels. Raises DamageError."""
+        data = unpack_chunk(self._read(chunk.at, chunk.length if chunk.length < LARGEST_RECORD else 0))
+        for op, begin, end in records(data):
+            if op == Op.MESSAGE:
+                yield data, begin, end
+            elif op in (Op.SCHEMA, Op.CHANNEL):
+                self._name(record_of(data[begin - HEAD.size : end]))
 
-    def _declare(self, data: bytes, channels: dict[int, Channel]) -> None:
-        """Add a schema or channel from its record. Raises DamageError."""
-        if data[0] in (Op.SCHEMA, Op.CHANNEL):
-            self._name(record_of(data), channels)
+    def _unpacked_later(self, chunk: Chunk, chooses: Chooses) -> Iterator[Recorded]:
+        yield from self._unpacked(chunk, chooses)[0]
 
-    def _name(self, record: McapRecord, channels: dict[int, Channel]) -> None:
+    def _name(self, record: McapRecord, *, is_certain: bool = True) -> None:
+        """Take a schema or channel. Beside chunks no checksum protects them: there none replaces another."""
         from mcap.records import Channel as ChannelRecord
         from mcap.records import Schema as SchemaRecord
 
         if isinstance(record, SchemaRecord):
-            self._schemas.setdefault(record.id, Schema(record.name, record.encoding, record.data))
-        elif isinstance(record, ChannelRecord):
+            self._schemas[record.id] = Schema(record.name, record.encoding, record.data)
+        elif isinstance(record, ChannelRecord) and (is_certain or record.id not in self.channels):
             schema = self._schemas.get(record.schema_id)
             channel = Channel(record.id, record.topic, record.message_encoding, record.metadata, schema)
-            channels.setdefault(record.id, channel)
+            self.channels[record.id] = channel
 
-    def _channel(self, number: int) -> Channel:
-        """Return the channel of this number from any place that declares it, as the first such chunk may be lost."""
-        if number not in self.channels and number in self._names:
-            self.channels[number] = self._names[number]
-        if number not in self.channels and not self._looked_everywhere:
-            self._looked_everywhere = True
-            for chunk in self.chunks:
-                self._learn(chunk)
-        return self.channels.get(number) or unnamed(number)
-
-    def _records(self, chunk: Chunk) -> bytes:
-        """Return the records of a chunk. Raises DamageError."""
-        head = self._read(chunk.at, HEAD.size if chunk.length < LARGEST_RECORD else 0)
-        if len(head) < HEAD.size or HEAD.unpack(head) != (Op.CHUNK, chunk.length - HEAD.size):
-            raise DamageError("a chunk is damaged")
-        return unpack_chunk(self._read(chunk.at + HEAD.size, chunk.length - HEAD.size))
+    def _record(self, at: int) -> McapRecord:
+        """Return the record at a position beside chunks. Raises DamageError."""
+        head = self._read(at, HEAD.size)
+        length = HEAD.unpack(head)[1] if len(head) == HEAD.size else LARGEST_RECORD
+        if length >= LARGEST_RECORD:
+            raise DamageError("a record is cut off, or of a size that cannot be")
+        return record_of(self._read(at, HEAD.size + length))
 
     def _read(self, at: int, length: int) -> bytes:
         try:
@@ -418,7 +351,8 @@ def in_time_order(streams: Iterable[tuple[int, Callable[[], Iterator[Recorded]]]
 
 def missing_before(metadata: dict[str, dict[str, str]]) -> int:
     """Return how many messages were already missing when this copy was made, by its metadata."""
-    return sum(number_in(metadata.get(name, {}), MISSING) for name in (DAMAGE, OLD_COPY))
+    text = metadata.get(DAMAGE, {}).get(MISSING, "")
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 18 else 0
 
 
 def _indexed(index: ChunkIndex) -> Chunk:
@@ -430,12 +364,5 @@ def _indexed(index: ChunkIndex) -> Chunk:
         index.chunk_start_offset,
         index.chunk_length,
         channels,
-        entries // _INDEX_ENTRY,
+        entries // INDEX_ENTRY,
     )
-
-
-def _with_own_topic(message: Recorded) -> Recorded:
-    if message.channel.topic != OLD_OTHER:
-        return message
-    channel, payload = with_own_topic(message.channel, message.payload)
-    return Recorded(channel, message.sequence, message.log_ns, message.publish_ns, payload)

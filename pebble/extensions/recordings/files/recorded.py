@@ -87,18 +87,7 @@ class Damage:
         return f"{text} ({self.why})" if text and self.why else text
 
 
-def unnamed(number: int) -> Channel:
-    """Return a substitute for a channel whose declaration is lost."""
-    return Channel(number, f"{UNNAMED}{number}", "application/octet-stream")
-
-
 def require_package() -> None:
     """Raise RecordingError if the package ``mcap`` is not installed."""
     if find_spec("mcap") is None:
         raise RecordingError('recordings need the package mcap: pip install "pebble-robot[record]"')
-
-
-def number_in(items: Mapping[str, str], name: str) -> int:
-    """Return a number from metadata; 0 if it has none."""
-    text = items.get(name, "")
-    return int(text) if text.isascii() and text.isdigit() and len(text) < 18 else 0

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import re
 import struct
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import IntEnum
 from io import BytesIO
 from typing import TYPE_CHECKING, Final
 
-from pebble.errors import PebbleError
-from pebble.extensions.recordings.files.recorded import Channel, DamageError
+from pebble.extensions.recordings.files.recorded import DamageError
 
 if TYPE_CHECKING:
     from mcap.records import McapRecord
@@ -24,32 +22,24 @@ LARGEST_RECORD: Final = LARGEST_CHUNK + (1 << 16)
 
 
 class Op(IntEnum):
-    """Kinds of records; those from PADDING on are private to the program that wrote them."""
+    """Kinds of records before a summary."""
 
     HEADER = 0x01
-    FOOTER = 0x02
     SCHEMA = 0x03
     CHANNEL = 0x04
     MESSAGE = 0x05
     CHUNK = 0x06
     MESSAGE_INDEX = 0x07
-    ATTACHMENT = 0x09
     METADATA = 0x0C
     DATA_END = 0x0F
-    PADDING = 0x80  # covers damaged bytes in files of the last version
 
 
 HEAD: Final = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 CHUNK: Final = struct.Struct("<QQQII")  # first and last log time, unpacked size, checksum, length of a name
 INDEX: Final = struct.Struct("<BQHI")  # opcode, length, channel, length of the entries
-FOOTER: Final = struct.Struct("<BQQQI")
-#: The begin of a chunk: opcode; lengths below 4 GB; one of MCAP's compressions, and how its data begin.
-LOOKS_LIKE_CHUNK: Final = re.compile(
-    rb"\x06.{4}\x00{4}.{16}.{4}\x00{4}.{4}"
-    rb"(?:\x04\x00{3}zstd.{4}\x00{4}\x28\xb5\x2f\xfd|\x03\x00{3}lz4.{4}\x00{4}\x04\x22\x4d\x18|\x00{4}.{4}\x00{4})",
-    re.DOTALL,
-)
+#: The begin of a chunk of ours: opcode; a length below 4 GB; "zstd", or uncompressed.
+LOOKS_LIKE_CHUNK: Final = re.compile(rb"\x06.{4}\x00{4}.{28}(?:\x04\x00{3}zstd|\x00{4}).{4}\x00{4}", re.DOTALL)
 
 
 def records(data: bytes) -> Iterator[tuple[int, int, int]]:
@@ -66,44 +56,33 @@ def records(data: bytes) -> Iterator[tuple[int, int, int]]:
         at += length
 
 
-def unpack_chunk(body: bytes) -> bytes:
-    """Return the records of a chunk. Raises DamageError if its checksum is wrong."""
+def unpack_chunk(data: bytes) -> bytes:
+    """Return the records of a chunk from its record. Raises DamageError if its checksum is wrong."""
+    from mcap.records import Chunk
+    from mcap.stream_reader import get_chunk_data_stream
+
+    chunk = record_of(data)
+    if not isinstance(chunk, Chunk) or chunk.uncompressed_size > LARGEST_CHUNK:
+        raise DamageError("a chunk is damaged")
     with _damage():
-        _, _, size, checksum, name_length = CHUNK.unpack_from(body)
-        at = CHUNK.size + name_length
-        name, packed = body[CHUNK.size : at].decode(), body[at + 8 :]
-    if size > LARGEST_CHUNK:
-        raise DamageError(f"a chunk of {size} bytes")
-    unpacked = _unpack(name, packed, size)
-    if len(unpacked) != size or (checksum and zlib.crc32(unpacked) != checksum):
-        raise DamageError("a chunk's checksum is wrong")
-    return unpacked
-
-
-def with_own_topic(channel: Channel, payload: bytes) -> tuple[Channel, bytes]:
-    """Return channel and payload of a payload that begins with topic and metadata. Raises DamageError."""
-    from mcap.data_stream import ReadDataStream
-    from mcap.records import Metadata
-
-    with _damage():
-        stream = ReadDataStream(BytesIO(payload))
-        metadata = Metadata.read(stream)
-    return Channel(channel.id, metadata.name, channel.encoding, metadata.metadata), payload[stream.count :]
+        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+        return stream.read(size)
 
 
 def record_of(data: bytes) -> McapRecord:
-    """Return the parsed record. Raises DamageError, also for a channel whose lengths do not fit exactly."""
+    """Return the parsed record. Raises DamageError, also if its lengths do not fit exactly, except for a chunk."""
     from mcap.data_stream import RecordBuilder
-    from mcap.records import Channel as ChannelRecord
+    from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
 
     builder = RecordBuilder()
     with _damage():
-        record = next(StreamReader(BytesIO(data), skip_magic=True).records)
-        if isinstance(record, ChannelRecord):
-            record.write(builder)
-    if isinstance(record, ChannelRecord) and builder.end() != data:
-        raise DamageError("the name of a channel is damaged")
+        record = next(StreamReader(BytesIO(data), skip_magic=True, emit_chunks=True).records)
+        if isinstance(record, Chunk):
+            return record
+        record.write(builder)
+    if builder.end() != data:
+        raise DamageError("a record's lengths are damaged")
     return record
 
 
@@ -123,24 +102,5 @@ def _damage() -> Iterator[None]:
     """Raise DamageError in place of the errors of parsing damaged bytes."""
     try:
         yield
-    except PebbleError:
-        raise
     except Exception as error:  # noqa: BLE001  the package raises its own, struct's, zstandard's, KeyError, StopIteration …
         raise DamageError(f"a record is damaged: {error or type(error).__name__}") from None
-
-
-def _unpack(name: str, packed: bytes, size: int) -> bytes:
-    """Decompress at most ``size`` + 1 bytes, since the size in the data may be wrong."""
-    if not name:
-        return packed
-    with _damage():
-        if name == "zstd":
-            import zstandard
-
-            with zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True) as reader:
-                return reader.read(size + 1)
-        if name == "lz4":
-            import lz4.frame
-
-            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1))
-    raise DamageError(f"a chunk is compressed by {name[:16]!r}, which is none of MCAP's")

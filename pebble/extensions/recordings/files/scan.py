@@ -1,9 +1,10 @@
 """A scan for the records of a file without a summary, from its beginning to its end, also after damage."""
 
+import struct
 from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
-from pebble.extensions.recordings.files.recorded import Damage, DamageError, RecordingError
+from pebble.extensions.recordings.files.recorded import Damage, DamageError
 from pebble.extensions.recordings.files.records import (
     CHUNK,
     HEAD,
@@ -16,7 +17,9 @@ from pebble.extensions.recordings.files.records import (
     unpack_chunk,
 )
 
-_CHECKSUM: Final = 4  # bytes
+INDEX_ENTRY: Final = 16  # bytes
+_INDEX: Final = struct.Struct("<HI")  # channel, length of the entries
+_KINDS: Final = frozenset(Op) - {Op.MESSAGE}  # of records beside chunks
 _LONGEST_NAME: Final = 16  # of a compression
 _SEARCHED, _OVERLAP = 1 << 20, 64  # bytes behind damage that are read at once
 
@@ -25,22 +28,20 @@ Read = Callable[[int, int], bytes]
 
 
 class Found(NamedTuple):
-    """A record that was found, with its place."""
+    """A record that was found, with its place; of a chunk, what its indexes hold if none of them is damaged."""
 
     op: int
     at: int
     end: int
+    channels: frozenset[int] = frozenset()
+    messages: int = 0
 
 
 class Scan:
-    """A scan that continues where it ended, when the file has grown.
+    """A scan that continues where it ended, when the file has grown. Records that we never write count as damage."""
 
-    ``name``: the file's, for errors; ``is_ours``: it is a file of ours, in which records that we never write count as
-    damage.
-    """
-
-    def __init__(self, name: object, read: Read, damage: Damage, *, is_ours: bool) -> None:
-        self._name, self._read, self._damage, self._is_ours = name, read, damage, is_ours
+    def __init__(self, read: Read, damage: Damage) -> None:
+        self._read, self._damage = read, damage
         self._at = len(MAGIC)  # what was looked at ends here
         self._searched = 0  # no chunk begins before
         self._size, self._ended = 0, False
@@ -52,13 +53,10 @@ class Scan:
         if len(rest) < HEAD.size or not any(rest):
             return len(rest) >= self._damage.torn
         op, length = HEAD.unpack_from(rest)
-        return self._may_begin(op, length) and self._at + HEAD.size + length > self._size
+        return op in _KINDS and length < 1 << 32 and self._at + HEAD.size + length > self._size
 
     def records(self, size: int) -> Iterator[Found]:
-        """Yield the records of a file of ``size`` bytes that were not yielded before.
-
-        Raises RecordingError for a file whose messages are not in chunks.
-        """
+        """Yield the records of a file of ``size`` bytes that were not yielded before."""
         self._size = size
         while self._at < size and not self._ended:
             record = self._record_at(self._at)
@@ -70,40 +68,34 @@ class Scan:
                 self._damage.add(self._at, f"{next_chunk - self._at:,} bytes are no record")
                 self._at = next_chunk
                 continue
-            found_record = Found(record[0], self._at, record[1])
-            self._at, self._ended = found_record.end, found_record.op == Op.DATA_END
-            yield found_record
+            self._at, self._ended = record.end, record.op == Op.DATA_END
+            yield self._with_indexes(record) if record.op == Op.CHUNK else record
         self._damage.torn = 0 if self._ended else max(0, size - self._at)
 
-    def _record_at(self, at: int) -> tuple[int, int] | None:
-        """Return the opcode and the end of the record at ``at``; None if there is no complete record."""
+    def _with_indexes(self, chunk: Found) -> Found:
+        """Pass the indexes behind a chunk, and return it with what they hold."""
+        counts: dict[int, int] = {}
+        while (record := self._record_at(self._at)) is not None and record.op == Op.MESSAGE_INDEX:
+            channel, length = _INDEX.unpack(self._read(self._at + HEAD.size, _INDEX.size))
+            counts[channel], self._at = length // INDEX_ENTRY, record.end
+        are_all = record is not None or self._at >= self._size
+        return chunk._replace(channels=frozenset(counts if are_all else ()), messages=sum(counts.values()))
+
+    def _record_at(self, at: int) -> Found | None:
+        """Return the record at ``at``; None if there is no complete record."""
         head = self._read(at, HEAD.size)
-        if len(head) < HEAD.size:
-            return None
-        op, length = HEAD.unpack_from(head)
+        op, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
         end = at + HEAD.size + length
-        if end > self._size:
+        if op not in _KINDS or end > self._size:
             return None
         if op == Op.CHUNK:
             is_one = self._is_chunk(at, length)
-        elif op == Op.CHANNEL:
-            is_one = self._is_channel(at, length)
-        elif op == Op.DATA_END:
-            is_one = length == _CHECKSUM
-        elif op == Op.MESSAGE and not self._is_ours:
-            raise RecordingError(f"{self._name}: its messages are not in chunks: `mcap compress` puts them there")
+        elif op == Op.MESSAGE_INDEX:
+            entries = self._read(at + HEAD.size, _INDEX.size)
+            is_one = length >= _INDEX.size and length == _INDEX.size + _INDEX.unpack(entries)[1]
         else:
-            is_one = self._may_begin(op, length) and self._begins_record(end)
-        return (op, end) if is_one else None
-
-    def _begins_record(self, at: int) -> bool:
-        """True if a record may begin at ``at``, or the file ends there."""
-        head = self._read(at, HEAD.size)
-        return len(head) < HEAD.size or self._may_begin(*HEAD.unpack(head))
-
-    def _may_begin(self, op: int, length: int) -> bool:
-        is_known = Op.HEADER <= op <= Op.DATA_END or op == Op.PADDING or (op > 0 and not self._is_ours)
-        return is_known and length < 1 << 32
+            is_one = self._is_exact(at, length)
+        return Found(op, at, end) if is_one else None
 
     def _is_chunk(self, at: int, length: int) -> bool:
         """True if the lengths in a chunk's head agree."""
@@ -113,8 +105,8 @@ class Scan:
         data_at = CHUNK.size + min(CHUNK.unpack_from(head)[4], _LONGEST_NAME)
         return bool(length == data_at + 8 + int.from_bytes(head[data_at : data_at + 8], "little"))
 
-    def _is_channel(self, at: int, length: int) -> bool:
-        """True if a channel's lengths agree exactly; it has no checksum."""
+    def _is_exact(self, at: int, length: int) -> bool:
+        """True if all lengths in a record agree; it has no checksum."""
         try:
             record_of(self._read(at, HEAD.size + min(length, LARGEST_RECORD)))
         except DamageError:
@@ -127,14 +119,14 @@ class Scan:
             part, offset = self._read(at, _SEARCHED + _OVERLAP), -1
             while (match := LOOKS_LIKE_CHUNK.search(part, offset + 1)) is not None and match.start() < _SEARCHED:
                 offset = match.start()
-                if (record := self._record_at(at + offset)) is not None and self._is_whole(at + offset, record[1]):
+                if (record := self._record_at(at + offset)) is not None and self._is_whole(record):
                     return at + offset
             at += _SEARCHED
         return None
 
-    def _is_whole(self, at: int, end: int) -> bool:
+    def _is_whole(self, chunk: Found) -> bool:
         try:
-            for _ in records(unpack_chunk(self._read(at + HEAD.size, end - at - HEAD.size))):
+            for _ in records(unpack_chunk(self._read(chunk.at, chunk.end - chunk.at))):
                 pass
         except DamageError:
             return False

@@ -56,10 +56,6 @@ class RecordingWriter:
         """Add metadata about the file."""
         self._writer.add_metadata(name, dict(items))
 
-    def attach(self, name: str, media_type: str, data: bytes, *, log_ns: int, create_ns: int) -> None:
-        """Add an attachment."""
-        self._writer.add_attachment(create_ns, log_ns, name, media_type, data)
-
     def schema(self, name: str, encoding: str, data: bytes) -> int:
         """Declare the schema of messages; return its number for :meth:`channel`."""
         number: int = self._writer.register_schema(name, encoding, data)

@@ -24,7 +24,7 @@ def mend(path: Path) -> Rewritten:
     """
     target = finished_path(path)
     copy = rewrite(path, target)
-    if copy.is_empty:
+    if not copy.messages:
         target.unlink()
     sync_folder(path.parent)
     if copy.is_whole:
@@ -86,7 +86,7 @@ class Finisher:
         self._unfinished.discard(path)
         if not copy.is_whole:
             self._event("damaged", file=path.name, why=copy.unread)
-        if not copy.is_empty:
+        if copy.messages:
             self._event("recovered", file=path.name, messages=copy.messages, missing=copy.missing)
             self._on_finished()
 

@@ -25,10 +25,10 @@ STATE: Final = "state"
 MEDIA: Final = "media."
 DAMAGED: Final = ".damaged"
 LOCK: Final = "recorder.lock"
-_NAME: Final = re.compile(
+NAME: Final = re.compile(
     r"(?P<stamp>\d{8}T\d{6}Z)-(?P<number>\d{6,})\.(?P<lane>state|media\.[A-Za-z0-9_.-]{1,120})\.mcap(?P<state>|\.active|\.damaged)"
 )
-_COPY: Final = re.compile(rf"\.{_NAME.pattern}\.\d+{re.escape(PART)}")
+_COPY: Final = re.compile(rf"\.{NAME.pattern}\.\d+{re.escape(PART)}")
 _DAY: Final = "%Y/%m/%d"
 
 
@@ -123,7 +123,7 @@ class Folder:
         """Return the recorder's files, the oldest first; links and foreign files are left out."""
         entries = []
         for path in self._files():
-            match = _NAME.fullmatch(path.name)
+            match = NAME.fullmatch(path.name)
             try:
                 about = path.lstat()
             except OSError:

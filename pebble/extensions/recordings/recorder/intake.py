@@ -8,7 +8,6 @@ from collections.abc import Callable
 from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
-from pebble.contract import OUTGOING
 from pebble.extensions.recordings.recorder.clock import RecordingClock
 from pebble.extensions.recordings.recorder.lane import Item
 from pebble.extensions.recordings.stamps import is_media
@@ -21,7 +20,6 @@ FORGET: Final = "$recorder/forget"
 _COST: Final = 300  # bytes of memory that a message takes beside its topic and payload
 _MOST_WAITING: Final = 1 << 20  # messages that wait to be written; the oldest is dropped, with an event
 _MOST_EVENTS: Final = 1000  # events that wait to be written
-_MOST_ROBOTS: Final = 1000  # whose newest message is remembered
 
 
 class Clocks(NamedTuple):
@@ -36,8 +34,7 @@ class Intake:
     """A bounded queue; pictures and sound never displace state. Any thread may add to it."""
 
     def __init__(self, limit: int, clocks: Clocks, clock: RecordingClock, counters: Counter[str]) -> None:
-        self.robots: dict[str, float] = {}  # when each was received last, seconds since 1970
-        self._boot_ns, self._wall_ns = clocks.boot_ns, clocks.wall_ns
+        self._boot_ns = clocks.boot_ns
         self._clock, self._counters = clock, counters
         self._lock = threading.Lock()
         self._state = BoundedQueue[Item](_MOST_WAITING, limit // 4)
@@ -50,14 +47,11 @@ class Intake:
     def add(self, topic: str, payload: bytes, qos: int | None, retain: bool | None, retained: str, source: str) -> None:
         item = Item(self._boot_ns(), topic, payload, qos, retain, retained, source)
         queue = self._media if is_media(payload) else self._state
-        robot = _robot_of(topic)
         with self._lock:
             lost = queue.append(item, len(topic) + len(payload) + _COST)
             self._counters["messages"] += 1
             self._counters["bytes"] += len(payload)
             self._counters["dropped"] += len(lost)
-            if robot and (robot in self.robots or len(self.robots) < _MOST_ROBOTS):
-                self.robots[robot] = self._wall_ns() / 1e9
 
     def note(self, event: str, **about: Any) -> None:
         """Add an event of the recording itself. Messages never displace it; only 1,000 events may wait."""
@@ -93,8 +87,3 @@ class Intake:
 
 
 _when = attrgetter("boot_ns")
-
-
-def _robot_of(topic: str) -> str:
-    levels = topic.split("/", 4)
-    return "/".join(levels[:3]) if len(levels) > 4 and levels[3] == OUTGOING else ""

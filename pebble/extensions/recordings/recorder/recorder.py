@@ -106,11 +106,6 @@ class Recorder:
     def waiting(self) -> int:
         return len(self._intake)
 
-    @property
-    def robots(self) -> dict[str, float]:
-        """Return the time of each robot's last message, in seconds since 1970."""
-        return dict(self._intake.robots)
-
     # -- the writer's thread
 
     def _write(self) -> None:

@@ -29,6 +29,7 @@ _SPACE_S: Final = 2.0  # between two looks at the disk
 _LISTED_S: Final = 60.0  # between two looks at all files
 _AGE_S: Final = 60.0  # between two files that are deleted for their age
 _IDLE_NS: Final = 60 * 10**9  # a robot's media file without pictures is finished after this
+_INDEX: Final = ".parquet"  # which an analysis has made beside a file
 _when = attrgetter("boot_ns")
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 
@@ -270,6 +271,7 @@ class Writing:
     def _delete(self, path: Path, size: int) -> None:
         try:
             path.unlink()
+            path.with_suffix(_INDEX).unlink(missing_ok=True)
         except OSError as error:
             self._quiet_log.warning("delete", "%s cannot be deleted: %s", path, error.strerror)
             return

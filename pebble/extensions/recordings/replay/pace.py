@@ -8,9 +8,9 @@ SLOWEST, FASTEST = 0.1, 100.0
 class Pace:
     """A speed and a starting point. Positions are in nanoseconds since 1970; ``now``, in seconds, never goes back."""
 
-    def __init__(self, now: Callable[[], float], *, speed: float, slowest: float) -> None:
-        self._now, self._slowest = now, slowest
-        self._speed = min(max(speed, slowest), FASTEST)
+    def __init__(self, now: Callable[[], float], *, speed: float) -> None:
+        self._now = now
+        self._speed = min(max(speed, SLOWEST), FASTEST)
         self.from_ns, self._from = 0, 0.0  # a position, and when playing went on from it
 
     @property
@@ -20,7 +20,7 @@ class Pace:
     def change(self, speed: float, position_ns: int) -> None:
         """Play at another speed, from this position."""
         self.go_on_from(position_ns)
-        self._speed = min(max(speed, self._slowest), FASTEST)
+        self._speed = min(max(speed, SLOWEST), FASTEST)
 
     def go_on_from(self, position_ns: int) -> None:
         self.from_ns, self._from = position_ns, self._now()

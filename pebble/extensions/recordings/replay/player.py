@@ -6,7 +6,7 @@ from typing import Final, Protocol
 from pebble.extensions.recordings.files.reader import Chooses
 from pebble.extensions.recordings.files.recorded import Recorded
 from pebble.extensions.recordings.library import FOREVER_NS
-from pebble.extensions.recordings.replay.pace import SLOWEST, Pace
+from pebble.extensions.recordings.replay.pace import Pace
 from pebble.extensions.recordings.replay.rules import Rules, zero
 from pebble.transports import Message
 
@@ -132,7 +132,6 @@ class Player:
         since_ns: int = 0,
         until_ns: int = FOREVER_NS,
         speed: float = 1.0,
-        slowest: float = SLOWEST,
         loop: bool = False,
         paused: bool = False,
         stays: bool = False,
@@ -147,7 +146,7 @@ class Player:
         self.at_end = False  # it is paused there
         self._reading = Reading(source, publishes, until_ns)
         self._output = output
-        self._pace = Pace(now, speed=speed, slowest=slowest)
+        self._pace = Pace(now, speed=speed)
         self._now, self._wait = now, wait
         self._since_ns, self._loop, self._stays, self._longest_gap_ns = since_ns, loop, stays, longest_gap_ns
         self._begins_ns = 0  # the first message

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Final
@@ -17,14 +18,11 @@ Make = Callable[[str, Message | None], Transport]
 
 
 class ReplayedRobots:
-    """A publisher in the names of robots, which it finally publishes as offline.
+    """A publisher in the names of robots, which it finally publishes as offline."""
 
-    ``wall_ms`` returns the time since 1970.
-    """
-
-    def __init__(self, make: Make, bases: Iterable[str], *, wall_ms: Callable[[], int]) -> None:
+    def __init__(self, make: Make, bases: Iterable[str]) -> None:
         self.problem = ""  # why nothing is published now
-        self._make, self._bases, self._wall_ms = make, list(bases), wall_ms
+        self._make, self._bases = make, list(bases)
         self._robots: dict[str, Transport] = {}
 
     def __enter__(self) -> ReplayedRobots:
@@ -61,6 +59,7 @@ class ReplayedRobots:
             with suppress(TransportError):
                 transport.close()
 
-    def _offline(self, base: str) -> Message:
-        payload = codec.encode(ONLINE, Heartbeat(t=self._wall_ms(), online=False))
+    @staticmethod
+    def _offline(base: str) -> Message:
+        payload = codec.encode(ONLINE, Heartbeat(t=time.time_ns() // 1_000_000, online=False))
         return Message(ONLINE.topic(base), payload, QoS.DELIVERED)

@@ -1,6 +1,5 @@
-"""An archive: a folder of recordings, from which a robot's state, messages and picture at a time are read."""
+"""An archive: recordings from which a robot's state, messages and picture at a time are read."""
 
-import re
 import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -10,12 +9,11 @@ from typing import Final, NamedTuple
 from pebble.contract.channels import LOGS
 from pebble.contract.identity import Direction, parse_topic
 from pebble.errors import PebbleError
-from pebble.extensions.recordings.files.reader import Chunk
+from pebble.extensions.recordings.files.reader import Chunk, RecordingFile
 from pebble.extensions.recordings.files.recorded import Channel, Recorded
 from pebble.extensions.recordings.library import recordings_in
-from pebble.extensions.recordings.recorder.folder import MEDIA
-from pebble.extensions.recordings.recorder.lane import OTHER_MEDIA, lane_of
-from pebble.extensions.recordings.seek.file import SeekableFile, is_carried
+from pebble.extensions.recordings.recorder.folder import MEDIA, NAME
+from pebble.extensions.recordings.recorder.lane import CARRIED, OTHER_MEDIA, lane_of
 from pebble.extensions.recordings.stamps import is_keyframe, is_media, is_picture
 
 LOG_LINES: Final = 50  # of the state at a time
@@ -25,7 +23,6 @@ _CHAIN_NS, _CHAIN_BYTES = 15 * 10**9, 8 << 20
 LIST_S: Final = 1.0  # between two looks at the folder
 _LONGEST_FILE_NS: Final = 25 * 3600 * 10**9
 _MOST_OPEN: Final = 64  # files that are open at once
-_NAME: Final = re.compile(r"(?P<stamp>\d{8}T\d{6}Z)-\d{6,}\.(?P<lane>.+?)\.mcap(?:\.active)?")
 
 
 class _Named(NamedTuple):
@@ -37,13 +34,13 @@ class _Named(NamedTuple):
 
 
 class Archive:
-    """The recordings below ``folder``. Not thread-safe."""
+    """The recordings in ``places``, files or folders. Not thread-safe."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, *places: Path) -> None:
+        self._places = places
         self._named: list[_Named] = []
         self._listed_at = float("-inf")
-        self._open: dict[Path, SeekableFile] = {}
+        self._open: dict[Path, RecordingFile] = {}
         self._failed: dict[Path, str] = {}  # those that cannot be opened, and why
 
     def close(self) -> None:
@@ -54,13 +51,13 @@ class Archive:
         """Return the messages from and to a robot, from ``since_ns`` to before ``until_ns``."""
         messages: list[Recorded] = []
         for file in self.files(robot, since_ns, until_ns):
-            for chunk in _within(file, file.channels_of(robot), since_ns, until_ns):
+            for chunk in _within(file, _channels_of(file, robot), since_ns, until_ns):
                 messages += (
                     message
-                    for message in file.messages_of(chunk)
+                    for message in file.messages(chunk)
                     if since_ns <= message.log_ns < until_ns
                     and _is_of(message.channel, robot)
-                    and not is_carried(message.channel)
+                    and not _is_carried(message.channel)
                 )
         messages.sort(key=lambda message: message.log_ns)
         return messages
@@ -74,7 +71,7 @@ class Archive:
         file = max(files, key=lambda file_: file_.first_ns)
         topics = {channel.topic for channel in file.channels.values() if _is_of(channel, robot)}
         newest: dict[str, Recorded] = {}
-        for chunk in reversed(_within(file, file.channels_of(robot), 0, at_ns)):
+        for chunk in reversed(_within(file, _channels_of(file, robot), 0, at_ns)):
             missing = topics - newest.keys()
             if not missing:
                 break
@@ -82,7 +79,7 @@ class Archive:
                 file.channels[number].topic in missing for number in chunk.channels if number in file.channels
             ):
                 continue
-            for message in reversed(file.messages_of(chunk)):
+            for message in reversed(file.messages(chunk)):
                 topic = message.channel.topic
                 if message.log_ns < at_ns and topic not in newest and _is_of(message.channel, robot):
                     newest[topic] = message
@@ -100,7 +97,7 @@ class Archive:
             for chunk in reversed(_within(file, numbers, at_ns - _LOG_NS, at_ns)):
                 lines = [
                     message
-                    for message in file.messages_of(chunk)
+                    for message in file.messages(chunk)
                     if message.channel.topic == topic and message.log_ns < at_ns
                 ]
                 newest_first += reversed(lines)
@@ -135,7 +132,7 @@ class Archive:
                 earliest_ns = first_ns if earliest_ns is None else min(earliest_ns, first_ns)
         return earliest_ns
 
-    def files(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[SeekableFile]:
+    def files(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[RecordingFile]:
         """Return the files that may hold messages of a robot in a period, opened, in the order of time."""
         lane = lane_of(f"{robot}/", is_media=True)
         files = []
@@ -150,7 +147,7 @@ class Archive:
             files.append(file)
         return sorted(files, key=lambda file_: file_.first_ns)
 
-    def all_files(self) -> Iterator[SeekableFile]:
+    def all_files(self) -> Iterator[RecordingFile]:
         """Yield all files, each opened."""
         files = (self._opened(named.path) for named in self._list())
         yield from (file for file in files if file is not None)
@@ -164,15 +161,16 @@ class Archive:
     def _list(self) -> list[_Named]:
         now = time.monotonic()
         if now - self._listed_at >= LIST_S:
-            self._named = sorted(_named(path) for path in recordings_in(self.folder) if path.is_file())
+            paths = (path for place in self._places for path in (recordings_in(place) if place.is_dir() else (place,)))
+            self._named = sorted(_named(path) for path in paths if path.is_file())
             self._listed_at = now
-            paths = {named.path for named in self._named}
-            for path in [path for path in self._open if path not in paths]:
+            there = {named.path for named in self._named}
+            for path in [path for path in self._open if path not in there]:
                 self._open.pop(path).close()
-            self._failed = {path: why for path, why in self._failed.items() if path in paths}
+            self._failed = {path: why for path, why in self._failed.items() if path in there}
         return self._named
 
-    def _opened(self, path: Path) -> SeekableFile | None:
+    def _opened(self, path: Path) -> RecordingFile | None:
         """Return a file, opened; None if it is gone or is no recording."""
         file = self._open.pop(path, None)
         try:
@@ -180,7 +178,7 @@ class Archive:
                 file.close()
                 file = None
             if file is None:
-                file = SeekableFile(path)
+                file = RecordingFile(path)
             file.refresh()
         except (PebbleError, OSError) as error:
             self._failed[path] = str(error).removeprefix(f"{path}: ")
@@ -195,10 +193,10 @@ class Archive:
         """Yield the pictures before a time, newest first."""
         since_ns = at_ns - _CHAIN_NS
         for file in reversed(self.files(robot, since_ns, at_ns)):
-            for chunk in reversed(_within(file, file.channels_of(robot), since_ns, at_ns)):
-                for message in reversed(file.messages_of(chunk)):
+            for chunk in reversed(_within(file, _channels_of(file, robot), since_ns, at_ns)):
+                for message in reversed(file.messages(chunk)):
                     outgoing = message.channel.topic.startswith(f"{robot}/outgoing/")
-                    if message.log_ns < at_ns and outgoing and is_picture(message.payload):
+                    if since_ns <= message.log_ns < at_ns and outgoing and is_picture(message.payload):
                         yield message
 
 
@@ -210,15 +208,15 @@ def metric_of(topic: str) -> tuple[str, bool]:
     return parsed.metric, parsed.direction is Direction.INCOMING
 
 
-def _first(file: SeekableFile, robot: str, at_ns: int) -> int | None:
-    for chunk in _within(file, file.channels_of(robot), at_ns, 1 << 63):
-        for message in file.messages_of(chunk):
-            if message.log_ns >= at_ns and _is_of(message.channel, robot) and not is_carried(message.channel):
+def _first(file: RecordingFile, robot: str, at_ns: int) -> int | None:
+    for chunk in _within(file, _channels_of(file, robot), at_ns, 1 << 63):
+        for message in file.messages(chunk):
+            if message.log_ns >= at_ns and _is_of(message.channel, robot) and not _is_carried(message.channel):
                 return message.log_ns
     return None
 
 
-def _within(file: SeekableFile, channels: frozenset[int], since_ns: int, until_ns: int) -> list[Chunk]:
+def _within(file: RecordingFile, channels: frozenset[int], since_ns: int, until_ns: int) -> list[Chunk]:
     """Return the chunks of a period that hold messages of these channels."""
     return [
         chunk
@@ -229,12 +227,21 @@ def _within(file: SeekableFile, channels: frozenset[int], since_ns: int, until_n
     ]
 
 
+def _channels_of(file: RecordingFile, robot: str) -> frozenset[int]:
+    return frozenset(number for number, channel in file.channels.items() if _is_of(channel, robot))
+
+
+def _is_carried(channel: Channel) -> bool:
+    """True if the message was copied to the beginning of the file, and is older than the file."""
+    return channel.metadata.get("retained") == CARRIED
+
+
 def _is_of(channel: Channel, robot: str) -> bool:
     return channel.topic.startswith((f"{robot}/outgoing/", f"{robot}/incoming/"))
 
 
 def _named(path: Path) -> _Named:
-    match = _NAME.fullmatch(path.name)
+    match = NAME.fullmatch(path.name)
     if match is None:
         return _Named(path, "", 0)
     try:

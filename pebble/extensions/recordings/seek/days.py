@@ -10,11 +10,10 @@ from typing import Final
 from msgspec import Struct, field
 
 from pebble.contract import DRIVE
-from pebble.extensions.recordings.files.reader import Chunk
+from pebble.extensions.recordings.files.reader import Chunk, RecordingFile
 from pebble.extensions.recordings.library import robot_of
 from pebble.extensions.recordings.recorder.intake import EVENTS
 from pebble.extensions.recordings.seek.archive import Archive
-from pebble.extensions.recordings.seek.file import SeekableFile
 
 DAY_NS: Final = 86_400 * 10**9
 _MOST_DAYS: Final = 31  # of one chunk
@@ -67,10 +66,11 @@ class Days:
         return sorted(by_name.values(), key=lambda day: day.day, reverse=True)
 
 
-def _days(file: SeekableFile) -> list[Day]:
+def _days(file: RecordingFile) -> list[Day]:
     if not file.chunks:
         return []
     gaps = _gaps(file)
+    robots = sorted({robot for channel in file.channels.values() if (robot := robot_of(channel)) is not None})
     days: list[Day] = []
     for number in sorted({number for chunk in file.chunks for number in _day_numbers(chunk)}):
         begin, end = number * DAY_NS, (number + 1) * DAY_NS
@@ -78,11 +78,11 @@ def _days(file: SeekableFile) -> list[Day]:
         size = 0 if days else file.size
         within = sum(begin <= ns < end for ns in gaps)
         driven = _driven(file, begin, end)
-        days.append(Day(_day_of(number * 86_400), sorted(file.robots()), size, first / 1e6, last / 1e6, within, driven))
+        days.append(Day(_day_of(number * 86_400), robots, size, first / 1e6, last / 1e6, within, driven))
     return days
 
 
-def _driven(file: SeekableFile, begin: int, end: int) -> dict[str, float]:
+def _driven(file: RecordingFile, begin: int, end: int) -> dict[str, float]:
     """Return the driven seconds within a day, by robot."""
     drives = {number: robot_of(channel) for number, channel in file.channels.items() if _drives(channel.topic)}
     robots = {number: robot for number, robot in drives.items() if robot is not None}
@@ -121,7 +121,7 @@ def _merge(day: Day, other: Day) -> None:
         day.driven[robot] = day.driven.get(robot, 0.0) + seconds
 
 
-def _gaps(file: SeekableFile) -> list[int]:
+def _gaps(file: RecordingFile) -> list[int]:
     """Return the gaps that the recorder noted."""
     numbers = {number for number, channel in file.channels.items() if channel.topic == EVENTS}
     times = []
@@ -129,7 +129,7 @@ def _gaps(file: SeekableFile) -> list[int]:
         if not chunk.channels.isdisjoint(numbers):
             times += [
                 message.log_ns
-                for message in file.messages_of(chunk)
+                for message in file.messages(chunk)
                 if message.channel.id in numbers and _is_gap(message.payload)
             ]
     return times

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 from msgspec import Struct, field
 
 from pebble.errors import PebbleError
-from pebble.extensions.recordings.files.recorded import SUFFIX, RecordingError
 from pebble.extensions.recordings.library import ACTIVE, files
 from pebble.extensions.recordings.recorder.folder import finished_path
 from pebble.extensions.recordings.traffic.duck import connected, parquet
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 Progress = Callable[[str, float], None]
 
 _MEMORY_MB: Final = 128
-_OLD: Final = "index"  # the folder in which the last version had its index
 
 
 class Sources(Struct):
@@ -42,12 +40,12 @@ def sources(places: Iterable[Path], scratch: Path, progress: Progress = lambda _
     """Return the indexes of all recordings in ``places``, files or folders.
 
     Missing indexes are made: beside the recording if its folder can be written, otherwise, as for files that are still
-    being written, below ``scratch``. Recordings that were indexed and then deleted count, too. Raises RecordingError.
+    being written, below ``scratch``. Raises RecordingError.
     """
     indexed = Sources()
     scratch.mkdir(parents=True, exist_ok=True)
     with connected(scratch, memory_mb=_MEMORY_MB) as connection:
-        for path in _indexes([place.resolve() for place in places], scratch, connection, progress):
+        for path in _indexes(places, scratch, connection, progress):
             facts = about(path, connection)
             if facts is not None:
                 indexed.indexes.append(path)
@@ -59,15 +57,10 @@ def sources(places: Iterable[Path], scratch: Path, progress: Progress = lambda _
     return indexed
 
 
-def _indexes(places: list[Path], scratch: Path, connection: DuckDBPyConnection, progress: Progress) -> Iterator[Path]:
-    deleted = [path for place in places if place.is_dir() for path in _of_deleted(place)]
-    try:
-        paths = list(dict.fromkeys(path.resolve() for path in files(places)))
-    except RecordingError:
-        if not deleted:
-            raise
-        paths = []
-    yield from dict.fromkeys(deleted)
+def _indexes(
+    places: Iterable[Path], scratch: Path, connection: DuckDBPyConnection, progress: Progress
+) -> Iterator[Path]:
+    paths = list(dict.fromkeys(path.resolve() for path in files(places)))
     sizes = [path.stat().st_size if path.exists() else 0 for path in paths]
     done, total = 0, max(1, sum(sizes))
     for number, (path, size) in enumerate(zip(paths, sizes, strict=True)):
@@ -75,14 +68,6 @@ def _indexes(places: list[Path], scratch: Path, connection: DuckDBPyConnection, 
         index = _index(path, scratch / f"{number}{INDEX}", connection, advance)
         done += size
         if index is not None:
-            yield index
-
-
-def _of_deleted(place: Path) -> Iterator[Path]:
-    """Yield the indexes of deleted recordings."""
-    for index in sorted(place.rglob(f"*{INDEX}")):
-        is_ours = _OLD not in index.relative_to(place).parts and not index.name.startswith(".")
-        if is_ours and not index.with_suffix(SUFFIX).exists():
             yield index
 
 

@@ -12,8 +12,6 @@ import cv2
 import numpy as np
 import pytest
 
-from pebble.extensions.media.h264 import seal
-from pebble.extensions.media.packets import Picture
 from pebble.extensions.media.pcm import to_bytes
 from pebble.extensions.media.scene import Scene
 from pebble.extensions.media.sound import make_sound_encoder
@@ -192,20 +190,6 @@ def test_encodings_and_sizes_that_change(tmp_path: Path) -> None:
     assert times == pytest.approx([number * STEP_MS for number in range(45)], abs=1)
     assert [number for _, number, _ in film.shown[:20]] == list(range(20))
     assert film.click_ms == pytest.approx(film.flash_ms, abs=80)
-
-
-def test_undamaged_units_that_are_no_h264_are_left_out(tmp_path: Path) -> None:
-    units = [b"\0\0\0\1\x67\xff\0\0\0\1\x68\xff\0\0\0\1\x65\xff", b"\0\0\0\1\x61\x9a\xff\xee"]
-    first, second = (
-        recorded(CAMERA, T0_MS + at_ms, Picture(5, number, T0_MS + at_ms, seal(unit), flags).pack())
-        for unit, at_ms, number, flags in ((units[0], -66, 0, 1), (units[1], 12 * STEP_MS, 12, 0))
-    )
-    good, other = pictures("h264", range(12)), pictures("pbvd", range(13, 20))
-    result = write_film(lambda: [first, *good, second, *other], tmp_path / "walk.mkv", ROBOT)
-    film = opened(tmp_path / "walk.mkv")
-    assert result.pictures + result.left_out == 21
-    assert result.pictures == len(film.shown)
-    assert [number for _, number, _ in film.shown] == [*range(12), *range(13, 20)]
 
 
 def offset_ms(message: Recorded) -> int:

@@ -14,7 +14,6 @@ from mcap.stream_reader import StreamReader
 from pebble.extensions.recordings.files.reader import RecordingFile
 from pebble.extensions.recordings.files.recorded import UNNAMED
 from pebble.extensions.recordings.files.rewrite import rewrite
-from pebble.extensions.recordings.files.writer import RecordingWriter
 from tests.ext.recordings.demo_robots import DRIVE, MEDIA
 from tests.ext.recordings.files.other_readers import Counted, by_mcap, by_mcap_core
 from tests.ext.recordings.messages import START_NS, STEP_NS, contents, is_part_of, read, write
@@ -66,7 +65,6 @@ class TestWhole:
             path.write_bytes(data)
             file.refresh()
             assert [(one.channel.topic, one.payload) for one in file.read()] == written
-            assert all(chunk.channels for chunk in file.chunks[:-1])
             assert file.damage.parts == set()
         assert sorted(set(lengths)) == [0, 50, 100, 150, 200, 250, 300]
         assert lengths == sorted(lengths)
@@ -96,18 +94,6 @@ class TestLastVersion:
         cut = tmp_path / "cut.mcap.active"
         cut.write_bytes(path.read_bytes()[:end])
         assert contents(cut) == contents(path)
-
-    def test_topics_without_a_channel_of_their_own(self, tmp_path: Path) -> None:
-        """They had one for all beyond 512 of a robot, in which each message begins with its topic."""
-        path, topic = tmp_path / "a.mcap", b"pebble/robots/goob/outgoing/x"
-        begin = len(topic).to_bytes(4, "little") + topic + b"\x0b\0\0\0\x03\0\0\0qos\0\0\0\0"
-        with path.open("wb", buffering=0) as file:
-            writer = RecordingWriter(file, "pebble 0.9 0123456789abcdef")
-            other = writer.channel("$recorder/other", "application/octet-stream", {})
-            writer.add(other, START_NS, begin + b"payload")
-            writer.finish()
-        assert contents(path) == [(topic.decode(), b"payload")]
-        assert contents(path, chooses=lambda channel: channel.topic.startswith("pebble/robots/fred/")) == []
 
 
 def cut(raw: bytearray, rng: random.Random) -> None:

@@ -11,10 +11,9 @@ import pytest
 from pebble.extensions.recordings.catalogue import look_at
 from pebble.extensions.recordings.files.recorded import RecordingError
 from pebble.extensions.recordings.files.rewrite import rewrite
-from pebble.extensions.recordings.files.writer import RecordingWriter
 from tests.ext.recordings.files.other_readers import Counted, by_mcap
 from tests.ext.recordings.files.test_files import zero_a_page
-from tests.ext.recordings.messages import START_NS, contents, write
+from tests.ext.recordings.messages import contents, write
 
 
 def test_without_some_messages(tmp_path: Path) -> None:
@@ -44,19 +43,6 @@ def test_what_is_missing_stays_known(tmp_path: Path) -> None:
         assert rewrite(path, copy).missing == missing
         assert (look_at(copy).missing, look_at(copy).damaged) == (missing, True)
         path = copy
-
-
-def test_one_that_the_last_version_mended_is_not_replaced(tmp_path: Path) -> None:
-    """It has left damaged bytes in it, of which something may be read yet."""
-    path = tmp_path / "a.mcap"
-    with path.open("wb", buffering=0) as file:
-        writer = RecordingWriter(file)
-        writer.add(writer.channel("a/b/c/outgoing/x", "json", {}), START_NS, b"1")
-        writer.metadata("pebble.damage", {"missing_messages": "20", "damaged_bytes": "4096", "torn_bytes": "0"})
-        writer.finish()
-    assert look_at(path).missing == 20
-    with pytest.raises(RecordingError, match="4,096 damaged bytes are left in it, and would be lost"):
-        rewrite(path, path, keeps=lambda _message: False)
 
 
 def test_more_topics_than_a_file_can_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,7 +45,6 @@ def test_speed_has_limits(walk: Path) -> None:
     assert stage.player.speed == 100
     stage.player.speed = 0.01
     assert stage.player.speed == 0.1
-    assert Stage(walk, ALL, speed=0.5, slowest=1.0).player.speed == 1.0
 
 
 def test_speed_may_change_meanwhile(walk: Path) -> None:

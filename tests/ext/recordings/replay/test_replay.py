@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,7 +19,6 @@ from tests.commands.command_line import Run, program
 from tests.ext.recordings import messages
 from tests.ext.recordings.playing import FRED, GOOB, Line, demo, js, ms, write
 from tests.ext.recordings.recorder.test_record import Reference
-from tests.kit.terminal import Terminal
 from tests.support import Broker, until
 
 REPLAYED = "replay/robots/goob"
@@ -173,34 +171,10 @@ def test_a_broker_that_restarts_gets_the_rest(tmp_path: Path, run: Run) -> None:
     broker.stop()
 
 
-def test_keys_on_a_terminal(tmp_path: Path, operator: Reference, at: tuple[str, str]) -> None:
-    command = [*(sys.executable, "-m", "pebble.cli", "replay", str(walk(tmp_path))), *at, "--paused"]
-    console = Terminal(*command)
-    try:
-        assert console.sees("Space pauses")
-        assert console.sees("paused · 0 sent")
-        console.type(b" ")
-        assert until(lambda: len(operator.of(LOGS)) > 2)
-        console.type(b" ")
-        assert console.sees("paused · ")
-        count = len(operator.of(LOGS))
-        console.type(b"\x1b[C\x1b[C+ ")  # 20 s on, twice as fast
-        assert until(lambda: len(operator.of(LOGS)) > count + 2)
-        assert json.loads(operator.of(LOGS)[-1])["n"] > 80
-        assert console.sees("× 2 · ")
-        console.type(b"\x03")
-        assert console.process.wait(10) == 0
-        assert console.sees(" skipped")
-    finally:
-        console.close()
-    assert until(lambda: states(operator)[-1] is False, 3)
-
-
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
         (("--incoming", "--speed", "0.5"), "--speed 0.5 would drive a robot for longer"),
-        (("--paused",), "--paused needs a terminal"),
         (("--base", "pebble"), "--base pebble is the base of pebble/robots/goob itself"),
         (("--only", "other/#"), "no topic other/# in "),
         (("--only", "+/+/+/incoming/#"), "there is nothing to publish"),

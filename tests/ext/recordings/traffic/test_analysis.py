@@ -280,22 +280,6 @@ def test_a_file_that_is_being_written_is_read_and_not_indexed(tmp_path):
     assert robots == {GOOB: 8, FRED: 12}
 
 
-def test_a_recording_that_was_deleted_still_counts(tmp_path):
-    path = write_recording(tmp_path / "a.mcap", steady(GOOB, seconds=2.0))
-    sources([tmp_path], tmp_path / "scratch")
-    path.unlink()
-    again = sources([tmp_path], tmp_path / "scratch")
-    assert (len(again.indexes), again.robots) == (1, [GOOB])
-
-
-def test_the_index_of_the_last_version_is_left_alone(tmp_path):
-    write_recording(tmp_path / "a.mcap", steady(GOOB, seconds=2.0))
-    old = tmp_path / "index" / "day=2025-11-20" / "robot=pebble%2Frobots%2Ffred" / "a.parquet"
-    old.parent.mkdir(parents=True)
-    old.write_bytes(b"rows of fred")
-    assert sources([tmp_path], tmp_path / "scratch").robots == [GOOB]
-
-
 def test_names_of_folders_are_no_patterns(tmp_path):
     folder, scratch = tmp_path / "it's [1] *?", tmp_path / "scratch"
     path = write_recording(folder / "a.mcap", steady(GOOB, seconds=2.0))

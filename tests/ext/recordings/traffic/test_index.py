@@ -137,12 +137,3 @@ def test_a_failure_leaves_the_former_index_and_nothing_temporary(tmp_path, monke
         sources([tmp_path], tmp_path / "scratch")
     assert state(tmp_path) == before
     assert {one.suffix for one in path.parent.iterdir()} == {".mcap", ".parquet"}
-
-
-def test_a_torn_recording_is_indexed_as_far_as_it_goes_and_not_beside_it(tmp_path):
-    path = write_recording(tmp_path / "x.mcap.active", HEARTBEATS, finished=False)
-    whole = path.read_bytes()
-    path.write_bytes(whole + whole[-1000:-500])
-    (index,) = sources([tmp_path], tmp_path / "scratch").indexes
-    assert query("SELECT count(*) FROM read_parquet(?)", str(index)) == [(len(HEARTBEATS),)]
-    assert list(tmp_path.glob("*.parquet")) == []
