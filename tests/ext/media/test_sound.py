@@ -165,12 +165,6 @@ def test_bitrate_is_as_configured() -> None:
     assert sizes[16000] < sizes[32000] * 8 / 8 < 36_000 / 8 * SECONDS
 
 
-def test_pcm_has_nothing_to_conceal_with() -> None:
-    decoder = SoundDecoder()
-    decoder.feed(packets("pcm", speech(16000)[:320], 16000)[0])
-    assert decoder.conceal() is None
-
-
 def test_any_change_in_midstream() -> None:
     numbers = sequence_numbers()
     made = []
