@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import logging
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +13,7 @@ import pytest
 
 from pebble.commands import app
 from pebble.extension import ours
-from tests.commands.command_line import Run, config_file, program, running
+from tests.commands.command_line import Run, config_file, program
 from tests.support import ROOT, free_port, some, until
 
 NAMES = [tuple(words.split()) for words in app.commands(["up"])]
@@ -99,42 +98,31 @@ def test_a_command_imports_no_other() -> None:
         (("watch", "goob.json"), "--picture", "pebble watch --help"),
         (("topic", "pub", "drive-values"), "PAYLOAD", "pebble topic pub --help"),
         (("topic", "pub", "drive-values", "{}", "--qos", "2"), "qos", "pebble topic pub --help"),
+        (("up", "/nowhere/goob.json"), "/nowhere/goob.json", ""),
+        (("doctor", "/nowhere/goob.json"), "/nowhere/goob.json", ""),
+        (("topic", "list"), "--config CONFIG or --url URL", ""),
+        (("topic", "list", "--config", "a", "--url", "b"), "--config CONFIG or --url URL", ""),
+        (("topic", "list", "--url", "http://x"), "mqtt://HOST", ""),
+        (("topic", "list", "--url", "mqtt://127.0.0.1", "--remote"), "--remote", ""),
+        (("topic", "echo", "online", "--url", "mqtt://127.0.0.1", "--robot", "a/b"), "--robot a/b", ""),
+        (
+            ("topic", "list", "--url", "mqtt://127.0.0.1", "--password-file", "/nowhere/p"),
+            "--password-file: No such file",
+            "",
+        ),
+        (("topic", "list", "--url", "mqtt://127.0.0.1:1"), "127.0.0.1:1", ""),
+        (("topic", "contract", "--base", "a/b"), "a/b", ""),
     ],
 )
-def test_a_wrong_command_line_is_one_line_and_exit_code_2(
+def test_what_is_wrong_is_one_line_and_exit_code_1_or_for_a_command_line_2(
     run: Run, arguments: tuple[str, ...], named: str, help_: str
 ) -> None:
-    assert run(*arguments) == 2
+    assert run(*arguments) == (2 if help_ else 1)
     assert run.out == ""
     assert run.err.startswith("pebble: ")
     assert run.err.count("\n") == 1
     assert named in run.err
     assert help_ in run.err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (("up", "/nowhere/goob.json"), "/nowhere/goob.json"),
-        (("doctor", "/nowhere/goob.json"), "/nowhere/goob.json"),
-        (("topic", "list"), "--config CONFIG or --url URL"),
-        (("topic", "list", "--config", "a", "--url", "b"), "--config CONFIG or --url URL"),
-        (("topic", "list", "--url", "http://x"), "mqtt://HOST"),
-        (("topic", "list", "--url", "mqtt://127.0.0.1", "--remote"), "--remote"),
-        (("topic", "echo", "online", "--url", "mqtt://127.0.0.1", "--robot", "a/b"), "--robot a/b"),
-        (
-            ("topic", "list", "--url", "mqtt://127.0.0.1", "--password-file", "/nowhere/p"),
-            "--password-file: No such file",
-        ),
-        (("topic", "list", "--url", "mqtt://127.0.0.1:1"), "127.0.0.1:1"),
-        (("topic", "contract", "--base", "a/b"), "a/b"),
-    ],
-)
-def test_a_failure_is_one_line_and_exit_code_1(run: Run, arguments: tuple[str, ...], named: str) -> None:
-    assert run(*arguments) == 1
-    assert run.err.startswith("pebble: ")
-    assert run.err.count("\n") == 1
-    assert named in run.err
 
 
 def test_up_loads_nothing_that_a_running_robot_does_not_need(tmp_path: Path) -> None:
@@ -178,27 +166,6 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
     os.close(read)
     assert process.communicate(timeout=60)[1] == ""
     assert process.returncode == 1
-
-
-def test_demo_hands_over(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pebble.extensions.lab.demo import main
-
-    asked: list[tuple[float | None, bool]] = []
-    monkeypatch.setattr(main, "run", lambda seconds, *, for_phones: asked.append((seconds, for_phones)) or 3)
-    assert run("demo") == 3
-    assert run("demo", "--seconds", "20", "--phone") == 3
-    assert asked == [(None, False), (20.0, True)]
-
-
-def test_sim_is_there_until_ctrl_c(tmp_path: Path) -> None:
-    link = tmp_path / "goob"
-    with running("sim", "goob", "--link", link) as process:
-        assert until(link.exists, 30)
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=30)
-    assert (process.returncode, err) == (0, "")
-    assert str(link) in out
-    assert not link.exists()
 
 
 def test_a_command_whose_package_is_missing_says_what_to_install() -> None:

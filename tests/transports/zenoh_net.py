@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import zenoh
 
 from pebble.transports import Message, QoS, State, ZenohSettings, create
+from pebble.transports.zenoh import session as zenoh_session
 from tests.support import until
 from tests.transports.forked import Forked
 from tests.transports.net import Net
@@ -65,6 +69,17 @@ class HubProcess:
             client.subscribe("#", lambda message: answered.append(message))
             assert until(lambda: any(message.topic == "settle" and message.retain for message in answered))
             client.publish("settle", b"", qos=QoS.DELIVERED, retain=True)
+
+
+@contextlib.contextmanager
+def stranger_at(settings: ZenohSettings) -> Iterator[zenoh.Session]:
+    """A program that speaks Zenoh as it likes, connected to ``settings.connect``."""
+    session = zenoh_session.open_session(zenoh_session.session_config(settings, "client", listen=[], connect=[]))
+    try:
+        assert until(lambda: list(session.info.routers_zid()))
+        yield session
+    finally:
+        zenoh_session.close_session(session)
 
 
 class ZenohNet(Net):

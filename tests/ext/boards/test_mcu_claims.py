@@ -90,14 +90,6 @@ def test_a_channel_that_the_config_renames_is_the_robots_own_too() -> None:
     assert "robot's own" in taken.refused["a"]
 
 
-def test_malformed_manifests_of_other_devices_raise_nothing() -> None:
-    odd = McuManifest(protocol="x", schema_version=1, interface_count=1, schema_hash="", device_uid="u",
-                      firmware_version="", model="", interfaces=[
-                          {}, {"channel": 5}, {"channel": "a", "encoding": 7}, {"channel": "sensors/imu",
-                           "profile": "imu.summary.v1", "encoding": {"fields": [1, {}, None]}}])  # fmt: skip
-    assert claims(odd).granted == {"outgoing/a": "None"}
-
-
 _ANYTHING = st.recursive(
     st.none() | st.booleans() | st.integers(-9, 9) | st.floats(allow_nan=False) | st.text(max_size=4),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner, max_size=3),

@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pebble.forwarding.side import Gate
-from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.serial_mcu_bridge.devices.private_topics import LocalOnly
-from pebble.transports import Message, MqttSettings, create
-from tests.kit.board import SerialRig
-from tests.kit.robot import BASE, Listener, Running
-from tests.services.mqtt_bridge.bridge_rig import gate_of
-from tests.support import Broker, until
+from pebble.transports import Message
+from tests.kit.robot import BASE
 
 OUT = f"{BASE}/outgoing"
 PRIVATE = ("mcu/spy-1/fast", "lab/fast", "mcu/spy-1/secret", "lab/secret", "mcu/spy-1/imu_fast", "lab/imu-fast")
@@ -152,44 +145,3 @@ def test_memory_is_bounded() -> None:
 
 
 # -- with real bridges
-
-
-@pytest.fixture(params=["mqtt", "zenoh"])
-def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SerialRig]:
-    rig = SerialRig(request.param, tmp_path)
-    yield rig
-    rig.close()
-
-
-class World:
-    """A remote broker, an operator that subscribes to everything there, and a bridge that can be restarted."""
-
-    def __init__(self, rig: SerialRig) -> None:
-        self.rig = rig
-        self.broker = Broker(rig.folder)
-        self.operator = Listener(create("mqtt", "operator", MqttSettings(host="127.0.0.1", port=self.broker.port)))
-        self.bridge: Running | None = None
-
-    def start(self) -> None:
-        section = {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": self.broker.port}}
-        config = self.rig.network.config(self.rig.folder, {}, mqtt_bridge=section)
-        service = MqttBridge(config, self.rig.network.robots_transport(config, "local-bridge", as_published=True))
-        self.bridge = Running(service)
-        assert until(lambda: gate_of(service) is Gate.OPEN)
-
-    def stop(self) -> None:
-        if self.bridge is not None:
-            self.bridge.stop()
-            self.bridge = None
-
-    def close(self) -> None:
-        self.stop()
-        self.operator.transport.close()
-        self.broker.stop()
-
-
-@pytest.fixture
-def world(rig: SerialRig) -> Iterator[World]:
-    world = World(rig)
-    yield world
-    world.close()

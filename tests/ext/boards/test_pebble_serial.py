@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import struct
 from typing import Any
 
 import pytest
@@ -24,7 +23,7 @@ from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import (
 )
 from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine
 from tests.ext.boards import mcu_wire as wire
-from tests.ext.boards.mcu_wire import IMU, STATION, M, Received
+from tests.ext.boards.mcu_wire import STATION, M, Received
 
 OPENED = 100.0
 WALL_MS = 1_700_000_000_123
@@ -125,19 +124,6 @@ def test_the_first_request_begins_with_a_frame_end(host: Host) -> None:
     assert host.of(Send)[0].data.startswith(b"\0")
 
 
-def test_a_described_device_is_understood(host: Host) -> None:
-    host.describe(IMU)
-    (described,) = host.of(Described)
-    assert described.manifest.uid == "goob-imu-nano"
-    assert not described.remembered
-    payload = struct.pack("<9h", 9807, 0, -1, 100, -100, 1, 2512, 33, -7)
-    (reading,) = host.feed(wire.frame(wire.SAMPLE, payload, 1, 5, 1234))
-    assert isinstance(reading, Reading)
-    assert (reading.interface.name, reading.sequence, reading.mcu_ms) == ("imu_fast", 5, 1234)
-    assert reading.values["ax"] == 9.807
-    assert reading.values["temp_c"] == 25.12
-
-
 def test_a_known_hello_makes_a_device_usable_at_once(host: Host) -> None:
     host.describe()
     assert host.feed(HELLO) == [], "that of a reboot changes nothing"
@@ -160,19 +146,6 @@ def test_any_difference_in_a_hello_asks_again(host: Host, change: dict[str, Any]
     assert host.refused(state()) == "early"
     host.until(host.now + 0.3)
     assert host.asked() == [0.25]
-
-
-def test_after_a_replug_it_asks_again_and_drops_the_old_manifest(host: Host) -> None:
-    host.describe()
-    host.session.closed()
-    host.until(OPENED + 50)
-    assert host.asked() == []
-    host.session.opened(host.now)
-    assert host.refused(state()) == "early"
-    host.until(host.now + 1.5)
-    assert host.asked() == [51.0]
-    host.describe()
-    assert len(host.of(Described)) == 2
 
 
 def test_half_a_frame_from_before_the_replug_is_not_continued(host: Host) -> None:
@@ -239,15 +212,6 @@ def test_frames_that_make_no_sense_are_refused_and_counted_by_name(host: Host, f
     host.describe()
     assert host.refused(frame) == subject
     assert isinstance(host.feed(state())[0], Reading)
-
-
-def test_chunks_may_be_cut_anywhere(host: Host) -> None:
-    stream = wire.frame(wire.DESCRIBE, STATION.describe()) + state() + b"\0\0" + state(4)
-    for byte in stream:
-        host.feed(bytes([byte]))
-    assert len(host.of(Described)) == 1
-    assert [reading.interface.name for reading in host.of(Reading)] == ["o1_state", "o2_state"]
-    assert host.of(RefusedInput) == []
 
 
 def test_its_log_lines_are_reported_and_made_printable(host: Host) -> None:

@@ -5,30 +5,20 @@ from __future__ import annotations
 import json
 import math
 import random
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from pebble.contract import IMU_FAST, MOTOR_POWER, TOUCH_SENSORS
-from pebble.contract.payloads import (
-    Drive,
-    ImuFast,
-    ImuFastValues,
-    MotorPower,
-    Orientation,
-    TouchSensors,
-    TouchValues,
-    Vector,
-)
+from pebble.contract.payloads import Drive, TouchSensors
 from pebble.extensions.calibrate.wheels import Wanted, calibrate
 from pebble.extensions.lab.simulation.motion import Wheels
 from pebble.extensions.lab.simulation.world.script_robot import SimulatedRobot
+from tests.ext.scripts.perception.wheels_rig import powers, touches, turning
 
 TRUE = Wheels(61.0 * 1.01, 61.0 * 0.99, 130.5 * 1.03)
 ROOM = {"x_min": -0.5, "x_max": 2.4, "y_min": -2.0, "y_max": 2.0}
 TAG = {"id": 13, "x": 2.3, "y": 0.0, "z": 0.2, "yaw_deg": 180.0}
-_touch = re.compile(rb"T a0=(\d+) a1=(\d+) a2=(\d+)").fullmatch
 
 
 class Measured(SimulatedRobot):
@@ -55,29 +45,18 @@ class Measured(SimulatedRobot):
         super()._pass_step()
         self.turned += math.remainder(self.body.pose.heading - self._heading, math.tau)
         self._heading = self.body.pose.heading
-        *lines, self._received = (self._received + self.body.read()).split(b"\n")
-        for found in filter(None, map(_touch, (line.strip() for line in lines))):
-            a0, a1, a2 = (int(value) + round(self._noise.gauss(0, 2)) for value in found.groups())
-            self.receive(TOUCH_SENSORS, TouchSensors(value=TouchValues(a0=a0, a1=a1, a2=a2)))
+        found, self._received = touches(self._received + self.body.read(), lambda: self._noise.gauss(0, 2))
+        for values in found:
+            self.receive(TOUCH_SENSORS, TouchSensors(value=values))
         if self._gyro and round(self.world.now() * 1000) % 10 == 0:
-            self.receive(IMU_FAST, self._imu())
+            motion = self.body.motion
+            z = math.degrees((motion.right_mm_s - motion.left_mm_s) / motion.wheels.track_mm)
+            self.receive(IMU_FAST, turning(z + 0.3 + self._noise.gauss(0.0, 0.05), self.world.now()))
         self.at_step()
 
     def _drive(self, command: Drive) -> bool:
-        left, right = (max(-1.0, min(1.0, power)) for power in (command.z + command.x, command.z - command.x))
-        self.receive(MOTOR_POWER, MotorPower(left=left, right=right))
+        self.receive(MOTOR_POWER, powers(command))
         return super()._drive(command)
-
-    def _imu(self) -> ImuFast:
-        motion = self.body.motion
-        z = math.degrees((motion.right_mm_s - motion.left_mm_s) / motion.wheels.track_mm)
-        values = ImuFastValues(
-            accel_mps2=Vector(x=0, y=0, z=9.81),
-            gyro_dps=Vector(x=0, y=0, z=z + 0.3 + self._noise.gauss(0.0, 0.05)),
-            temp_c=30.0,
-            orientation_deg=Orientation(roll=0, pitch=0),
-        )
-        return ImuFast(t=0, seq=0, mcu_ms=round(self.world.now() * 1000), value=values)
 
 
 class Measurer:

@@ -10,7 +10,6 @@ import pytest
 
 from pebble.config.security import SecurityLevel
 from pebble.contract import CHANNELS, INCOMING
-from pebble.extensions.fleet.broker_files import acl_text
 from pebble.extensions.fleet.folder import Fleet, Server
 from pebble.extensions.fleet.roles import ROLES, WRITES, Account
 from pebble.extensions.thin.expander import is_stream
@@ -332,10 +331,3 @@ def _cell(what: str, name: str) -> str:
         assert len(may) == 1, (what, name, level)
         answers.append(may.pop())
     return {(True, True): "yes", (True, False): "login", (False, True): "named", (False, False): "–"}[tuple(answers)]
-
-
-def test_the_file_of_a_large_fleet_stays_small() -> None:
-    people = {f"p{number}": Account(roles=("driver",)) for number in range(50)}
-    robots = {f"r{number}": Account(roles=("robot",), bases=(f"pebble/robots/r{number}",)) for number in range(200)}
-    fleet = Fleet(level="named", brokers=(Server(host="hall"),), accounts=people | robots)
-    assert len(acl_text(fleet)) < 100_000

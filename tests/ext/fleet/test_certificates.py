@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import ipaddress
 import shutil
 import socket
 import ssl
@@ -15,7 +14,6 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.hashes import SHA256
-from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from pebble.extensions.fleet import authority
 from pebble.extensions.fleet.certificates import CertificateError, init, renew, show
@@ -151,14 +149,3 @@ def test_openssl_finds_nothing_wrong(folder: Path) -> None:
     arguments = ["verify", "-x509_strict", "-purpose", "sslserver", "-CAfile", "ca.pem", "server.pem"]
     result = subprocess.run([openssl, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     assert (result.returncode, result.stdout.strip()) == (0, "server.pem: OK")
-
-
-def test_the_fields_that_phones_ask_for(folder: Path) -> None:
-    server = x509.load_pem_x509_certificate((folder / "server.pem").read_bytes())
-    names = server.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    assert names.get_values_for_type(x509.IPAddress)[0] == ipaddress.ip_address("192.168.1.20")
-    purposes = list(server.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value)
-    assert purposes == [x509.oid.ExtendedKeyUsageOID.SERVER_AUTH]
-    authority = x509.load_pem_x509_certificate((folder / "ca.pem").read_bytes())
-    assert authority.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
-    assert load_pem_private_key((folder / "ca.key").read_bytes(), None).public_key() == authority.public_key()

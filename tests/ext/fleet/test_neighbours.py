@@ -10,7 +10,6 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +17,14 @@ import pytest
 
 from pebble.contract import DRIVE, codec
 from pebble.contract.payloads import SCRIPT, Drive
-from pebble.extensions.fleet import applying, certificates
-from pebble.extensions.fleet.folder import ZENOH, Fleet, Server, refused
+from pebble.extensions.fleet import certificates
+from pebble.extensions.fleet.folder import Fleet, Server, refused
 from pebble.extensions.fleet.roles import Account, rules
-from pebble.transports import Message, QoS, TlsSettings, Transport, ZenohSettings, create
+from pebble.transports import Message, QoS, Transport, ZenohSettings, create
 from pebble.transports.topics import matches
+from tests.ext.fleet.secured_hub import SecuredHub
 from tests.robot.rig import STOP, Rig
-from tests.support import Child, free_port, until
-from tests.transports.zenoh_net import HubProcess
+from tests.support import Child, until
 
 FRED, GOOB = "pebble/robots/fred", "pebble/robots/goob"
 LEAD = """
@@ -83,22 +82,15 @@ def test_one_neighbour_has_a_base(tmp_path: Path) -> None:
     assert refused(fleet, "two", neighbour("fred")) == ""
 
 
-class Hall:
+class Hall(SecuredHub):
     """The hub, fred and goob; ``incoming``: what is received below fred's ``incoming/`` on fred's own transport."""
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
-        certificates.init(folder, ["127.0.0.1", "localhost"])
         accounts = {f"{name}-lan": neighbour(name) for name in ("fred", "goob", "carl")}
-        for name in accounts:
-            certificates.of_account(folder, name)
-        fleet = Fleet(level="login", brokers=(Server(host="127.0.0.1"),), hubs="here", accounts=accounts)
-        applying.write_zenoh(folder, fleet)
-        self.folder, self.endpoint, self._stack = folder, f"tls/127.0.0.1:{free_port()}", stack
-        own = self._tls(folder / certificates.SERVER_CERT, folder / certificates.SERVER_KEY)
-        hub = HubProcess(folder / "run")
-        hub.settings = replace(hub.settings, listen=(self.endpoint,), tls=own, access=folder / ZENOH, lease_ms=2000)
-        hub.start()
-        stack.callback(hub.end)
+        super().__init__(folder, "login", accounts, accounts)
+        self._stack = stack
+        self.hub.start()
+        stack.callback(self.hub.end)
         self.fred = self._robot("fred", shares=["wheel-odometry"], commanded={"goob": ["drive-values"]})
         self.goob = self._robot("goob", listens={"fred": ["wheel-odometry"]})
         local = ZenohSettings(run_dir=self.fred.folder / "run", client=True)
@@ -108,9 +100,6 @@ class Hall:
 
     def _on_incoming(self, message: Message) -> None:
         self.incoming.append((time.monotonic(), message))
-
-    def _tls(self, certificate: Path, key: Path) -> TlsSettings:
-        return TlsSettings(ca_cert=self.folder / certificates.CA_CERT, client_cert=certificate, client_key=key)
 
     def _robot(self, name: str, **section: Any) -> Rig:
         place, account = self.folder / certificates.ACCOUNTS, f"{name}-lan"
@@ -123,11 +112,7 @@ class Hall:
 
     def client(self, account: str, stack: ExitStack) -> Transport:
         """A program that has the certificate of this account, and sends what it likes."""
-        place = self.folder / certificates.ACCOUNTS
-        tls = self._tls(place / f"{account}.pem", place / f"{account}.key")
-        run_dir = self.folder / f"run-{account}"
-        settings = ZenohSettings(run_dir=run_dir, connect=(self.endpoint,), tls=tls, client=True, account=account)
-        return stack.enter_context(create("zenoh", f"{account}-x", settings))
+        return stack.enter_context(create("zenoh", f"{account}-x", self.settings(account)))
 
     def script(self, stack: ExitStack) -> None:
         """goob's script drives fred."""

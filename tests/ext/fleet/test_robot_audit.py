@@ -147,16 +147,6 @@ def test_refusals_of_one_kind_and_sender_are_one_row(log: Log) -> None:
     assert log.rows() == [late, many, late | {"count": 2}]
 
 
-def test_a_flood_of_refusals_hides_no_act(log: Log) -> None:
-    for number in range(1000):
-        log.audit.refused(Drop.UNNAMED, DRIVE, f"eve{number}")
-    log.audit.note("stop-not-confirmed", owner="serial")
-    rows = log.rows()
-    assert {"what": "stop-not-confirmed", "who": ROBOT, "owner": "serial"} in rows
-    assert len(rows) == audit_module.OF_STRANGERS + 2
-    assert sum(row.get("count", 1) for row in rows) == 1001
-
-
 def test_the_log_is_the_robots_own_and_turns_over(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     assert until(log.path.exists)
     assert stat.S_IMODE(log.path.stat().st_mode) == 0o600

@@ -9,7 +9,6 @@ import json
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -18,18 +17,18 @@ import msgspec
 import pytest
 import zenoh
 
-from pebble.extensions.fleet import applying, certificates
-from pebble.extensions.fleet.folder import ZENOH, Fleet, Server
+from pebble.extensions.fleet import applying
 from pebble.extensions.fleet.roles import Account
-from pebble.transports import QoS, TlsSettings, ZenohSettings, create
+from pebble.transports import QoS, ZenohSettings, create
 from pebble.transports.zenoh import session as zenoh_session
 from pebble.transports.zenoh import wire
 from tests.ext.fleet import test_attempts
+from tests.ext.fleet.secured_hub import SecuredHub
 from tests.ext.fleet.test_attempts import ACCOUNTS, FRED, GOOB, TOPICS
 from tests.ext.fleet.zenoh_account import Plan
-from tests.support import free_port, until
+from tests.support import until
 from tests.transports.forked import Forked
-from tests.transports.zenoh_net import HubProcess
+from tests.transports.zenoh_net import stranger_at as raw
 
 NAMES = tuple(name for name in ACCOUNTS if name != "hub")  # that is no client
 DRIVE, STATE, FLAG = f"{GOOB}/incoming/drive-values", f"{GOOB}/outgoing/status", f"{GOOB}/incoming/flags/mqtt-video"
@@ -47,22 +46,12 @@ def lets_through(name: str, topic: str, level: str) -> bool:
     return test_attempts.lets_through(name, topic, level)
 
 
-class Hall:
-    """A fleet's folder with its Zenoh hub; ``received``: what a local program received, by who sent it."""
+class Hall(SecuredHub):
+    """The hub, and what passes it; ``received``: what a local program received, by who sent it."""
 
     def __init__(self, folder: Path, level: Literal["login", "named"]) -> None:
-        certificates.init(folder, ["127.0.0.1", "localhost"])
-        self.folder, self.endpoint = folder, f"tls/127.0.0.1:{free_port()}"
-        self.fleet = Fleet(level=level, brokers=(Server(host="127.0.0.1"),), hubs="here", accounts=ACCOUNTS)
-        for name in NAMES:
-            certificates.of_account(folder, name)
-        applying.write_zenoh(folder, self.fleet)
+        super().__init__(folder, level, ACCOUNTS, NAMES)
         self.local = ZenohSettings(run_dir=folder / "run", client=True)
-        own = self._tls(folder / certificates.SERVER_CERT, folder / certificates.SERVER_KEY)
-        self.hub = HubProcess(folder / "run", folder / "journal")
-        self.hub.settings = replace(
-            self.hub.settings, listen=(self.endpoint,), tls=own, access=folder / ZENOH, lease_ms=2000
-        )
         self.received: list[tuple[str, str]] = []
 
     @contextmanager
@@ -74,15 +63,6 @@ class Hall:
                 yield self
         finally:
             self.hub.end()
-
-    def settings(self, name: str) -> ZenohSettings:
-        place = self.folder / certificates.ACCOUNTS
-        tls = self._tls(place / f"{name}.pem", place / f"{name}.key")
-        run_dir = self.folder / f"run-{name}"
-        return ZenohSettings(run_dir=run_dir, connect=(self.endpoint,), tls=tls, client=True, account=name)
-
-    def _tls(self, certificate: Path, key: Path) -> TlsSettings:
-        return TlsSettings(ca_cert=self.folder / certificates.CA_CERT, client_cert=certificate, client_key=key)
 
     @contextmanager
     def account(self, name: str, **plan: Any) -> Iterator[Forked]:
@@ -202,17 +182,6 @@ def test_a_robot_leaves_a_will_for_itself_and_no_one_else_leaves_any(hall: Hall)
     assert until(lambda: name_of_will["lamp"] in hall.of("lamp"))
     hall.mark("wills")
     assert {topic for name in name_of_will for topic in hall.of(name)} == {name_of_will["lamp"]}
-
-
-@contextmanager
-def raw(settings: ZenohSettings) -> Iterator[zenoh.Session]:
-    """A program that speaks Zenoh as it likes, with the certificate of an account."""
-    session = zenoh_session.open_session(zenoh_session.session_config(settings, "client", listen=[], connect=[]))
-    try:
-        assert until(lambda: list(session.info.routers_zid()))
-        yield session
-    finally:
-        zenoh_session.close_session(session)
 
 
 def test_a_program_with_a_certificate_poses_as_no_one_else(hall: Hall) -> None:

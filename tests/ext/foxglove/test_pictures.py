@@ -131,25 +131,6 @@ def test_a_signal_withdraws_the_requests(broker: Broker, by: signal.Signals) -> 
         assert until(lambda: watcher.closed)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"command_topic": "pebble/robots/fred/incoming/front-camera"},
-        {"topic": "pebble/robots/fred/outgoing/front-camera"},
-        {"flag_topic": "pebble/robots/goob/incoming/estop"},
-    ],
-)
-def test_capabilities_that_name_topics_of_others_get_no_channel_and_no_request(
-    broker: Broker, wrong: dict[str, str]
-) -> None:
-    with filming(broker, **wrong) as robot, live(broker) as server:
-        watcher = Watcher(server.address)
-        watcher.subscribe(CAPABILITIES)
-        assert until(lambda: watcher.count(CAPABILITIES))
-        assert set(watcher.channels) == {CAPABILITIES}
-        assert robot.requests == []
-
-
 def test_why_there_are_no_pictures_is_shown_in_foxglove(broker: Broker) -> None:
     with filming(broker) as robot, live(broker) as server:
         watcher = Watcher(server.address)

@@ -60,14 +60,19 @@ def test_a_clock_before_1970_is_no_reason_not_to_send(name: str) -> None:
     assert shown.captured_ms is None
 
 
-@pytest.mark.parametrize("name", FORMS)
-def test_a_key_frame_comes_when_asked_for_and_the_interval_begins_anew(name: str) -> None:
-    encoder = make_encoder(name, fps=15, keyframe_interval=4)
+@pytest.mark.parametrize(
+    ("name", "interval", "expected"), [*((name, 4, [0, 4, 6, 10]) for name in FORMS), ("json", None, [0, 5, 6, 11])]
+)
+def test_a_key_frame_comes_when_asked_for_and_the_interval_begins_anew(
+    name: str, interval: int | None, expected: list[int]
+) -> None:
+    """The usual interval is a third of a second."""
+    encoder = make_encoder(name, fps=15, keyframe_interval=interval)
     keys = []
     for number in range(12):
         encoder.encode(picture(number), T0 + number, keyframe=number == 6)
         keys.append(encoder.last_was_keyframe)
-    assert [number for number, key in enumerate(keys) if key] == [0, 4, 6, 10]
+    assert [number for number, key in enumerate(keys) if key] == expected
 
 
 @pytest.mark.parametrize("name", FORMS)
@@ -147,15 +152,6 @@ def test_differences_are_exact_and_clipped() -> None:
     wide = one.astype(int)
     assert np.array_equal(subtract(one, other), np.clip(wide - other + 128, 0, 255))
     assert np.array_equal(add(one, other), np.clip(wide + other - 128, 0, 255))
-
-
-def test_the_usual_interval_is_a_third_of_a_second() -> None:
-    encoder = make_encoder("json", fps=15, keyframe_interval=None)
-    keys = []
-    for number in range(11):
-        send(encoder, 1, first=number)
-        keys.append(encoder.last_was_keyframe)
-    assert [number for number, key in enumerate(keys) if key] == [0, 5, 10]
 
 
 def test_a_name_that_does_not_exist() -> None:

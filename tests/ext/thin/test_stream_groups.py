@@ -138,16 +138,6 @@ def test_of_two_expanders_the_smaller_id_works_and_no_value_comes_twice(start: S
     assert len(values) == len(set(values))
 
 
-def test_values_come_once_while_expanders_change(start: Start) -> None:
-    world = start()
-    second = Beside(world, "7")
-    number = run(world, 5, second)
-    first = Beside(world, "3")
-    run(world, 8, first, second, first=number)
-    values = world.remote.payloads(TOUCH)
-    assert len(values) == len(set(values))
-
-
 def test_heartbeats_states_and_stops_are_never_in_a_group(start: Start) -> None:
     world = start()
     expander = Beside(world)

@@ -25,12 +25,11 @@ from pebble.errors import TransportError
 from pebble.extensions.lab.bench.usage import pss_mb
 from pebble.transports import Message, QoS, State, TlsSettings, Transport, ZenohSettings, create
 from pebble.transports.zenoh import publishers, wire
-from pebble.transports.zenoh import session as zenoh_session
 from pebble.transports.zenoh.hub import ZenohHub
 from tests.support import ROOT, free_port, until
 from tests.transports.forked import Forked
 from tests.transports.received import Received
-from tests.transports.zenoh_net import HubProcess
+from tests.transports.zenoh_net import HubProcess, stranger_at
 
 DELIVERED = QoS.DELIVERED
 CERTIFICATES = ROOT / "tests" / "data" / "tls"
@@ -446,17 +445,6 @@ def test_only_certificates_with_an_allowed_name_get_through(tmp_path: Path, sche
         robot.publish("state", b"robot", qos=DELIVERED, retain=True)
         assert until(lambda: b"robot" in received.payloads and hub.retained == {"state": b"robot"})
         assert (overheard, b"stranger" in received.payloads) == ([], False)
-
-
-@contextlib.contextmanager
-def stranger_at(settings: ZenohSettings) -> Iterator[zenoh.Session]:
-    """A program that speaks Zenoh as it likes, connected to ``settings.connect``."""
-    session = zenoh_session.open_session(zenoh_session.session_config(settings, "client", listen=[], connect=[]))
-    try:
-        assert until(lambda: list(session.info.routers_zid()))
-        yield session
-    finally:
-        session.close()  # type: ignore[no-untyped-call]
 
 
 def _tls(name: str) -> TlsSettings:

@@ -20,14 +20,11 @@ RIGHTS, *OTHERS = PROBES
 #: What needs more than a sound broker: an account, or a restart.
 NEED_MORE = ("refused subscriptions", "retained, after a restart")
 
-#: A line of mosquitto.conf, the probe that finds it, and words of what it tells.
+#: A line of mosquitto.conf, or rules of its acl_file, the probe that finds it, and words of what it tells.
 SETTINGS = [
-    ("set_tcp_nodelay false", "small messages", "holds them back"),
-    ("retain_available false", "rights", "it retains nothing"),
-    further("max_qos 0", "rights", "it has no QoS 1"),
-]
-#: Rules of mosquitto's acl_file.
-RULES = [
+    ("set_tcp_nodelay false", "small messages", State.WARN, "holds them back"),
+    ("retain_available false", "rights", State.WARN, "it retains nothing"),
+    further("max_qos 0", "rights", State.WARN, "it has no QoS 1"),
     further("topic read #", "rights", State.FAILED, "may not publish"),
     further("topic write #", "rights", State.FAILED, "may not read"),
     further(
@@ -71,22 +68,17 @@ def found(port: int, name: str, restart: Callable[[], bool] | None = None) -> Ch
     return last
 
 
-@pytest.mark.parametrize(("line", "name", "words"), SETTINGS)
-def test_what_a_setting_of_mosquitto_takes_away(line: str, name: str, words: str, tmp_path: Path) -> None:
-    broker = Broker(tmp_path, line)
-    finding = found(broker.port, name)
-    broker.stop()
-    assert (finding.state, words in finding.text) == (State.WARN, True), finding
-    assert finding.fix.startswith("in mosquitto.conf: ")
-
-
-@pytest.mark.parametrize(("rules", "name", "level", "words"), RULES)
-def test_what_an_account_may_not_do(rules: str, name: str, level: State, words: str, tmp_path: Path) -> None:
-    (tmp_path / "acl").write_text(f"{rules}\n")
-    broker = Broker(tmp_path, f"acl_file {tmp_path / 'acl'}")
+@pytest.mark.parametrize(("lines", "name", "level", "words"), SETTINGS)
+def test_what_settings_and_rules_of_mosquitto_take_away(
+    lines: str, name: str, level: State, words: str, tmp_path: Path
+) -> None:
+    (tmp_path / "acl").write_text(f"{lines}\n")
+    are_rules = lines.startswith("topic ")
+    broker = Broker(tmp_path, f"acl_file {tmp_path / 'acl'}" if are_rules else lines)
     finding = found(broker.port, name)
     broker.stop()
     assert (finding.state, words in finding.text) == (level, True), finding
+    assert are_rules or finding.fix.startswith("in mosquitto.conf: ")
 
 
 @pytest.mark.parametrize(("fault", "name", "words"), FAULTS)

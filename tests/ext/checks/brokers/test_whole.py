@@ -46,8 +46,6 @@ def test_the_document_has_what_is_found(name: str) -> None:
     [
         further(["set_tcp_nodelay true"], 0, "robots can use it"),
         further([], 1, "robots can use it, with limits: small messages"),
-        further(["set_tcp_nodelay true", "retain_available false"], 1, "robots can use it, with limits: rights"),
-        further(["set_tcp_nodelay true", "max_qos 0"], 1, "robots can use it, with limits: rights"),
         (["acl_file RULES"], 2, "robots cannot use it with this account: rights"),
     ],
 )

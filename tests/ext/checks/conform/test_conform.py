@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -266,17 +266,16 @@ def test_it_passes_at_another_broker(tmp_path: Path, sample: Sample) -> None:
         assert lacking(judged(robot, *ALL.values())) == {}
 
 
-@pytest.mark.parametrize(("name", "reason", "old", "new"), some(VIOLATIONS, 10))
-def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str, reason: str, old: str, new: str) -> None:
-    with switched_on(changed(tmp_path, old, new), at_open(broker), tmp_path) as robot:
-        state, text = judged(robot, ALL[name])[name]
-    assert (state, reason in text) == (State.FAILED, True), text
-
-
-@pytest.mark.parametrize(("name", "reason", "old", "new"), some(NAMED_VIOLATIONS, 5))
-def test_a_violation_at_level_named_is_found(tmp_path: Path, name: str, reason: str, old: str, new: str) -> None:
-    program = changed(tmp_path, old, new)
-    with believing(tmp_path / "hall") as broker, switched_on(program, at_named(broker, tmp_path), tmp_path) as robot:
+@pytest.mark.parametrize(
+    ("violation", "named"),
+    [*((one, False) for one in some(VIOLATIONS, 10)), *((one, True) for one in some(NAMED_VIOLATIONS, 5))],
+)
+def test_a_violation_is_found(broker: Broker, tmp_path: Path, violation: tuple[str, ...], named: bool) -> None:
+    name, reason, old, new = violation
+    with ExitStack() as stack:
+        hall = stack.enter_context(believing(tmp_path / "hall")) if named else broker
+        place = at_named(hall, tmp_path) if named else at_open(broker)
+        robot = stack.enter_context(switched_on(changed(tmp_path, old, new), place, tmp_path))
         state, text = judged(robot, ALL[name])[name]
     assert (state, reason in text) == (State.FAILED, True), text
 

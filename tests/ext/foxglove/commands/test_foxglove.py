@@ -11,7 +11,7 @@ import pytest
 from tests.commands.command_line import Run, config_file
 from tests.ext.foxglove.live import FRED, GOOB, Live, client, online
 from tests.ext.foxglove.watcher import Watcher
-from tests.support import Broker, free_port, until
+from tests.support import Broker, until
 
 
 def test_which_robots_are_shown_has_to_be_named(run: Run, tmp_path: Path) -> None:
@@ -23,21 +23,6 @@ def test_which_robots_are_shown_has_to_be_named(run: Run, tmp_path: Path) -> Non
     assert run.err.startswith("pebble: services.mqtt_bridge.remote_mqtt.host: is not set")
     assert run("foxglove", "--url", f"zenoh:{tmp_path}") == 1
     assert run.err == "pebble: Foxglove needs the robots' broker: use --url mqtt://HOST[:PORT] or mqtts://…\n"
-
-
-def test_without_a_broker_it_does_not_start(run: Run) -> None:
-    port = free_port()
-    assert run("foxglove", "--url", f"mqtt://127.0.0.1:{port}", "--port", "0") == 1
-    assert run.err.startswith(f"pebble: cannot connect to mqtt://127.0.0.1:{port}: ")
-    assert run.err.count("\n") == 1
-
-
-def test_a_port_that_is_in_use(run: Run, broker: Broker) -> None:
-    assert run("foxglove", "--url", f"mqtt://127.0.0.1:{broker.port}", "--port", str(broker.port)) == 1
-    start, _, end = run.err.partition(" of user ")
-    fact = f"Address already in use (by process {broker.pid}"
-    assert start == f"pebble: cannot listen on 127.0.0.1 port {broker.port}: {fact}"
-    assert end.endswith("); choose another with --port\n")
 
 
 @pytest.mark.parametrize("module", ["foxglove", "foxglove_schemas_protobuf.RawAudio_pb2"])

@@ -73,12 +73,6 @@ def line() -> Iterator[tuple[str, int]]:
     os.close(slave)
 
 
-def send_later(master: int, data: bytes) -> threading.Timer:
-    timer = threading.Timer(0.3, os.write, (master, data))
-    timer.start()
-    return timer
-
-
 def frame() -> bytes:
     """A HELLO without content, as pebble_serial_v1 puts it on the wire."""
     body = bytes((1, 1, 0, 0, 0, 0, 0, 0, 0, 7, 0, 0, 0))
@@ -87,24 +81,23 @@ def frame() -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("robot", "reported"),
+    ("robot", "sent", "is_report"),
     [
-        ("goob", b"1 a2=3\r\nT a0=1 a1=2 a2=3\r\n"),
-        ("fred", b"Done!\r\nT t0=1 t1=2 t2=3 chg=0\r\n"),
-        ("goob_imu", b"garbage\0" + frame()),
+        ("goob", b"1 a2=3\r\nT a0=1 a1=2 a2=3\r\n", True),
+        ("fred", b"Done!\r\nT t0=1 t1=2 t2=3 chg=0\r\n", True),
+        ("goob_imu", b"garbage\0" + frame(), True),
+        ("goob", b"\r\n>>> \r\n", False),
+        ("goob_imu", b"x\0" + frame()[:-3] + b"\1\0", False),
     ],
 )
-def test_a_report_on_the_line(robot: str, reported: bytes, line: tuple[str, int]) -> None:
-    timer = send_later(line[1], reported)
-    assert on_serial_port(line[0], FIRMWARE[robot], timeout_s=5) == "the robot sends reports"
-    timer.join()
-
-
-@pytest.mark.parametrize(
-    ("robot", "reported"), [("goob", b"\r\n>>> \r\n"), ("goob_imu", b"x\0" + frame()[:-3] + b"\1\0")]
-)
-def test_other_bytes_are_shown_in_the_error(robot: str, reported: bytes, line: tuple[str, int]) -> None:
-    timer = send_later(line[1], reported)
-    with pytest.raises(DeviceError, match=f"no report from {robot} within 1 s; received b'"):
-        on_serial_port(line[0], FIRMWARE[robot], timeout_s=1)
+def test_a_report_on_the_line_counts_and_other_bytes_are_shown(
+    robot: str, sent: bytes, is_report: bool, line: tuple[str, int]
+) -> None:
+    timer = threading.Timer(0.3, os.write, (line[1], sent))
+    timer.start()
+    if is_report:
+        assert on_serial_port(line[0], FIRMWARE[robot], timeout_s=5) == "the robot sends reports"
+    else:
+        with pytest.raises(DeviceError, match=f"no report from {robot} within 1 s; received b'"):
+            on_serial_port(line[0], FIRMWARE[robot], timeout_s=1)
     timer.join()

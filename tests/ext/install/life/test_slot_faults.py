@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -13,9 +12,7 @@ import pytest
 
 from tests.kit.slots import ID, TRIAL, Seen, Slots
 from tests.small_disk import SmallDisk
-from tests.support import cases
 
-ROUNDS = cases(100, 1000)
 #: command, the proof's result and status, and which slots may be active at the end
 COMMANDS = {
     "choose": ("choose", "", "", "a"),
@@ -82,12 +79,3 @@ def test_what_cannot_be_counted_is_not_tried(
         slots.judged("exit-code", "1")
         slots.run("choose")
         assert slots.seen().current == "a"
-
-
-def test_random_bytes_as_a_trial(tmp_path: Path) -> None:
-    generator = random.Random(7)
-    slots = Slots(tmp_path)
-    for _ in range(ROUNDS):
-        slots.trial.write_bytes(generator.randbytes(generator.randrange(1000)))
-        assert slots.run("choose").returncode == 0
-        assert slots.seen() == Seen("a", "a", "", "")

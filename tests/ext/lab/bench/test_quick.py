@@ -84,20 +84,3 @@ def test_ctrl_c_leaves_nothing(temporary: Path) -> None:
     assert until(lambda: all(map(gone, started)), 5)
     assert not any(segment.exists() for segment in shared)
     assert list(temporary.iterdir()) == [temporary / "results"]
-
-
-LARGE = "{'numpy', 'cv2', 'av', 'zenoh', 'matplotlib'}"  # part of a robot's memory would be counted as the bench's
-
-
-@pytest.mark.parametrize(
-    ("modules", "never", "options"),
-    [
-        ("pebble.extensions.lab.bench.cost, pebble.extensions.lab.commands.bench", LARGE, ()),
-        ("frames_worker", "{'pebble'}", ("-I",)),  # the system's Python runs it as a plain file
-    ],
-)
-def test_measuring_processes_import_little(modules: str, never: str, options: tuple[str, ...]) -> None:
-    folder = ROOT / "pebble/extensions/lab/bench"
-    code = f"import sys; sys.path.append({str(folder)!r}); import {modules}; print({never} & set(sys.modules))"
-    ended = subprocess.run([sys.executable, *options, "-c", code], capture_output=True, text=True, check=True)
-    assert ended.stdout == "set()\n"

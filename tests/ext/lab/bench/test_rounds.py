@@ -12,7 +12,7 @@ from rich.console import Console
 
 from pebble.errors import PebbleError
 from pebble.extensions.lab.bench import rounds
-from pebble.extensions.lab.bench.results import Cell, Results, round_cell
+from pebble.extensions.lab.bench.results import Cell, Results, percentile, round_cell
 from pebble.extensions.lab.bench.rounds import LEAST_ROUNDS, Progress, add_round, in_turn, measure_rounds, paired
 
 Rounds = list[list[float]]
@@ -64,6 +64,14 @@ def test_what_never_arrived_is_infinitely_late() -> None:
     assert paired([*never[:1], *mostly[:9]], [*never[:2], *mostly[:8]]).rounds == 9
 
 
+@pytest.mark.parametrize(
+    ("figures", "percent", "expected"),
+    [([3.0, 1.0, 2.0], 50, 2.0), ([1.0, 2.0], 50, 1.0), (list(range(1, 101)), 99, 99), ([], 50, math.nan)],
+)
+def test_a_percentile_is_a_figure_that_was_measured(figures: list[float], percent: float, expected: float) -> None:
+    assert percentile(figures, percent) == pytest.approx(expected, nan_ok=True)
+
+
 # -- turns
 
 
@@ -71,7 +79,7 @@ def test_every_other_round_goes_backwards() -> None:
     assert [in_turn("abc", number) for number in range(3)] == ["abc", "cba", "abc"]
 
 
-def measured(outcomes: str, printed: io.StringIO | None = None) -> Results:
+def measured(outcomes: str) -> Results:
     """One round for each letter; ``x`` fails after its first variant."""
     results = Results(bench="wake-up")
 
@@ -81,7 +89,7 @@ def measured(outcomes: str, printed: io.StringIO | None = None) -> Results:
             raise PebbleError("the robot is not up\nits last [words]")
         yield round_cell("socket", "way", "us", [] if outcomes[number] == "-" else [1.0])
 
-    measure_rounds(results, len(outcomes), measure, Console(file=printed or io.StringIO(), width=80))
+    measure_rounds(results, len(outcomes), measure, Console(file=io.StringIO()))
     return results
 
 
@@ -94,14 +102,6 @@ def test_a_round_that_fails_counts_for_no_variant(outcomes: str, complete: bool)
     results = measured(outcomes)
     assert [len(cell.rounds) for cell in results.cells] == [outcomes.count(".") + outcomes.count("-")] * 2
     assert results.complete is complete
-
-
-def test_a_failed_round_is_noted_and_shown_at_once() -> None:
-    printed = io.StringIO()
-    noted = ["2 of 3 rounds failed and were left out; round 2: the robot is not up"]
-    assert measured(".xx", printed).notes == noted
-    assert "round 3: the robot is not up\nits last [words]" in printed.getvalue()
-    assert measured("..").notes == []
 
 
 def test_two_failures_at_the_start_end_the_run() -> None:

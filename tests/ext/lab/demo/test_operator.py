@@ -69,19 +69,6 @@ def test_a_persons_stop_is_left_to_the_person(robot: RecordingRobot, operator: O
     assert until(robot.drives, START_S)
 
 
-def test_a_robot_that_another_program_drives_is_left_alone_as_well(
-    broker: Broker, robot: RecordingRobot, operator: Operator
-) -> None:
-    operator.begin()
-    assert until(lambda: robot.drives(0.0))
-    robot.stranger(x=0, z=0.3)
-    assert until(lambda: operator.activity.endswith("; goob is driven by another program"))
-    taken = time.monotonic()
-    assert until(lambda: operator.visitors.left_alone == {"goob"})
-    assert until(lambda: robot.drives(taken + 0.1), 2 * START_S)
-    assert [one for one in operator.completed if one.ended > taken > one.began] == []
-
-
 def test_a_robot_with_scripts_draws_its_trail_from_the_first_drive_on(
     robot: RecordingRobot, operator: Operator
 ) -> None:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from pebble.extensions.lab.demo.outcome import Driven, Outcome, Outcomes, Wheels, outcome_of
+from pebble.extensions.lab.demo.outcome import Driven, Outcome, Wheels, outcome_of
 from pebble.extensions.lab.simulation.trace import Entry
 
 AHEAD, BACK, STOP = (0.6, 0.5), (-0.6, -0.5), (0.0, 0.0)
@@ -42,16 +42,3 @@ def test_a_robot_moves_while_it_is_driven_and_stands_afterwards(changes: Changes
             True,
             bool(wrong),
         )
-
-
-def test_of_each_robot_and_step_the_worst_round_stays() -> None:
-    outcomes = Outcomes()
-    right, slow = Outcome("goob", "back, stop", 0.1, ""), Outcome("goob", "back, stop", 0.5, "")
-    wrong = Outcome("goob", "back, stop", 0.1, "it did not move as commanded")
-    for outcome, worst in ((right, right), (slow, slow), (right, slow), (wrong, wrong), (slow, wrong)):
-        outcomes.add(outcome)
-        assert outcomes.of("goob", "back, stop") == worst
-    outcomes.add(Outcome("fred", "back, stop", 0.1, ""))
-    assert outcomes.steps() == ["back, stop"]
-    assert outcomes.problems("goob") == ["back, stop: it did not move as commanded"]
-    assert outcomes.problems("fred") == []

@@ -1,22 +1,15 @@
-"""The firmware of Goob and Fred on simulated boards, without a real clock or a pty."""
+"""The firmware of Goob and Fred on simulated boards, and a body, without a real clock or a pty."""
 
 from itertools import pairwise
 
 import pytest
 
 from pebble.extensions.lab.simulation.board import SimulatedMcu
+from pebble.extensions.lab.simulation.bodies import body_of
+from pebble.extensions.lab.simulation.micropython.board import Board
+from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
+from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import END, Type, decode
-
-
-def run(mcu: SimulatedMcu, start: float, seconds: float, command: bytes = b"") -> bytes:
-    """Tick for ``seconds``, sending ``command`` at 10 Hz. Returns the MCU's output."""
-    output = b""
-    for step in range(round(seconds / 0.01)):
-        now = start + 0.01 * (step + 1)
-        if command and step % 10 == 0:
-            output += mcu.receive(command, now)
-        output += mcu.tick(now)
-    return output
 
 
 def test_after_a_pause_there_is_one_report_and_not_all_that_were_missed() -> None:
@@ -54,3 +47,19 @@ def test_a_host_that_was_away_for_a_while_misses_no_sample() -> None:
     samples = [frame.timestamp for frame in frames if frame.type == Type.SAMPLE]
     assert [b - a for a, b in pairwise(samples)] == [10] * (len(samples) - 1)
     assert len(samples) >= 98
+
+
+def test_a_long_turn_reports_each_change_within_it() -> None:
+    clock = VirtualClock(50.0)
+    body = body_of("minilamp", Board(clock))
+    changes: list[tuple[float, tuple[float, float]]] = []
+    body.on_motors = lambda now, motors: changes.append((now, motors))
+    machine = body.board.firmware.module("machine")
+    for ahead, _ in (body.pins.LEFT, body.pins.RIGHT):
+        machine.PWM(machine.Pin(ahead), freq=1000, duty_u16=65535)
+    clock.advance(2.0)
+    body.board.pins.float_all()
+    clock.advance(3.0)
+    body.end_turn()
+    assert changes == [(50.0, (1.0, 1.0)), (52.0, (0.0, 0.0))]
+    assert body.state().pose.x_mm == pytest.approx(2.0 * FULL_SPEED_MM_S, rel=0.01), "it rolled two seconds, not five"

@@ -1,22 +1,17 @@
-"""Kills and stops readers and the writer in a random order: `python -m tests.ext.media.frames.frames_faults 50`."""
+"""Kills and stops readers and the writer in a random order."""
 
 from __future__ import annotations
 
-import json
 import random
 import signal
-import sys
-import tempfile
 import time
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from pebble.transports import segments
 from tests.ext.media.frames.frames_net import FramesNet, Peer
-from tests.support import Child, until
+from tests.support import until
 
 VGA = 640 * 480 * 3
 RATE = 30.0  # Hz
@@ -26,13 +21,10 @@ BETWEEN = 45  # frames from one fault to the next
 class Figures(msgspec.Struct, kw_only=True):
     """What the run has shown."""
 
-    faults: dict[str, int] = {}
     written: int = 0  # by all writers together
     shares: list[float] = []  # of these, what each surviving reader got
     wrong: int = 0  # frames that were torn or out of order and not marked as invalid
-    copied: list[int] = []  # frames each survivor got as bytes
     memory_kb: list[list[int]] = []  # of each survivor: resident after a third of the faults, and at the end
-    mapped_kb: list[int] = []  # shared memory each survivor has mapped at the end
     segments_left: int = 0  # after the last process has ended, and one sweep
 
 
@@ -49,8 +41,6 @@ class Faults:
         self._wait_until_quiet()
         for number in range(faults):
             fault = self._random.choice([self._kill_writer, self._kill_reader, self._kill_reader, self._stop_reader])
-            name = fault.__name__.removeprefix("_")
-            self.figures.faults[name] = self.figures.faults.get(name, 0) + 1
             fault()
             self._wait_until_quiet()
             if number in (faults // 3, faults - 1):
@@ -89,8 +79,6 @@ class Faults:
         answers = [self._final(reader) for reader in self.survivors]
         figures.shares = [round(seen["received"] / figures.written, 4) for seen in answers]
         figures.wrong = sum(seen["wrong"] + seen["backwards"] for seen in answers)
-        figures.mapped_kb = [seen["mapped"] for seen in answers]
-        figures.copied = [seen.get("copied", 0) for seen in answers]
         self._net.note_segments()
         self._net.close()
         time.sleep(segments.YOUNG_S)  # younger segments may be about to be locked
@@ -109,28 +97,3 @@ class Faults:
 
         until(quiet, 5, step=0.1)
         return seen[-1]
-
-
-def under_load(hogs: int, work: Callable[[], Figures]) -> Figures:
-    command = [sys.executable, "-c", "while True: pass"]
-    running = [Child(command) for _ in range(hogs)]
-    try:
-        return work()
-    finally:
-        for hog in running:
-            hog.kill()
-            hog.wait()
-
-
-def main(faults: str, seed: str = "1", hogs: str = "1") -> None:
-    with tempfile.TemporaryDirectory(prefix="frames-") as folder:
-        net = FramesNet(Path(folder, "run"))
-        try:
-            figures = under_load(int(hogs), lambda: Faults(net, int(seed)).run(int(faults)))
-        finally:
-            net.close()
-    sys.stdout.write(json.dumps(msgspec.to_builtins(figures)) + "\n")
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

@@ -19,7 +19,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from pebble.extensions.media.frames import Frame, FrameInfo, FrameReader, FrameWriter, memory, views
+from pebble.extensions.media.frames import Frame, FrameInfo, FrameReader, FrameWriter, views
 from pebble.runtime.parent import end_with_parent as die_with_parent
 
 FORMAT = "bgr24"
@@ -35,15 +35,12 @@ class Options(msgspec.Struct, kw_only=True):
     views: bool = False
     depth: int = 1
     work_s: float = 0.0  # how long a reader looks at a frame
-    without_views: bool = False  # as if zenoh had changed
     memlock: int | None = None  # RLIMIT_MEMLOCK, bytes, as the user below
     user: int | None = None  # become this user, which takes root
 
 
 def main(role: str, folder: str, options: str) -> None:
     chosen = msgspec.json.decode(options, type=Options)
-    if chosen.without_views:
-        views.KNOWN_VERSIONS = frozenset({"0.0.0"})
     if chosen.memlock is not None:
         resource.setrlimit(resource.RLIMIT_MEMLOCK, (chosen.memlock, chosen.memlock))
     if chosen.user not in (None, os.geteuid()):
@@ -158,7 +155,6 @@ class Reader:
             "last": self._last[1],
             "sharing": reader.shared,
             "problem": reader.problem,
-            "views": views.why_unavailable(),
         }
 
     def stop(self) -> None:
@@ -178,13 +174,9 @@ class Tally:
 
 
 def _memory() -> dict[str, Any]:
-    """kB, as in /proc; the shared memory that is mapped."""
+    """kB, as in /proc."""
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-    return {
-        "rss": int(status["VmRSS"].split()[0]),
-        "locked": int(status["VmLck"].split()[0]),
-        "mapped": memory.mapped() >> 10,
-    }
+    return {"rss": int(status["VmRSS"].split()[0])}
 
 
 if __name__ == "__main__":

@@ -20,7 +20,6 @@ def net(tmp_path: Path) -> Iterator[FramesNet]:
 
 @pytest.mark.thorough
 def test_the_others_get_what_is_written_and_nothing_is_left(net: FramesNet) -> None:
-    """A short form of `python -m tests.ext.media.frames.frames_faults 50`."""
     figures = Faults(net, seed=3).run(6)
     assert figures.wrong == 0
     assert min(figures.shares) >= 0.95, figures

@@ -6,6 +6,7 @@ import json
 from operator import sub
 from typing import Any
 
+from pebble.contract.payloads import EstopState
 from pebble.motion.latch import Latch, reset_of, stop_of
 from pebble.transports import Message, QoS
 
@@ -19,6 +20,12 @@ def outgoing(base: str, metric: str, body: object, *, retain: bool = False) -> M
 
 def capabilities(base: str, value: dict[str, Any], *, retain: bool = True) -> Message:
     return outgoing(base, "capabilities", {"schema": "pebble-capabilities/v1", "t": 1, "value": value}, retain=retain)
+
+
+def estop_state(**changes: Any) -> EstopState:
+    """The state of a motor owner that is free."""
+    free = {"latched": False, "boot": "b1", "count": 0, "recent": [], "by": "", "why": "", "since": 0}
+    return EstopState(**{**free, **changes})
 
 
 class Owner:

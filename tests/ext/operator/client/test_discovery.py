@@ -113,12 +113,3 @@ def test_only_what_a_robot_offers_is_assumed_of_it(drive: dict[str, object], dri
     assert robot.online(2.1) is False, "people are told after 1.5 s"
     publish(discovery, "online", {"t": int(WALL * 1000), "online": False}, now=0.6)
     assert robot.liveness.online(0.6) is False, "a will"
-
-
-def test_nonsense_is_passed_over() -> None:
-    discovery = Discovery()
-    publish(discovery, "online", "nonsense")
-    publish(discovery, "capabilities", {"value": 3})
-    discovery.receive(Message("other/topic", b""), 0.0, WALL)
-    assert list(discovery.robots) == [BASE]
-    assert discovery.robots[BASE].liveness.received_at is None

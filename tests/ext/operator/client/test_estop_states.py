@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from pebble.extensions.operator.client.driveable import driveable_of
 from pebble.extensions.operator.client.estop_states import MAX_OWNERS, Reset, RobotEstop
 from pebble.extensions.operator.client.robot_estop import is_of_another
 from pebble.transports import Message
@@ -153,3 +154,24 @@ def test_only_stopped_owners_are_reset() -> None:
 )
 def test_topics_of_another_robot_are_told_by_their_base(topic: str, another: bool) -> None:
     assert is_of_another(topic, "pebble/robots/goob") is another
+
+
+WHY = "serial: no /dev/ttyACM0"
+
+
+@pytest.mark.parametrize(
+    ("driveable", "doubt"),
+    [
+        ({"state": "no", "why": WHY}, f"CANNOT BE DRIVEN OR STOPPED: {WHY}"),
+        ({"state": "unknown", "why": WHY}, f"not known whether its motors obey: {WHY}"),
+        ({"state": "no"}, "CANNOT BE DRIVEN OR STOPPED: it does not say why"),
+        ({"state": "no", "why": "x" * 9000}, f"CANNOT BE DRIVEN OR STOPPED: {'x' * 300}"),
+        ({"state": "yes"}, ""),
+        (None, None),  # an older robot
+        ("no", None),
+        ({"state": ["no"]}, None),
+    ],
+)
+def test_a_status_tells_whether_a_robot_can_be_driven(driveable: object, doubt: str | None) -> None:
+    found = driveable_of(json.dumps({"t": 1, "value": {"services": {}, "driveable": driveable}}).encode())
+    assert (found and found.doubt) == doubt

@@ -106,32 +106,16 @@ def test_a_stop_is_confirmed_by_every_owner(run: Run, robot_on: Make, url: str) 
     assert second[2]["valid_ms"] == 0
 
 
-UNPLUGGED = "serial: no /dev/ttyACM0"
-DOUBTS = {
-    "no": ({"state": "no", "why": UNPLUGGED}, f"CANNOT BE DRIVEN OR STOPPED: {UNPLUGGED}"),
-    "unknown": ({"state": "unknown", "why": UNPLUGGED}, f"not known whether its motors obey: {UNPLUGGED}"),
-    "no reason": ({"state": "no"}, "CANNOT BE DRIVEN OR STOPPED: it does not say why"),
-    "escapes": ({"state": "no", "why": "\x1b[2J"}, "CANNOT BE DRIVEN OR STOPPED: \\u001b[2J"),
-    "long": ({"state": "no", "why": "x" * 9000}, f"CANNOT BE DRIVEN OR STOPPED: {'x' * 300}\n"),
-    "it can": ({"state": "yes"}, ""),
-    "an older robot": (None, ""),
-    "no object": ("no", ""),
-    "another state": ({"state": ["no"]}, ""),
-}
-
-
-@pytest.mark.parametrize(("driveable", "doubt"), DOUBTS.values(), ids=DOUBTS)
-def test_a_stop_of_a_robot_that_cannot_be_driven_is_reported_with_that(
-    run: Run, robot_on: Make, url: str, driveable: object, doubt: str
-) -> None:
+def test_a_stop_of_a_robot_that_cannot_be_driven_is_reported_with_that(run: Run, robot_on: Make, url: str) -> None:
     robot = robot_on("base")
+    driveable = {"state": "no", "why": "serial: no board\x1b[2J"}
     robot.publish("status", {"value": {"services": {}, "driveable": driveable}}, retain=True)
     assert run("estop", robot.id, url) == 0
     output = run.out
     assert "stopped and confirmed" in output
     assert run("estop", "status", robot.id, url) == 0
     for text in (output, run.out):
-        assert (doubt in text) if doubt else ("status says" not in text and "DRIVEN" not in text)
+        assert "CANNOT BE DRIVEN OR STOPPED: serial: no board\\u001b[2J" in text
 
 
 def test_a_robot_that_does_not_answer_is_reported_and_ctrl_c_ends_it(robot_on: Make, url: str) -> None:
@@ -159,17 +143,6 @@ def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printe
         _, err = process.communicate(timeout=30)
     assert (process.returncode, err) == (0, "")
     assert robot.latched
-
-
-def test_all_robots_are_stopped_and_others_spared(run: Run, robot_on: Make, url: str) -> None:
-    robots = [robot_on("serial"), robot_on("mcu", "arm")]
-    outlet = robot_on(estop=None, drive={"available": False})
-    began = time.monotonic()
-    assert run("estop", "--all", url) == 0
-    assert 3.0 <= time.monotonic() - began < 10.0
-    assert all(robot.latched for robot in robots)
-    assert run.out.count("stopped and confirmed") == 2
-    assert f"{outlet.id}: does not drive" in run.out
 
 
 def test_a_stop_of_all_says_when_a_name_may_be_gone(
@@ -452,16 +425,6 @@ def test_status_of_one_and_of_all(run: Run, robot_on: Make, url: str) -> None:
     assert run("estop", "status", stopped.id, url) == 0
     assert list(dict(line.split(": ", 1) for line in run.out.splitlines())) == [stopped.id]
     assert run("estop", "status", "unknown", url) == 1
-
-
-def test_no_name_from_the_network_reaches_the_terminal_unchanged(run: Run, robot_on: Make, url: str) -> None:
-    robot = robot_on("a\u202eb")
-    state = {"latched": True, "boot": "0", "count": 1, "recent": [], "by": "\x1b[31m", "why": "\u202e", "since": 1}
-    robot.publish("estop/a\u202eb", state, retain=True)
-    assert run("estop", "status", robot.id, url) == 0
-    assert "\x1b" not in run.out
-    assert "\u202e" not in run.out
-    assert "stopped by ?[31m" in run.out
 
 
 # -- other commands

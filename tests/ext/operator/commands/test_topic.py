@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands.command_line import Run, config_file, running
+from tests.commands.command_line import Run, running
 from tests.support import Broker
 from tests.transports.zenoh_net import HubProcess
 
@@ -59,24 +58,6 @@ def test_retained_topics_are_listed_with_their_synonym_and_echoed_raw(at: tuple[
     assert rows["outgoing/heartbeat"][-3:] == ["state", "(like", "online)"]
     assert run("topic", "echo", "online", "--raw", "--count", "1", "--seconds", "30", *at) == 0
     assert run.out == '{"t": 1710969600123}\n'
-
-
-def test_a_config_leads_to_its_own_side_and_to_the_remote_one(
-    tmp_path: Path, run: Run, local_transports: dict[str, str]
-) -> None:
-    port = int(local_transports["mqtt"].rpartition(":")[2])
-    path = config_file(
-        tmp_path,
-        robot={"id": "two-sided"},
-        transport={"kind": "zenoh", "run_dir": local_transports["zenoh"].removeprefix("zenoh:")},
-        services={"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": port}}},
-    )
-    sides = {"robot": ("--config", path), "operators": ("--config", path, "--remote")}
-    for side, where in sides.items():
-        assert run("topic", "pub", "status", json.dumps({"value": {"side": side}}), *where) == 0
-    for side, where in sides.items():
-        assert run("topic", "echo", "status", "-n", "1", "-s", "30", "--raw", *where) == 0
-        assert json.loads(run.out)["value"]["side"] == side
 
 
 def test_a_password_comes_from_a_file_or_the_environment(

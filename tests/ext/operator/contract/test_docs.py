@@ -57,21 +57,6 @@ def test_every_link_leads_to_a_payload() -> None:
     assert {"drive", "touchvalues", "imuhealth"} <= links
 
 
-def test_who_decides_and_where_it_goes() -> None:
-    assert topic_docs.authority(c.CHARGING_LEVEL) == "robot"
-    assert "live only" in topic_docs.authority(c.DRIVE)
-    assert "last change" in topic_docs.authority(c.MQTT_VIDEO)
-    assert topic_docs.travels(c.IMU_FAST) == "stays on the robot"
-    assert topic_docs.travels(c.MQTT_VIDEO) == "both ways"
-    assert "remote broker" in topic_docs.travels(c.AUDIO_STREAM)
-
-
-def test_units_and_synonyms_are_documented() -> None:
-    text = topics_document()
-    assert "| `t` | integer | required | epoch milliseconds |" in text
-    assert "Understood like `online`." in text
-
-
 @pytest.mark.parametrize(
     ("channel", "value"),
     [

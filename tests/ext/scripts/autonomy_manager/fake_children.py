@@ -12,11 +12,12 @@ import msgspec
 from msgspec.structs import replace
 
 from pebble.config import Security
-from pebble.contract.payloads import ControlState, EstopState
+from pebble.contract.payloads import ControlState
 from pebble.services.autonomy_manager.child import Launch
 from pebble.services.autonomy_manager.script import Script
 from pebble.services.autonomy_manager.service import AutonomyManager
 from pebble.transports import Message, QoS
+from tests.ext.operator.client.estop_robot import estop_state
 from tests.kit.robot import BASE, Listener, LocalNetwork, Running
 from tests.support import Clock, until
 
@@ -113,8 +114,7 @@ class Bench:
 
     def owner(self, **fields: Any) -> None:
         """Publish the state of the motor owner."""
-        state = {"latched": False, "boot": "aa", "count": 0, "recent": [], "by": "", "why": "", "since": 0, **fields}
-        raw = msgspec.json.encode(EstopState(**state))
+        raw = msgspec.json.encode(estop_state(**fields))
         self.world.transport.publish(f"{BASE}/outgoing/estop/serial", raw, qos=QoS.DELIVERED, retain=True)
         self.quiet()
 

@@ -38,24 +38,21 @@ def test_what_cannot_be_executed_is_named_with_the_reason(first: str, mode: int,
         started(path)
 
 
-@pytest.mark.parametrize("first", ["#!/bin/sh\n", "#!/bin/sh\t-e\n", "#!/usr/bin/env -S sh -e\n", "\n"])
-def test_others_start(first: str, tmp_path: Path) -> None:
+def denied(_pid: int) -> int:
+    raise PermissionError(errno.EPERM, "Operation not permitted")
+
+
+FIRST_LINES = ["#!/bin/sh\n", "#!/bin/sh\t-e\n", "#!/usr/bin/env -S sh -e\n", "\n"]
+
+
+@pytest.mark.parametrize(("first", "may"), [*((line, True) for line in FIRST_LINES), (FIRST_LINES[0], False)])
+def test_others_start_and_their_end_is_noticed_also_where_pidfd_open_is_denied(
+    first: str, may: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not may:
+        monkeypatch.setattr(os, "pidfd_open", denied)
     codes: list[int] = []
     process = started(script(tmp_path, f"{first}exit 7\n", 0o755))
     process.watch(codes.append)
     process.wait(10)
     assert codes == [7]
-
-
-def test_the_end_of_a_script_is_noticed_where_pidfd_open_is_denied(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def denied(_pid: int) -> int:
-        raise PermissionError(errno.EPERM, "Operation not permitted")
-
-    monkeypatch.setattr(os, "pidfd_open", denied)
-    codes: list[int] = []
-    process = started(script(tmp_path, "#!/bin/sh\nexit 3\n", 0o755))
-    process.watch(codes.append)
-    process.wait(10)
-    assert codes == [3]

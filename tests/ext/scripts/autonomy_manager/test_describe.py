@@ -125,28 +125,25 @@ def test_a_manifest_describes_a_script_of_any_language(tmp_path: Path) -> None:
         read_manifest(path)
 
 
+CONTROL = (
+    r'{"label": "\u001b[31mred"}',
+    r'{"summary": "two\nlines"}',
+    r'{"configs": [{"key": "a\nb"}]}',
+    r'{"configs": [{"key": "a", "label": "\u202e"}]}',
+    r'{"configs": [{"key": "a", "arg": "--a\u0000"}]}',
+    r'{"configs": [{"key": "a", "type": "enum", "options": ["\r"]}]}',
+)
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
-    [('{"summary": "%s"}' % ("x" * 161), "longer than 160"), ('{"main": ["a", "b", "c", "d"]}', "more than 3 main")],
-)
-def test_what_operators_read_first_is_short(tmp_path: Path, text: str, why: str) -> None:
-    (tmp_path / "script.json").write_text(text)
-    with pytest.raises(DescribeError, match=why):
-        read_manifest(tmp_path / "script.json")
-
-
-@pytest.mark.parametrize(
-    "text",
     [
-        r'{"label": "\u001b[31mred"}',
-        r'{"summary": "two\nlines"}',
-        r'{"configs": [{"key": "a\nb"}]}',
-        r'{"configs": [{"key": "a", "label": "\u202e"}]}',
-        r'{"configs": [{"key": "a", "arg": "--a\u0000"}]}',
-        r'{"configs": [{"key": "a", "type": "enum", "options": ["\r"]}]}',
+        ('{"summary": "%s"}' % ("x" * 161), "longer than 160"),
+        ('{"main": ["a", "b", "c", "d"]}', "more than 3 main"),
+        *((text, "control characters") for text in CONTROL),
     ],
 )
-def test_texts_for_operators_have_no_control_characters(tmp_path: Path, text: str) -> None:
+def test_what_operators_read_is_short_and_printable(tmp_path: Path, text: str, why: str) -> None:
     (tmp_path / "script.json").write_text(text)
-    with pytest.raises(DescribeError, match="control characters"):
+    with pytest.raises(DescribeError, match=why):
         read_manifest(tmp_path / "script.json")

@@ -7,18 +7,13 @@ from typing import Any
 
 import pytest
 
-from pebble.contract.payloads import ControlState, EstopState
+from pebble.contract.payloads import ControlState
 from pebble.extensions.scripts.runs import SUPERSEDED, following
 from pebble.motion.arbiter import Arbiter
 from pebble.motion.latch import Latch
 from pebble.motion.lease import Lease
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, MotorOwners
-
-
-def state(**fields: Any) -> EstopState:
-    return EstopState(
-        **{"latched": False, "boot": "aa", "count": 0, "recent": [], "by": "", "why": "", "since": 0} | fields
-    )
+from tests.ext.operator.client.estop_robot import estop_state as state
 
 
 @pytest.fixture
@@ -36,27 +31,25 @@ def test_only_a_latched_robot_refuses_and_names_who(owners: MotorOwners) -> None
 
 
 @pytest.mark.parametrize(
-    ("fields", "why"),
+    ("newest_run", "fields", "why"),
     [
-        ({"latched": True, "count": 1, "barred": 8}, "emergency stop of motor owner serial: reset it first"),
-        ({"count": 1, "barred": 8, "by": "bob"}, "emergency stop by bob of motor owner serial: it was reset since"),
-        ({"barred": 8}, OVERRIDDEN),
-        ({"barred": 9, "boot": "bb"}, SUPERSEDED),
-        ({"boot": "bb"}, "motor owner serial was restarted: start the script again"),
-        ({"barred": 7}, ""),
+        (0, {"latched": True, "count": 1, "barred": 8}, "emergency stop of motor owner serial: reset it first"),
+        (0, {"count": 1, "barred": 8, "by": "bob"}, "emergency stop by bob of motor owner serial: it was reset since"),
+        (0, {"barred": 8}, OVERRIDDEN),
+        (8, {"barred": 8}, OVERRIDDEN),
+        (9, {"barred": 8}, SUPERSEDED),
+        (0, {"barred": 9, "boot": "bb"}, SUPERSEDED),
+        (0, {"boot": "bb"}, "motor owner serial was restarted: start the script again"),
+        (0, {"barred": 7}, ""),
     ],
 )
-def test_a_run_ends_with_the_reason(owners: MotorOwners, fields: dict[str, Any], why: str) -> None:
+def test_a_run_ends_with_the_reason_and_a_newer_run_is_no_operator(
+    owners: MotorOwners, newest_run: int, fields: dict[str, Any], why: str
+) -> None:
+    if newest_run:
+        owners.note_run(newest_run)
     baseline = owners.baseline()
     owners.receive("serial", state(**fields))
-    assert owners.ending(8, baseline) == why
-
-
-@pytest.mark.parametrize(("newest_run", "why"), [(8, OVERRIDDEN), (9, SUPERSEDED)])
-def test_a_newer_run_is_no_operator(owners: MotorOwners, newest_run: int, why: str) -> None:
-    owners.note_run(newest_run)
-    baseline = owners.baseline()
-    owners.receive("serial", state(barred=8))
     assert owners.ending(8, baseline) == why
 
 

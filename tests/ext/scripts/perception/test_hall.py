@@ -28,13 +28,6 @@ def test_the_distance_is_exact_between_steps(second: float | None, start: float)
     assert 12 <= wheel.extrema <= 14
 
 
-def test_all_updates_together_are_the_distance() -> None:
-    wheel = HallWheel(STEP_MM)
-    total = sum(wheel.update(sample(0.2 * number)) for number in range(300))
-    assert total == pytest.approx(wheel.mm)
-    assert wheel.ready
-
-
 def test_a_second_sensor_shows_a_direction_against_the_command() -> None:
     wheel = HallWheel(STEP_MM)
     for number in range(400):

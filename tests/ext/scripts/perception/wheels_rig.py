@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import count
 
 from pebble.contract.payloads import Drive, ImuFast, ImuFastValues, MotorPower, Orientation, TouchValues, Vector
@@ -16,6 +16,29 @@ from pebble.extensions.scripts.perception.odometry import Odometry, OdometrySett
 TICK_S = 0.01
 REPEAT_S = 0.1  # of a drive command
 _touch = re.compile(rb"T a0=(\d+) a1=(\d+) a2=(\d+)").fullmatch
+
+
+def powers(drive: Drive) -> MotorPower:
+    left, right = (max(-1.0, min(1.0, power)) for power in (drive.z + drive.x, drive.z - drive.x))
+    return MotorPower(left=left, right=right)
+
+
+def touches(output: bytes, noise: Callable[[], float]) -> tuple[list[TouchValues], bytes]:
+    """The hall sensors in what a board has sent, and what is left of it."""
+    *lines, rest = output.split(b"\n")
+    found = filter(None, map(_touch, (line.strip() for line in lines)))
+    values = [[int(value) + round(noise()) for value in one.groups()] for one in found]
+    return [TouchValues(a0=a0, a1=a1, a2=a2) for a0, a1, a2 in values], rest
+
+
+def turning(dps: float, now: float, seq: int = 0) -> ImuFast:
+    values = ImuFastValues(
+        accel_mps2=Vector(x=0, y=0, z=9.81),
+        gyro_dps=Vector(x=0, y=0, z=dps),
+        temp_c=30.0,
+        orientation_deg=Orientation(roll=0, pitch=0),
+    )
+    return ImuFast(t=0, seq=seq, mcu_ms=round(now * 1000), value=values)
 
 
 class WheelsRig:
@@ -56,9 +79,9 @@ class WheelsRig:
         self.wait(seconds)
 
     def command(self, drive: Drive) -> None:
-        left, right = (max(-1.0, min(1.0, power)) for power in (drive.z + drive.x, drive.z - drive.x))
-        self.odometry.power(MotorPower(left=left, right=right), self.now)
-        self._take(self.mcu.receive(b"M %.3f %.3f\n" % (left, right), self.now))
+        power = powers(drive)
+        self.odometry.power(power, self.now)
+        self._take(self.mcu.receive(b"M %.3f %.3f\n" % (power.left, power.right), self.now))
 
     def wait(self, seconds: float) -> None:
         end = self.now + seconds
@@ -82,18 +105,11 @@ class WheelsRig:
         return value["left_mm"] - self.motion.left_mm + left, value["right_mm"] - self.motion.right_mm + right
 
     def _take(self, output: bytes) -> None:
-        *lines, self._received = (self._received + output).split(b"\n")
-        for found in filter(None, map(_touch, (line.strip() for line in lines))):
-            a0, a1, a2 = (int(value) + round(self._random.gauss(0.0, self._noise)) for value in found.groups())
-            self.odometry.touch(TouchValues(a0=a0, a1=a1, a2=a2), self.now)
+        found, self._received = touches(self._received + output, lambda: self._random.gauss(0.0, self._noise))
+        for values in found:
+            self.odometry.touch(values, self.now)
 
     def _imu(self) -> ImuFast:
         turn = math.degrees((self.motion.right_mm_s - self.motion.left_mm_s) / TRACK_MM)
         z = max(-327.0, min(327.0, self._sign * turn + 0.3 + self._random.gauss(0.0, 0.05)))
-        values = ImuFastValues(
-            accel_mps2=Vector(x=0, y=0, z=9.81),
-            gyro_dps=Vector(x=0, y=0, z=z),
-            temp_c=30.0,
-            orientation_deg=Orientation(roll=0, pitch=0),
-        )
-        return ImuFast(t=0, seq=next(self._sequence), mcu_ms=round(self.now * 1000), value=values)
+        return turning(z, self.now, next(self._sequence))

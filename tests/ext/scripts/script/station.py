@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 
 from pebble.config import LAUNCHER_LOCK, load
 from pebble.contract import DRIVE, ESTOP_STATE, codec
-from pebble.contract.payloads import Drive, EstopState
+from pebble.contract.payloads import Drive
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message, QoS
+from tests.ext.operator.client.estop_robot import estop_state
 from tests.support import Broker, Child, until
 from tests.transports.zenoh_net import HubProcess
 
@@ -86,8 +87,7 @@ class Station:
 
     def publish_state(self, **changes: Any) -> None:
         """The emergency stop's state of the motor owner."""
-        usual = {"latched": False, "boot": "b1", "count": 0, "recent": [], "by": "", "why": "", "since": 0}
-        raw = codec.encode(ESTOP_STATE, EstopState(**{**usual, **changes}))
+        raw = codec.encode(ESTOP_STATE, estop_state(**changes))
         self.transport.publish(ESTOP_STATE.topic(self.config.base, owner="serial"), raw, qos=QoS.DELIVERED, retain=True)
 
     def publish_drive(self, drive: Drive) -> None:

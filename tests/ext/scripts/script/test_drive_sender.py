@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pebble.contract.payloads import Drive, EstopState
+from pebble.contract.payloads import Drive
 from pebble.extensions.scripts.script.drive_sender import HOLD_S, MAX_PER_S, DriveSender
+from tests.ext.operator.client.estop_robot import estop_state as state
 from tests.support import cases
 
 RUN = 17
@@ -53,11 +54,6 @@ class Sending:
     @property
     def values(self) -> list[float]:
         return [sent.z for sent in self.published]
-
-
-def state(**changes: object) -> EstopState:
-    usual = {"latched": False, "boot": "b1", "count": 0, "recent": [], "by": "", "why": "", "since": 0}
-    return EstopState(**{**usual, **changes})  # type: ignore[arg-type]
 
 
 steps = st.lists(

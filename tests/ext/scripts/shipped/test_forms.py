@@ -47,10 +47,6 @@ def test_those_that_only_measure_say_so(name: str) -> None:
     assert described(name).get("drives", True) is (name not in ("apriltag-locations", "wheel-odometry"))
 
 
-def test_these_are_all() -> None:
-    assert sorted(path.name for path in SCRIPTS.iterdir() if path.name != "__pycache__") == sorted(NAMES)
-
-
 @pytest.mark.parametrize("name", ORIGINALS)
 def test_the_originals_settings_are_all_there(name: str) -> None:
     wanted = [entry for entry in ORIGINALS[name] if entry["key"] not in GONE]
@@ -120,12 +116,6 @@ def test_each_has_a_sentence_and_main_settings(name: str) -> None:
     found = described(name)
     assert 10 < len(found["summary"]) <= 160
     assert 1 < len(found["main"]) <= 3
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_no_setting_is_a_path(name: str) -> None:
-    words = {word for entry in described(name)["configs"] for word in entry["key"].split("_")}
-    assert words.isdisjoint({"file", "path", "dir", "folder", "calibration"})
 
 
 def test_the_tags_size_must_be_given_or_confirmed() -> None:

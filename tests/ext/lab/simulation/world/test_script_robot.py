@@ -8,8 +8,6 @@ from pathlib import Path
 import pytest
 
 from pebble import Robot
-from pebble.contract import DRIVE
-from pebble.contract.payloads import Drive
 from pebble.errors import PebbleError
 from pebble.extensions.lab.simulation.world.script_robot import SimulatedRobot
 
@@ -33,20 +31,6 @@ def test_a_script_moves_its_robot_and_leaves_it_at_rest(robot: SimulatedRobot) -
     before = robot.body.pose
     robot.world.run(1.0)
     assert robot.body.pose.x == pytest.approx(before.x, abs=0.03)
-
-
-def test_a_person_goes_first(robot: SimulatedRobot) -> None:
-    obeyed: list[bool] = []
-
-    def main(robot: Robot) -> None:
-        for _ in range(40):
-            obeyed.append(robot.drive(z=0.5))
-            robot.sleep(0.1)
-
-    robot.receive(DRIVE, Drive(z=-0.1))
-    robot.run(main, seconds=4.0)
-    assert obeyed.index(True) == 20
-    assert all(obeyed[20:])
 
 
 def test_a_script_for_which_time_stands_still_is_named(robot: SimulatedRobot) -> None:

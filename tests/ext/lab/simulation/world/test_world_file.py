@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pebble.errors import ConfigError, DeviceError
-from pebble.extensions.lab.simulation.world.world_file import open_world, parse_world
+from pebble.errors import ConfigError
+from pebble.extensions.lab.simulation.world.world_file import parse_world
 
 GOOB = {"x": 0.0, "y": 0.0}
 
@@ -65,17 +63,3 @@ def test_values_that_contradict_each_other_are_refused(keys: dict[str, Any], pro
 @pytest.mark.parametrize("name", ["a/b", "", "x" * 65, "ü" * 40])
 def test_a_robots_name_must_fit_into_a_topic_and_the_page(name: str) -> None:
     assert "the name must be a topic level" in problems(robots={name: GOOB})[0]
-
-
-def test_a_missing_or_wrong_file_is_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "world.json"
-    with pytest.raises(DeviceError, match=r"world.json: there is no such file$"):
-        open_world(path, "goob")
-    path.write_text('{"robots": {')
-    with pytest.raises(DeviceError, match=r"^.*world.json: line 1, column 13: not JSON"):
-        open_world(path, "goob")
-    path.write_text(json.dumps({"robots": {"goob": {"x": 1, "z": 2}}}))
-    with pytest.raises(DeviceError) as caught:
-        open_world(path, "goob")
-    assert str(caught.value).endswith(" (and 1 more)")
-    assert str(caught.value).startswith(f"{path}: robots.goob.z: unknown key")
