@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import socket
@@ -77,6 +78,11 @@ def until(condition: Callable[[], object], timeout: float = 10.0, *, step: float
         time.sleep(step)
         step = max(step, min(1.2 * step, _LONGEST_PAUSE_S))
     return bool(condition())
+
+
+def errors(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """Return what was logged as an error."""
+    return [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
 
 
 class Clock:

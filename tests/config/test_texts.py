@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from pebble.config import load, resolved
+from pebble.config import load
 from pebble.config.secret_text import without_secrets
 from pebble.config.text_files import NotTextError, text_of
 from pebble.config.visible import shown
@@ -152,15 +152,6 @@ def test_a_secret_on_a_command_line_is_not_printed_again(run: Run) -> None:
     for words in commands:
         assert run(*words), words
         assert SECRET not in run.out + run.err, words
-
-
-def test_the_resolved_config_hides_them(tmp_path: Path) -> None:
-    raw = config(f"{REMOTE}/password", SECRET)
-    raw["services"]["mqtt_bridge"]["remote_mqtt"]["username"] = "rover"
-    raw["services"]["mqtt_bridge"]["reboot_control"] = {"command": ["curl", "--token", SECRET, f"http://a:{SECRET}@b"]}
-    raw["services"]["autonomy_manager"] = {"scripts": {"walk": {"args": [{"key": "api_key", "default": SECRET}]}}}
-    assert problems(tmp_path, raw) == ""
-    assert SECRET not in json.dumps(resolved(load(tmp_path / "c.json")))
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from pebble.extension import OURS
-from pebble.transports import MqttSettings, QoS, create
+from tests.robot.operator import Operator
 from tests.support import ROOT, Broker, Child, until
 
 BASE = "pebble/robots/rover"
@@ -110,42 +110,33 @@ def robot(core: Path, kind: str, line: Line, broker: Broker, folder: Path) -> It
 @pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
 def test_a_robot_is_started_driven_and_stopped_and_its_line_ends(core: Path, kind: str, tmp_path: Path) -> None:
     broker, line = Broker(tmp_path), Line()
-    states: dict[str, Any] = {}
-    operator = create("mqtt", "operator", MqttSettings(host="127.0.0.1", port=broker.port))
-    operator.open()
-    operator.subscribe(f"{BASE}/outgoing/#", lambda message: states.update({message.topic: message.payload}))
-
-    def send(metric: str, value: dict[str, Any]) -> None:
-        operator.publish(f"{BASE}/incoming/{metric}", json.dumps(value).encode(), qos=QoS(1))
-
-    def state(metric: str) -> Any:
-        return json.loads(states.get(f"{BASE}/outgoing/{metric}", b"{}"))
+    operator = Operator(broker.port, BASE)
 
     def driveable() -> str | None:
-        value: dict[str, Any] = state("status").get("value", {})
+        value: dict[str, Any] = operator.newest("status").get("value", {})
         return value.get("driveable", {}).get("state")
 
     def driven(wanted: str) -> bool:
-        send("drive-values", {"x": 0, "z": 0.5})
+        operator.send("incoming/drive-values", {"x": 0, "z": 0.5})
         time.sleep(0.05)
         return line.read()[-1:] == [wanted]
 
     try:
         with robot(core, kind, line, broker, tmp_path):
-            assert until(lambda: driveable() in ("yes", "unknown"), 20), states
+            assert until(lambda: driveable() in ("yes", "unknown"), 20)
             assert until(lambda: driven("M 0.500 0.500"), 10)
             begun = time.monotonic()
             assert until(lambda: line.read()[-1] == "M 0.000 0.000", 5)
             assert time.monotonic() - begun < 2
             assert until(lambda: driven("M 0.500 0.500"), 10)
-            send("estop", {"by": "ann"})
-            assert until(lambda: state("estop/serial").get("latched") is True, 5), states
+            operator.send("incoming/estop", {"by": "ann"})
+            assert until(lambda: operator.newest("estop/serial").get("latched") is True, 5)
             assert line.read()[-1] == "M 0.000 0.000"
             count = len(line.lines)
             assert not any(driven("M 0.500 0.500") for _ in range(10))
             assert {*line.read()[count:]} <= {"M 0.000 0.000"}
             line.end()
-            assert until(lambda: driveable() == "no", 10), states
+            assert until(lambda: driveable() == "no", 10)
     finally:
         operator.close()
         broker.stop()

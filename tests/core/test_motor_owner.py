@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from pebble.transports import MqttSettings, QoS, create
+from tests.robot.operator import Operator
 from tests.support import ROOT, Broker, Child, until
 
 BASE = "pebble/robots/spider"
@@ -100,16 +100,10 @@ def test_legs_of_an_owner_are_driven_stopped_and_reset(kind: str, tmp_path: Path
             }
         )
     )
-    states: dict[str, Any] = {}
-    operator = create("mqtt", "operator", MqttSettings(host="127.0.0.1", port=broker.port))
-    operator.open()
-    operator.subscribe(f"{BASE}/outgoing/#", lambda message: states.update({message.topic: message.payload}))
+    operator = Operator(broker.port, BASE)
 
     def send(metric: str, value: dict[str, Any]) -> None:
-        operator.publish(f"{BASE}/incoming/{metric}", json.dumps(value).encode(), qos=QoS(1))
-
-    def state(metric: str) -> Any:
-        return json.loads(states.get(f"{BASE}/outgoing/{metric}", b"{}"))
+        operator.send(f"incoming/{metric}", value)
 
     def moved() -> bool:
         begun = len(moves.read_text())
@@ -120,10 +114,10 @@ def test_legs_of_an_owner_are_driven_stopped_and_reset(kind: str, tmp_path: Path
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     process = Child(command, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL)
     try:
-        assert until(lambda: state("status").get("value", {}).get("driveable", {}).get("state") == "yes", 20), states
-        absent = state("status")["value"]["services"]["absent"]
+        assert until(lambda: operator.newest("status").get("value", {}).get("driveable", {}).get("state") == "yes", 20)
+        absent = operator.newest("status")["value"]["services"]["absent"]
         assert (absent["state"], absent["last_exit"]) == ("failed", "not installed")
-        offer = state("capabilities")["value"]
+        offer = operator.newest("capabilities")["value"]
         assert (offer["drive"]["available"], offer["estop"]["owners"]) == (True, ["legs"])
         if kind == "zenoh":  # the other robot has one broker, so nothing is forwarded
             for sound in ("horn", "bell"):
@@ -135,12 +129,12 @@ def test_legs_of_an_owner_are_driven_stopped_and_reset(kind: str, tmp_path: Path
         assert until(lambda: moves.read_text().endswith("halt\n"), 3)  # no further command has come
         assert moved()
         send("estop", {"by": "ann"})
-        assert until(lambda: state("estop/legs")["latched"], 5)
+        assert until(lambda: operator.newest("estop/legs")["latched"], 5)
         assert moves.read_text().endswith("halt\n")
         assert not moved()
-        stopped = state("estop/legs")
+        stopped = operator.newest("estop/legs")
         send("estop-reset", {"boot": stopped["boot"], "count": stopped["count"]})
-        assert until(lambda: not state("estop/legs")["latched"], 5)
+        assert until(lambda: not operator.newest("estop/legs")["latched"], 5)
         assert until(moved, 5)
     finally:
         process.send_signal(signal.SIGTERM)

@@ -67,20 +67,6 @@ def test_a_stop_halts_latches_and_is_confirmed(kind: str) -> None:
     assert not any(drill.outputs())
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_reset_of_the_newest_state_frees_once_the_stick_was_released(kind: str) -> None:
-    drill = stopped(kind)
-    drill.reset()
-    drill.nonsense(b'{"z": 0.5}')
-    wait(drill)
-    assert not any(drill.outputs())
-    assert not drill.state()["latched"]
-    drill.command(0.0, 0.0)
-    drill.command(0.0, 0.5)
-    wait(drill)
-    assert drill.outputs() == AHEAD[kind]
-
-
 @pytest.mark.parametrize(
     "payload",
     [b"{}", b'{"stop": "<16 hex digits>"}', b"x", b"[" * 400, b'{"stop": "', b"\xff", b"x" * 700, b"x" * 5000],
@@ -130,18 +116,6 @@ def test_a_zero_counts_though_a_newer_command_replaces_it() -> None:
     wait(drill)
     assert not any(drill.outputs())
     assert drill.state()["barred"] == 17
-
-
-@pytest.mark.parametrize(("valid_ms", "runs_s"), [(300, 0.3), (5000, 0.9)])
-def test_a_command_moves_no_longer_than_it_is_valid(valid_ms: int, runs_s: float) -> None:
-    drill = online("benjr")
-    drill.command(0.0, 0.5, valid_ms=valid_ms)
-    while not any(drill.outputs()):
-        drill.turn(0.005)
-    began = drill.seconds
-    while any(drill.outputs()):
-        drill.turn(0.005)
-    assert drill.seconds - began == pytest.approx(runs_s, abs=0.03)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.lab.simulation.fleet import members
 from pebble.extensions.lab.simulation.trace import read_trace
 from pebble.extensions.lab.simulation.wireless import KINDS
-from tests.firmware.wireless_rig import Operator
+from tests.robot.operator import Operator
 from tests.support import ROOT, Broker, Child, free_port, until
 
 END_S = 1.0
@@ -79,10 +80,10 @@ def test_both_are_driven_and_end_at_once_by_a_signal_with_motors_off(
     def motors(kind: str) -> list[Any]:
         return [entry.motors for entry in read_trace(traces[kind])]
 
-    with Operator(broker.port) as operator:
+    with closing(Operator(broker.port, "pebble/robots")) as operator:
         for kind, program in programs.items():
-            assert until(lambda kind=kind: operator.beating(kind, 0.0) > 1, 15), program.err  # type: ignore[misc]
-            operator.drive(kind, 0.0, 1.0)
+            assert until(lambda kind=kind: len(operator.on(f"{kind}/outgoing/online")) > 1, 15), program.err  # type: ignore[misc]
+            operator.send(f"{kind}/incoming/drive-values", {"z": 1.0})
         assert until(lambda: all(motors(kind) == [(1.0, 1.0), (0.0, 0.0)] for kind in KINDS), 5)
         for (kind, program), number in zip(programs.items(), (signal.SIGTERM, signal.SIGINT), strict=True):
             began, ended = read_trace(traces[kind])
@@ -91,7 +92,7 @@ def test_both_are_driven_and_end_at_once_by_a_signal_with_motors_off(
             capabilities = retained(broker.port, f"pebble/robots/{kind}/outgoing/capabilities")["value"]
             assert capabilities["identity"] == {"system": "pebble", "type": "robots", "id": kind, "name": NAME}
             assert capabilities["drive"]["topic"] == f"pebble/robots/{kind}/incoming/drive-values"
-            operator.drive(kind, 0.0, 1.0)
+            operator.send(f"{kind}/incoming/drive-values", {"z": 1.0})
             assert until(lambda kind=kind: motors(kind)[-1] == (1.0, 1.0))  # type: ignore[misc]
             program.process.send_signal(number)
             signalled = time.monotonic()
@@ -107,8 +108,8 @@ def test_its_files_survive_a_killed_program_which_is_published_as_offline(
     topic, online = (f"pebble/robots/benjr/outgoing/{metric}" for metric in ("estop/mcu", "online"))
     program = start(*arguments)
     assert until(lambda: (retained(broker.port, topic) or {}).get("latched") is False, 15), program.err
-    with Operator(broker.port) as operator:
-        operator.send("benjr", b'{"stop": "00000000000000aa"}', metric="estop")
+    with closing(Operator(broker.port, "pebble/robots/benjr")) as operator:
+        operator.send("incoming/estop", {"stop": "00000000000000aa"})
         assert until(lambda: retained(broker.port, topic)["persisted"] and retained(broker.port, topic)["latched"])
     first = retained(broker.port, topic)
     assert retained(broker.port, online)["online"] is True

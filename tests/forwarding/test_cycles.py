@@ -15,7 +15,7 @@ from pebble.transports import Message, QoS
 from tests.forwarding.test_forwarding import grows_no_more
 from tests.forwarding.virtual import Connection, Running, World
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client, make_config
-from tests.support import Clock
+from tests.support import Clock, errors
 
 LOCAL, REMOTE = Side.LOCAL, Side.REMOTE
 DRIVE, ESTOP, FLAG = "incoming/drive-values", "incoming/estop", "incoming/flags/mqtt-video"
@@ -66,10 +66,6 @@ def arrives(world: World, client: Client, suffix: str, payload: bytes) -> bool:
     (world.remote if client is world.local else world.local).publish(suffix, payload)
     world.run(1)
     return client.payloads(suffix)[before:] == [payload]
-
-
-def errors(caplog: pytest.LogCaptureFixture) -> list[str]:
-    return [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
 
 
 @pytest.mark.parametrize("mirroring", [False, True])

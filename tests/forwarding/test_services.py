@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import time
 from collections.abc import Callable
 from itertools import groupby
@@ -20,6 +19,7 @@ from pebble.services.mqtt_bridge.requests.actions import Action
 from pebble.transports.base import Answer
 from tests.forwarding.virtual import Hub, Running, World
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client
+from tests.support import errors
 
 DRIVE, STOP, RESET = "incoming/drive-values", "incoming/estop", "incoming/estop-reset"
 LIGHTS, EVENT = "incoming/lights-solid", "outgoing/somebody/happened"
@@ -75,10 +75,6 @@ def do(world: World, history: str) -> None:
         else:
             words[word]()
         world.run()
-
-
-def errors(caplog: pytest.LogCaptureFixture) -> list[str]:
-    return [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
 
 
 class TestFlags:

@@ -181,15 +181,6 @@ def test_a_robot_whose_run_directory_another_takes_stops_in_order(launch: Launch
     assert robot.events("bridge", "stop")
 
 
-def test_a_killed_launcher_leaves_no_orphans(launch: Launch) -> None:
-    robot = launch(("hub", "good", LOCAL_TRANSPORT), ("serial", "good", DEVICE))
-    assert robot.ready("hub", "serial")
-    pids = robot.events("hub", "start") + robot.events("serial", "start")
-    robot.process.kill()
-    assert until(lambda: all(gone(pid) for pid in pids))
-    assert robot.events("serial", "stop"), "children get SIGTERM, so that they can stop their hardware"
-
-
 @pytest.mark.parametrize("trouble", ["hangs", "broken"])
 def test_supervision_does_not_wait_for_a_transport(launch: Launch, trouble: str) -> None:
     robot = launch(("serial", "good", DEVICE), options=(trouble,))
@@ -198,16 +189,6 @@ def test_supervision_does_not_wait_for_a_transport(launch: Launch, trouble: str)
     assert until(lambda: len(robot.events("serial", "ready")) == 2, 20)
     assert robot.stop() == 0
     assert len(robot.events("serial", "stop")) == 1
-
-
-def test_a_killed_announcer_is_started_again_and_receives_what_it_missed(launch: Launch) -> None:
-    robot = launch(("serial", "good", DEVICE), republish_s=600)
-    assert robot.ready("serial", "announcer")
-    os.kill(robot.children()["announcer"], signal.SIGKILL)
-    again = {"state": "ready", "restarts": 1, "last_exit": "signal 9", "restarts_per_minute": 1}
-    assert until(lambda: robot.services()["announcer"] == again)
-    assert len(robot.published("capabilities")) >= 2
-    assert len(robot.events("serial", "start")) == 1
 
 
 # -- a forked process

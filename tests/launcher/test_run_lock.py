@@ -12,6 +12,7 @@ import pytest
 from pebble.config import LAUNCHER_LOCK
 from pebble.errors import PebbleError
 from pebble.launcher.run_lock import RunLock
+from tests.support import refused
 
 
 def test_the_folder_is_made_for_this_user_alone(tmp_path: Path) -> None:
@@ -28,10 +29,10 @@ def test_an_open_folder_of_ours_is_closed(tmp_path: Path) -> None:
 
 def test_a_second_lock_names_the_holder(tmp_path: Path) -> None:
     with RunLock(tmp_path, "x/y/z", tmp_path / "state.lock") as lock:
-        with pytest.raises(PebbleError) as refused:
+        with pytest.raises(PebbleError) as caught:
             RunLock(tmp_path, "x/y/z", tmp_path / "state.lock").take()
         fact = f"x/y/z already runs: process {os.getpid()} holds {lock.path}"
-        assert str(refused.value) == f"{fact}; end it there with Ctrl-C"
+        assert str(caught.value) == f"{fact}; end it there with Ctrl-C"
     with RunLock(tmp_path, "x/y/z", tmp_path / "state.lock"):
         pass
 
@@ -55,12 +56,9 @@ def test_a_robot_without_a_state_directory_starts(tmp_path: Path, caplog: pytest
 
 
 def test_a_full_disk_does_not_keep_a_robot_from_starting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> int:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "pwrite", full)
-    refused = pytest.raises(PebbleError, match=r"x/y/z already runs: process \(unknown\) holds")
-    with RunLock(tmp_path, "x/y/z", tmp_path / "state.lock"), refused:
+    monkeypatch.setattr(os, "pwrite", refused(errno.ENOSPC))
+    unknown = pytest.raises(PebbleError, match=r"x/y/z already runs: process \(unknown\) holds")
+    with RunLock(tmp_path, "x/y/z", tmp_path / "state.lock"), unknown:
         RunLock(tmp_path, "x/y/z", tmp_path / "state.lock").take()
 
 

@@ -160,9 +160,9 @@ def _lost(rig: Rig) -> Iterator[None]:
 
 @contextmanager
 def _unplugged(rig: Rig) -> Iterator[None]:
-    rig.mcu.command("unplug")  # type: ignore[attr-defined]
+    rig.mcu.command("unplug")
     yield
-    rig.mcu.command("replug")  # type: ignore[attr-defined]
+    rig.mcu.command("replug")
 
 
 @contextmanager

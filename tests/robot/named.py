@@ -15,7 +15,7 @@ from tests.robot.operator import Operator
 from tests.robot.rig import BASE, Rig, lines
 from tests.support import free_port, until
 
-DRIVE, CONTROL, STATE = "drive-values", "control", "outgoing/control/serial"
+DRIVE, CONTROL, STATE = "drive-values", "control", "control/serial"
 PEOPLE = {"otto": "driver", "mia": "driver", "zoe": "driver", "vera": "viewer", "boss": "driver,safety,maintainer"}
 _ids = itertools.count()
 
@@ -93,8 +93,7 @@ class Named(Rig):
         return until(lambda: has_effect() or self.send(name, metric, body) or has_effect(), timeout, step=0.2)
 
     def state(self) -> dict[str, Any]:
-        last = self.operator.last(STATE)
-        return {} if last is None else last.json
+        return self.operator.newest(STATE)
 
     @contextmanager
     def held(self, name: str, metric: str = CONTROL, for_ms: int = 10_000) -> Iterator[str]:

@@ -34,7 +34,7 @@ class ReceivedMessage:
 class Operator:
     """Connects to one broker, subscribes to one robot, records every message, and publishes on request.
 
-    ``login``: a user name and its password. ``will``: what the broker publishes when the connection is lost.
+    ``login``: a user name and its password.
     """
 
     def __init__(
@@ -44,15 +44,12 @@ class Operator:
         listens: str = "#",
         *,
         login: tuple[str, str] | None = None,
-        will: tuple[str, Any] | None = None,
     ) -> None:
         self.base, self._listens = base, listens
         self.seen: list[ReceivedMessage] = []
         self._client = paho.Client(CallbackAPIVersion.VERSION2)
         if login is not None:
             self._client.username_pw_set(*login)
-        if will is not None:
-            self._client.will_set(f"{base}/{will[0]}", json.dumps(will[1]), qos=1)
         self._client.on_connect = self._subscribe
         self._client.on_message = self._remember
         self._client.on_socket_open = _send_at_once
@@ -89,6 +86,11 @@ class Operator:
     def last(self, suffix: str) -> ReceivedMessage | None:
         seen = self.on(suffix)
         return seen[-1] if seen else None
+
+    def newest(self, metric: str) -> dict[str, Any]:
+        """Return what the robot said last; an empty dict if it has said nothing, or removed it."""
+        seen = self.last(f"outgoing/{metric}")
+        return {} if seen is None or not seen.payload else dict(seen.json)
 
     def wait_for(self, suffix: str, timeout: float = 10.0, since: float = 0.0) -> ReceivedMessage:
         """The first message on a topic after ``since``; fails when none comes in time."""
@@ -127,21 +129,15 @@ def number_of(left: float, right: float) -> int:
     return round((left - 0.1) * 1000) + _STEPS * round((right - 0.1) * 1000)
 
 
-class Driver:
-    """Sends commands at ``rate_hz`` until stopped, and remembers when each was sent; ``body`` makes one of a number."""
+_PERIOD_S = 0.05
 
-    def __init__(
-        self,
-        operator: Operator,
-        rate_hz: float = 20.0,
-        first: int = 0,
-        *,
-        qos: int = 1,
-        body: Callable[[int], dict[str, Any]] = numbered,
-    ) -> None:
+
+class Driver:
+    """Sends 20 commands a second until stopped, and remembers when each was sent; ``body`` makes one of a number."""
+
+    def __init__(self, operator: Operator, first: int = 0, *, body: Callable[[int], dict[str, Any]] = numbered) -> None:
         self.sent_at: dict[int, float] = {}
-        self._operator, self._period, self._first, self._qos = operator, 1 / rate_hz, first, qos
-        self._body = body
+        self._operator, self._first, self._body = operator, first, body
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -154,9 +150,9 @@ class Driver:
         number, due = self._first, time.monotonic()
         while not self._stop.is_set():
             self.sent_at[number] = time.monotonic()
-            self._operator.send("incoming/drive-values", self._body(number), qos=self._qos)
+            self._operator.send("incoming/drive-values", self._body(number))
             number += 1
-            due += self._period
+            due += _PERIOD_S
             self._stop.wait(max(0.0, due - time.monotonic()))
 
 

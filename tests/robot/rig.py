@@ -11,7 +11,6 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -113,8 +112,8 @@ class Rig:
     """Brokers, MCU, robot and operator. ``kind`` is ``mqtt``, ``zenoh`` or ``single`` (one broker for both sides).
 
     The robot reaches the remote broker through ``uplink``, a proxy that can fail. With ``direct`` it connects without
-    the proxy, because a proxy acknowledges TCP segments itself and so changes the timing. ``remote`` and ``local``
-    replace its own brokers, ``motors`` its own MCU. ``listens``: what the operator subscribes to, below the robot's
+    the proxy, because a proxy acknowledges TCP segments itself and so changes the timing. ``remote`` replaces
+    its own broker. ``listens``: what the operator subscribes to, below the robot's
     base; ``operator`` replaces it. ``scripts``: which of ours it has. ``top``: more sections of the config; others are
     services'.
     """
@@ -126,11 +125,9 @@ class Rig:
         name: str = "rover",
         mirror: bool = False,
         mcu: str = "goob",
-        motors: Motors | None = None,
         start: bool = True,
         direct: bool = False,
         remote: Broker | None = None,
-        local: Broker | None = None,
         listens: str = "#",
         operator: Operator | None = None,
         scripts: tuple[str, ...] = (),
@@ -143,7 +140,7 @@ class Rig:
         self.folder = Path(self._folder.name)
         self.remote = remote or Broker(self.folder)
         self.uplink = TcpProxy(self.remote.port)
-        self.local = local or Broker(self.folder) if kind == "mqtt" or mirror else None
+        self.local = Broker(self.folder) if kind == "mqtt" or mirror else None
         self.mirror, self._scripts = mirror, scripts
         if scripts:
             with_paho = (
@@ -153,7 +150,7 @@ class Rig:
             self._extra = config | {"autonomy_manager": manager | config.get("autonomy_manager", {})}
         for script in scripts:
             shutil.copytree(SCRIPTS / script, self.folder / "autonomy" / script)
-        self.mcu = motors or Mcu(self.folder, mcu)
+        self.mcu = Mcu(self.folder, mcu)
         self.config = self.folder / "robot.json"
         self.config.write_text(json.dumps(self._config(), indent=1))
         self.log = self.folder / "robot.log"
@@ -245,15 +242,6 @@ class Rig:
         os.kill(pid, signal.SIGKILL)
         return time.monotonic()
 
-    def freeze(self, program: str, seconds: float) -> None:
-        """Let one process of the robot, if it runs, do nothing for so long."""
-        pid = self.processes().get(program)
-        if pid is not None:
-            with suppress(ProcessLookupError):  # killed before, and not started again yet
-                os.kill(pid, signal.SIGSTOP)
-                time.sleep(seconds)
-                os.kill(pid, signal.SIGCONT)
-
     # -- its scripts
 
     def run_script(self, file: str, config: dict[str, Any] | None = None) -> float:
@@ -270,8 +258,7 @@ class Rig:
 
     def script(self) -> dict[str, Any]:
         """Return the newest ``autonomy-status``; empty before the first."""
-        seen = self.operator.last("outgoing/autonomy-status")
-        return {} if seen is None else dict(seen.json)
+        return self.operator.newest("autonomy-status")
 
     def lists_scripts(self, since: float = 0.0) -> bool:
         """True if all of them are in a catalogue that was published after ``since``."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,8 +10,9 @@ from typing import Any
 import pytest
 
 from pebble.config import LAUNCHER_LOCK
+from tests.commands.command_line import program
 from tests.robot.rig import Rig
-from tests.support import ROOT, further, until
+from tests.support import further, until
 
 
 @pytest.fixture(params=["mqtt", "zenoh"])
@@ -23,8 +22,7 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
 
 
 def driveable(rig: Rig) -> dict[str, str]:
-    status = rig.operator.last("outgoing/status")
-    found: dict[str, str] = {} if status is None else status.json["value"].get("driveable", {})
+    found: dict[str, str] = rig.operator.newest("status").get("value", {}).get("driveable", {})
     return found
 
 
@@ -33,20 +31,18 @@ def shows(rig: Rig, state: str, why: str = "", seconds: float = 20.0) -> bool:
 
 
 def pebble(*words: object) -> str:
-    command = [sys.executable, "-m", "pebble.cli", *map(str, words)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
-    return done.stdout + done.stderr
+    return "".join(program(*map(str, words)).communicate(timeout=60))
 
 
 @pytest.mark.parametrize("rig", [further("mqtt"), "zenoh"], indirect=True)
 def test_an_unplugged_board_is_named_everywhere_until_it_is_back(rig: Rig) -> None:
     assert shows(rig, "yes")
-    rig.mcu.command("unplug")  # type: ignore[attr-defined]
+    rig.mcu.command("unplug")
     assert shows(rig, "no", f"serial: cannot open {rig.mcu.port}")
     assert _mcu(rig)["state"] == "absent"
     assert f"CANNOT BE DRIVEN OR STOPPED: serial: cannot open {rig.mcu.port}" in pebble("estop", rig.config, "--remote")
     assert f"serial: cannot open {rig.mcu.port}" in " ".join(pebble("estop", "status", rig.config, "--remote").split())
-    rig.mcu.command("replug")  # type: ignore[attr-defined]
+    rig.mcu.command("replug")
     assert shows(rig, "yes")
     again = {"starts_per_minute": 1, "why": "its board has started again once within a minute"}
     assert _mcu(rig) == {"state": "ready", "heard_ms": 0, **again}
@@ -79,9 +75,7 @@ def _socket_of(pid: int, folder: Path) -> Path:
 
 
 def _mcu(rig: Rig) -> dict[str, Any]:
-    status = rig.operator.last("outgoing/status")
-    assert status is not None
-    found: dict[str, Any] = status.json["value"]["mcu"]["serial"]
+    found: dict[str, Any] = rig.operator.newest("status")["value"]["mcu"]["serial"]
     return found
 
 

@@ -46,7 +46,7 @@ def _retained_is_current(rig: Rig, charging: bool) -> bool:
 
 def changed_state(rig: Rig) -> None:
     """Change what the MCU reports, in the middle of the fault."""
-    rig.mcu.command(rig.charge_later)  # type: ignore[attr-defined]
+    rig.mcu.command(rig.charge_later)
 
 
 @pytest.mark.parametrize(

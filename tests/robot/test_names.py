@@ -22,7 +22,6 @@ from tests.support import beside, cases, until
 
 pytestmark = pytest.mark.alone  # lines are counted
 
-ESTOP = "outgoing/estop/serial"
 FLOOD_S = float(cases(2, 60))
 
 
@@ -62,9 +61,7 @@ def test_only_who_has_control_drives(rig: Named) -> None:
             assert until(lambda since=zeroed: lines(rig, 0.0, since), 5), (name, suffix)
             assert until(lambda: not rig.mcu.moving(), 5)
     assert [z for z in (0.12, 0.13, 0.14, 0.15, 0.16, 0.17, 0.18, 0.19) if lines(rig, z)] == []
-    capabilities = rig.operator.last("outgoing/capabilities")
-    assert capabilities is not None
-    assert capabilities.json["value"]["named"] is True
+    assert rig.operator.newest("capabilities")["value"]["named"] is True
 
 
 def test_everybody_stops_it_and_only_a_safety_officer_resets_it(rig: Named) -> None:
@@ -85,8 +82,7 @@ def test_everybody_stops_it_and_only_a_safety_officer_resets_it(rig: Named) -> N
 
 
 def state_of(rig: Named) -> dict[str, Any]:
-    last = rig.operator.last(ESTOP)
-    return {} if last is None else last.json
+    return rig.operator.newest("estop/serial")
 
 
 def test_who_is_removed_while_driving_stands(rig: Named) -> None:

@@ -65,16 +65,6 @@ def test_silence_stops_the_wheels(station: Station) -> None:
     assert 0.70 <= stopped - started <= 0.85
 
 
-def test_telemetry(station: Station) -> None:
-    touch = station.operator.wait_for("outgoing/touch-sensors").json
-    assert set(touch["value"]) == {"a0", "a1", "a2"}
-    assert touch["unit"] == "adc"
-    level = station.operator.wait_for("outgoing/charging-level").json
-    assert level["unit"] == "v"
-    assert 5 < level["value"] < 9
-    assert station.operator.wait_for("outgoing/charging-status").json == {"value": None}
-
-
 def test_actions_run_once_and_only_for_true(station: Station) -> None:
     before = len(station.rig.recorded())
     for body in (False, {"value": False}, 1, "true", {"value": 1}, None, {"on": True}, b"true\xff"):

@@ -31,9 +31,7 @@ def rigs() -> Iterator[Callable[[str], Rig]]:
     """Robots by their transport, each started when it is first needed."""
 
     def opened(kind: str) -> Rig:
-        rig = stack.enter_context(
-            Rig(kind, mirror=kind == "zenoh", direct=True, scripts=("cruise", "flood", "crash", "needy", "follow"))
-        )
+        rig = stack.enter_context(Rig(kind, mirror=kind == "zenoh", direct=True, scripts=("cruise", "flood", "follow")))
         assert until(rig.lists_scripts, 60), rig.log.read_text()[-3000:]
         return rig
 
@@ -123,25 +121,10 @@ def test_one_stop_of_a_person_is_enough(rig: Rig) -> None:
     assert rested <= AT_ONCE_S
 
 
-@pytest.mark.parametrize("rig", ["zenoh"], indirect=True)
-def test_a_script_stops_with_what_it_needs(rig: Rig) -> None:
-    """``needy`` needs ``crash``, which ends with code 3 after half a second."""
-    began = rig.run_script("needy")
-    statuses = lambda: [seen.json for seen in rig.operator.on("outgoing/autonomy-status", began)]  # noqa: E731
-    assert until(lambda: any(one["running"] for one in statuses()), 10)
-    assert until(lambda: not rig.script()["running"] and rig.script()["error"], 10)
-    assert "crash" in rig.script()["error"]
-    assert "3" in rig.script()["error"]
-    pids = {one["pid"] for status in statuses() for one in (status, *status["dependencies"])} - {None}
-    assert until(lambda: all(map(gone, pids)), 3)
-    assert not until(lambda: rig.script()["running"], 1.0), "it starts again"
-
-
 def control(rig: Rig, **wanted: Any) -> dict[str, Any]:
     """Ask for control, and return the state of the motor owner."""
     rig.operator.send(CONTROL, {**MIA, **wanted})
-    seen = rig.operator.last("outgoing/control/serial")
-    return {} if seen is None else dict(seen.json)
+    return rig.operator.newest("control/serial")
 
 
 def test_a_person_with_control_goes_before_a_script_of_the_original(rig: Rig) -> None:

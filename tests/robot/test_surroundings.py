@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import os
 import resource
 import signal
 import subprocess
 import time
-from contextlib import ExitStack
 from typing import Any
 
 import pytest
 
-from tests.fakes.bad_brokers import BEHAVIOURS, mute, resolving, serving
 from tests.robot.rig import STOP, Rig, descendants
 from tests.support import ROOT, further, gone, some, until
 
@@ -48,21 +45,6 @@ def test_a_robot_runs(kind: str, surroundings: dict[str, Any]) -> None:
     with Rig(kind, start=False) as rig:
         began = rig.start(ready=False, **surroundings)
         rig.wait_until_up(began)
-        drives_and_stops(rig)
-
-
-@pytest.mark.parametrize("kind", ["mqtt", further("zenoh")])
-def test_a_robot_runs_where_some_addresses_of_its_brokers_are_dead(kind: str) -> None:
-    with ExitStack() as opened:
-        rig = opened.enter_context(Rig(kind, start=False, mqtt_bridge={"remote_mqtt": {"host": "fleet.test"}}))
-        port = rig.uplink.port
-        config = json.loads(rig.config.read_text())
-        config["services"]["mqtt_bridge"]["remote_mqtt"]["port"] = port
-        rig.config.write_text(json.dumps(config))
-        opened.enter_context(serving("127.0.0.2", port, mute))
-        opened.enter_context(serving("127.0.0.3", port, BEHAVIOURS["closing"]))
-        addresses = [f"127.0.0.{last}" for last in (2, 3, 1)]
-        rig.start(env=resolving({"fleet.test": addresses, "localhost": ["127.0.0.9", "127.0.0.1"]}))
         drives_and_stops(rig)
 
 

@@ -200,14 +200,6 @@ def test_T03_delivered_messages_arrive_in_order(net: Net, base: str) -> None:
         assert [p for p in received.payloads if int(p) % 3 == lane] == wanted[lane::3]
 
 
-def test_T03_latest_messages_arrive_when_nothing_is_in_the_way(net: Net, base: str) -> None:
-    sender, receiver, received = net.client("sender"), net.client("receiver"), Received()
-    receiver.subscribe(base, received, qos=LATEST)
-    for number in range(20):
-        assert sender.publish(base, b"%d" % number)
-    assert received.until(*(b"%d" % number for number in range(20)))
-
-
 def test_T04_what_was_not_accepted_is_never_delivered(net: Net, base: str) -> None:
     sender, receiver, received = net.client("sender"), net.client("receiver"), Received()
     receiver.subscribe(base, received)
@@ -586,15 +578,6 @@ def test_T19_a_message_knows_how_long_it_has_waited_for_a_process_that_stood_sti
     assert waited[0] < 0.6 <= waited[1]
 
 
-def test_T19_a_fresh_message_has_not_waited(net: Net, base: str) -> None:
-    client, sender, waited = net.client("client"), net.client("sender"), []
-    client.subscribe(base, lambda message: waited.append(message.waited_s))
-    for _ in range(20):
-        assert sender.publish(base, b"", qos=DELIVERED)
-    assert until(lambda: len(waited) == 20)
-    assert min(waited) < 0.1
-
-
 # -- T13, T14: handlers
 
 
@@ -802,13 +785,6 @@ def test_T16_own_publishes_do_not_come_back_where_that_is_promised(net: Net, bas
     other.publish(f"{base}/y", b"after", qos=DELIVERED)
     assert until(lambda: received.payloads[-1:] == [b"after"])
     assert b"own" not in received.payloads
-
-
-def test_T16_an_echo_is_the_default(net: Net, base: str) -> None:
-    client, received = net.client("client"), Received()
-    client.subscribe(base, received)
-    client.publish(base, b"own", qos=DELIVERED)
-    assert received.until(b"own")
 
 
 def test_T17_close_is_idempotent_and_leaves_nothing_behind(net: Net, base: str) -> None:

@@ -79,12 +79,9 @@ def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_keeps_no_process_from_being_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> int:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     registry = PeerRegistry(tmp_path)
     lock = registry.register("first")
-    monkeypatch.setattr(os, "pwrite", full)
+    monkeypatch.setattr(os, "pwrite", refused(errno.ENOSPC))
     lock.ready()
     assert registry.ready() == {lock.name: "?"}
     lock.release()

@@ -189,7 +189,7 @@ def test_what_an_old_id_has_left_is_named_with_what_removes_it(rig: Rig) -> None
 
 
 def test_a_pulled_board_is_named_and_the_exit_code_is_1(rig: Rig) -> None:
-    rig.mcu.command("unplug")  # type: ignore[attr-defined]
+    rig.mcu.command("unplug")
     began = time.monotonic()
     code, checks = command(rig)
     assert code == 1
@@ -197,7 +197,7 @@ def test_a_pulled_board_is_named_and_the_exit_code_is_1(rig: Rig) -> None:
     assert str(rig.mcu.port) in checks["boards"]["text"]
     assert checks["boards"]["fix"].startswith("plug it in")
     assert moved(rig, began) == set()
-    rig.mcu.command("replug")  # type: ignore[attr-defined]
+    rig.mcu.command("replug")
     assert until(lambda: found(rig, only("boards"))["boards"][0] == "ok", 30)
 
 

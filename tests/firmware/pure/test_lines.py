@@ -33,33 +33,31 @@ def obeyed(data):
     return answer, [(letter, numbers[: {"M": 2, "L": 3, "F": 4}[letter]]) for letter, numbers in calls.commands]
 
 
-def test_each_command():
-    assert obeyed(b"M 0.5 -0.25\n") == (b"OK M\r\n", [("M", [0.5, -0.25])])
-    assert obeyed(b"L 1 0.5 0\n") == (b"OK L\r\n", [("L", [1.0, 0.5, 0.0])])
-    assert obeyed(b"F 0.25 0.5 1 1.5\n") == (b"OK F\r\n", [("F", [0.25, 0.5, 1.0, 1.5])])
+M_ONE = [("M", [1.0, 1.0])]
+#: What a line is answered, and what it does.
+OBEYED = (
+    (b"M 0.5 -0.25\n", b"OK M", [("M", [0.5, -0.25])]),
+    (b"L 1 0.5 0\n", b"OK L", [("L", [1.0, 0.5, 0.0])]),
+    (b"F 0.25 0.5 1 1.5\n", b"OK F", [("F", [0.25, 0.5, 1.0, 1.5])]),
+    (b"M 1 1\r\n", b"OK M", M_ONE),
+    (b" \tM\t 1   1  \r\n", b"OK M", M_ONE),
+    (b"\n\r\n \n\t\n", b"", []),
+    (b"M 1 1 spare tokens are ignored here\n", b"OK M", M_ONE),
+    (b"M 1\n", b"ERR M needs 2 values", []),
+    (b"m\n", b"ERR M needs 2 values", []),
+    (b"L 1 1\n", b"ERR L needs 3 values", []),
+    (b"F 1 1 1\n", b"ERR F needs 4 values", []),
+    (b"X 1 1\n", b"ERR unknown command", []),
+    (b"\xffM 1 1\n", b"ERR unknown command", []),
+    (b"\x03M 1 1\n", b"ERR unknown command", []),
+    (b"M 1 1 " + b"x" * 250 + b"\n", b"OK M", M_ONE),  # 256 bytes
+    (b"M 1 1 " + b"x" * 251 + b"\n", b"WARN line too long", []),
+)
 
 
-def test_cr_and_blanks_do_not_matter():
-    assert obeyed(b"M 1 1\r\n") == (b"OK M\r\n", [("M", [1.0, 1.0])])
-    assert obeyed(b" \tM\t 1   1  \r\n") == (b"OK M\r\n", [("M", [1.0, 1.0])])
-    assert obeyed(b"\n\r\n \n\t\n") == (b"", [])
-
-
-def test_spare_tokens_are_not_looked_at():
-    assert obeyed(b"M 1 1 spare tokens are ignored here\n") == (b"OK M\r\n", [("M", [1.0, 1.0])])
-
-
-def test_missing_numbers_are_reported():
-    assert obeyed(b"M 1\n") == (b"ERR M needs 2 values\r\n", [])
-    assert obeyed(b"m\n") == (b"ERR M needs 2 values\r\n", [])
-    assert obeyed(b"L 1 1\n") == (b"ERR L needs 3 values\r\n", [])
-    assert obeyed(b"F 1 1 1\n") == (b"ERR F needs 4 values\r\n", [])
-
-
-def test_unknown_commands_are_reported():
-    assert obeyed(b"X 1 1\n") == (b"ERR unknown command\r\n", [])
-    assert obeyed(b"\xffM 1 1\n") == (b"ERR unknown command\r\n", [])
-    assert obeyed(b"\x03M 1 1\n") == (b"ERR unknown command\r\n", [])
+def test_what_a_line_does():
+    for line, answer, commands in OBEYED:
+        assert obeyed(line) == (answer + b"\r\n" * bool(answer), commands), line
 
 
 def test_an_unfinished_line_is_dropped_after_200_ms_of_silence():
@@ -81,29 +79,19 @@ def test_a_line_too_long_is_discarded_and_reported_once():
     assert calls.commands == [("M", [0.5, 0.5, 0.0, 0.0, 0.0])]
 
 
-def test_256_bytes_are_not_too_long():
-    assert obeyed(b"M 1 1 " + b"x" * 250 + b"\n") == (b"OK M\r\n", [("M", [1.0, 1.0])])
-    assert obeyed(b"M 1 1 " + b"x" * 251 + b"\n") == (b"WARN line too long\r\n", [])
-
-
-def read(text):
-    return number(text, 0, len(text))
+#: Texts and the numbers that they are; those of many digits nearly so.
+NUMBERS = (
+    (b"0.5", 0.5), (b"-.25", -0.25), (b"+1.", 1.0), (b"0.930", 0.93), (b"12.125", 12.125),
+    (b"0." + b"3" * 200, 1 / 3), (b"0" * 200 + b"1", 1.0), (b"0." + b"0" * 200 + b"1", 0.0),
+)  # fmt: skip
 
 
 def test_numbers():
-    assert read(b"0.5") == 0.5
-    assert read(b"-.25") == -0.25
-    assert read(b"+1.") == 1.0
-    assert read(b"0.930") == 0.93
-    assert read(b"12.125") == 12.125
-
-
-def test_long_numbers():
-    assert clamp(read(b"9" * 200), -1.0) == 1.0
-    assert clamp(read(b"-" + b"9" * 200), -1.0) == -1.0
-    assert abs(read(b"0." + b"3" * 200) - 1 / 3) < 1e-6
-    assert abs(read(b"0" * 200 + b"1")) == 1.0
-    assert read(b"0." + b"0" * 200 + b"1") < 1e-6
+    for text, expected in NUMBERS:
+        assert abs(number(text, 0, len(text)) - expected) < 1e-6, text
+    for sign, limit in ((b"", 1.0), (b"-", -1.0)):
+        text = sign + b"9" * 200
+        assert clamp(number(text, 0, len(text)), -1.0) == limit
 
 
 def test_clamp():

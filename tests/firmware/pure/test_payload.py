@@ -21,10 +21,21 @@ def order(raw: bytes) -> "tuple | None":
     return command[3:5] if command else None
 
 
-def test_bare_and_wrapped() -> None:
-    assert parse(b'{"x": 0.5, "z": -0.25, "y": 1}') == (0.5, -0.25, 1.0)
-    assert parse(b'{"value": {"x": 0.5, "z": -0.25}, "z": 1}') == (0.5, -0.25, 0.0)
-    assert parse(b'{"value": 3, "z": 0.25}') == (0.0, 0.25, 0.0)
+#: The axes of commands; None: they are none.
+AXES = (
+    (b'{"x": 0.5, "z": -0.25, "y": 1}', (0.5, -0.25, 1.0)),
+    (b'{"value": {"x": 0.5, "z": -0.25}, "z": 1}', (0.5, -0.25, 0.0)),
+    (b'{"value": 3, "z": 0.25}', (0.0, 0.25, 0.0)),
+    (b'{"z": 1, "n": "\xc3\xab"}', (0.0, 1.0, 0.0)),
+    (b"", None), (b" ", None), (b"1", None), (b"[1, 1]", None), (b'"x"', None), (b"null", None), (b"\x00", None),
+    (b'{"z": 1', None), (b'{"z": 1}}', None), (b'{"z": 1} x', None), (b"z", None),
+    (b"\xff\xfe\x00", None), (b'{"z": 1, "n": "\xff"}', None),
+)  # fmt: skip
+
+
+def test_the_axes_of_a_command() -> None:
+    for raw, expected in AXES:
+        assert parse(raw) == expected, raw
 
 
 def test_numbers_are_read_as_on_linux() -> None:
@@ -44,17 +55,6 @@ def test_bytes_around_a_command_change_nothing() -> None:
     assert parse(bytes([byte for char in b'{"x": 0}' for byte in (char, 0)])) is None  # UTF-16
 
 
-def test_what_is_no_object_is_refused() -> None:
-    for raw in (b"", b" ", b"1", b"[1, 1]", b'"x"', b"null", b'{"z": 1', b'{"z": 1}}', b'{"z": 1} x', b"\x00", b"z"):
-        assert parse(raw) is None, raw
-
-
-def test_what_is_no_utf8_is_refused() -> None:
-    assert parse(b"\xff\xfe\x00") is None
-    assert parse(b'{"z": 1, "n": "\xff"}') is None
-    assert parse(b'{"z": 1, "n": "\xc3\xab"}') == (0.0, 1.0, 0.0)
-
-
 def test_length_and_depth_have_limits() -> None:
     body = b'{"z": 1, "pad": "%s"}'
     room = 512 - len(body % b"")
@@ -65,19 +65,27 @@ def test_length_and_depth_have_limits() -> None:
     assert parse(b'{"z": 1, "a":' + b"[" * 20 + b"]" * 20 + b"}") == (0.0, 1.0, 0.0)
 
 
-def test_a_script_signs_with_its_run() -> None:
-    assert order(b'{"z": 1, "source": "autonomy", "run": 17}') == (17, -1)
-    assert order(b'{"value": {"z": 1, "source": "autonomy", "run": 1073741823}}') == (1073741823, -1)
-    assert order(b'{"z": 0, "source": "autonomy", "run": 17, "valid_ms": 0}') == (17, 0)
-    assert order(b'{"source": "autonomy", "run": 17}') == (17, -1)
+#: Run and validity of commands; None: they move nothing, and are none.
+ORDERS = (
+    (b'{"z": 1, "source": "autonomy", "run": 17}', (17, -1)),
+    (b'{"value": {"z": 1, "source": "autonomy", "run": 1073741823}}', (1073741823, -1)),
+    (b'{"z": 0, "source": "autonomy", "run": 17, "valid_ms": 0}', (17, 0)),
+    (b'{"source": "autonomy", "run": 17}', (17, -1)),
+    (b'{"z": 1, "valid_ms": 400}', (0, 400)),
+    (b'{"z": 1, "valid_ms": 250.9}', (0, 250)),
+    (b'{"z": 0, "valid_ms": 0}', (0, 0)),
+    (b'{"z": 0, "valid_ms": 0.5}', (0, 0)),
+    (b'{"z": 1, "valid_ms": 999999999999}', (0, 60_000)),
+    (b'{"z": 0.5, "source": "autonomy"}', None),  # a script's without its run
+    (b'{"source": "autonomy"}', (-1, -1)),
+    (b'{"z": 0.5, "valid_ms": 0}', None),
+    (b'{"z": 0.5, "valid_ms": 0.5}', None),
+)
 
 
-def test_a_command_may_be_valid_for_a_shorter_time() -> None:
-    assert order(b'{"z": 1, "valid_ms": 400}') == (0, 400)
-    assert order(b'{"z": 1, "valid_ms": 250.9}') == (0, 250)
-    assert order(b'{"z": 0, "valid_ms": 0}') == (0, 0)
-    assert order(b'{"z": 0, "valid_ms": 0.5}') == (0, 0)
-    assert order(b'{"z": 1, "valid_ms": 999999999999}') == (0, 60_000)
+def test_the_run_and_the_validity_of_a_command() -> None:
+    for raw, expected in ORDERS:
+        assert order(raw) == expected, raw
 
 
 def test_a_command_may_name_the_control_it_is_sent_under() -> None:
@@ -103,13 +111,6 @@ def test_a_wrong_field_refuses_what_moves_and_never_a_zero() -> None:
     for text, zero in wrong:
         assert order(('{"z": 0.5, ' + text + "}").encode()) is None, text
         assert order(('{"z": 0, ' + text + "}").encode()) == zero, text
-
-
-def test_a_scripts_command_without_its_run_and_one_that_is_valid_for_no_time_move_nothing() -> None:
-    assert order(b'{"z": 0.5, "source": "autonomy"}') is None
-    assert order(b'{"source": "autonomy"}') == (-1, -1)
-    assert order(b'{"z": 0.5, "valid_ms": 0}') is None
-    assert order(b'{"z": 0.5, "valid_ms": 0.5}') is None
 
 
 def test_nothing_beyond_full_speed() -> None:

@@ -171,12 +171,12 @@ class Rig:
         retained = {m.topic.removeprefix(f"{self.base}/"): m.payload for m in late.seen if m.retain}
         return {suffix: payload for suffix, payload in retained.items() if suffix != "outgoing/online"}
 
-    def after_all(self, speaker: Side, suffix: str = "incoming/lights-solid") -> None:
+    def after_all(self, speaker: Side) -> None:
         """Wait until earlier messages of the client on that side have passed, if they do."""
         listener = self.clients[speaker.other]
         mark = b'{"b": %d}' % len(listener.seen)
-        self.clients[speaker].publish(suffix, mark)
-        assert until(lambda: mark in listener.payloads(suffix))
+        self.clients[speaker].publish("incoming/lights-solid", mark)
+        assert until(lambda: mark in listener.payloads("incoming/lights-solid"))
 
     def stop(self) -> None:
         if self._running is not None:

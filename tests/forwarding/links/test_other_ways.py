@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import shutil
 import subprocess
 import time
@@ -29,10 +28,6 @@ from tests.support import AmqttBroker, cases, until
 LIGHTS, STATUS = "incoming/lights-solid", "outgoing/status"
 MOVE = b'{"z": 0.5}'
 Make = Callable[..., Rig]
-
-
-def errors(caplog: pytest.LogCaptureFixture) -> list[str]:
-    return [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
 
 
 @pytest.fixture

@@ -18,7 +18,6 @@ from tests.robot.lockstep.commands import Command, Commands
 from tests.robot.lockstep.network import Connection, Network
 from tests.robot.lockstep.people import BASE
 from tests.robot.lockstep.processes import Process
-from tests.robot.lockstep.publish_rules import PublishRules
 
 _BEGIN_S = 0.2  # until an interpreter has started
 _RETURN_S = 0.01  # until main has noticed that it is to end
@@ -97,7 +96,8 @@ PROGRAMS: dict[str, Callable[[], Doings]] = {
 class Script(Process):
     """One process of a script; a parent may hold it as its child.
 
-    It uses the script API, whose threads and transport are simulated, and whose rules are the real ones.
+    It uses the script API, whose threads and transport are simulated, and whose rules are the real ones: tests of
+    tests/ext/scripts/script say what it may publish.
     """
 
     _pids = count(100)
@@ -120,7 +120,6 @@ class Script(Process):
         self._busy = False
         self._driven = False  # before, nothing ends it but signals
         self._exit_code = 0
-        self.rules = PublishRules(self.run, self.scheduler)
         self.turn_at(self._next_at)
 
     # -- the kernel
@@ -207,7 +206,6 @@ class Script(Process):
             return
         self._driven = True
         x, z = self._commands.add(Command(self.run, self.name, now, 5.0, may_move=True))
-        self.rules.wants_to_drive(x, z)
         self.sender.owners(self.estop.states, now)
         self.sender.drive(Drive(x=x, z=z), now)
 
@@ -217,7 +215,6 @@ class Script(Process):
         self._driven = True
         self.sender.owners(self.estop.states, now)
         self.sender.drive(Drive(), now)
-        self.rules.wants_zero(waits=not self.sender.ended(now))
 
     def _end_on_signal(self, number: int) -> None:
         if self.connection is None:
@@ -230,7 +227,6 @@ class Script(Process):
             return
         self.ended, self._exit_code = True, code
         self.sender.end(why, self.scheduler.now)
-        self.rules.has_ended()
         wait = END_S if self._busy else _RETURN_S
         self.scheduler.after(wait, lambda: self.do(lambda: self.exit(code)))
 
@@ -238,12 +234,10 @@ class Script(Process):
 
     def _publish(self, command: Drive) -> bool:
         assert self.connection is not None
-        self.rules.publishes(command, self.scheduler.now)
         return self.connection.publish(DRIVE.topic(BASE), codec.encode(DRIVE, command), qos=QoS.DELIVERED)
 
     def _receive_owner(self, message: Message) -> None:
         self.estop.receive(message)
-        self.rules.receives(self.estop)
 
     def _receive_drive(self, message: Message) -> None:
         if not message.retain:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import pytest
 
 from pebble.transports import Message, MqttSettings, QoS, State, create
 from tests.services.serial_mcu_bridge.motor_rig import BASE, STOP, STOPPED, Bench
-from tests.support import RefusingBroker, until
+from tests.support import RefusingBroker, errors, until
 
 ESTOP, ESTOP_RESET = (f"{BASE}/incoming/{metric}" for metric in ("estop", "estop-reset"))
 
@@ -52,10 +51,6 @@ def retained(broker: RefusingBroker) -> list[Any]:
     with create("mqtt", "observer", MqttSettings(host="127.0.0.1", port=broker.port)) as client:
         client.subscribe(f"{BASE}/outgoing/estop/+", found.append, direct=True)
     return [json.loads(message.payload) for message in found if message.payload]
-
-
-def errors(caplog: pytest.LogCaptureFixture) -> list[str]:
-    return [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
 
 
 BOTH = pytest.param((ESTOP, ESTOP_RESET), marks=pytest.mark.thorough)
