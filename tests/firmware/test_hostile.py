@@ -1,0 +1,123 @@
+"""Real sockets and a real broker: whatever arrives or fails, motors are off in time and heartbeats go on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from pebble.extensions.lab.simulation.wireless import KINDS
+from tests.firmware.schedules import HOSTILE
+from tests.firmware.wireless_rig import Operator, Robots
+from tests.support import Broker, until
+from tests.tcp_proxy import TcpProxy
+
+HUGE = (
+    b'{"x": 0, "z": 1, "pad": "' + b"x" * 100_000 + b'"}',
+    b"[" * 100_000,
+    b'{"z": 0.' + b"9" * 900 + b"e400}",
+    b'{"z": 1' + b"0" * 900 + b"}",
+    b'{"z": "0x1"}',
+    b'{"z": "1_0"}',
+    b'{"value": {"z": {"value": 1}}}',
+    b'{"value": {"x": 0, "z": NaN}}',
+    b'\xef\xbb\xbf{"z": 1',
+    b"\x00" * 1000,
+)
+LIMIT_S, RATE_HZ, EVERY_S = 1.0, 4.0, 0.05
+
+
+class Hall:
+    """A broker, a link to one robot of each kind, and an operator; while they connect, a command is retained."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self.broker = Broker(folder)
+        stack.callback(self.broker.kill)
+        self.link = stack.enter_context(TcpProxy(self.broker.port))
+        self.operator = stack.enter_context(Operator(self.broker.port))
+        for info in [self.operator.send(kind, b'{"x": 0, "z": 1}', retain=True) for kind in KINDS]:
+            assert info is not None
+            info.wait_for_publish(5)
+        self.robots = stack.enter_context(Robots("127.0.0.1", self.link.port))
+        self.robots.wait_online()
+        assert self.beating(time.monotonic())
+        self.have_not_moved()
+
+    def moving(self) -> bool:
+        return all(map(self.robots.moving, KINDS))
+
+    def resting(self) -> bool:
+        return not any(map(self.robots.moving, KINDS))
+
+    def drive(self, z: float = 0.8) -> float:
+        """Return when the broker had it."""
+        for info in [self.operator.drive(kind, 0.0, z) for kind in KINDS]:
+            assert info is not None
+            info.wait_for_publish(5)
+        return time.monotonic()
+
+    def beating(self, since: float, count: float = 2.0) -> bool:
+        return until(lambda: all(self.operator.beating(kind, since) > count for kind in KINDS))
+
+    def have_not_moved(self) -> None:
+        assert [self.robots.moves[kind] for kind in KINDS] == [[], []]
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+    with ExitStack() as stack:
+        yield Hall(tmp_path_factory.mktemp("hall"), stack)
+
+
+@pytest.fixture
+def hall(running: Hall) -> Hall:
+    """With robots online, free and at rest."""
+    running.robots.wait_online()
+    assert until(running.resting)
+    for moves in running.robots.moves.values():
+        moves.clear()
+    return running
+
+
+def test_nothing_hostile_moves_a_robot_or_stops_its_heartbeat(hall: Hall) -> None:
+    began = time.monotonic()
+    for number, payload in enumerate((*HOSTILE, *HUGE)):
+        for kind in KINDS:
+            hall.operator.send(kind, payload, qos=number % 2)
+        time.sleep(EVERY_S)
+    assert hall.beating(began, 2.5 * RATE_HZ)
+    hall.have_not_moved()
+    for kind in KINDS:
+        stamps = [body["t"] for at, body in hall.operator.heartbeats[kind] if at > began]
+        assert (len(stamps) - 1) / (stamps[-1] - stamps[0]) * 1000 == pytest.approx(RATE_HZ, rel=0.1)
+        assert hall.robots.robots[kind].online
+    hall.drive()
+    assert until(hall.moving)
+    assert hall.robots.alive
+
+
+@pytest.mark.parametrize("fault", ["black hole", "Wi-Fi lost", "broker killed"])
+def test_motors_are_off_within_a_second_and_no_retained_command_moves_them_afterwards(hall: Hall, fault: str) -> None:
+    radios = [robot.network.radio for robot in hall.robots.robots.values()]
+    begin, end = {
+        "black hole": (hall.link.blackhole, hall.link.resume),
+        "Wi-Fi lost": (lambda: [radio.lose() for radio in radios], lambda: [radio.restore() for radio in radios]),
+        "broker killed": (hall.broker.kill, hall.broker.start),
+    }[fault]
+    last = hall.drive()
+    assert until(hall.moving)
+    begin()
+    assert until(hall.resting, 3.0)
+    for kind in KINDS:
+        assert hall.robots.stopped_at(kind) - last <= LIMIT_S, kind
+    assert until(lambda: not any(robot.online for robot in hall.robots.robots.values()))
+    end()
+    moves = {kind: len(moves) for kind, moves in hall.robots.moves.items()}
+    hall.robots.wait_online(20.0)
+    assert hall.beating(time.monotonic())
+    assert {kind: len(moves) for kind, moves in hall.robots.moves.items()} == moves
+    assert until(lambda: [hall.operator.drive(kind, 0.0, 0.8) for kind in KINDS] and hall.moving(), step=EVERY_S)
+    assert hall.robots.alive
