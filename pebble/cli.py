@@ -59,7 +59,7 @@ def _fail(*lines: str) -> int:
 
 
 def _flushes(stream: TextIO) -> bool:
-    """True if the buffer was written. Otherwise it is discarded: the interpreter would try again at its end."""
+    """True if the buffer was written. Otherwise it is discarded: Python would try to write it again at its exit."""
     try:
         stream.flush()
     except OSError:

@@ -21,7 +21,7 @@ K = TypeVar("K", bound=Hashable)
 
 
 class Patience(Struct, frozen=True):
-    """Seconds after which a sender is believed although all its messages seem late: its clock was changed.
+    """Times in seconds after which a sender is believed whose messages all seem late: its clock was changed.
 
     ``believed_s`` counts in general, ``set_back_s`` if its stamps went back, which no delay explains. This holds only
     while no two of its messages are more than ``gap_s`` apart. A sender that was silent for ``silent_s`` is forgotten.
@@ -76,9 +76,8 @@ class SenderClocks(Generic[K]):
     def age_s(self, key: K, sent: float, waited_s: float, now: float, late_s: float) -> float:
         """Return the seconds that a message stamped ``sent`` has waited at ``now``; learn the sender's clock from it.
 
-        A message that has waited for more than ``late_s`` is late. ``waited_s`` is the longest time that it can have
-        waited, as far as is known without the stamp. It counts, too, until the clock is two seconds old, and one of the
-        sender's messages was in time by it.
+        A message that has waited for more than ``late_s`` is late. ``waited_s``: the longest time that the message can
+        have waited, by other evidence. It is the least age while the clock is younger than two seconds.
         """
         with self._lock:
             clock = self._clocks.get(key)
@@ -99,7 +98,7 @@ class SenderClocks(Generic[K]):
             return clock is not None and clock.newest - _JUMP_S < sent < clock.newest
 
     def pass_over(self, key: K, sent: float, now: float) -> None:
-        """Note the stamp of a message without judging it: the sender's earlier messages are late from now on."""
+        """Note the stamp of a message without judging it. Earlier messages of the sender are late from now on."""
         with self._lock:
             clock = self._clocks.get(key)
             if clock is not None and sent - clock.newest < now - clock.received_at + _JUMP_S:

@@ -108,9 +108,11 @@ class Subscription:
         with self._lock:
             if self._closed:
                 return
+            if not transport.as_published:
+                repeat = message.retain and not transport.policy.delivers_late
             if not self._delivered_topics.has(message.topic):
                 self._delivered_topics[message.topic] = None
-            elif repeat if transport.as_published else message.retain and not transport.policy.delivers_late:
+            elif repeat:
                 transport.counters.add("stale")
                 return
             if self._thread is None:

@@ -98,7 +98,7 @@ class AddressRound:
 
     @property
     def untried(self) -> bool:
-        """True if one of several addresses was not tried yet."""
+        """True if the host has several addresses, and this first round has not tried all of them."""
         return self._is_first and self.several
 
     @property
@@ -107,7 +107,7 @@ class AddressRound:
         return HANDSHAKE_S if self._left and self._left[0] in self._slow else CONNECT_TIMEOUT_S
 
     def opened(self, seconds: float) -> None:
-        """Note how long TCP and TLS took. Addresses that failed by time before were then dead, not slow."""
+        """Note how long TCP and TLS took. If that was short, no address counts as slow any more."""
         self._slow = {self._left[0]} if seconds > CONNECT_TIMEOUT_S else set()
 
     def was_slow(self) -> None:

@@ -21,10 +21,9 @@ class OwnRetained(BoundedTable[Message]):
         self._counters = counters
 
     def remember(self, message: Message, *, sent: bool, shared: bool | None = None) -> bool:
-        """Store a message, to send it again; return False if there is no room.
+        """Store a message, to send it again; return False if there is no room: then an older message is forgotten, too.
 
-        Without room an older message of the topic is not sent again either. ``shared`` None: as for the older message
-        of the topic.
+        ``sent``: it need not be sent now. ``shared``: others publish on the topic as well; None: as before.
         """
         shared = message.topic in self.shared if shared is None else shared
         self.pending.pop(message.topic, None)

@@ -15,7 +15,7 @@ def load(raw: memoryview | bytes):
     """Return parsed JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError.
 
     Around it may be what programs add: a byte order mark, white space, a C string's NUL and the rest of its buffer.
-    There everything but printable ASCII is removed, with which every JSON text begins and ends.
+    There all but printable ASCII and bytes unknown to UTF-8 (from 0xF5) is removed; JSON begins and ends with ASCII.
     """
     size = len(raw)
     if size > _MAX_BYTES:

@@ -58,7 +58,7 @@ class Clock:
                 self._close(add(now, _RETRY_MS))
 
     def _close(self, due: int) -> None:
-        """Close the socket until the time ``due``. While one is open, ``_due`` is when its request began."""
+        """Close the socket, and open none before the time ``due``."""
         self.read(due)  # regularly, because ticks wrap
         self._due = due
         if self._open:

@@ -58,7 +58,7 @@ def run(arguments: list[str]) -> int:
 
 
 def application(words: Sequence[str] = ()) -> Any:
-    """Return the command line for these words; modules of commands are imported when they are needed."""
+    """Return the command ``pebble``, which parses a command line; ``words``: those typed, to look for their command."""
     app = typer.Typer(cls=_Pebble, rich_markup_mode=None)
     app.callback()(_options)
     command = typer.main.get_command(app)
@@ -135,8 +135,9 @@ def _complete_values(command: Any) -> None:
     for parameter in command.params:
         if place := places.get(parameter.metavar or ""):
             parameter.shell_complete = partial(_values, part(place))
-    for below in command.commands.values() if isinstance(command, TyperGroup) else ():
-        _complete_values(below)
+    if isinstance(command, TyperGroup):
+        for subcommand in command.commands.values():
+            _complete_values(subcommand)
 
 
 def _values(values: Callable[[Any], list[str]], context: Any, incomplete: str) -> list[_Completion]:

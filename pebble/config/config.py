@@ -232,7 +232,7 @@ def _tree(installed: tuple[Extension, ...]) -> tuple[type[Root], Any, tuple[Rule
     names = {"__doc__": Config.__doc__, "__module__": __name__}
     kind = defstruct("Config", added_fields, bases=(Config,), namespace=names, frozen=True, kw_only=True)
     with_rules = [added for added in installed if added.rules]
-    rules = [(of, _guarded(added, rule)) for added in with_rules for of, rule in extension.part(added.rules)]
+    rules = [(checked, _guarded(added, rule)) for added in with_rules for checked, rule in extension.part(added.rules)]
     return tree, kind, (*CHECKS, *rules)
 
 

@@ -50,12 +50,8 @@ def masked(value: Any, key: str = "") -> Any:
     if isinstance(value, tuple | list) and (key == "command" or key.endswith("_command")):
         return [masked(word) if number == 0 else HIDDEN for number, word in enumerate(value)]  # any may be a secret
     if isinstance(value, tuple | list):
-        return [
-            HIDDEN
-            if place and isinstance(value[place - 1], str) and is_secret_option(value[place - 1])
-            else masked(item, key)
-            for place, item in enumerate(value)
-        ]
+        follows_option = [False, *(isinstance(item, str) and is_secret_option(item) for item in value)]
+        return [HIDDEN if follows_option[place] else masked(item, key) for place, item in enumerate(value)]
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, str):

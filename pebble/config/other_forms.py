@@ -10,7 +10,7 @@ _SWITCHES = {"1": True, "true": True, "yes": True, "on": True, "0": False, "fals
 
 
 class Reading(NamedTuple):
-    """The value to use for an unexpected one. ``differs``: it changes the meaning, and not only the form."""
+    """A value to use in place of an unexpected one; ``differs``: its meaning is another, and not only its form."""
 
     value: Any
     differs: bool = True
@@ -41,7 +41,8 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
     if "unlike" in extra:
         return Reading(extra["unlike"])
     is_empty = not raw or (raw is True and kind not in (int, float))
-    if default is not NODEFAULT and (number == 0 or (is_empty and "exact" not in extra)):
+    means_default = number == 0 or (is_empty and "exact" not in extra)
+    if means_default and default is not NODEFAULT:
         return Reading(default)
     if kind not in (int, float) or number is None or "exact" in extra:
         return None

@@ -40,7 +40,7 @@ class Notes:
         self.warnings.append(Note(path, text))
 
     def forget_inherited(self, written: Any, merged: Any) -> None:
-        """Remove the notes about values that are in ``merged`` but not in ``written``: their source has them too."""
+        """Remove notes about values in ``merged`` that are not ``written``: the section they are from has them."""
         for notes in (self.problems, self.warnings, self.retired):
             notes[:] = [note for note in notes if holds(written, note.path) or not holds(merged, note.path)]
 

@@ -61,7 +61,8 @@ class Reader:
             is_switch = self._other_forms and "enabled" in keys and switch(raw) is not None
             raw = {"enabled": raw} if is_switch else self._otherwise(kind, raw, path, {} if path else NODEFAULT)
         values: dict[str, Any] = {}
-        for written, value in () if raw is _WRONG else raw.items():
+        pairs = () if raw is _WRONG else raw.items()
+        for written, value in pairs:
             key = self._key(kind, keys, written, (*path, written))
             field = keys.get(key)
             if field is None or value in ("", None) or (self._other_forms and value == [] and field.default):
@@ -136,8 +137,8 @@ class Reader:
         """Return the value to use for ``raw``, which the key does not accept; note it unless only the form differs."""
         kind, metas = unwrap(annotation)
         shown = "a value of another kind" if _extra(metas, "secret") else _shown(raw)
-        instead = "" if shown == "text" and (get_origin(kind) is Literal or kind in (str, Path)) else f", not {shown}"
-        must_be = f"must be {expected(kind, metas)}{instead}"
+        tells_nothing = shown == "text" and (get_origin(kind) is Literal or kind in (str, Path))
+        must_be = f"must be {expected(kind, metas)}" + ("" if tells_nothing else f", not {shown}")
         reading = reading_of(annotation, kind, metas, raw, default) if self._other_forms else None
         if reading is None or (not reading.differs and (type(reading.value), reading.value) == (type(raw), raw)):
             self.notes.problem(path, must_be)

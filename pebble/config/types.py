@@ -134,7 +134,7 @@ class Section(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @classmethod
     def all_retired(cls) -> dict[str, str]:
-        """Return ``retired`` of this class and of its base classes."""
+        """Return the keys that this class and its base classes no longer use, each with the reason."""
         return {key: why for kind in reversed(cls.__mro__) for key, why in getattr(kind, "retired", {}).items()}
 
 

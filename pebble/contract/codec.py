@@ -160,7 +160,7 @@ def _unwrap(channel: Channel, plain: Any, remark: Remark) -> Any:
 
 
 def _switch(plain: Any) -> Any:
-    """Return the fields of a command: a boolean or an object, bare or under ``value`` (paper A.8.10)."""
+    """Return the fields of a start or stop command: it may be a boolean or an object, bare or under ``value``."""
     if isinstance(plain, bool):
         return {"enabled": plain}
     if isinstance(plain, dict):
@@ -174,7 +174,7 @@ def _switch(plain: Any) -> Any:
 
 
 def _request(channel: Channel, plain: Any) -> Any:
-    """Return the fields of a boolean control in any of its forms, with its state as ``enabled``."""
+    """Return the fields of a media request, which may have any form of a boolean control; ``enabled`` is its state."""
     inner = plain["value"] if isinstance(plain, dict) and isinstance(plain.get("value"), dict) else plain
     return {**(inner if isinstance(inner, dict) else {}), "enabled": _boolean(channel, inner)}
 
@@ -187,18 +187,18 @@ def _drive(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str,
         expected = 'expected {"x": steering, "z": throttle}, each -1 to 1'
         remark(channel, _sender(plain), f"none of x, z and y is in it, but {keys}: so it is a stop; {expected}")
     moves = any(axes.values())
-    more = {key: plain[key] for key in _DRIVE_CHECKS if plain.get(key) is not None}
-    wrong = [key for key, value in more.items() if not _DRIVE_CHECKS[key][0](value)]
+    checked = {key: plain[key] for key in _DRIVE_CHECKS if plain.get(key) is not None}
+    wrong = [key for key, value in checked.items() if not _DRIVE_CHECKS[key][0](value)]
     if moves and wrong:
         raise PayloadError(f"{channel.metric}: {wrong[0]} is not {_DRIVE_CHECKS[wrong[0]][1]}")
-    if moves and more.get("source") == SCRIPT and "run" not in more:
+    if moves and checked.get("source") == SCRIPT and "run" not in checked:
         raise PayloadError(f"{channel.metric}: run is missing, which a script's command needs")
-    if moves and "valid_ms" in more and more["valid_ms"] < 1:
+    if moves and "valid_ms" in checked and checked["valid_ms"] < 1:
         raise PayloadError(f"{channel.metric}: valid_ms is less than 1, so it moves nothing")
-    more = {key: value for key, value in more.items() if key not in wrong}
-    if "valid_ms" in more:
-        more["valid_ms"] = int(more["valid_ms"])
-    return axes | more | {key: plain[key] for key, fits in _DRIVE_MORE.items() if fits(plain.get(key))}
+    valid = {key: value for key, value in checked.items() if key not in wrong}
+    if "valid_ms" in valid:
+        valid["valid_ms"] = int(valid["valid_ms"])
+    return axes | valid | {key: plain[key] for key, fits in _DRIVE_MORE.items() if fits(plain.get(key))}
 
 
 #: Fields of a drive command besides its axes; null is the same as absent.

@@ -286,7 +286,7 @@ class EstopState(Payload, frozen=True, kw_only=True):
 
     @property
     def last_barred(self) -> int:
-        """``barred``; 0 where it is unset."""
+        """The newest run that moves nothing any more, nor any run before it; 0 if no run is barred."""
         return self.barred if isinstance(self.barred, int) else 0
 
 

@@ -1,8 +1,8 @@
 """Ages of commands, by the clocks of their senders.
 
-The age that pings show includes the way *up*, where messages may wait behind pictures on a thin link. A drive command
-with its sender's clock ``t`` and a ``key`` needs no pings once one with this key was fast; a request for control has an
-``id``.
+Pings show an age as well. But on a thin link it includes the wait for the ping's own way *up*, behind pictures. A drive
+command with a stamp ``t`` and a ``key`` needs no pings once an earlier one with this key was fast. In a request for
+control, ``id`` takes the place of the key.
 """
 
 from math import inf
@@ -24,8 +24,8 @@ _PATIENCE = Patience(believed_s=60.0, set_back_s=2.0, silent_s=60.0)
 class CommandAges:
     """Ages of drive commands and requests for control that carry a time stamp; thread-safe.
 
-    :attr:`keys` are the present keys of control. A command with any other key has no age here, as the motor owner
-    refuses it. None: no motor owner gives keys, and senders choose their keys.
+    :attr:`keys` are the present keys of control. The stamp of a command with any other key is not judged, as the motor
+    owner refuses the command. None: no motor owner gives keys, and senders choose their keys.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class CommandAges:
     def waited_s(self, subject: Subject, message: Message, account: str) -> float:
         """Return the seconds for which a message with a time stamp has waited; remember the sender's clock.
 
-        The stamp counts if the message has a valid key or id, which belongs to the ``account`` that uses it.
+        The stamp counts if the message has a valid key or id; the clock belongs to that key or id of this ``account``.
         """
         waited_s = message.waited_s
         assert subject.channel is not None  # noqa: S101 - else it is not stamped

@@ -52,7 +52,7 @@ class Finding(Enum):
 
 
 class _Way(Struct):
-    """Our way from one side to the other, for one topic."""
+    """The messages of one topic that are forwarded from one side to the other, counted to find cycles."""
 
     began: float
     counts: dict[int, int] = {}  # of payloads, by their hash, since then
@@ -92,22 +92,22 @@ class Cycles:
         topic, payload = message.topic, message.payload
         if subject.is_stop:
             return Finding.CIRCULATES if self._repeats_stop(side, topic, payload) else Finding.PASS
-        once, usual = subject.kind.one_shot, _usual_count(subject)
+        is_one_shot, usual = subject.kind.one_shot, _usual_count(subject)
         number = _number_of(payload) if payload[-1:] in _DIGITS else None
         with self._lock:
             if number is not None:
                 return self._receive_probe(side, topic, number)
             way, now = self._ways.get((side, topic)) or self._way(side, topic), self._clock()
             count = way.count(payload, now)
-            if way.closed and ((once and not subject.runs) or count > SUSPICIOUS):
+            if way.closed and ((is_one_shot and not subject.runs) or count > SUSPICIOUS):
                 return Finding.CIRCULATES
             period = _PERIOD_IN_STORM_S if count > STORM and not way.closed else PROBE_PERIOD_S
             never_probed = way.probed_at == float("-inf")
-            suspicious = way.closed or count > usual or (never_probed and bool(self.closed_ways))
-            suspicious = suspicious and (once or len(payload) <= _LONGEST)
+            is_suspicious = way.closed or count > usual or (never_probed and bool(self.closed_ways))
+            can_be_probed = is_one_shot or len(payload) <= _LONGEST
             # The other way may be younger than the last probe: so the first suspicious message is probed at once.
-            due = now - way.probed_at >= period or count == usual + 1
-            return Finding.SUSPECT if suspicious and due else Finding.PASS
+            is_due = now - way.probed_at >= period or count == usual + 1
+            return Finding.SUSPECT if is_suspicious and can_be_probed and is_due else Finding.PASS
 
     def _repeats_stop(self, side: Side, topic: str, payload: bytes) -> bool:
         """True if a stop comes back faster than a sender repeats it. Counts the stop; stops are not probed."""
@@ -191,8 +191,8 @@ class Cycles:
 def _usual_count(subject: Subject) -> int:
     """Return how many equal messages within 2 s are normal; more of them start a probe.
 
-    Actions are probed at once. Programs of others need to know of probes on those topics already; on topics of other
-    commands they see one only after a repetition.
+    An action is probed at once: other programs must expect probes on its topic anyway. On topics of other commands they
+    see a probe only after a repetition.
     """
     if subject.kind.direction == OUTGOING:
         return STORM

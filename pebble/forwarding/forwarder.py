@@ -69,7 +69,7 @@ class Mirroring:
         self.on, self._was_refused = on, on and self._was_refused
 
     def is_possible(self) -> bool:
-        """True if the broker does not send our commands back: else they would be repeated, even after a stop."""
+        """True if no side sends our own messages back. Otherwise commands would be repeated, even after a stop."""
         if all(state.transport.exact_echo for state in self._sides.values()):
             return True
         if not self._was_refused:
@@ -278,7 +278,8 @@ class Forwarder:
         return None if finding is Finding.PASS else self._act_on(finding, source.side, subject, message, forward)
 
     def _refused_by_step(self, source: SideState, subject: Subject, message: Message, *_: object) -> Drop | None:
-        for name, step in () if subject.is_stop else self._steps.items():
+        steps = {} if subject.is_stop else self._steps
+        for name, step in steps.items():
             try:
                 why = step(source.side, subject, message)
             except Exception as error:  # noqa: BLE001 - whatever a stranger's code raises: it is no refusal

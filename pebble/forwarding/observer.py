@@ -26,7 +26,7 @@ Step: TypeAlias = Callable[[Side, Subject, Message], str]
 
 
 class Observer:
-    """An observer of messages to the robot, passed and refused. It is made before anything else, with config and clock.
+    """An observer of messages to the robot, passed and refused. It is made with config and clock before they pass.
 
     ``by`` is the sender that the broker has checked, ROBOT, or None where no names are checked.
     """
@@ -41,7 +41,7 @@ class Observer:
         """Note a command, or a changed flag, that was forwarded."""
 
     def refused(self, drop: Drop, channel: Channel | None, by: str | None) -> None:
-        """Note a message from outside that was refused."""
+        """Note a message from outside that was refused; ``drop`` is the reason."""
 
     def control(self, state: ControlState) -> None:
         """Note the state of control, as the deciding motor owner has published it."""

@@ -53,7 +53,7 @@ class Publisher:
             to.loopback.forget(topic)
 
     def note_return(self, to: SideState, subject: Subject, message: Message) -> None:
-        """Expect ``message`` to come back from the side to which it does not go, if its topic circulates.
+        """Expect ``message``, published to one side, to come back on the other side, if its topic circulates.
 
         A command that runs something is expected even before its probe has shown whether its topic circulates.
         """
@@ -78,7 +78,7 @@ class Publisher:
             self.probe(side, topic, b"")
 
     def probe_again(self, sides: tuple[Side, ...], value: Callable[[str], bytes | None]) -> None:
-        """Probe topics that circulated, and then also commands from ``sides``. Call this once a second.
+        """Probe topics that circulated; if any circulates, also all commands from ``sides``. Call this once a second.
 
         ``value`` returns the newest value of a topic. Commands were probed when the connection began, but the other way
         may have been set up since.

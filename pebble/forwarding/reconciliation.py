@@ -44,7 +44,7 @@ class LastValue(Struct, frozen=True):
 
 
 class Known(NamedTuple):
-    """The facts that are known about a topic when one side sends a retained message on it."""
+    """The facts about a topic at the moment when one side sends a retained message on it."""
 
     last: LastValue | None  # the newest value, whichever side published it
     winner: Side
@@ -135,9 +135,9 @@ class Reconciliation:
         other_away: bool = False,
         went_back: bool = False,
     ) -> Resolution:
-        """Resolve a message of ``side``; ``retained``: a subscription brought it, so it may be old.
+        """Return what to do with a message of ``side``; ``retained``: a subscription brought it, so it may be old.
 
-        ``went_back``: ``side`` has older values than it had a moment ago.
+        ``other_away``: the other side has no connection. ``went_back``: ``side`` has older values than a moment ago.
         """
         if len(self._received[side]) < TOPICS:
             self._received[side].add(topic)
@@ -198,9 +198,9 @@ class Reconciliation:
         )
 
     def _may_come_late(self, topic: str) -> bool:
-        """True if an old value of the winner may still arrive."""
+        """True if an old value of the winner may still arrive, although its retained messages count as received."""
         return self._synchronized[self._winner] and topic not in self._received[self._winner]
 
     def _is_missing(self, side: Side, topic: str, last: LastValue) -> bool:
-        """True if ``side`` lacks the newest value. It lacks a removal only if it had received the value before."""
+        """True if ``side`` lacks the newest value. It lacks a removal only if the value was published there."""
         return topic not in self._received[side] and self._published[side].get(topic, b"") != last.payload

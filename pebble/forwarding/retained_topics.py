@@ -39,7 +39,7 @@ class RetainedTopics:
     def receive(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, *, old: bool = False
     ) -> Forward | Drop:
-        """Forward ``message``, which will be retained, or return why not. ``old``: ignore it if it is a live one."""
+        """Forward a message that will be retained, or return why not. ``old``: ignore it if it is a live one."""
         with self._lock:
             self._begin_restarted()
             if subject.kind in self._both_ways:
@@ -117,7 +117,7 @@ class RetainedTopics:
     # -- with the lock held
 
     def _reconcile(self, source: SideState, subject: Subject, message: Message, *, old: bool) -> Drop | None:
-        """Return why a two-way message must not pass; None if it may."""
+        """Return why a two-way message must not pass; None if it may. ``old``: a live one must not."""
         side, topic, payload, transport = source.side, message.topic, message.payload, source.transport
         if message.retain and topic in source.seen and transport.policy.delivers_late and not transport.as_published:
             return Drop.KNOWN  # older than what was seen
@@ -149,7 +149,7 @@ class RetainedTopics:
 
     @property
     def _own_return(self) -> bool:
-        """True if on no side our own messages are recognised with certainty."""
+        """True if messages of our own may come back from a side without being recognised."""
         return not any(state.transport.exact_echo for state in self._sides.values())
 
     def _is_retained(self, source: SideState, message: Message) -> bool:

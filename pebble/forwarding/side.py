@@ -66,10 +66,7 @@ class SideState:
 
     @property
     def has_gone_back(self) -> bool:
-        """True if older retained values of this side come from a save that was restored.
-
-        Otherwise a program has set the older value again.
-        """
+        """True if older retained values of this side are from a restored save, and not set again by a program."""
         if self._wins or not self._went_back:
             return self._went_back
         return self._was_brief or self.transport.was_ended
@@ -77,7 +74,7 @@ class SideState:
     def arrived(self) -> None:
         """Note that the retained messages of this side have arrived.
 
-        An older value that comes from now on was set again by a program.
+        If an older value comes after them, a program has set it again.
         """
         self._went_back = False
 

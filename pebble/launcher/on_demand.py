@@ -67,7 +67,7 @@ class OnDemand:
             supervisor.request()
 
     def ended(self, program: Program) -> None:
-        """Note that a program has ended: its requests last OUTLIVE_S longer, and its holds end."""
+        """Note the end of a program. What it has requested runs for OUTLIVE_S longer, and what it holds runs again."""
         if not program.may_request:
             return
         held, self._held = self._held, set()

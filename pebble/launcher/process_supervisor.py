@@ -263,13 +263,12 @@ class ProcessSupervisor:
         self._on_end()
 
     def _ended_as_asked(self, how: str) -> None:
-        again = self.state is ProgramState.REPLACED
-        self.state = (
-            ProgramState.IDLE if self.state in (ProgramState.RELEASED, ProgramState.REPLACED) else ProgramState.STOPPED
-        )
+        was_replaced = self.state is ProgramState.REPLACED
+        was_released = was_replaced or self.state is ProgramState.RELEASED
+        self.state = ProgramState.IDLE if was_released else ProgramState.STOPPED
         self.policy.stopped(how)
         self._on_change()
-        if again:
+        if was_replaced:
             self._start_after_request()
 
     def _restart(self, how: str) -> None:

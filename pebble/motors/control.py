@@ -82,11 +82,11 @@ class Control:
             self.lease.hold(client, int(request.for_ms), over, _ms(now))
 
     def vouch(self, vouched: ControlVouched, now: float) -> None:
-        """Note the time for which the bridge vouches that it has passed on all messages."""
+        """Note the period for which the bridge vouches that it has forwarded every message."""
         self.lease.vouch(vouched.begin, vouched.end, _ms(now))
 
     def doubt(self, now: float) -> None:
-        """Note that messages the bridge passed on earlier may not have arrived here."""
+        """Note that messages may be lost here: the bridge vouches only for what it has sent."""
         self.lease.doubt(_ms(now))
 
     def account(self, drive: Drive) -> str | None:
@@ -105,12 +105,12 @@ class Control:
         return frozenset() if self._shared is None else self._shared.peers
 
     def receive_turn(self, owner: str, turn: ControlTurn, now: float) -> None:
-        """Handle the turn of a peer. Call :meth:`note` afterwards."""
+        """Handle the grant of control that another motor owner has sent. Call :meth:`note` afterwards."""
         if self._shared is not None:
             self._shared.receive(owner, turn, _ms(now))
 
     def turn(self, barred: int, now: float) -> ControlTurn | None:
-        """Return the turn for the other motor owners; ``barred`` is the newest script run that the arbiter bars."""
+        """Return the grant for the other owners, or None; ``barred``: the newest script run that the arbiter bars."""
         return None if self._shared is None else self._shared.shown(barred, _ms(now))
 
     def waits(self, now: float) -> bool:
@@ -118,7 +118,7 @@ class Control:
         return self._shared is not None and self._shared.waits(_ms(now))
 
     def left_ms(self, now: float) -> int:
-        """Return the longest time for which a command that is permitted now may still move the motors."""
+        """Return for how long the motors may move without another grant; a longer command must be cut to that."""
         return sys.maxsize if self._shared is None else max(0, self._shared.until - _ms(now))
 
     def note(self, now: float) -> bool:
@@ -136,8 +136,8 @@ class Control:
         halts, lease.halts = lease.halts, False
         if halts:
             _, _, by, device = lease.holder or _NO_CLIENT
-            shown = f"{by or 'somebody without a name'}{f' ({device})' if device else ''}" if lease.key else "nobody"
-            self._log.log("control", logging.INFO, "%s has control", shown)
+            holder = (by or "somebody without a name") + (f" ({device})" if device else "")
+            self._log.log("control", logging.INFO, "%s has control", holder if lease.key else "nobody")
         return halts
 
     @property
@@ -155,7 +155,7 @@ class Control:
         self._turns.tick(now)
 
     def show_turn(self, now: float) -> None:
-        """Send the turn to the other owners if it has changed or must be repeated. Halt the motors before."""
+        """Send the grant to the other owners if it has changed or must be repeated. Halt the motors before."""
         if self._turn_due is not None and now >= self._turn_due:
             self._turn_due = now + _REPEAT_S
             self._turns.changed(now)

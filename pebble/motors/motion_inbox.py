@@ -127,7 +127,7 @@ class MotionInbox:
             return was_empty
 
     def note_state(self, state: State) -> None:
-        """Note a lost connection, and with it lost messages; the loss counts when the next messages come."""
+        """Note that the connection is lost, and messages with it. The next batch says so."""
         if state is not State.CONNECTED:
             with self._lock:
                 self._lost = True

@@ -121,11 +121,10 @@ class MotorGuard:
         if self._arbiter.barred != self._barred:
             self._note_barred(now)
         if limit == REFUSED:
-            strange = self._control.lease.refuses(
-                drive.moves, run != PERSON or account is None, key, account or "", _ms(now)
-            )
+            needs_no_key = run != PERSON or account is None
+            is_stranger = self._control.lease.refuses(drive.moves, needs_no_key, key, account or "", _ms(now))
             waits = drive.moves and self._control.waits(now)
-            reason = "handover" if waits else "stranger" if strange else "latched" if self.latched else "overruled"
+            reason = "handover" if waits else "stranger" if is_stranger else "latched" if self.latched else "overruled"
             self._counters.add(reason)
             if drive.moves or run == PERSON:  # a script's zero is only to bar older runs, which the arbiter has done
                 self._log.warning(reason, "refused a drive command: %s", self._why_refused(reason, run, key))
@@ -176,9 +175,9 @@ class MotorGuard:
             self._barred_file.save(self._barred)
 
     def appeared_stop(self) -> EstopCommand | None:
-        """Return the stop in a file that has just appeared (a late mount), if this owner does not know it; else None.
+        """Return a stop that this owner does not know, from a file that has just appeared (a late mount), or None.
 
-        A file that has appeared without an unknown stop is overwritten with the state here, which is newer.
+        A file that has appeared without such a stop is overwritten with the state here, which is newer.
         """
         saved = None if self._file.busy or not self._can_save else self._file.appeared()
         if saved is None:

@@ -114,7 +114,7 @@ class MotorOwner(Service, ABC):
         """Carry out the members of a group without a drive command; on the service's thread."""
 
     def report(self, able: bool, why: str = "") -> None:
-        """Tell the launcher whether the motors can be moved, and if not, why: ``driveable`` in the robot's status."""
+        """Tell the launcher whether the motors can be moved, or why not; the robot's status has it as ``driveable``."""
         self.notifier.mcu("ready" if able else "absent", 0 if able else None, why)
 
     def start(self) -> None:

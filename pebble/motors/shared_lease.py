@@ -1,6 +1,6 @@
 """The leases of a robot with several motor owners: the first owner by name grants, the others follow. Pure.
 
-Times are milliseconds of the clock that all processes of a machine share.
+A *turn* is a grant with its number, which the others repeat. Times are milliseconds of the machine's clock.
 """
 
 import sys
@@ -20,7 +20,7 @@ class SharedLease(VouchedLease):
     until = sys.maxsize  # when everything stops, unless another turn is received before
 
     def __init__(self, peers: frozenset[str], now: int, *lease: Any) -> None:
-        """Store the peers, whose turns are given to :meth:`receive`; ``lease``: the other arguments of VouchedLease."""
+        """Store the peers, which are the other motor owners; ``lease``: the other arguments of VouchedLease."""
         super().__init__(now, *lease)
         self.peers = peers
 
@@ -34,7 +34,7 @@ class SharedLease(VouchedLease):
 
     @abstractmethod
     def receive(self, owner: str, turn: ControlTurn, now: int) -> None:
-        """Note the turn of a peer."""
+        """Note the turn that a peer has sent."""
 
     @abstractmethod
     def shown(self, barred: int, now: int) -> ControlTurn | None:
@@ -83,7 +83,7 @@ class FollowingLease(SharedLease):
         return now >= self.until
 
     def receive(self, _owner: str, turn: ControlTurn, now: int) -> None:
-        """Follow the newest turn. A turn whose time lies in the future is from another clock, and ignored."""
+        """Follow the first owner's newest turn. Ignore a turn from the future: its time is of another clock."""
         earlier = self._followed
         if turn.t > now or (earlier is not None and turn.t < earlier.t):
             return

@@ -17,12 +17,12 @@ class VouchedLease(Lease):
     _received_all_since = 0
 
     def vouch(self, begin: int, end: int, now: int) -> None:
-        """Note the time for which the bridge vouches. A time in the future is from another clock, and ignored."""
+        """Note the period for which the bridge vouches. Ignore one from the future: it is of another clock."""
         if self.vouched is not None and begin <= end <= now:
             self.vouched = max(begin, self._received_all_since), end
 
     def doubt(self, now: int) -> None:
-        """Note that messages which the bridge passed on earlier may not have arrived here."""
+        """Note that messages may be lost here, from now back to any time, although the bridge has forwarded them."""
         self._received_all_since = now
 
     def tick(self, now: int) -> None:

@@ -46,11 +46,10 @@ def as_before() -> Iterator[None]:
 
 
 def require_own(folder: Path, does: str = "does not write there", *, there: bool = False) -> None:
-    """Raise PebbleError if this process is root and the folder belongs to another user.
+    """Raise PebbleError if this process is root and the folder belongs to another user, or to all, as /tmp does.
 
-    For programs with threads, or that use the folder for long. A folder in which every user may make files, such as
-    /tmp, is refused, too. ``folder`` may be a file; with ``there`` it has to exist. ``does`` completes the error: "root
-    does not …".
+    For programs with threads, or that use the folder for long. ``folder`` may be a file; with ``there`` it has to
+    exist. ``does`` completes the error: "root does not …".
     """
     if not is_root():
         return

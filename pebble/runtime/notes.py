@@ -58,7 +58,7 @@ class Mcu(Struct, frozen=True, tag_field="note", tag="mcu"):
 
 
 class Reach(Struct, frozen=True, tag_field="note", tag="reach"):
-    """A note whether messages of a motor owner arrive in this process."""
+    """A note that messages of a motor owner arrive in this process, or do not."""
 
     owner: _Name
     reached: bool

@@ -160,7 +160,7 @@ class Reported:
     """A value that is sent to the launcher when it changes, until the launcher has taken it."""
 
     def __init__(self, send: Callable[..., bool], *known: object) -> None:
-        """Make a reporter. ``known``: the value that the launcher assumes at first."""
+        """Make a reporter that calls ``send``. ``known``: the value that the launcher assumes at first."""
         self._send, self._known = send, known
 
     def report(self, *value: object) -> None:

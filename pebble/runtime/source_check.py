@@ -36,7 +36,7 @@ class SourceCheck:
         self._recent.clear()
 
     def take(self, content: Hashable, now: float, *, counts: bool = True) -> None:
-        """Note a content. ``counts``: False while contents may repeat themselves, as those of a sensor at rest do."""
+        """Note a content. ``counts``: False while repetitions are normal, as for a sensor at rest."""
         if content not in self._recent:
             self.changes += bool(self._recent)
             self._recent.append(content)

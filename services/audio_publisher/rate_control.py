@@ -98,9 +98,9 @@ class RateController:
 
 
 class LevelControl:
-    """The choice of a step. It begins with the last one, because the connection is not known yet.
+    """The choice of a step. It begins with the last step, because the connection is not known yet.
 
-    It goes up while packets do not wait, later after each try that failed, and down while they wait.
+    Quality rises while packets do not wait, later after each rise that failed, and falls while they wait.
     """
 
     def __init__(self, last: int, now: float) -> None:
@@ -119,13 +119,14 @@ class LevelControl:
         self._polled_at = now
         self._slow_since = (self._slow_since or now) if age_s > _SLOW_S else None
         self._empty_at = now if age_s < _EMPTY_S else self._empty_at
-        fast = age_s < _FAST_S or now - self._empty_at < _BEACON_S
-        self._fast_since = (self._fast_since or now) if fast else None
+        is_fast = age_s < _FAST_S or now - self._empty_at < _BEACON_S
+        self._fast_since = (self._fast_since or now) if is_fast else None
         if now - self._changed_at < _PAUSE_S:
             return False
         if self._slow_since is not None and now - self._slow_since >= _PATIENCE_S and self.level < self._last:
-            failed = now - self._raised_at < 2 * self._calm_s
-            self._calm_s = min(max(_CALM_S, (1 + failed) * self._calm_s), _CALMEST_S)
+            last_rise_failed = now - self._raised_at < 2 * self._calm_s
+            longer_s = 2 * self._calm_s if last_rise_failed else self._calm_s
+            self._calm_s = min(max(_CALM_S, longer_s), _CALMEST_S)
             return self._change(1, now)
         if self.level and self._fast_since is not None and now - max(self._fast_since, self._changed_at) > self._calm_s:
             self._raised_at = now

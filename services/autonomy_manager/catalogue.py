@@ -260,7 +260,7 @@ def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
 
 
 def _first_seen(script: Script, configs: Iterable[Mapping[str, object]]) -> dict[str, object]:
-    """Return a script's summary, and the keys of the settings that operators see first, if the script gives them."""
+    """Return the optional fields of a script's entry: summary, first settings, and whether it was not asked yet."""
     keys = {setting["key"] for setting in configs}
     first = {"summary": script.summary, "main": [key for key in script.main if key in keys]}
     unasked = {} if script.asked else {"asked": False}

@@ -35,7 +35,7 @@ class MotorOwners:
         return owner in self._names or (not self._names and (owner in owners or len(owners) < _MOST))
 
     def holder_beside(self, by: str) -> str:
-        """Return the account that has control, if it is not ``by``'s; else empty. The first owner by name decides."""
+        """Return the account that has control at the first owner, if it is not that of ``by``; else empty."""
         state = self._controls[min(self._controls)] if self._controls else None
         if state is None or not state.key or state.by.partition("/")[0] == by.partition("/")[0]:
             return ""
@@ -54,12 +54,13 @@ class MotorOwners:
     def steps_to(self, run: int) -> Iterator[int]:
         """Yield run numbers whose zeros make every owner treat ``run`` as newer.
 
-        Needed if an owner was away while a stranger sent numbers far ahead: then ``run`` may seem older to it, more
-        than half of all numbers behind.
+        Needed if a stranger sent numbers far ahead while an owner was away. To that owner ``run`` may seem older,
+        because it is more than half of all numbers behind.
         """
-        for state in self._states.values():
-            if not newer(run, state.last_barred):
-                yield state.last_barred + ((run - state.last_barred) & LAST_RUN) // 2 & LAST_RUN or LAST_RUN
+        for barred in [state.last_barred for state in self._states.values()]:
+            if not newer(run, barred):
+                ahead = (run - barred) & LAST_RUN
+                yield (barred + ahead // 2) & LAST_RUN or LAST_RUN
 
     @property
     def refusal(self) -> str:
@@ -78,7 +79,7 @@ class MotorOwners:
     def ending(self, run: int, baseline: Baseline, signs: bool = True) -> str:
         """Return why this run must end; empty if it may continue. New owners are added to ``baseline``.
 
-        A run that does not sign its commands bars itself by them, which does not end it.
+        ``signs`` False: its commands look like a person's, so owners bar it by its own commands, which does not end it.
         """
         for owner, state in self._states.items():
             boot, count, barred = baseline.setdefault(owner, (state.boot, state.count, 0))

@@ -77,7 +77,7 @@ class Runner:
 
     @property
     def stoppable(self) -> Run | None:
-        """The present run; None if it is being ended without a successor, or cannot move the robot."""
+        """The run that a stop must end; None if none can move the robot, or the only one is being ended already."""
         if not self.drives:
             return None
         return self.active if self._next is None else self._run

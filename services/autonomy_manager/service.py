@@ -106,9 +106,9 @@ class AutonomyManager(Service):
             self._runner.stop()
 
     def _start_script(self, file: str, config: Mapping[str, Any], by: str | None, until: float) -> None:
-        """Start the script, if that becomes possible before ``until``.
+        """Start a script, or wait until ``until`` for the list of scripts to name it.
 
-        ``by`` None: a program of the robot asks, without control.
+        ``by`` is the person who asks; None: a program of the robot, which needs no control.
         """
         try:
             if by is not None and self.config.security.named and (holder := self._owners.holder_beside(by)):
@@ -129,7 +129,7 @@ class AutonomyManager(Service):
             self._runner.start(wanted)
 
     def _wait(self, start: Callable[[], None]) -> None:
-        """Try again soon, unless another command, a person who drives or an emergency stop comes first."""
+        """Call ``start`` again soon, unless another command, a person who drives or an emergency stop comes first."""
 
         def again() -> None:
             if self._waiting is start:
@@ -191,7 +191,7 @@ class AutonomyManager(Service):
         self.changed()
 
     def _person_stops(self) -> None:
-        """End unsigned scripts, and refuse starts while the arbiter holds a person's zero: they may be older."""
+        """End unsigned scripts, and refuse starts for as long as the arbiter holds a person's zero."""
         self._refused_until = self.clock() + _HOLD_S
         self._end_unsigned()
 

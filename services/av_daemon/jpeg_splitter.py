@@ -20,7 +20,9 @@ class JpegSplitter:
         buffer += chunk
         while True:
             start = buffer.find(_START)
-            del buffer[: start if start >= 0 else len(buffer) - buffer.endswith(_START[:1])]
+            if start < 0:  # the last byte may be the beginning of a start
+                start = len(buffer) - buffer.endswith(_START[:1])
+            del buffer[:start]
             end = _end(buffer)
             if end > 0:
                 pictures.append(bytes(buffer[:end]))

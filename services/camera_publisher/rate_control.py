@@ -169,7 +169,7 @@ class LevelControl:
         return STEPS[self.level]
 
     def lost(self, turns: float, now: float) -> None:
-        """Note how many frames could not be sent just now, because earlier ones were late."""
+        """Note that frames could not be sent, because earlier ones were late; ``turns``: how many."""
         if now - (turns + 1) * self._frame_s > self._changed_at:  # else those before them were of another step
             self._lost.append((now, turns))
 

@@ -30,9 +30,9 @@ class SendWindow:
     Over a long round trip several frames travel at once: at first one, then one more for each that arrived promptly,
     because the capacity of the path shows only after a round trip.
 
-    Delayed acknowledgements come together: a late frame is acknowledged at once with younger ones, for which a slow
-    connection would have needed longer. To tell the two apart, a younger frame must be in flight: when there is only
-    one, and it is late, another is let through now and then.
+    If an access point delays acknowledgements, they come together: a late frame is acknowledged at once with younger
+    frames, for which a slow connection would have needed longer. This shows only while a younger frame is in flight. So
+    if the only frame is late, another is let through now and then.
     """
 
     def __init__(self) -> None:
@@ -75,7 +75,7 @@ class SendWindow:
         return acknowledged
 
     def _note_beacon(self, frames: list[Sent], since_s: float, now: float) -> None:
-        """Note that an access point held acknowledgements back, if they came together, later than the first needed."""
+        """Note that an access point delays acknowledgements, if these came together, later than the first needed."""
         sizes = [frame.size for frame in frames]
         needed_s = since_s * sizes[0] / sum(sizes[1:])  # by the first frame, at the pace of those that came with it
         if now - frames[0].at - self._round_trip_s > max(SLACK_S, 2 * needed_s):
@@ -96,7 +96,7 @@ class SendWindow:
         return max(0.0, self._frames.age_s(now) - round_trip_s - self._slack_s(now))
 
     def _slack_s(self, now: float) -> float:
-        """Return how late an acknowledgement may be without telling anything about the connection."""
+        """Return the delay up to which an acknowledgement says nothing about the connection."""
         return BEACON_SLACK_S if now < self._beacon_until else SLACK_S
 
 

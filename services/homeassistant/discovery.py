@@ -105,9 +105,10 @@ def _components(
             button = {"p": "button", "name": key.capitalize(), "dev_cla": "restart", "pl_prs": "true"}
             yield key, button | command(where)
     owners = estop.get("owners")
-    for owner in owners if isinstance(owners, list) else ():
-        state = c.ESTOP_STATE.topic(base, owner=owner)
-        yield f"stopped_{owner}", _binary(f"Stopped {owner}", "problem", state, "latched")
+    if isinstance(owners, list):
+        for owner in owners:
+            state = c.ESTOP_STATE.topic(base, owner=owner)
+            yield f"stopped_{owner}", _binary(f"Stopped {owner}", "problem", state, "latched")
 
 
 def _binary(name: str, kind: str, topic: str, field: str) -> Component:

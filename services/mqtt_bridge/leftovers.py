@@ -66,9 +66,9 @@ class Leftovers:
         return True
 
     def remove(self, remove: Callable[..., bool]) -> list[str]:
-        """Remove messages that only the broker retains; return their topics. This is the last call.
+        """Remove messages that only the broker retains; return their topics. Nothing is noted afterwards.
 
-        ``remove(topic, unless=…)`` removes one message, unless there is a reason not to, and returns True if it did.
+        ``remove(topic, unless=stays)`` removes one message unless ``stays(topic)``, and returns True if it did.
         """
         self._close()
         removed = [topic for topic in sorted(self._at_remote) if remove(topic, unless=self._stays)]

@@ -19,7 +19,7 @@ class MotorOwners:
         self.topics = {ESTOP_STATE.topic(base, owner=owner): owner for owner in owners}
         self._notifier = notifier
         self._messages = dict.fromkeys(self.topics, 0)  # of this connection
-        self._checked = dict(self._messages)
+        self._checked = dict(self._messages)  # at the last check
         self._received_at: dict[str, float | None] = dict.fromkeys(self.topics)  # None: since the first check
         self._reported: dict[str, bool | None] = dict.fromkeys(self.topics)
 
@@ -33,10 +33,10 @@ class MotorOwners:
     def check(self, now: float) -> None:
         """Report changes. Call this every ``CHECK_S``, on one thread."""
         for topic, owner in self.topics.items():
-            count, checked = self._messages[topic], self._checked[topic]
+            count, count_before = self._messages[topic], self._checked[topic]
             self._checked[topic] = count
             received_at = self._received_at[topic]
-            if received_at is None or (count > 1 and count != checked):
+            if received_at is None or (count > 1 and count != count_before):
                 received_at = self._received_at[topic] = now
             reached = True if count > 1 else self._reported[topic]
             if now - received_at >= _MISSED_S:

@@ -31,7 +31,7 @@ def is_named(payload: bytes) -> bool:
 
 
 def named(payload: bytes) -> bytes:
-    """Return a stop from the remote side with a name, and without an owner: only the bridge may add that."""
+    """Return a stop from the remote side with a name, and without an owner, which only the bridge may add."""
     if not is_stop(payload):
         return payload
     stop = codec.decode(ESTOP, payload)
@@ -42,7 +42,7 @@ def named(payload: bytes) -> bytes:
 
 
 class Pending(Struct, frozen=True):
-    """A stop that an owner has not confirmed. ``first``: when it was first forwarded; ``at``: when it began to wait."""
+    """A stop that an owner has not confirmed. ``first``: when it was first forwarded; ``at``: when this wait began."""
 
     stop: EstopCommand
     first: float
@@ -92,9 +92,9 @@ class PassedStops:
         return {key: owner.pending for key, owner in self._owners.items() if owner.pending is not None}
 
     def accept(self, payload: bytes) -> list[bytes]:
-        """Remember a stop with a name as forwarded; return the payloads to publish.
+        """Remember a named stop as forwarded, and let owners confirm it; return the payloads to publish.
 
-        A motor owner that was reset since the stop gets no copy of it.
+        An owner that was reset since the stop was first forwarded gets no copy of it.
         """
         if not is_stop(payload):
             return [payload]
@@ -104,13 +104,13 @@ class PassedStops:
             first = self._passed.setdefault(name, now)
             if len(self._passed) > NAMES:
                 del self._passed[next(iter(self._passed))]
-            waits = {key for key, owner in self._owners.items() if _waits(owner, name)}
-            ended = {key for key, owner in self._owners.items() if owner.freed_at > first} - waits
-            if ended:
-                return [_addressed(stop, key) for key in self._owners if key not in ended]
+            waiting = {key for key, owner in self._owners.items() if _waits(owner, name)}
+            reset_since = {key for key, owner in self._owners.items() if owner.freed_at > first} - waiting
+            if reset_since:
+                return [_addressed(stop, key) for key in self._owners if key not in reset_since]
             for key, owner in self._owners.items():
-                newer = owner.pending is not None and owner.pending.first > first
-                if key not in waits and not newer and not owner.confirms(name):
+                has_newer = owner.pending is not None and owner.pending.first > first
+                if key not in waiting and not has_newer and not owner.confirms(name):
                     owner.pending = Pending(stop, first, now)
         return [payload]
 

@@ -80,7 +80,7 @@ class SameBrokerProbe:
     def begin_round(self, remote_topic: str) -> int | None:
         """Send a probe, wait (bounded) until it would have arrived, and return the round; None without a connection.
 
-        The barrier is first on the side to which the probe went, then on the side where it would arrive.
+        It waits first for the remote side to have the probe, then for the local side to have received what that sent.
         """
         self._round += 1
         if not self.send():

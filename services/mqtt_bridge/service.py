@@ -184,7 +184,7 @@ class MqttBridge(ForwardingService):
             self._publish_heartbeat()
 
     def _look_later(self) -> None:
-        """Wait until all messages that the robot retains are known; then look for others at the remote side."""
+        """Look for messages that only the remote side retains, once all of the robot's must be known."""
         if self._leftovers.done:
             return
         if self._leftover_timer is not None:
@@ -383,7 +383,7 @@ class MqttBridge(ForwardingService):
             self._passed_stops.follow(owner, codec.decode(ESTOP_STATE, payload) if payload else None)
 
     def _has_passed(self, message: Message) -> bool:
-        """True if this stop came over the stops' own connection before. Remembers or forgets the stop."""
+        """True if the stops' own connection has passed this stop on already. Otherwise remembers it."""
         return self._stops is not None and not self.forwarder.mirroring.on and self._stops.is_copy(message)
 
     def _pass_stop(self, message: Message) -> None:

@@ -189,5 +189,6 @@ class StopConnection:
             self._connected_at = self._clock()
             return
         doubtful = self._copies.lost()
-        for message in doubtful if state is State.CONNECTING else ():
-            self._pass_on(message)
+        if state is State.CONNECTING:
+            for message in doubtful:
+                self._pass_on(message)

@@ -87,7 +87,7 @@ class MqttMirror(ForwardingService):
             self._check_broker(epoch)
 
     def _check_broker(self, epoch: int) -> None:
-        """Wait whether probes of the bridge arrive from the broker, before anything is forwarded."""
+        """Watch for probes of the bridge from the broker for some seconds, and forward nothing before that."""
         self.forwarder.rearm()
         self._announced, self._under_way = False, bool(self._watched)
         self.unsubscribe(Side.REMOTE)
@@ -100,7 +100,7 @@ class MqttMirror(ForwardingService):
         self.call_at(begins, partial(self._begin, epoch, begins + self._slowest_s))
 
     def _begin(self, epoch: int, latest: float) -> None:
-        """Start forwarding, unless a probe may be under way; after ``latest`` no bridge has an unprobed connection."""
+        """Start forwarding on connection ``epoch``, once no probe is under way, at the latest at ``latest``."""
         if self._under_way and self.clock() < latest:
             self._request_again()
             self.call_at(self.clock() + _ARRIVAL_S, partial(self._begin, epoch, latest))
@@ -136,7 +136,7 @@ class MqttMirror(ForwardingService):
         self._refuse("is the remote one, which the bridge serves already", seconds)
 
     def _refuse(self, why: str, seconds: float = CHECK_AGAIN_S) -> None:
-        """Forward nothing until the next check, because the address may then lead to another broker."""
+        """Forward nothing for ``seconds``, then check the broker again; ``why`` completes "the broker … "."""
         self.forward_nothing(seconds)
         if why != self._refused:
             self._refused = why
@@ -178,7 +178,7 @@ class MqttMirror(ForwardingService):
             self.post_message(ONLINE, self._request_again, newest_of="suspect")
 
     def _is_fresh(self, message: Message) -> bool:
-        """True if a heartbeat is recent: a retained one may be old. Its sender uses the same clock."""
+        """True if a heartbeat is recent, and not an old retained one. Its sender, the robot, uses the same clock."""
         try:
             heartbeat = codec.decode(ONLINE, message.payload)
         except PayloadError:

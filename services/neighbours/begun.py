@@ -15,7 +15,7 @@ _decode = msgspec.json.Decoder(dict[str, Annotated[int, msgspec.Meta(gt=0, le=LA
 
 
 def begin(path: Path, names: Collection[str], name: str, run: int) -> str:
-    """Return why this run of robot ``name`` cannot begin; empty: it has begun, and never begins again.
+    """Note that this run of robot ``name`` begins; return why it must not, or "". A run begins only once.
 
     ``path`` holds the newest run of each of ``names``, the robots that may begin any. If the file cannot be read or
     written, no run begins until it can: otherwise a run that a person has stopped would continue after a restart.

@@ -67,8 +67,8 @@ def _check(reader: Reader, section: Neighbours, path: Path) -> Neighbours:
     for name, granted in section.commanded.items():
         if any(metric != DRIVE.metric for metric in granted):
             problem((*path, "commanded", name), f'must be ["{DRIVE.metric}"]: nothing else can be granted')
-    named = [(("shares",), section.shares), *((("listens", name), heard) for name, heard in section.listens.items())]
-    for place, metrics in named:
+    metrics_at = {("shares",): section.shares} | {("listens", name): heard for name, heard in section.listens.items()}
+    for place, metrics in metrics_at.items():
         if len(metrics) > MOST_METRICS:
             problem((*path, *place), f"has {len(metrics)} metrics: {MOST_METRICS} are the most")
         for metric in metrics:

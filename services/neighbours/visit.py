@@ -16,9 +16,9 @@ LOCAL, PERSON = "a script of its own runs", "a person drives it"
 
 
 class Visit:
-    """The run of another robot here. ``begin`` returns why it cannot begin, ``number`` numbers it, ``publish`` drives.
+    """The run of another robot here. ``publish`` drives. One thread; times are of one clock.
 
-    ``local_runs``: whether a script of this robot runs, which comes first. One thread; times are of one clock.
+    ``begin`` returns why a run cannot begin, ``number`` a number for it; ``local_runs``: a script of this robot runs.
     """
 
     def __init__(
@@ -91,8 +91,8 @@ class Visit:
         barred = newest(state.last_barred for state in self._states.values())
         number = None if why else self._number(barred, self._received)
         if number is None:
-            refused = self._refused.get(name)
-            if refused is None or refused.run != run:  # else the first reason is the one to know
+            refusal = self._refused.get(name)
+            if refusal is None or refusal.run != run:  # of one run the first reason is kept
                 self._refused[name] = NeighbourRefusal(run=run, why=why or LOCAL)
             return False
         self.end(SUPERSEDED, now)

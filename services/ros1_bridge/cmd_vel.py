@@ -30,8 +30,8 @@ _END_S = 1.0  # longest wait for the thread at the end
 class CmdVel:
     """The publisher of commands to the base, and of its lock. Its methods may be called on any thread.
 
-    ``save(owed)`` stores whether a lock that was set is still to be opened. ``owed``: the value that an earlier process
-    of this program stored. A process that has set no lock, and owes none, never opens it.
+    ``save(owed)`` stores whether this program has locked the base, and still has to unlock it; ``owed`` is the value
+    that an earlier process stored. A lock that this program has not set stays locked.
     """
 
     def __init__(
@@ -178,7 +178,7 @@ class CmdVel:
         self._out.send(self._body)
 
     def _plan(self, now: float) -> None:
-        """Set when the thread sends next, and wake it if that is sooner than it looks by itself."""
+        """Set the time of the thread's next message, and wake the thread if it would sleep longer."""
         if self._body != ZERO:
             due = min(now + self._period_s, self._until)
         elif self._zeros > 0:

@@ -148,7 +148,7 @@ class Node:
         self._rest()
 
     def _rest(self) -> None:
-        """Disconnect all subscribers until this node is registered again."""
+        """Stop publishing because another node has this name: disconnect all subscribers, and call ``on_evicted``."""
         self._evicted, self.registered = True, False
         self._on_evicted(self.problem)
         for publication in self._publications.values():
@@ -358,7 +358,7 @@ class Node:
         self._close(subscriber.sock)
 
     def _hear(self, subscriber: Subscriber) -> None:
-        """Read a subscriber's request; a connected subscriber only ever sends its end."""
+        """Read what a subscriber has sent: first its request, later only its end."""
         publication = subscriber.publication
         try:
             chunk = subscriber.sock.recv(4096)

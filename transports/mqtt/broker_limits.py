@@ -89,7 +89,7 @@ class BrokerLimits:
             self.limits = EVERYTHING
 
     def note_probe(self, result: Result) -> None:
-        """Note how a CONNECT without a will has ended."""
+        """Note how a CONNECT without a will has ended: if it was accepted, try the one with a will again."""
         self._asking = Asking.AGAIN if result is Result.ACCEPTED else Asking.NOTHING
 
     def note_connect(self, result: Result, now: float) -> None:

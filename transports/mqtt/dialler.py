@@ -170,18 +170,17 @@ class Dialler:
     def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
         """True if this loss means that the broker has ended.
 
-        A lost connection does, unless the broker was only silent. A failed attempt keeps the earlier verdict
-        ``was_ended`` while nothing listens, or shortly after.
+        A lost connection means it, unless the broker was only silent. After a failed attempt the earlier verdict
+        ``was_ended`` holds, while nothing listens and shortly after; then it is False.
         """
-        now, silent = time.monotonic(), isinstance(lost, Silent)  # then it may be we who stood still
+        now, was_silent = time.monotonic(), isinstance(lost, Silent)  # after a silence it may be we who stood still
         if connected:
             self._gone_at = now
-            return not silent
+            return not was_silent
         if isinstance(lost, Absent):
             self._gone_at = now
-        elif silent or now - self._gone_at > _ENDING_S:
-            return False
-        return was_ended
+            return was_ended
+        return was_ended and not was_silent and now - self._gone_at <= _ENDING_S
 
     def failed(self, problem: str, held_s: float) -> tuple[str, bool]:
         """End the turn of the address, unless its broker will be asked once more in another way.

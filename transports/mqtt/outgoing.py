@@ -194,9 +194,9 @@ class InFlightTable:
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
-        """Return the size of the largest unconfirmed recent message of each topic.
+        """Return the size of the largest recent message of each topic that may be unconfirmed.
 
-        Messages that are neither the first of their topic nor larger than all before are left out.
+        A message is counted only if it is the first of its topic, or larger than all before it.
         """
         sizes: dict[str, int] = {}
         for written in (*(written for _, _, written in self._pings), self._written):
@@ -260,7 +260,7 @@ class InFlightTable:
         return min(self._round_trips, default=0.0)
 
     def newest_answer(self, now: float) -> tuple[int, float]:
-        """Return the number of answered pings, and the seconds of the newest answer or of a longer wait for one."""
+        """Return the number of answered pings, and the seconds of the newest answer or of a longer wait."""
         waits = now - self._pings[0][0] if self._pings else 0.0
         return self._pong_number, max(self._newest_s, waits)
 

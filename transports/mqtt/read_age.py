@@ -43,17 +43,17 @@ class WaitingTime:
 
 
 class BrokerDelay:
-    """The time for which messages that are received now have waited at the broker: it answers a ping after them.
+    """A measure of how long messages that arrive now have waited at the broker. The broker answers a ping after them.
 
     A ping that itself took long to get there, behind our own data, tells nothing. The usual time of an answer is no
-    delay: that of the shortest answer of this connection, and TCP's own round trips, which do not wait for the broker.
+    delay: it is that of the shortest answer of this connection, or TCP's own round trip.
 
     A broker that stood still then reads a packet of each client in turn: it may have answered all our pings before it
     has read the last old message of another client. So if nothing at all has come since an overdue ping was sent, the
     messages of the next moment count as having waited as long.
 
-    Answers carry no number, and mosquitto drops them where a client's queue is full. A later PUBACK shows that, and so
-    do answers that always come right after the newest ping, as pings are not sent at regular intervals.
+    Answers carry no number, and mosquitto drops them where a client's queue is full. A later PUBACK shows that an
+    answer was lost. So do answers that always come right after the newest of several pings.
     """
 
     def __init__(self) -> None:
@@ -68,7 +68,7 @@ class BrokerDelay:
         self._prompt = 0  # answers in a row that came right after the newest of several pings
 
     def usual(self, seconds: float) -> None:
-        """Note how long an answer took that did not wait anywhere."""
+        """Note the time of an answer that did not wait anywhere, such as TCP's."""
         self._shortest = min(self._shortest, seconds)
 
     def asked(self, now: float, *, clear: bool) -> None:
@@ -76,7 +76,7 @@ class BrokerDelay:
         self._asked.append((now, now, clear))
 
     def stalled(self, since: float, now: float) -> None:
-        """Note a ping after a time without reading: what a socket cannot hold has waited at the broker."""
+        """Note that a ping was sent after a time without reading, in which messages may have waited at the broker."""
         self._asked.append((since, now, True))
 
     def answered(self, now: float) -> None:

@@ -307,22 +307,21 @@ class MqttTransport(Transport):
         self._dialler.stalled = False
 
     def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
-        """Return the own topics that need not be sent again: the broker has our newest value, or one by others.
+        """Return the topics of our retained messages that the broker has, so that they need not be sent again.
 
-        Also sets ``went_back``. The messages have arrived when a ping is answered, because they have QoS 0.
+        Sets ``went_back`` if it has an older value on a topic that is not shared. All have arrived when a ping is
+        answered, because they have QoS 0.
         """
         self.went_back = False
         with self._publishing:
             messages = {topic: message for topic, message in self._own.items() if topic not in self._own.pending}
-            unsure = self._own.shared | {
-                topic for topic, message in messages.items() if not self._accepts(connection, message)
-            }
+            not_accepted = {topic for topic, message in messages.items() if not self._accepts(connection, message)}
+            may_differ = self._own.shared | not_accepted
         retained = self._find(connection, list(messages), stopping)
         if self.will is not None and retained.get(self.will.topic) == self.will.payload:
             del retained[self.will.topic]  # our own will, published although we were running
-        older = {
-            topic for topic, payload in retained.items() if topic not in unsure and payload != messages[topic].payload
-        }
+        differing = {topic for topic, payload in retained.items() if payload != messages[topic].payload}
+        older = differing - may_differ
         self.went_back = bool(older)
         return retained.keys() - older
 

@@ -72,7 +72,7 @@ class HubWatch:
                 self._change(hubs=self._view.hubs - {name})
 
     def _on_connection(self, event: zenoh.TransportEvent) -> None:
-        """Note that a session has come back under its id: it was running, and we have missed its messages."""
+        """Note a lost connection; if it comes back under its id, announce that messages were missed."""
         session = str(event.transport.zid)
         with self._changed:
             if event.kind == zenoh.SampleKind.DELETE:

@@ -90,8 +90,8 @@ def read_live(attachment: zenoh.ZBytes | None) -> LiveStamp:
 class Stamp(msgspec.Struct, frozen=True):
     """The origin of a retained message. ``retained_count`` 0: it was sent again, or the hub made it.
 
-    The fields are not checked, because a hub is not told from which session a message has come. A client that may
-    retain on a topic can therefore have a session pass over its message, or a query answered half a second too early.
+    The fields are not checked, because a hub is not told from which session a message has come. So a client that may
+    retain on a topic can forge them: a session then skips its message, or a query is answered half a second too early.
     """
 
     qos: QoS

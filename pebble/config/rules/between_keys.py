@@ -106,7 +106,7 @@ def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
 def _without_uplink(notes: Notes, root: Root) -> Root:
     """Return ``root`` with the robot's own broker as the bridge's remote broker, if no remote host is set.
 
-    In the original's examples, operators connect to that. A Zenoh robot has no broker, and runs without a bridge.
+    Operators connect to that broker in the original's examples. A Zenoh robot has no broker: its bridge is disabled.
     """
     bridge, transport = root.services.mqtt_bridge, root.transport
     if not bridge.enabled or bridge.remote_mqtt.host or (bridge.remote is not None and bridge.remote.kind != "mqtt"):

@@ -54,8 +54,9 @@ def connections(root: Root) -> Iterator[tuple[Path, Section]]:
     for place, holder in (("services",), root.services), ((), root):
         for name in holder.__struct_fields__:
             section = getattr(holder, name)
-            for path, connection in section.connections() if isinstance(section, Section) else ():
-                yield (*place, name, *path), connection
+            if isinstance(section, Section):
+                for path, connection in section.connections():
+                    yield (*place, name, *path), connection
 
 
 def core_connections(root: Root) -> Iterator[tuple[Path, Section]]:

@@ -113,7 +113,9 @@ class _Session:
                 raise PebbleError(f"{name} stays {off}: does a wheel slip, or a magnet miss?")
             repeats[worst] += 1
             self._person.tell(f"{name} is {off}, more than {LIMIT_SIGMA:g}: it is repeated")
-            for number in (worst // 2 * 2, worst // 2 * 2 + 1) if self.runs[worst].mm is not None else (worst,):
+            there = worst // 2 * 2  # the even one of a pair of straight runs
+            repeated = (there, there + 1) if self.runs[worst].mm is not None else (worst,)
+            for number in repeated:
                 self.runs[number] = self._drive(number)  # there and back: it ends where it began
             result = self._fit()
         for run, mm, sigma in zip(self.runs, result.mm, result.sigma, strict=True):

@@ -56,7 +56,8 @@ def who_drives(config: Config) -> Iterator[CheckResult]:
         yield warn(warning, "pebble fleet init, then the account of this robot")
         return
     yield ok(f"level {level}: it is driven by {_DRIVERS[level]}")
-    for folder in _folders(config) if level != "open" else ():
+    folders = _folders(config) if level != "open" else []
+    for folder in folders:
         try:
             yield ok(_accounts(load(folder)), what=_WHO)
         except FleetError as error:

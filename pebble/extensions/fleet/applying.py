@@ -22,7 +22,7 @@ def make(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None,
     """Write all files of a new fleet. Raises PebbleError.
 
     ``passwords``: those of its first accounts. ``others``: more machines of the fleet, which the broker's certificate
-    also names and for which its authority may sign. The configuration of a broker that is ``included`` is elsewhere.
+    also names and for which its authority may sign. An ``included`` broker gets no `mosquitto.conf`: it has its own.
     """
     if (folder / CONF).exists():
         raise FleetError(f"{folder / CONF} exists already: name another folder")

@@ -102,7 +102,7 @@ class Audit:
 def _values(row: Row) -> tuple[float | str | int, ...]:
     """Return the values of a row in their stored form.
 
-    A row without its texts stands for rows that differ too much to be counted together.
+    A row for many different rows (see :meth:`RowWriter.add`) has only a kind; its user is OTHERS.
     """
     texts = (row.get(field, OTHERS if field == "user" else "") for field in _FIELDS)
     return (row["t"], row["what"], *texts, row.get("count", 1))

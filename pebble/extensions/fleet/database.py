@@ -71,7 +71,7 @@ class Database:
             return self._connection.execute(statement, values)
 
     def version(self) -> tuple[int, int]:
-        """Return a number that differs after each change by any process. Raises DatabaseError."""
+        """Return numbers that differ after each change by any process. Raises DatabaseError."""
         with self._errors():
             (by_others,) = self._connection.execute("PRAGMA data_version").fetchone()
             return by_others, self._connection.total_changes

@@ -51,9 +51,9 @@ class Server(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
 class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The content of `fleet.json`. The first broker is the one whose files are in this folder.
 
-    ``rules``: `plugin` if an earlier version made it for mosquitto's dynamic-security plugin; `pebble fleet apply`
-    turns it into files. ``plain``: all robots keep their topics without account names beside those with them. ``hubs``:
-    the machines of Zenoh hubs that read the rules, here in this folder or elsewhere.
+    ``rules``: `plugin` if an earlier version made the fleet for mosquitto's dynamic-security plugin; `pebble fleet
+    apply` turns it into files. ``plain``: robots read topics without account names as well as topics with them.
+    ``hubs``: the place of the Zenoh hubs that read the rules.
     """
 
     level: Literal["login", "named"]

@@ -106,7 +106,7 @@ def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dic
 
 
 def first(commands: Sequence[str], stops: Sequence[str]) -> dict[str, Any]:
-    """Return Zenoh's qos: of other machines' messages only ``stops`` have the first priority, and only they block.
+    """Return Zenoh's setting ``qos``: from other machines only ``stops`` get the first priority, and only they block.
 
     Otherwise the sender would choose: commands with the first priority would delay stops, and a blocking sender would
     make the hub disconnect a slow receiver. Both parameters are keys; ``stops`` are among ``commands``.

@@ -27,13 +27,13 @@ _USUAL_BYTES = 256  # of a drive command
 _LONGEST = 40  # characters of a sender
 _UNSIGNED = (bool, bytes)  # payloads that take no name: a flag has the same bytes from every sender
 #: Payloads that need not be objects; of all others only objects are commands.
-_BARE = (*_UNSIGNED, AutonomyCommand, EstopCommand, MediaRequest, SoundboardCommand)
+_MAY_BE_BARE = (*_UNSIGNED, AutonomyCommand, EstopCommand, MediaRequest, SoundboardCommand)
 
 _decoder, _encoder = msgspec.json.Decoder(), msgspec.json.Encoder()
 
 
 class CheckedNames(Names):
-    """The senders of messages, by topic. ``strangers``: the rights of senders without an account."""
+    """A table of the senders of messages, by topic. ``strangers``: the rights of senders without an account."""
 
     def __init__(self, base: str, subjects: Subjects, strangers: Strangers) -> None:
         super().__init__()
@@ -64,31 +64,31 @@ class CheckedNames(Names):
     def sign(self, sender: Sender, message: Message) -> Signed | Drop:
         """Return ``message`` with its sender in the payload, or why it is refused. Called for each message.
 
-        A ``by`` that the sender wrote is a claim. From an account it becomes the person, from a stranger it is removed.
-        A stop needs no account; its claim stays, with a mark.
+        A ``by`` in the payload is only a claim: behind an account it names the person, from a stranger it is removed. A
+        stop needs no account; its claim stays, with a mark.
         """
         subject, account, payload = sender.subject, sender.account, message.payload
         channel = None if subject is None else subject.channel
-        form = None if channel is None else channel.payload
+        payload_type = None if channel is None else channel.payload
         if account == NO_ACCOUNT:
-            if form is EstopCommand:
+            if payload_type is EstopCommand:
                 return Signed(_moved(message, sender.topic, _doubted(payload)), NO_ACCOUNT)
             if channel is None or not (channel.suffix in self._strangers or _is_zero(channel, payload)):
                 return Drop.UNNAMED
-        elif (message.retain or message.retain_requested) and form is not EstopCommand:
+        elif (message.retain or message.retain_requested) and payload_type is not EstopCommand:
             return Drop.STALE
         fields, by = _object(payload), account
         if channel is GROUP and not _is_group(payload):
             return Drop.UNREADABLE
         if fields is None:
-            if channel is not None and form not in _BARE:
+            if channel is not None and payload_type not in _MAY_BE_BARE:
                 return Drop.UNREADABLE
         else:
             body = _body(fields)
             claim = body.get("by")
             if account != NO_ACCOUNT and isinstance(claim, str) and claim:
                 by = _with_person(account, claim[:_LONGEST])
-            if form not in _UNSIGNED:
+            if payload_type not in _UNSIGNED:
                 fields.pop("by", None)
                 body["by"] = by
                 payload = _encoder.encode(fields)

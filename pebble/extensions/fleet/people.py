@@ -126,7 +126,7 @@ class People:
         return [User(name, Role(role)) for name, role in self._rows("SELECT name, role FROM people ORDER BY name")]
 
     def version(self) -> tuple[int, int]:
-        """Return a number that changes with people and sessions, by any process. Raises DatabaseError."""
+        """Return numbers that change with people and sessions, by any process. Raises DatabaseError."""
         with self._lock:
             return self._database.version()
 

@@ -46,7 +46,7 @@ def hub_file(keys: str) -> dict[str, Any]:
 
 
 def boards_file(fleet: Fleet, name: str, below: str) -> dict[str, Any]:
-    """Return the file of a gateway for boards whose account is a neighbour's.
+    """Return the config file of a gateway for boards; ``name`` is its account, which is also that of a neighbour.
 
     ``below``: the path prefix of the fleet's folder in that file.
     """

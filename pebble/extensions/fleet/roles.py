@@ -230,13 +230,13 @@ def _of_rights(
         yield Rule("read", f"{_ANY}/{INCOMING}/flags/#")
     if Right.STOP in held:
         yield Rule("write", c.ESTOP.filter(_ANY))  # a stop needs no name, at any level
-    for right in Right:
-        if right in held:
-            for metric in metrics(right, extra):
-                if level == "named":
-                    yield Rule("write", f"{_ANY}/{INCOMING}/{BY}/{name}/{metric}")
-                for base in plain if level == "named" else (_ANY,):
-                    yield Rule("write", f"{base}/{INCOMING}/{metric}")
+    bases_without_names = plain if level == "named" else (_ANY,)
+    for right in [right for right in Right if right in held]:
+        for metric in metrics(right, extra):
+            if level == "named":
+                yield Rule("write", f"{_ANY}/{INCOMING}/{BY}/{name}/{metric}")
+            for base in bases_without_names:
+                yield Rule("write", f"{base}/{INCOMING}/{metric}")
     if Right.DRIVE in held:
         yield Rule("write", c.BRIDGE_PROBE.filter(f"+/{SERVERS}/+"))
     if Right.EXPAND in held:

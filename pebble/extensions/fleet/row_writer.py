@@ -20,16 +20,16 @@ Row = dict[str, Any]
 
 
 class RowWriter:
-    """A queue of rows, which ``store`` gets in order. Thread-safe.
+    """A queue of rows for ``store``, which gets them in order. Thread-safe.
 
     If ``store`` raises OSError or PebbleError, the rows wait, and that is logged once. A row has its time ``t``, its
-    kind ``what``, and more; kinds are a fixed set.
+    kind ``what`` from a fixed set, and more fields.
     """
 
     def __init__(self, store: Callable[[list[Row]], None], clock: Callable[[], float] = time.monotonic) -> None:
         self._store, self._clock = store, clock
         self._lock = threading.Lock()  # guards what follows
-        self._counts: dict[Hashable, tuple[Row, int]] = {}  # of this window: the newest row, how many are not stored
+        self._counts: dict[Hashable, tuple[Row, int]] = {}  # of this window: the newest similar row, copies not stored
         self._since = 0.0
         self._rows: list[Row] = []  # that wait
         self._lost = 0
@@ -49,25 +49,25 @@ class RowWriter:
             log.error("audit: %d rows are lost", lost)
 
     def add(self, row: Row, like: Hashable = None, most: int = DIFFERENT) -> None:
-        """Store ``row``, or only count it if a row ``like`` it was already stored in this window.
+        """Store ``row``; if a similar row was stored in this window, only count it.
 
-        Without ``like``, rows are alike if they differ only in their time.
+        ``like``: a key that similar rows share; None: all fields but the time. Beyond ``most`` keys it is the kind.
         """
-        like = (tuple(row.items())[1:],) if like is None else like
+        key = (tuple(row.items())[1:],) if like is None else like  # the row without its time
         now = self._clock()
         with self._lock:
             if now - self._since >= WINDOW_S:
                 self._end_window(now)
-            if like not in self._counts and len(self._counts) >= most:
-                row, like = {"t": row["t"], "what": row["what"]}, row["what"]
-            count = self._counts[like][1] + 1 if like in self._counts else 0
-            self._counts[like] = row, count
-            if not count:
+            if key not in self._counts and len(self._counts) >= most:
+                row, key = {"t": row["t"], "what": row["what"]}, row["what"]
+            copies = self._counts[key][1] + 1 if key in self._counts else 0
+            self._counts[key] = row, copies
+            if not copies:
                 self._put(row)
         self._wake.set()
 
     def _end_window(self, now: float) -> None:
-        """Queue a row with the number of rows for each kind that was only counted, and reset the counts."""
+        """For each row that was counted, queue its newest copy with the number of copies; begin a new window."""
         for row, count in self._counts.values():
             if count:
                 self._put({**row, "count": count})
@@ -92,7 +92,8 @@ class RowWriter:
 
     def _store_all(self) -> None:
         with self._lock:
-            rows, lost = [*self._rows], self._lost
+            waiting, lost = len(self._rows), self._lost
+            rows = [*self._rows]
         if lost:
             rows.append({"t": round(time.time(), 3), "what": "audit-dropped", "count": lost})
         if not rows:
@@ -108,5 +109,5 @@ class RowWriter:
             log.warning("audit: rows are written again, %d are lost", lost)
         self._saved = True
         with self._lock:
-            del self._rows[: len(rows) - bool(lost)]
+            del self._rows[:waiting]
             self._lost -= lost

@@ -120,7 +120,7 @@ class H264Encoder:
 
 
 class H264Decoder:
-    """A decoder of access units to BGR pictures. As far as FFmpeg tells, a picture that it repaired is refused."""
+    """A decoder of access units to BGR pictures. Refuses a picture if FFmpeg reports that it has repaired it."""
 
     def __init__(self) -> None:
         self._av = pyav.load("h264")

@@ -12,9 +12,8 @@ class Sent(NamedTuple):
 class InFlight:
     """The unacknowledged messages of one connection, oldest first; ``limit``: the most that are remembered.
 
-    TCP acknowledges bytes in order, so the unacknowledged bytes belong to the newest messages: up to its size to the
-    newest, then to the one before it, and so on. A message for which no bytes are left is acknowledged. ``slack`` bytes
-    of pings and headers may be unacknowledged although the message before them is not.
+    TCP acknowledges bytes in order. So if n bytes are unacknowledged, they are the last n that were sent, and each
+    message that was sent before them is acknowledged. ``slack``: so many unacknowledged bytes may be pings and headers.
     """
 
     def __init__(self, slack: int, limit: int | None = None) -> None:
@@ -32,7 +31,7 @@ class InFlight:
         self._messages.append(Sent(size, now))
 
     def acknowledge(self, waiting: int) -> list[Sent]:
-        """Remove and return the messages that are acknowledged when ``waiting`` bytes are not."""
+        """Remove and return the messages that are acknowledged if ``waiting`` bytes are still unacknowledged."""
         acknowledged = []
         newer = sum(message.size for message in self._messages)
         while self._messages:
@@ -47,5 +46,5 @@ class InFlight:
         return now - self._messages[0].at if self._messages else 0.0
 
     def clear(self) -> None:
-        """Forget all messages: the connection is lost, and they with it."""
+        """Forget all messages, which are lost with the connection."""
         self._messages.clear()

@@ -52,8 +52,8 @@ def ahead(sequence: int, of: int) -> int:
 class Depth:
     """The amount of sound that should wait: enough for the network's jitter, and no more.
 
-    A late packet raises the target by its lateness; calm times lower it again. Sound that was too much during a whole
-    window is not needed: the sender's clock is faster than the player's, or a stall has ended.
+    A late packet raises the target by its lateness; calm times lower it again. Sound above the target in a whole window
+    is left out: the sender's clock is faster than the player's, or a stall has ended.
     """
 
     WINDOW_S = 1.0
@@ -246,7 +246,7 @@ class JitterBuffer:
         return received if len(received.samples) else None
 
     def _leave_out(self, received: ReceivedSound, excess: float) -> ReceivedSound:
-        """Return the packet to play without ``excess`` seconds, its beginning faded over from ``received``."""
+        """Skip waiting packets of ``excess`` seconds; return the next, faded over from ``received``."""
         newest, remaining_s = received, excess
         while self._waiting and remaining_s > len(newest.samples) / newest.rate - _ROUNDING_S:
             remaining_s -= len(newest.samples) / newest.rate
@@ -270,7 +270,7 @@ class JitterBuffer:
         return Chunk(to_int16(estimate * gain[:, None]), last.rate, last.channels, concealed=True)
 
     def _estimated(self, last: ReceivedSound, size: int) -> Samples:
-        """Return the codec's estimate, or else the last packet, in turn backwards and forwards: without a step."""
+        """Return ``size`` samples of the codec's estimate, else of ``last``, played backwards and forwards in turn."""
         if self._spare is None or not len(self._spare):
             self._spare = self._decoder.conceal()
         if self._spare is not None:

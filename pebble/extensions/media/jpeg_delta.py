@@ -53,7 +53,7 @@ class JpegDelta:
         return jpeg
 
     def _is_reference(self) -> bool:
-        """True if the next picture is a difference from this one."""
+        """True if the next picture will be a difference from this one; remembers the answer."""
         self._chained = self._since_keyframe + 1 < self._interval
         return self._chained
 

@@ -114,9 +114,9 @@ def make_sound_encoder(
 ) -> SoundEncoder:
     """Return an encoder of sound with ``rate`` and ``channels``.
 
-    It sends ``sent_rate`` and ``sent_channels``, as far as the encoding has them. Opus packets last ``chunk_ms``
-    rounded up to 20, 40 or 60, and ``bundle`` of them (at most 3) share a PBAT packet. Raises PebbleError for an
-    encoding that is unknown, or not installed.
+    It sends at ``sent_rate`` with ``sent_channels``, or the nearest that the encoding has. Opus packets last
+    ``chunk_ms`` rounded up to 20, 40 or 60, and ``bundle`` of them (at most 3) share a PBAT packet. Raises PebbleError
+    for an encoding that is unknown, or not installed.
     """
     numbers = sequence_numbers() if numbers is None else numbers
     rate_out, channels_out = sent_rate or rate, sent_channels or channels

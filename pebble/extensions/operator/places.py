@@ -25,7 +25,7 @@ class Places:
 
     @cached_property
     def unfinished(self) -> Path:
-        """A mark while setup runs: programs that read its files were not yet restarted. No backup has it."""
+        """A file that marks an unfinished setup: services do not use its files yet. No backup has it."""
         return self.etc / "setup.new"
 
     @cached_property

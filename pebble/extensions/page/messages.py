@@ -49,7 +49,7 @@ class Watch(_FromPage, frozen=True, kw_only=True, tag="watch"):
 
 
 class ReadLogs(_FromPage, frozen=True, kw_only=True, tag="read-logs"):
-    """Send the log lines of the watched component, or no longer. The page has those of ``origin`` up to ``after``."""
+    """Begin or end to send log lines of the watched component. The page has those of ``origin`` up to ``after``."""
 
     ref: Ref
     on: bool
@@ -58,7 +58,7 @@ class ReadLogs(_FromPage, frozen=True, kw_only=True, tag="read-logs"):
 
 
 class Lease(_FromPage, frozen=True, kw_only=True, tag="lease"):
-    """Request (``take``) or release control, or ask for it no more. ``over``: from a driver who is active."""
+    """Request control (``take``), release it, or withdraw the request. ``over``: even from an active driver."""
 
     ref: Ref
     take: bool
@@ -147,7 +147,7 @@ class SoundboardOp(_Asked, frozen=True, kw_only=True, tag="soundboard"):
 
 
 class AutonomyOp(_Asked, frozen=True, kw_only=True, tag="autonomy"):
-    """Start one of the robot's scripts; "" stops."""
+    """Start the robot's script ``file`` with the settings ``config``; "" stops the running script."""
 
     ref: Ref
     file: Annotated[str, Meta(max_length=200)]
@@ -179,7 +179,7 @@ class ActionOp(_Asked, frozen=True, kw_only=True, tag="action"):
 
 
 class BoardOp(_Asked, frozen=True, kw_only=True, tag="board"):
-    """Let pages drive a board that does not say what it can do, or no longer; or clear its retained drive command."""
+    """Let pages drive a board that does not say what it can do, end that, or clear its retained drive command."""
 
     ref: Ref
     do: Literal["allow", "withdraw", "clear"]
@@ -187,7 +187,7 @@ class BoardOp(_Asked, frozen=True, kw_only=True, tag="board"):
 
 
 class FlagOp(_Asked, frozen=True, kw_only=True, tag="flag"):
-    """A switch whose last position the broker remembers."""
+    """Set a flag of the robot. The broker retains flags."""
 
     ref: Ref
     name: Literal["remote-mirror", "mqtt-audio", "mqtt-video"]
@@ -229,7 +229,7 @@ class _ToPage(Struct, frozen=True, kw_only=True, tag_field="op"):
 
 
 class Welcome(_ToPage, frozen=True, kw_only=True, tag="welcome"):
-    """The answer to Hello. ``rights``: of drive, reset, take, system, people; ``named_rights``: at level named."""
+    """The answer to Hello. ``rights``: the person's, of those named in roles.py; ``named_rights``: at level named."""
 
     server: str
     version: str
@@ -256,8 +256,8 @@ class Ping(_ToPage, frozen=True, kw_only=True, tag="ping"):
 class State(_ToPage, frozen=True, kw_only=True, tag="state"):
     """The newest value of everything that changed: ``[ref, metric, value, age in ms]``; ``gone``: removed components.
 
-    Metrics are those of the contract, with their payload as JSON, and some of the server's own, below ``web/``. What
-    cards read of a payload is as the contract has it, or left out. null: the value was removed.
+    Metrics are those of the contract, with their payload as JSON, and some of the server's own, below ``web/``. Fields
+    that cards read are valid, or left out. null: the value was removed.
     """
 
     now: float
@@ -268,7 +268,7 @@ class State(_ToPage, frozen=True, kw_only=True, tag="state"):
 class Logs(_ToPage, frozen=True, kw_only=True, tag="logs"):
     """Log lines of the watched component, if it asked for them. ``first`` is the number of the first one.
 
-    Numbers that are left out are of lines that were dropped. They count within one ``origin``.
+    A missing number belongs to a dropped line. Numbers count within one ``origin``.
     """
 
     ref: str
@@ -278,7 +278,7 @@ class Logs(_ToPage, frozen=True, kw_only=True, tag="logs"):
 
 
 class Refused(_ToPage, frozen=True, kw_only=True, tag="refused"):
-    """Something was not done. ``g``: the gesture that is over, if it was a drive command. ``n``: of the command."""
+    """The refusal of a request with number ``n``. ``g``: for a drive command, the gesture that is over."""
 
     cmd: str
     ref: str
@@ -307,14 +307,14 @@ class Played(_ToPage, frozen=True, kw_only=True, tag="played"):
 
 
 class Bye(_ToPage, frozen=True, kw_only=True, tag="bye"):
-    """The last message of a connection that the server closes. ``again``: whether to connect again."""
+    """The last message of a connection that the server closes. ``again``: the page may connect again."""
 
     why: str
     again: bool
 
 
 class TalkAnswer(Struct, frozen=True, kw_only=True):
-    """On the sound socket, as text: whether the page's talk of that number lasts. One that is over never goes on."""
+    """The state of a page's talk, as text on the sound socket. A talk that is over never goes on."""
 
     talk: int
     on: bool
@@ -355,7 +355,7 @@ class OwnerState(Struct, frozen=True, kw_only=True):
 
 
 class EstopView(Struct, frozen=True, kw_only=True):
-    """``web/estop``: the emergency stop of a component, and of the stop that is being sent to it."""
+    """``web/estop``: the emergency stop of a component, and the progress of a stop that the server sends to it."""
 
     available: bool  # False: an old robot, or a broker that refuses: it can be stopped, but not held
     latched: bool
@@ -383,7 +383,7 @@ class DriverView(Struct, frozen=True, kw_only=True):
 
 
 class PictureView(Struct, frozen=True, kw_only=True):
-    """``web/picture``: the pictures of a component, as they come from it."""
+    """``web/picture``: the state of a component's pictures on their way to pages."""
 
     state: str  # "rest", "starting", "flowing", "silent", "held" (it waits while people drive) or "refused"
     why: str
@@ -394,7 +394,7 @@ class PictureView(Struct, frozen=True, kw_only=True):
 
 
 class SoundView(Struct, frozen=True, kw_only=True):
-    """``web/sound``: the sound of a component, as it comes from it, and who talks to it."""
+    """``web/sound``: the state of a component's sound on its way to pages, and who talks to the component."""
 
     state: str  # "rest", "starting", "flowing", "silent", "held" (it waits while people drive) or "refused"
     why: str
@@ -432,9 +432,9 @@ class BoardView(Struct, frozen=True, kw_only=True):
 
 
 class FlagsView(Struct, frozen=True, kw_only=True):
-    """``web/flags``: the flags of the component that is open, as the broker has them; null: it has none.
+    """``web/flags``: the flags of the open component, as the broker retains them; null: it retains none.
 
-    One that is removed while the server has no broker is not noticed.
+    A flag that is removed while the server has no broker keeps its value here.
     """
 
     remote_mirror: bool | None = None

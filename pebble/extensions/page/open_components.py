@@ -53,7 +53,7 @@ class OpenComponents:
         keep_s: float = KEEP_S,
         step_s: float = STEP_S,
     ) -> None:
-        """Store the connection. ``spawn`` runs a coroutine in the background."""
+        """Store the arguments. ``spawn`` runs a coroutine in the background."""
         self._broker, self._robots, self._spawn = broker, robots, spawn
         self._keep_s, self._step_s = keep_s, step_s
         self._pages: Counter[str] = Counter()
@@ -79,14 +79,14 @@ class OpenComponents:
         self._broker.loop.call_later(self._keep_s, self._closed, ref)
 
     def _closed(self, ref: str) -> None:
-        """Note that a page was closed, after a delay in which a reloaded page still finds everything."""
+        """Note that a page was closed. It is called after a delay, so that a reloaded page still finds everything."""
         self._pages[ref] -= 1
         if not self._pages[ref]:
             del self._pages[ref]
             self.update(ref)
 
     def update(self, ref: str) -> None:
-        """Note that a component's capabilities, or the pages that have it open, may have changed."""
+        """Update a component's subscriptions after its capabilities, or the pages that show it, may have changed."""
         wanted = set(self._filters(ref)) if ref in self._pages else None
         received = set(self._subscriptions[ref]) if ref in self._subscriptions else None
         if ref not in self._following and wanted != received:
@@ -123,7 +123,7 @@ class OpenComponents:
             self._following.discard(ref)
 
     def _forget(self, ref: str) -> None:
-        """Unsubscribe from a component and forget it, which may be none: pages may open any address."""
+        """Forget what was kept for a component's open page, and the component if it has published nothing."""
         self._subscriptions.pop(ref, None)
         self._wanted.pop(ref, None)
         self._flags.pop(ref, None)

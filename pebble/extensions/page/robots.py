@@ -149,9 +149,8 @@ class Robots:
                 continue
             has_large = has_large or size > LARGE_BYTES
             room -= size
-            taken.append(
-                (ref, metric, None, 0.0) if stored is None else (ref, metric, stored.raw, 1000 * (now - stored.at))
-            )
+            value, age_ms = (None, 0.0) if stored is None else (stored.raw, 1000 * (now - stored.at))
+            taken.append((ref, metric, value, age_ms))
         interest.more = room <= 0
         return tuple(taken), has_large
 
@@ -206,7 +205,7 @@ class Robots:
         self.receive_as(address.identity.base, address.metric, message, now)
 
     def receive_as(self, ref: str, metric: str, message: Message, now: float, channel: c.Channel | None = None) -> None:
-        """Handle a message as one on ``metric``, whatever its topic is called.
+        """Handle a message as if it had come on ``metric``.
 
         ``channel``: how to decode it, if the contract does not have it.
         """
@@ -242,7 +241,7 @@ class Robots:
         Whether a component is online is sent at once. Ages are sent for open components, and for at most a third of the
         others, so that no page has to draw all of them at once, and a thousand robots cause no flood.
         """
-        older: list[Component] = []
+        due: list[Component] = []
         opened = {interest.watched for interest in self.interests}
         every_s = max(_REFRESH_S, len(self.components) / _REFRESHES_PER_S)
         for component in self.components.values():
@@ -253,9 +252,10 @@ class Robots:
                 if component.ref in opened:
                     self._refresh(component, now)
                 elif age_s >= every_s:
-                    older.append(component)
-        older.sort(key=lambda value: value.refreshed_at)
-        for component in older[: 1 + min(len(self.components), _REFRESHES_PER_S) // 3]:
+                    due.append(component)
+        due.sort(key=lambda component: component.refreshed_at)
+        third = 1 + min(len(self.components), _REFRESHES_PER_S) // 3
+        for component in due[:third]:
             self._refresh(component, now)
 
     def _refresh(self, component: Component, now: float) -> None:
@@ -346,9 +346,10 @@ class Robots:
 
     def mark_drivers(self, refs: Collection[str]) -> None:
         """Update, for all pages, who drives these robots."""
-        for interest in self.interests if refs else ():
-            interest.dirty |= {(ref, "web/driver") for ref in refs}
-            interest.notify()
+        if refs:
+            for interest in self.interests:
+                interest.dirty |= {(ref, "web/driver") for ref in refs}
+                interest.notify()
 
     def _mark(self, ref: str, metric: str, *, everybody: bool = False) -> None:
         channel = _channel(metric)

@@ -171,7 +171,7 @@ class Server:
     def _has_sent(self) -> bool:
         """True if few messages wait to be sent.
 
-        Before that, repeating the stop of a thousand robots would only delay it.
+        While many wait, repeating the stop of a thousand robots would only delay it.
         """
         return self.stop_broker.transport.outgoing.waiting < _MANY_WAIT
 

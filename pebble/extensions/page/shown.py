@@ -127,7 +127,7 @@ _INSIDE = msgspec.json.Decoder(_Wrapped)
 
 
 def shown(channel: c.Channel | None, raw: bytes, payload: Any) -> bytes:
-    """Return the JSON of ``payload`` for pages: ``raw`` itself, unless a card relies on certain fields."""
+    """Return the JSON of ``payload`` for pages: ``raw`` itself if no card relies on its fields, or all are valid."""
     show = None if channel is None else _SHOWN.get(channel.metric)
     relied = payload if show is None else show(payload)
     if relied is payload:
@@ -151,7 +151,7 @@ def _inner(payload: Any) -> Any:
 
 
 def _is(kind: Any, payload: object) -> bool:
-    """True if the value is of this type."""
+    """True if the value can be converted to this type."""
     try:
         convert(payload, kind)
     except ValidationError:

@@ -60,7 +60,7 @@ class SilentBoards:
         self._boards: dict[str, _Board] = {}
 
     def refresh(self, now: float, spawn: Spawn) -> None:
-        """Find boards that have become silent, or are no longer. Call this a few times a second."""
+        """Add boards that have become silent, and remove those that no longer are. Call this a few times a second."""
         silent = {ref: component for ref, component in self._robots.components.items() if component.robot.silent}
         for ref in self._boards.keys() - silent:
             if (subscription := self._boards.pop(ref).subscription) is not None:
@@ -68,8 +68,8 @@ class SilentBoards:
             if ref in self._robots.components:
                 self._robots.set_server_metric(ref, _METRIC, m.BoardView(silent=False))
         for ref, component in silent.items():
-            is_new = ref not in self._boards and ref.split("/")[1] == "robots" and not self._robots.omitted
-            if is_new and component.robot.online(now):
+            may_be_board = ref.split("/")[1] == "robots" and not self._robots.omitted
+            if ref not in self._boards and may_be_board and component.robot.online(now):
                 self._boards[ref] = _Board(now)
             if ref in self._boards:
                 self._follow(component, self._boards[ref], now, spawn)

@@ -94,8 +94,8 @@ class StaticFiles:
     def answer(self, request: Request, name: str, headers: dict[str, str]) -> Response:
         """Return the file ``name``, compressed if the browser accepts that; 404 if there is none.
 
-        A number as query marks a module that is fetched again because one of its imports was lost. Its imports get the
-        query, too, except those that have run since the start.
+        If the page asks again for a module because one of its imports was lost, it adds a number as query. The query is
+        then added to the module's imports too, except to those that have run since the start.
         """
         if name not in self.files:
             return PlainTextResponse("not found", 404)

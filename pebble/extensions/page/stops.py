@@ -46,7 +46,7 @@ class Stops:
         known: Iterable[RobotView],
         user: str = "",
     ) -> list[Message]:
-        """Stop one robot, or all if ``ref`` is ""; the new stop replaces an earlier one of the same.
+        """Stop one robot, or all if ``ref`` is "", in place of an earlier stop of the same robots.
 
         ``known`` are the robots from which messages were received.
         """
@@ -85,7 +85,7 @@ class Stops:
         return ref in self._names
 
     def sends_to(self, ref: str) -> bool:
-        """True if there is a stop of this robot, or a stop of all with room for it."""
+        """True if any stop is sent to this robot and awaits its answer, be it a stop of all."""
         return any(ref in sender.robots for sender, _ in self._senders.values())
 
     def holds(self, ref: str) -> bool:
@@ -153,9 +153,9 @@ class Stops:
             self.changed.add(ref)
 
     def _replaced(self, ref: str, user: str, now: float) -> bool:
-        """Make room for a stop, by removing an older one of the same robots first.
+        """Remove the earlier stop of the same robots, and others if there are too many.
 
-        True if the new one belongs to this user alone.
+        True if a new stop belongs to this user alone: the removed stop was another user's only if it was over.
         """
         is_own = True
         if (older := self._names.get(ref)) is not None:
@@ -170,7 +170,7 @@ class Stops:
         return is_own
 
     def _worth(self, name: str) -> tuple[bool, bool, bool]:
-        """Return a stop's rank for keeping it: stops that are over, never heard of, or of one robot go first."""
+        """Return a sort key for removal: stops that are over first, then of robots never heard, then of one robot."""
         robots = self._senders[name][0].robots.values()
         heard = not self._refs[name] or any(robot.live or robot.estop.has_capabilities for robot in robots)
         return name not in self._over, heard, not self._refs[name]

@@ -32,7 +32,7 @@ _EPOCH_S = 1_735_689_600  # 2025-01-01: counted from here, seconds fit into a ru
 
 
 class LocalScripts:
-    """A lock held by each script of this robot, or its manager for it, from before it gets its run number.
+    """A lock that each script of this robot, or its manager, holds from before the script gets its run number.
 
     So a number that is taken while no script runs is older than the number of every later script. The kernel releases
     the lock of a killed process.
@@ -43,7 +43,7 @@ class LocalScripts:
         self._held: int | None = None
 
     def hold(self) -> None:
-        """Note that a script runs. Without the lock it starts all the same; then neighbours take no number, either."""
+        """Lock the file while a script runs. After a failure the script runs, but no neighbour gets a number."""
         if self._held is None:
             try:
                 self._held = self._open()
@@ -144,13 +144,13 @@ def _read(file: int, path: Path, wall_clock: Callable[[], float]) -> int:
 
 
 def _from_clock(wall_clock: Callable[[], float]) -> int:
-    """Return the seconds since 2025; 0 if the clock was never set, or is far ahead."""
+    """Return the seconds since 2025; 0 if the clock was never set, or shows a far future."""
     seconds = int(wall_clock()) - _EPOCH_S
     return seconds if 0 < seconds < LAST_RUN // 2 else 0
 
 
 def _above(barred: int, *used: int) -> int:
-    """Return the number after the furthest of ``barred`` and ``used`` that leaves room for a newer one."""
+    """Return the number after the newest of ``barred`` and ``used``, except those too far ahead to have a successor."""
     base = barred or newest(used)
     ahead = ((run - base) & LAST_RUN for run in used if run and newer(following(run), base))
     return following((base + max(ahead, default=0)) & LAST_RUN)

@@ -37,7 +37,7 @@ _TOPICS = 1000  # that are removed of one name
 
 
 class EarlierNames:
-    """The robot's names with this config file until now."""
+    """The names that the robot had with this config file, as base topics; kept in a file."""
 
     def __init__(self, config: Config, sides: list[Transport], call_in: CallIn) -> None:
         self._base, self._sides, self._call_in = config.base, sides, call_in
@@ -58,14 +58,8 @@ class EarlierNames:
         try:
             names = json.loads(self._file.read_bytes())
             self._names = [Identity(*name.split("/")).base for name in names][-_NAMES:]
-        except (
-            OSError,
-            ValueError,
-            TypeError,
-            AttributeError,
-            RecursionError,
-            ConfigError,
-        ):  # or it is the first start
+        # No file at the first start, or one that is damaged.
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError, ConfigError):
             self._names = []
         earlier = [name for name in self._names if name != self._base]
         self._save([*earlier, self._base])

@@ -56,7 +56,9 @@ class AliasUse:
 
     def _update(self, device: Device, route: Route, alias: Alias) -> None:
         owner = self._owners.get(alias.claim.partition("/")[2])
-        rivals = self._peers.claimants(alias.claim) if owner is None else [owner] if owner != device.uid else []
+        rivals = self._peers.claimants(alias.claim) if owner is None else [owner]
+        if owner == device.uid:
+            rivals = []
         self._log_conflict(device, alias.claim, rivals, owner)
         if rivals:
             self._release(alias.claim)

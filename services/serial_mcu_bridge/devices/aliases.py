@@ -59,7 +59,7 @@ def outlet_feature(claim: str) -> set[str]:
 
 
 def _why_not(claim: str, interface: Mapping[str, Any], lookup: Lookup) -> str:
-    """Return why an MCU must not use this channel: it would command or imitate the robot, or be unreadable."""
+    """Return why an MCU must not use this channel; empty if it may. It must not command or imitate the robot."""
     direction, family = claim.split("/")[:2]
     if family in _OWN_FAMILIES or c.is_reserved(family):
         return f"{direction}/{family} is the robot's own"

@@ -79,7 +79,7 @@ class Device:
         )
 
     def alias_body(self, route: Route, sample: McuSample) -> Payload | None:
-        """Return a sample as the payload of its alias; None if there is none yet. Stores motion, for summaries."""
+        """Return a sample as the payload of its alias, and store motion. None: there is no motion to summarise."""
         body = "" if route.alias is None else route.alias.body
         if route.interface.profile == imu.MOTION and imu.fits(imu.MOTION, sample.value):
             motion = self._reports.motion(sample.t, sample.seq, sample.mcu_ms, sample.value)  # summaries repeat it

@@ -21,7 +21,7 @@ class Outbox:
         self.waiting: dict[str, _Waiting] = {}  # by kind
 
     def drive(self, line: bytes, now: float, valid_s: float, replaces: str = "") -> None:
-        """Add a drive line that is valid for ``valid_s``, at most the timeout; ``replaces``: another kind."""
+        """Add a drive line that is valid for ``valid_s``, at most the timeout; drop a line of kind ``replaces``."""
         self.waiting.pop(replaces, None)
         self._place(_DRIVE, _Waiting(line, now + min(valid_s, self._drive_timeout)))
 

@@ -19,7 +19,7 @@ class Silence:
         self._received = 0
         self._received_at: float | None = None
         self._counted_at = 0.0
-        self._in_row = 0
+        self._unasked = 0  # checks in a row in which data had come unasked
 
     def check(self, state: LineState, opened: int, received: int, now: float, *, idle: bool) -> tuple[str, int | None]:
         """Return the line's state, and how long the board has been silent: at least 0, 1000 or 10000 ms.
@@ -28,16 +28,16 @@ class Silence:
         nothing was sent to the board for a second.
         """
         if opened != self._opened:
-            self._opened, self._received, self._received_at, self._in_row = opened, 0, None, 0
-        sent = received != self._received
+            self._opened, self._received, self._received_at, self._unasked = opened, 0, None, 0
+        has_sent = received != self._received
         self._received = received
-        if sent:
+        if has_sent:
             self._received_at = now
-        if self._in_row < _REGULAR and now - self._counted_at >= 0.9 * CHECK_S:
-            self._counted_at, self._in_row = now, self._in_row + 1 if sent and idle else 0
+        if self._unasked < _REGULAR and now - self._counted_at >= 0.9 * CHECK_S:
+            self._counted_at, self._unasked = now, self._unasked + 1 if has_sent and idle else 0
         if self._received_at is None or state is not LineState.READY:
             return state.value, None
         age_s = now - self._received_at
         if age_s >= _SILENT_S:
-            return "silent" if self._in_row >= _REGULAR else state.value, 10_000
+            return "silent" if self._unasked >= _REGULAR else state.value, 10_000
         return state.value, 0 if age_s < _RECENT_S else 1_000

@@ -21,7 +21,7 @@ class Starts:
             self._starts.append(now)
 
     def sent(self, opened: int, mcu_ms: int, now: float) -> None:
-        """Note the board's clock, which is 0 when the board starts; ``opened`` counts openings of the line."""
+        """Note the board's clock, which begins at 0 with each start. A clock that goes back shows a start."""
         earlier, self._clock = self._clock, (opened, mcu_ms)
         if earlier is not None and earlier[0] == opened:
             back_ms = (earlier[1] - mcu_ms) % (1 << _CLOCK_BITS)

@@ -9,7 +9,7 @@ PATIENCE_S = 0.5  # so long each waits
 
 
 class WaitingQueries:
-    """Queries, each with the number of retained messages per client that its answer must include. Not thread-safe."""
+    """Queries that wait, each until a given number of retained messages of each client is here. Not thread-safe."""
 
     def __init__(self) -> None:
         self._received: dict[str, int] = {}  # how many retained messages have arrived, by client
@@ -18,7 +18,7 @@ class WaitingQueries:
         self._looks = False  # True if some of them may have waited for long enough
 
     def count_from(self, client: str, count: int) -> None:
-        """Note that all ``count`` retained messages that this client has sent until now are here."""
+        """Note that this client has sent ``count`` retained messages until now, and that all of them are here."""
         self._received[client] = count
 
     def received(self, client: str, count: int) -> None:

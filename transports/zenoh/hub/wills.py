@@ -13,18 +13,18 @@ class WillTimes:
         self._due: dict[str, float] = {}
 
     def on_hello(self, name: str, now: float, *, alive: bool, has_will: bool) -> None:
-        """Note a client's will. If the client's token does not follow, the client has died since."""
+        """Note a client's hello. If its token is not there yet (``alive``) and does not follow, its will is due."""
         if alive:
             self._due.pop(name, None)
         elif has_will:
             self._due[name] = now + RETURN_S
 
     def on_gone(self, name: str, now: float) -> None:
-        """Note that the token of a client has gone, which has left a will here."""
+        """Note that a client that has left a will here is gone: its token has disappeared."""
         self._due[name] = now + GONE_S
 
     def on_restart(self, names: Iterable[str], now: float) -> None:
-        """Note the wills that were stored before a restart: their clients may come back."""
+        """Set the times of the wills that were stored before a restart, so that their clients can come back before."""
         for name in names:
             self._due.setdefault(name, now + RETURN_S)
 

@@ -73,7 +73,7 @@ def rights(trial: BrokerTrial) -> CheckResult:
 
 
 def _why_unread(trial: BrokerTrial, reader: Peer) -> str:
-    """Publish once more, without QoS 1; return why that message is not delivered, either, or "" if it is."""
+    """Publish once more, with QoS 0; return why even that message is not delivered, or "" if it is."""
     writer = trial.peer()
     writer.publish("x")
     if not trial.wait(lambda: reader.received or writer.closed):
@@ -189,7 +189,7 @@ def pings(trial: BrokerTrial) -> CheckResult:
 
 
 def _late(trial: BrokerTrial, peer: Peer) -> int:
-    """Return how many of twenty messages arrive after the answer to a ping that was sent after all of them."""
+    """Send twenty messages and then a ping; return how many of the messages arrive after the ping's answer."""
     for place in range(20):
         peer.publish("x", b"%d" % place)
     peer.ping()

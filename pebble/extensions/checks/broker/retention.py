@@ -52,7 +52,8 @@ def before_pong(trial: BrokerTrial) -> CheckResult:
     reader.ping()
     expected = len(names) if trial.wildcards else _BY_NAME
     trial.wait(lambda: len(reader.received) >= expected)
-    late = len(reader.received) - (reader.pongs or [0])[0]
+    received_before_pong = reader.pongs[0] if reader.pongs else 0
+    late = len(reader.received) - received_before_pong
     return warn(f"{late} of {expected} come later") if late else ok("all of them")
 
 

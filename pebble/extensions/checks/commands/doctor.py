@@ -168,8 +168,9 @@ def _broker(settings: MqttSettings, below: str, *, restart: bool, as_json: bool)
             printer.take(result)
         states = dict.fromkeys(printer.names("failed"), State.FAILED)
         if not states:
-            for result in beyond_loopback("broker", settings, own_addresses()) if is_loopback(settings.host) else ():
-                printer.take(result)
+            if is_loopback(settings.host):
+                for result in beyond_loopback("broker", settings, own_addresses()):
+                    printer.take(result)
             with reached(settings, below, _ask_to_restart if restart else None) as trial:
                 for probe, result in judge(trial):
                     printer.take(result, probe.why)
@@ -178,8 +179,9 @@ def _broker(settings: MqttSettings, below: str, *, restart: bool, as_json: bool)
                 more = f" and {len(trial.left) - 1} more" if len(trial.left) > 1 else ""
                 typer.echo(f"pebble: warning: still retained at the broker: {next(iter(trial.left))}{more}", err=True)
     words = assessment(states)
-    for line in () if as_json else words:
-        typer.secho(line, bold=True)
+    if not as_json:
+        for line in words:
+            typer.secho(line, bold=True)
     limits = printer.end(warnings_count=True, assessment=words)
     return 2 if printer.names("failed") else limits
 

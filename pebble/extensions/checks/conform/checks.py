@@ -63,7 +63,7 @@ def commanded(robot: Observer) -> str:
 
 
 def readable(robot: Observer) -> str:
-    """Return why this account cannot see requests to the robot: it sends one that changes nothing, and waits for it."""
+    """Return why this account cannot read requests to the robot; empty if one that changes nothing arrives."""
     account = (robot.account or "") if robot.view.named else ""
     is_read = robot.send_as(account, c.CONTROL, ControlRequest(id=secrets.token_hex(4), want="release"))
     return "" if is_read else "its broker does not let this account read incoming/: use an admin's"
@@ -181,13 +181,15 @@ def own_topics(robot: Observer) -> CheckResult:
 
 def _topics(value: object, path: str) -> Iterator[tuple[str, str]]:
     """Yield each value whose key says that it is a topic, at any depth."""
-    for key, inner in value.items() if isinstance(value, dict) else ():
+    fields = value if isinstance(value, dict) else {}
+    for key, inner in fields.items():
         where = f"{path}.{key}".lstrip(".")
+        parts = inner if isinstance(inner, list) else [inner]
         if isinstance(inner, str) and key.endswith("topic"):
             yield where, inner
-        for topic in inner if isinstance(inner, list) and key.endswith("topics") else ():
-            yield where, str(topic)
-        for part in inner if isinstance(inner, list) else (inner,):
+        if isinstance(inner, list) and key.endswith("topics"):
+            yield from ((where, str(topic)) for topic in inner)
+        for part in parts:
             yield from _topics(part, where)
 
 

@@ -38,7 +38,7 @@ class Driver:
         self._robot.send(c.CONTROL, self.request(want, for_ms))
 
     def leaves(self) -> bool:
-        """Release control; return False if the robot still shows it."""
+        """Release control; return False if the robot still reports this driver as the holder."""
         self.asks("release")
         return self._robot.answers(lambda: not self.holds)
 
@@ -48,8 +48,8 @@ class Driver:
 
     def send(self, z: object = 0, *, key: str | None = None, wrapped: bool = False, **fields: object) -> float:
         """Send one command; return the time (monotonic). ``key`` replaces its own key; "" sends none."""
-        of = self.key if key is None else key
-        command = {"x": 0, "z": z, **({"key": of} if of else {}), **fields}
+        key = self.key if key is None else key
+        command = {"x": 0, "z": z, **({"key": key} if key else {}), **fields}
         return self._robot.send(c.DRIVE, msgspec.json.encode({"value": command} if wrapped else command))
 
     def drive(self, seconds: float = DRIVES_S, *, z: object = SPEED, **fields: Any) -> tuple[float, float]:
@@ -68,7 +68,7 @@ class Driver:
 
     @property
     def key(self) -> str:
-        """Return the keys of its control, one for each motor owner; empty while it has no control."""
+        """Return the keys of this driver's control, one for each motor owner; empty while it has no control."""
         keys = [state.key for state in self._robot.view.control.states if state.id == self.id]
         return " ".join(keys) if self.holds else ""
 
@@ -147,7 +147,7 @@ def _taken(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _ends(robot: Observer, driver: Driver) -> CheckResult:
-    """Check that commands prolong control, with zeros, which move nothing, and that it ends after the last."""
+    """Check that zero commands prolong control although they move nothing, and that control ends after the last one."""
     began = time.monotonic()
     while driver.holds and time.monotonic() < began + 1.5 * _SHORTEST_MS / 1000:
         driver.send()

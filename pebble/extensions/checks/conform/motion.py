@@ -105,9 +105,9 @@ def _are_wheels(value: Any) -> bool:
 
 @contextmanager
 def at_the_wheel(robot: Observer, by: str = BY, answer_s: float = ANSWER_S) -> Iterator[Driver]:
-    """Yield a driver, which takes control if it is free.
+    """Yield a driver that takes control if it is free.
 
-    It sends a zero first and last, since a reset holds until the stick was at rest.
+    The driver sends a zero first and last: after a reset, a robot moves only once the stick was at rest.
     """
     driver = Driver(robot, by)
     try:

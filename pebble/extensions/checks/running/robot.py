@@ -48,7 +48,7 @@ class RobotSide(Observer):
         return is_loopback(config.services.mqtt_bridge.remote_mqtt.host)
 
     def ask(self, patience_s: float) -> None:
-        """Subscribe to retained topics by name, as some brokers require; the capabilities list some of them."""
+        """Subscribe to retained topics by name, as some brokers require, also to those of motor owners."""
         estop = self.view.estop
         self.transport.ask([self._addresses[channel].topic for channel in _WATCHED if not channel.is_pattern])
         self.wait(lambda: estop.has_capabilities, patience_s)
@@ -130,7 +130,7 @@ class RobotUnderTest:
 
 
 def user_of(folder: Path) -> pwd.struct_passwd | None:
-    """Return the user as whom root must reach the robot with this folder; None: no other user.
+    """Return the user that root must become to reach the robot with this folder; None: the present user.
 
     As that user, root leaves no files of its own.
     """

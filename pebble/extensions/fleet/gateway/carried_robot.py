@@ -45,7 +45,7 @@ LARGEST = 1024 * 1024  # bytes of a message; the brokers of `pebble fleet` take 
 
 
 class NamedSubjects(Subjects):
-    """The subjects of a robot without renamed topics. Topics with an account's name are forwarded unchanged."""
+    """A robot's subjects without renamed topics. Topics with an account's name are forwarded unchanged."""
 
     def _find(self, topic: str) -> Subject | None:
         if not topic.startswith(f"{self._base}/{INCOMING}/{BY}/"):
@@ -59,9 +59,9 @@ class NamedSubjects(Subjects):
 
 
 class Beginning:
-    """The time since which commands may have waited behind a new robot's retained messages at the broker.
+    """A stopwatch of the start of forwarding. Meanwhile commands may wait at the broker behind retained messages.
 
-    All share a connection that is almost never idle, so pings cannot tell their age.
+    All robots share a connection that is almost never idle, so pings cannot tell the age of a command.
     """
 
     LONG_S, REST_S = 0.5, 0.25  # what moves may wait so long; so long after it what had waited is still being read
@@ -80,7 +80,7 @@ class Beginning:
         self._began = None
 
     def aged(self, message: Message) -> Message:
-        """Return ``message`` with the time since which it may have waited. Called for each message."""
+        """Return ``message`` with the time since which it may have waited at the broker. Called for each message."""
         began = self._began
         if began is None and self._until == float("-inf"):
             return message
@@ -119,8 +119,8 @@ def _subscribe(robots: Sequence["CarriedRobot"], side: Side, transport: Transpor
 class CarriedRobot:
     """A robot of the hub for which the gateway forwards.
 
-    ``stops_pass``: called for each stop; True if another connection carries it. ``too_large``: called with the topic of
-    a message that is too large for any broker.
+    ``stops_pass()``: True if another connection carries stops; called for each stop. ``too_large``: called with the
+    topic of a message that is too large for any broker.
     """
 
     def __init__(

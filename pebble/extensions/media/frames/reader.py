@@ -239,7 +239,7 @@ class FrameReader:
         return "" if shared_memory.lockable(needed) else self._memlock_problem(needed)
 
     def _reopen_soon(self, problem: str) -> None:
-        """Let the next `read` reopen the session, without sharing after a ``problem``: this thread cannot."""
+        """Request that the next `read` reopens the session without sharing: the thread that calls this cannot."""
         self.problem = problem
         self._sharing_ended.set()
         self._latest.wake()

@@ -113,7 +113,7 @@ def lockable(size: int) -> bool:
 
 
 def memlock_problem(size: int, what: str) -> str:
-    """Return the reason, for logs, why ``what`` cannot share memory, and the limit to raise: not ``lockable(size)``."""
+    """Return a sentence for logs: why ``what`` cannot share memory, as it is not ``lockable(size)``, and what to do."""
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     return (
         f"{what} cannot use shared memory, frames are sent as bytes: this process may lock {limit >> 10} KiB "

@@ -119,7 +119,7 @@ def zenoh_version() -> str:
 
 
 def _offsets(buffer: Buffer) -> set[int]:
-    """Return the offsets in the object at which the address stands that Zenoh prints."""
+    """Return the offsets in the buffer object at which its address stands; Zenoh prints that address."""
     address = _printed(buffer)
     words = range(_HEAD, type(buffer).__basicsize__ - _WORD + 1, _WORD)
     return {offset for offset in words if _read_word(buffer, offset) == address}

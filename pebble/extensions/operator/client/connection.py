@@ -72,9 +72,9 @@ def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
 
 @contextmanager
 def listening(target: Target, sender: Transport) -> Iterator[Transport]:
-    """Open another connection to the same place as ``sender``, without waiting for it, so that it delays no command.
+    """Yield a connection to the same broker as ``sender``, for receiving, so that what arrives delays no command.
 
-    It is ``sender`` itself where each client needs its own id, and within a robot's Zenoh network.
+    It need not be connected yet. Yields ``sender`` itself if the config sets the client id, or on Zenoh.
     """
     kind, settings, _, _ = resolve(target)
     if not isinstance(settings, MqttSettings) or settings.client_id is not None:

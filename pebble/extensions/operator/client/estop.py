@@ -146,9 +146,8 @@ class RobotStop:
             return
         if self.estop.has_capabilities and not had_capabilities:
             self.next, self._names_due = now, self.estop.named  # its topics may be others
-        self._boots.update(
-            {owner: self.estop.states[owner].boot for owner in self.estop.owners if self._lists_it(owner)}
-        )
+        listing = [owner for owner in self.estop.owners if self._lists_it(owner)]
+        self._boots |= {owner: self.estop.states[owner].boot for owner in listing}
         if self.confirmed_s is None:
             if self.estop.owners and self.estop.available and not (self.unconfirmed or self.estop.zeros):
                 self.confirmed_s = now - self._began
@@ -177,9 +176,8 @@ class RobotStop:
             messages.append(_message(AUTONOMY_COMMAND, self.estop.script_topic, _END_SCRIPT))
         topics = dict.fromkeys((self.estop.drive_topic, *self.estop.zeros))
         messages += [_message(DRIVE, topic, _ZERO) for topic in topics]
-        return [
-            message for message in messages if not self._order.own_only or _is_incoming(message.topic, self.estop.base)
-        ]
+        own_only = self._order.own_only
+        return [message for message in messages if not own_only or _is_incoming(message.topic, self.estop.base)]
 
     def give_up(self) -> None:
         """Stop sending to this robot."""
@@ -197,7 +195,7 @@ class RobotStop:
         return state is not None and self._order.name in state.recent
 
     def _has_taken_it(self, owner: str) -> bool:
-        """True if the owner has listed this stop since the stop's start; its present stop may be a later one."""
+        """True if the owner's state has shown this stop, even if it shows a later one, and no restart since."""
         state = self.estop.states.get(owner)
         return state is not None and self._boots.get(owner) == state.boot
 
@@ -208,8 +206,8 @@ class StopSender:
     Publish what ``tick`` returns, pass every message of the robots' ``outgoing/#`` to ``receive``, and call ``tick``
     again afterwards and at ``due``. Times are seconds of one monotonic clock. A ``hold`` lasts until ``end``.
 
-    A stop of all is sent to every robot as soon as any message of it arrives. ``robots`` are those to which it is also
-    repeated without that, and which confirm it; if there are too many, the others count as ``omitted``.
+    A stop of all robots is sent to each robot that publishes anything. To those in ``robots`` it is repeated until they
+    confirm it. If there are too many, the stops of the others count as ``omitted``.
     """
 
     def __init__(
@@ -311,7 +309,7 @@ class StopSender:
 
     @property
     def _collect_s(self) -> float:
-        """Return for how many seconds newly heard robots are stopped: longer if some are reached only later."""
+        """Return for how many seconds newly heard robots are stopped: longer if there are too many to be confirmed."""
         return GIVE_UP_S if self.omitted else COLLECT_S
 
     def _receive_first(self, base: str, message: Message, now: float) -> None:

@@ -77,8 +77,8 @@ def listed(configs: object) -> list[Setting]:
 
     Invalid entries are left out; an unknown type counts as text.
     """
-    settings = []
-    for entry in configs if isinstance(configs, list) else ():
+    settings, entries = [], configs if isinstance(configs, list) else []
+    for entry in entries:
         with suppress(ValidationError, TypeError, KeyError):
             settings.append(convert(entry if entry["type"] in _TYPES else {**entry, "type": "string"}, Setting))
     return settings

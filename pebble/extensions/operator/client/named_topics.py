@@ -34,7 +34,7 @@ def why_not(name: str, account: str) -> str:
 
 
 class NamedTopics:
-    """The topics of a client. ``account``: its user name at the broker; ``is_named``: by a robot's base topic."""
+    """A client's topics, for ``account``, its user name at the broker; ``is_named(base)``: that robot needs one."""
 
     def __init__(self, account: str, is_named: Callable[[str], bool]) -> None:
         self.account = account

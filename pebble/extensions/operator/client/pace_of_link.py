@@ -24,7 +24,7 @@ _USELESS_MS, _LONGEST_S = 500, 2.0
 class Pace(NamedTuple):
     """The rate of messages to one robot.
 
-    ``stamped``: moving commands carry ``t`` and ``key``, requests for control ``t``.
+    ``stamped``: moving commands carry a time ``t`` and a ``key``, and requests for control a time ``t``.
     """
 
     step_s: float = _LEAST_S  # at least, between two commands of one gesture
@@ -36,10 +36,7 @@ class Pace(NamedTuple):
     answer_s: float = LEVELS["wide"].answer_s  # a robot that has not answered by then will not
 
     def dated(self, drive: Drive, now: float, key: str) -> Drive:
-        """Return a moving command with its time, and with the validity for this link.
-
-        ``key`` is used if the robot has given none.
-        """
+        """Return a moving command with its time, its validity for this link, and ``key`` if it has no other."""
         if not self.stamped:
             return drive
         return replace(drive, t=ms(now), key=drive.key or key, valid_ms=self.valid_ms)

@@ -76,16 +76,13 @@ class RobotEstop:
 
     @property
     def missing_control(self) -> list[str]:
-        """Return the topics of missing control states of these owners, if the robot publishes control."""
+        """Return the topics of missing control states of the listed owners, if the robot publishes control."""
         owners = [owner for owner in self.owners if owner not in self._states] if self.keeps_control else []
         return [CONTROL_STATE.topic(self.base, owner=owner) for owner in owners]
 
     @property
     def old(self) -> bool:
-        """True if the robot is known to have no emergency stop.
-
-        False for a robot that cannot receive its own topics.
-        """
+        """True if the robot is known to have no emergency stop; False if its broker refuses the topics of the stop."""
         return self.has_capabilities and not self.announces
 
     def subscribe(self, transport: Transport) -> None:

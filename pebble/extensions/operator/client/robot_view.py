@@ -275,7 +275,7 @@ class RobotView:
 
     @property
     def slow_s(self) -> float | None:
-        """Return how long commands take over the robot's thin link; None without one, or if it is offline."""
+        """Return how many seconds commands take over a thin link; None if the robot is offline or its link wide."""
         link = self.link
         return None if link is None or link.level == "wide" or self.liveness.reported_offline else way_s(link)
 

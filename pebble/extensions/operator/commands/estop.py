@@ -170,7 +170,7 @@ def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
 
 
 def _listen(transport: Transport, filters: list[str]) -> tuple[Listener, threading.Thread]:
-    """Subscribe on a thread, so that a slow network does not delay the stop; return the thread."""
+    """Subscribe on a thread, so that a slow network does not delay the stop; return the listener and the thread."""
     listener = Listener(transport, ())
 
     def subscribe() -> None:
@@ -246,19 +246,19 @@ class _Report:
     def update(self, now: float) -> None:
         if now - self._updated >= _REPORT_PERIOD_S:
             self._updated = now
-            self._print(patient=now - self._began < _QUICK_S)
+            self._print(is_early=now - self._began < _QUICK_S)
 
     def end(self) -> None:
         sender = self._sender
-        self._print(patient=False)
+        self._print(is_early=False)
         if not sender.robots:
             _echo("no robot was found: NOTHING IS STOPPED")
         if sender.omitted:
             _echo(f"there are more than {len(sender.robots)} robots: the others got the stop, NOT CONFIRMED")
 
-    def _print(self, *, patient: bool) -> None:
+    def _print(self, *, is_early: bool) -> None:
         for base, robot in list(self._sender.robots.items()):
-            line = _line(robot, patient=patient, sent=self._outbox.has_sent(base))
+            line = _line(robot, is_early=is_early, sent=self._outbox.has_sent(base))
             if line and robot.driveable is not None and robot.driveable.doubt:
                 line += f"; its status says: {robot.driveable.doubt}"
             if self._lines.get(base, "") != line:
@@ -274,7 +274,8 @@ def _echo(line: str, *, err: bool = False) -> None:
         show.discard_output(sys.stderr if err else sys.stdout)
 
 
-def _line(robot: RobotStop, *, patient: bool, sent: bool) -> str:
+def _line(robot: RobotStop, *, is_early: bool, sent: bool) -> str:
+    """Return the progress of the stop of a robot in words; nothing is missing yet while it ``is_early``."""
     match robot.progress:
         case Progress.CONFIRMED if not robot.estop.latched:
             return "was stopped, and reset since"
@@ -291,9 +292,9 @@ def _line(robot: RobotStop, *, patient: bool, sent: bool) -> str:
             return "does not drive"
         case Progress.NOT_CONFIRMED:
             return f"NOT CONFIRMED, no longer sent: {_why(robot)}"
-    if not sent:
-        return "" if patient else "STOP NOT SENT YET: it waits for the network"
-    return "stop sent" if patient else f"stop sent, not confirmed yet: {_why(robot)}"
+    if is_early:
+        return "stop sent" if sent else ""
+    return f"stop sent, not confirmed yet: {_why(robot)}" if sent else "STOP NOT SENT YET: it waits for the network"
 
 
 def _why(robot: RobotStop) -> str:

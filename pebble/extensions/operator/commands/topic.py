@@ -160,10 +160,10 @@ def pub(
         message = draft(names, topic, payload, retain=retain, qos=qos, force=force)
         for warning in message.warnings:
             typer.echo(f"pebble: warning: {warning}", err=True)
-        robot = cache(lambda: _estop(transport, names, message.topic))
-        estop = robot() if not force and _moves(names, message) else None
+        estop_of_robot = cache(lambda: _estop(transport, names, message.topic))
+        estop = estop_of_robot() if not force and _moves(names, message) else None
         if not force:
-            put_names(transport, names, lambda _base: (view := robot()) is not None and view.named)
+            put_names(transport, names, lambda _base: (known := estop_of_robot()) is not None and known.named)
         for number in range(1 if rate is None else count or sys.maxsize):
             if number:
                 time.sleep(1 / (rate or 1))

@@ -172,7 +172,8 @@ def _missing(settings: WebSettings, *, plain: bool, empty: bool) -> list[str]:
     """
     if not settings.login and not empty:
         return []
-    missing = [] if (settings.certificate is not None or plain) and not empty else ["certificate"]
+    lacks_certificate = empty or not (settings.certificate is not None or plain)
+    missing = ["certificate"] if lacks_certificate else []
     return missing if has_user(settings.people) else [*missing, "user"]
 
 

@@ -51,7 +51,7 @@ class TerminalDriver:
 
     @property
     def filters(self) -> list[str]:
-        """Filters of the topics that :meth:`receive` needs. Within the robot there is no link."""
+        """Filters of the topics that :meth:`receive` needs; the link's only outside of the robot."""
         channels = (c.ESTOP_STATE, c.CONTROL_STATE, c.CAPABILITIES, c.ONLINE, c.CHARGING_LEVEL, c.AUTONOMY_STATUS)
         further = [*([c.LINK] if self._heartbeat else []), *([c.DRIVE] if self._assumes else [])]
         return [channel.filter(self.robot.base) for channel in (*channels, *further)]

@@ -101,7 +101,7 @@ class Tab:
 
 @dataclass(slots=True, eq=False)
 class Wish:
-    """A page's request for control of a robot that itself decides. The answer calls ``granted`` or ``failed``."""
+    """A page's request to a robot that decides itself who drives it. The answer calls ``granted`` or ``failed``."""
 
     client: ControlClient
     granted: Callable[[], None]
@@ -126,9 +126,9 @@ class DrivenRobot:
         self.renew_key()
 
     def renew_key(self) -> None:
-        """Choose a new key.
+        """Choose a new key for a new connection to the broker.
 
-        Robots without control compare the ages of commands per key, and commands of the old connection must not count.
+        Robots without control compare the ages of commands with one key; those of the old connection must not count.
         """
         self._key = secrets.token_hex(4)
 
@@ -194,7 +194,7 @@ class DrivenRobot:
     def take(
         self, tab: Tab, now: float, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool
     ) -> list[Command]:
-        """Request control for this page; ``over``: even from its present holder."""
+        """Request control, ``over``: even from its holder; return the commands for a handover at this server."""
         robot = self._view()
         if robot is not None and robot.controlled:
             wish = self._wishes.get(tab)
@@ -277,7 +277,7 @@ class DrivenRobot:
         elif self.state is State.HELD and now - self._idle_from > IDLE_S:
             commands += self._on(Event.ENDED, now)
         if self._repeats and (late_s := now - self._repeats[0]) >= 0:
-            self._repeats = [at for at in self._repeats if at > now]
+            self._repeats = [due for due in self._repeats if due > now]
             if late_s <= SILENCE_S:  # else this process stood still: a newer gesture may have begun elsewhere
                 commands.append(Command(self.ref, FINAL_ZERO))
         messages: list[Message] = []
@@ -318,22 +318,22 @@ class DrivenRobot:
         if robot is None or not robot.controlled or robot.control is not client.robot:
             client.release()  # it is gone, or was forgotten meanwhile
         client.update(now)
-        had = self.client is client
+        had_control = self.client is client
         commands: list[Command] = []
-        if had and client.decided != self._decided:
+        if had_control and client.decided != self._decided:
             commands = self._on(Event.LOST, now)
         if client.held and self.client is not client:
             commands += self._give(tab, client, now)
             wish.granted()
         if client.failed:
-            if not had:  # who has had it sees who has it now
+            if not had_control:  # a page that loses control is shown the new driver instead
                 wish.failed(client.failed)
             client.failed = ""
             self._changed.add(self.ref)
         return commands
 
     def _is_over(self, wish: Wish, now: float) -> bool:
-        """True if the robot has confirmed the end of control. Until then this server has it."""
+        """True if the request has ended, and the robot confirms it by its state, or has not answered in time."""
         if not wish.client.done:
             wish.ended_at = float("inf")
             return False
@@ -349,7 +349,7 @@ class DrivenRobot:
         return replace(state, by=state.by or "somebody")
 
     def _active(self, now: float) -> str:
-        """Return the user who drives now and must be asked; empty if control can be taken."""
+        """Return the user who drives now, and must be asked for control; empty if control can be taken."""
         if other := self._elsewhere():
             return other.by
         if self.tab is None or (self.state is State.HELD and now - self._idle_from >= TAKEN_FROM_IDLE_S):
@@ -361,7 +361,7 @@ class DrivenRobot:
             other = self._active(now)
             return words(Code.LEASE if other else Code.LISTENING, driven=other)
         if tab.moves is not None and (tab.gesture != op.g or tab.moves is not self):
-            return LET_GO  # the end of the one before was lost
+            return LET_GO  # the end of the earlier gesture was lost
         if tab.moves is not None and now - self._received_at > SILENCE_S:
             return LET_GO  # the page stood still, or this process
         if problem := tab.clock.problem(now):
@@ -369,7 +369,7 @@ class DrivenRobot:
         return words(Code.LATE) if tab.clock.late(op.t, now) else ""
 
     def _zero(self, tab: Tab, op: DriveOp, now: float) -> list[Command]:
-        """Forward a zero, whatever the state. At the end of a gesture it is the release."""
+        """Return a zero to publish, which is sent in every state. It ends the gesture, and all before it."""
         tab.over = max(tab.over, op.g)
         if tab.moves is self and op.g >= tab.gesture:
             self._on(Event.LETS_GO, now)

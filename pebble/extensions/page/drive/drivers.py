@@ -42,7 +42,7 @@ class Drivers:
         self.refusals = Refusals(broker, lambda ref: self.robot(ref).moved_by, robots.view)
 
     def robot(self, ref: str) -> DrivenRobot:
-        """Return that robot. A robot at rest is not remembered."""
+        """Return the driving of this robot, a new one if it was at rest."""
         robot = self._driven.get(ref)
         if robot is None:
             robot = self._driven[ref] = DrivenRobot(ref, partial(self._robots.view, ref), self._changed)
@@ -120,7 +120,7 @@ class Drivers:
     def accompany(self, tab: Tab, ref: str, channel: Channel, message: Message) -> bool:
         """Keep lights for the next drive command of this page's gesture, and return True; False: send them now.
 
-        They share a message where the robot lists both as members of a group.
+        Lights and command share a message, so the robot must list both as members of a group.
         """
         listed = self._robots.capabilities(ref).get("groups")
         joins = isinstance(listed, list) and DRIVE.metric in listed and channel.metric in listed
@@ -143,7 +143,7 @@ class Drivers:
         self._publish(self.robot(ref).update(clock()))
 
     def renew_keys(self) -> None:
-        """Note that there is a new connection to the broker."""
+        """Choose new keys for all robots, because the connection to the broker is new."""
         for robot in self._driven.values():
             robot.renew_key()
 
@@ -168,8 +168,8 @@ class Drivers:
     def _publish(self, commands: list[Command], by: str = "") -> bool:
         """Publish a person's drive commands to the robot's own topic; return False if one was not accepted.
 
-        What is to accompany a command shares its message; a zero goes alone, and first. After a group a second zero
-        follows in its topic: there it takes the place of a group that still waits for a slow connection.
+        Waiting lights share the message of a moving command. A zero goes alone, and before them. After a group, a
+        second zero follows on the group's topic: it replaces a group that still waits for a slow connection.
         """
         accepted = True
         for ref, drive, qos in commands:

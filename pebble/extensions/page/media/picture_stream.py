@@ -49,9 +49,10 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         """Handle a page's answer: 0 drawn, 1 key frame wanted, 2 encoding cannot be decoded."""
         now = time.monotonic()
         frame = viewer.queue.acknowledge(seq, now)
-        if what == 1 and (frame is not None or seq == NO_FRAME):
-            viewer.queue.refuse(now)
-        elif what == 2 and (frame is not None or seq == NO_FRAME):
+        is_valid = frame is not None or seq == NO_FRAME
+        if what == 1 and is_valid:
+            viewer.queue.note_keyframe_request(now)
+        elif what == 2 and is_valid:
             viewer.queue.cannot_decode(self._arrivals.encoding if frame is None else frame.encoding)
         viewer.wakeup.set()
         if what:

@@ -102,16 +102,16 @@ class Link:
 
 
 class RobotSource:
-    """A robot in an archive. ``begins`` is called with a time and the picture at that time.
+    """The messages of one robot in an archive, for a player. ``begins`` gets a time and the picture at that time.
 
-    Messages received exactly at a time belong to the state at that time.
+    A message received exactly at a time belongs to the state at that time.
     """
 
     def __init__(self, archive: Archive, ref: str, begins: Callable[[int, Recorded | None], None]) -> None:
         self._archive, self._ref, self._begins = archive, ref, begins
 
     def messages(self, since_ns: int, until_ns: int) -> Iterator[Recorded]:
-        """Yield the messages from a time on."""
+        """Yield the messages after ``since_ns``, in steps, until a step reaches ``until_ns``."""
         next_ns: int | None = since_ns + 1
         while next_ns is not None and next_ns < until_ns:
             messages = self._archive.messages(self._ref, next_ns, next_ns + _STEP_NS)

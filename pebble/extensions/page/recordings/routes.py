@@ -48,7 +48,7 @@ _export_decoder = msgspec.json.Decoder(ExportRequest)
 
 @dataclass(slots=True)
 class _Timeline:
-    """A timeline, or the job that makes it. ``made``: JSON; while a newer one is being made, that of before."""
+    """A timeline and the job that makes it. ``made``: JSON, that of an earlier job while this one runs."""
 
     paths: list[str]
     active: bool
@@ -57,7 +57,7 @@ class _Timeline:
     began_at: float  # seconds since the machine was started
     made: bytes | None = None
 
-    def take(self) -> bytes | None:
+    def newest(self) -> bytes | None:
         if self.job.ready and self.target.exists():
             self.made = self.target.read_bytes()
             self.target.unlink()
@@ -103,7 +103,7 @@ class Recordings:
         self._scratch.cleanup()
 
     async def timeline(self, day: str, robot: str, *, again: bool = False) -> bytes | float:
-        """Return the timeline as JSON or, while it is made, how much is done (0 to 1). Raises PebbleError.
+        """Return the timeline as JSON or, while none is made yet, the finished share of the work. Raises PebbleError.
 
         After a failure it is made again only with ``again``, or for other recordings.
         """
@@ -111,13 +111,13 @@ class Recordings:
         paths, active = await self.process.ask(questions.files, robot, *period)
         timeline = self._timelines.pop(key, None)
         if timeline is None or self._is_old(timeline, paths, active=active, again=again):
-            before = None if timeline is None else timeline.take()
-            timeline = self._begin(robot, period, paths, active=active, before=before)
-        self._timelines[key] = timeline  # the last one used is the last one forgotten
+            earlier = None if timeline is None else timeline.newest()
+            timeline = self._begin(robot, period, paths, active=active, earlier=earlier)
+        self._timelines[key] = timeline  # at the end: the first ones are forgotten
         await self._forget()
         if timeline.job.why:
             raise PebbleError(timeline.job.why)
-        json_text = timeline.take()
+        json_text = timeline.newest()
         return timeline.job.done if json_text is None else json_text
 
     async def export(self, wanted: ExportRequest) -> str:
@@ -149,11 +149,11 @@ class Recordings:
             export.target.unlink(missing_ok=True)
 
     def _begin(
-        self, robot: str, period: tuple[int, int], paths: list[str], *, active: bool, before: bytes | None
+        self, robot: str, period: tuple[int, int], paths: list[str], *, active: bool, earlier: bytes | None
     ) -> _Timeline:
         target = self._target(f"{secrets.token_hex(8)}.json")
         job = Job(questions.make_timeline_job, paths, target, robot, period)
-        return _Timeline(paths, active, target, job, clock(), before)
+        return _Timeline(paths, active, target, job, clock(), earlier)
 
     def _target(self, name: str) -> Path:
         """Return the path for a job's result, in a new folder if the system has removed the old one."""

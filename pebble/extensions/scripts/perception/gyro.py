@@ -39,7 +39,7 @@ class GyroHeading:
             self._limited = self._limited or abs(z_dps) >= _LIMIT_DPS
 
     def take(self, wheels_rad: float, now: float) -> float | None:
-        """Return the turn since the last call; None: use ``wheels_rad``, the turn that the wheels show."""
+        """Return the turn since the last call; None if ``wheels_rad``, the turn by the wheels, must be used."""
         turn, self._turn_rad = self._turn_rad, 0.0
         limited, self._limited = self._limited, False
         if now - self._at > _FRESH_S or limited or not self._trusted:

@@ -113,7 +113,7 @@ class PhaseTracker:
         return self._move_to(self.phase, nearest, power)
 
     def update_pair(self, phase: float, power: float) -> float:
-        """Return the phase added since the last sample, as ``update``; ``phase`` is known but for whole waves."""
+        """Return the phase added since the last sample; ``phase``: within its wave, as two sensors show it."""
         if self.phase is None:
             self.phase = self._farthest = phase
             return 0.0
@@ -123,7 +123,7 @@ class PhaseTracker:
     def _predict(self, power: float) -> float:
         """Return the phase that this sample should add: by the power, and by the measured speed if that agrees.
 
-        When the expected direction changes, the farthest phase in that direction is the present one.
+        If the expected direction changes, the present phase becomes the farthest one, so that the phase can go back.
         """
         before = self._expected
         drive = (self._power + power) / 2  # a command comes between two samples
@@ -164,7 +164,7 @@ class HallWheel:
 
     @property
     def ready(self) -> bool:
-        """True if distances are final, or there are none yet. Until then, each may correct the last."""
+        """True if earlier distances will not be corrected any more, or there are none yet."""
         return self._warm_up is None or not self._range.swings
 
     @property
@@ -243,7 +243,7 @@ class HallWheel:
         counts.rad_in_any_direction += abs(added)
 
     def _second_sensor(self, samples: list[HallSample]) -> int:
-        """Return 1 or −1 if the second sensor shows the commanded directions, as mounted; 0 if it shows nothing."""
+        """Return the sign with which the second sensor shows the commanded directions, 1 or −1; 0 if it shows none."""
         if not self._second.swings or self._second.extrema < 1:
             return 0
         agreed = total = run = 0.0  # run: the motion since the direction changed

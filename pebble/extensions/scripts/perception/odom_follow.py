@@ -28,12 +28,10 @@ def pose_of(odometry: WheelOdometry | None) -> Pose | None:
     if odometry is None:
         return None
     value = odometry.value
-    parts = [
-        _number(value, *names) for names in (("x_mm", "x"), ("y_mm", "y"), ("heading_rad", "theta_rad", "heading"))
-    ]
-    if parts[2] is None and (degrees := _number(value, "heading_deg", "theta_deg")) is not None:
-        parts[2] = math.radians(degrees)
-    x, y, heading = parts
+    x, y = _number(value, "x_mm", "x"), _number(value, "y_mm", "y")
+    heading = _number(value, "heading_rad", "theta_rad", "heading")
+    if heading is None and (degrees := _number(value, "heading_deg", "theta_deg")) is not None:
+        heading = math.radians(degrees)
     if x is None or y is None or heading is None:
         return None
     metres = 1.0 if odometry.unit.lower() in ("m", "meter", "meters") else 0.001

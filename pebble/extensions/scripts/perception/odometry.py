@@ -89,7 +89,7 @@ class WheelPose(NamedTuple):
 
 @dataclass(slots=True)
 class _Part:
-    """A part of the way, as an arc: of one sample, or of the whole time in which distances are corrected."""
+    """An arc of the way: the part of one sample, or the part whose distances may still be corrected."""
 
     ahead_mm: float = 0.0
     turn_rad: float = 0.0
@@ -106,7 +106,7 @@ class _Part:
 
 
 class _Wheel:
-    """A wheel, with the time when it last turned, and how often it did not turn although commanded."""
+    """A wheel, with the time when it last turned, and the number of times it has stalled."""
 
     def __init__(self, mm_per_step: float) -> None:
         self.hall = HallWheel(mm_per_step)
@@ -131,7 +131,7 @@ class _Wheel:
 
 
 class Directions:
-    """The power of both motors, and the direction in which each wheel may turn, which one sensor does not show."""
+    """The power of both motors, and the direction in which each wheel may turn. One hall sensor does not show it."""
 
     def __init__(self, now: float) -> None:
         self._power = (0.0, 0.0)  # left, right

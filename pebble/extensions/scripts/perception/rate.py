@@ -9,7 +9,7 @@ class Rate:
         self._due = float("-inf")
 
     def due(self, now: float) -> bool:
-        """True if the next turn is due. Turns have fixed times: since the last one, a part would be lost each time."""
+        """True if the next turn is due. Turns have fixed times, which do not depend on the times of the events."""
         self._due = min(self._due, now + 1.0 / self.hz)  # the rate was raised
         if now < self._due:
             return False

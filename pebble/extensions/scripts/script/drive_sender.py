@@ -68,7 +68,7 @@ class DriveSender:
         return obeyed
 
     def drive_another(self, now: float) -> str:
-        """Note a command for another robot; return :meth:`refusal`, as the end of this run ends that, too."""
+        """Note that the script drives another robot, too; return :meth:`refusal`, which holds there as well."""
         self._tried = True
         return self.refusal(now)
 
@@ -129,7 +129,7 @@ class DriveSender:
         return "a person drives" if self.overridden(now) else ""
 
     def ended(self, now: float) -> str:
-        """Return why this run can never drive again; empty if it can, or never wanted to."""
+        """Return why this run can never drive again; empty if it can, or if the script has never tried."""
         if not self._end and self._tried:
             if self._superseded:
                 self._end = SUPERSEDED
@@ -146,7 +146,7 @@ class DriveSender:
         return min(times, default=None)
 
     def _compare(self, owner: str, before: EstopState | None, now: EstopState) -> None:
-        """Compare an owner's states: a run never outlives an emergency stop, or an owner that has forgotten its bar."""
+        """End this run if an owner's states show an emergency stop or a restart, which forgets what it barred."""
         if self._end or before is None:
             return
         if before.boot != now.boot:

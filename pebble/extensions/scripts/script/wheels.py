@@ -23,8 +23,8 @@ log = logging.getLogger(__name__)
 class Wheels:
     """The wheels of a robot, for one run of a script. Any thread may call every method.
 
-    ``number`` returns the run's number, above the given one. ``on_ended`` is called once, from another thread, with the
-    reason why this run can never drive again.
+    ``number(least)`` returns the run's number, which is above ``least``. ``on_ended(why)`` is called once, from another
+    thread, when this run can never drive again.
     """
 
     def __init__(

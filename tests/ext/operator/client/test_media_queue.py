@@ -124,11 +124,11 @@ def test_a_page_that_did_not_draw_waits_unless_a_key_frame_is_on_its_way() -> No
     queue.offer_direct(frame(1), 0.0)
     queue.take(0.0)
     queue.acknowledge(0, 0.0)
-    queue.refuse(0.0)
+    queue.note_keyframe_request(0.0)
     assert queue.waiting
     queue.offer_direct(frame(2, keyframe=True), 0.1)
     queue.take(0.1)
-    queue.refuse(0.1)
+    queue.note_keyframe_request(0.1)
     assert not queue.waiting
 
 

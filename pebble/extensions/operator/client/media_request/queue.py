@@ -102,7 +102,7 @@ class ViewerQueue:
             self._late_at = now
 
     def forget_lateness(self, now: float) -> None:
-        """Forget that frames were late: earlier ones say nothing about later ones."""
+        """Forget that frames were late, because later frames come in another way."""
         self.late_acks, self._late_at = 0, now
 
     def wait_for_keyframe(self) -> None:
@@ -111,9 +111,9 @@ class ViewerQueue:
         self.waiting = True
 
     def not_drawn(self) -> None:
-        """Note that the page could not draw a frame; unless a key frame is on its way, it waits for one."""
-        under_way = [frame for _, frame in self._under_way.values()]
-        if not any(frame.keyframe for frame in (*under_way, *self._queue)):
+        """Skip frames up to the next key frame, unless one is on its way, because the page could not draw one."""
+        frames_under_way = [frame for _, frame in self._under_way.values()]
+        if not any(frame.keyframe for frame in (*frames_under_way, *self._queue)):
             self.wait_for_keyframe()
 
     def _may_send(self, size: int) -> bool:
@@ -131,7 +131,7 @@ class ViewerQueue:
         return self.window < WINDOW and frame.encoding != "h264"
 
     def _begin_at(self, frame: Frame) -> None:
-        """Choose a page's first frames: if it keeps up, also earlier ones; if it is slow, only the newest."""
+        """Queue a key frame. Frames before it are dropped if the page is slow or waits for a key frame."""
         late = self.window < WINDOW or len(self._queue) > _FRESH_FRAMES
         if self.waiting or late or self._queued_bytes() + len(frame.data) > MAX_QUEUED_BYTES:
             self.wait_for_keyframe()
@@ -151,7 +151,7 @@ class ViewerQueue:
         self._undecodable.add(encoding)
 
     def offer_direct(self, frame: Frame, now: float) -> None:
-        """Offer one of the robot's own pictures. A page in the rescue stream returns at a key frame."""
+        """Queue or skip one of the robot's own pictures. A key frame ends the page's time in the rescue stream."""
         if self.rescued:
             if not (frame.keyframe and now >= self._retry_at and self.decodes(frame.encoding)):
                 return
@@ -165,19 +165,19 @@ class ViewerQueue:
             self._waiting_since = now
 
     def offer_rescue(self, frame: Frame) -> None:
-        """Offer a picture of the rescue stream; it replaces a waiting one."""
+        """Queue a picture of the rescue stream in place of a waiting one, if the page gets that stream."""
         if self.rescued:
             self.wait_for_keyframe()
             self.offer(frame)
 
     def lost(self, now: float) -> None:
-        """Note that a picture from the robot is missing, so that the following differences cannot be used."""
+        """Skip frames up to the next key frame, because a picture from the robot is missing."""
         if not self.rescued:
             self._note_waiting(now)
             self.wait_for_keyframe()
 
-    def refuse(self, now: float) -> None:
-        """Note that the page requested a key frame."""
+    def note_keyframe_request(self, now: float) -> None:
+        """Skip frames up to the next key frame, because the page requested one."""
         if not self.rescued:
             self._note_waiting(now)
             self.not_drawn()
@@ -211,16 +211,16 @@ def assess(viewers: Collection[ViewerQueue], encoding: str, now: float, *, can_r
     A key frame costs all viewers and the robot's uplink. One is requested if most wait, or once for a new viewer. A
     slow viewer among fast ones gets the rescue stream instead, and so does one whose connection is thin.
     """
-    for viewer in viewers if can_rescue else ():
-        if not viewer.rescued and (viewer.is_thin or not viewer.decodes(encoding)):
+    for viewer in viewers:
+        if can_rescue and not viewer.rescued and (viewer.is_thin or not viewer.decodes(encoding)):
             viewer.rescue(now)
     direct = [viewer for viewer in viewers if not viewer.rescued and viewer.decodes(encoding)]
     patience = 0.0 if encoding == "h264" else _JPEG_PATIENCE_S
     waiting = [viewer for viewer in direct if viewer.waiting and viewer.waiting_s(now) >= patience]
-    if encoding != "h264" or 2 * len(waiting) >= len(direct):
-        return 0 < len(direct) <= 2 * len(waiting)
+    most_wait = 0 < len(direct) <= 2 * len(waiting)
+    if most_wait or encoding != "h264":
+        return most_wait
     for viewer in waiting:
         if can_rescue and (viewer.overflowed or viewer.waiting_s(now) > _RESCUE_AFTER_S):
             viewer.rescue(now)
-    new = [viewer for viewer in waiting if viewer.new]
-    return bool(new)
+    return any(viewer.new for viewer in waiting)

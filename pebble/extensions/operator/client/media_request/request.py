@@ -69,9 +69,9 @@ class ViewerRequest:
         return False
 
     def _receive_request(self, message: Message) -> None:
-        """Note a request: this client's own, or the newest of others.
+        """Note another client's request, unless it is only for a key frame.
 
-        A request for a key frame comes from a viewer, as this client is.
+        Recognise this client's own, which come back.
         """
         if message.payload in self.sent:
             self.sent.remove(message.payload)
