@@ -225,15 +225,17 @@ def _without_broken(config: Config) -> Config:
 @cache
 def _tree(installed: tuple[Extension, ...]) -> tuple[type[Root], Any, tuple[Rule, ...]]:
     """Return the classes of a config file and of a read config, with these extensions' sections, and the rules."""
-    tree = tree_of({key: extension.part(place) for added in installed for key, place in added.sections.items()})
-    added_fields = [
-        (field.name, field.type, field.default) for field in fields(tree) if field.name not in Root.__struct_fields__
-    ]
+    part = extension.part
+    file_class = tree_of({key: part(place) for added in installed for key, place in added.sections.items()})
+    ours = Root.__struct_fields__
+    more = [(field.name, field.type, field.default) for field in fields(file_class) if field.name not in ours]
     names = {"__doc__": Config.__doc__, "__module__": __name__}
-    kind = defstruct("Config", added_fields, bases=(Config,), namespace=names, frozen=True, kw_only=True)
-    with_rules = [added for added in installed if added.rules]
-    rules = [(checked, _guarded(added, rule)) for added in with_rules for checked, rule in extension.part(added.rules)]
-    return tree, kind, (*CHECKS, *rules)
+    config_class = defstruct("Config", more, bases=(Config,), namespace=names, frozen=True, kw_only=True)
+    rules: list[Rule] = []
+    for added in installed:
+        if added.rules:
+            rules += [(section, _guarded(added, rule)) for section, rule in part(added.rules)]
+    return file_class, config_class, (*CHECKS, *rules)
 
 
 def _guarded(owner: Extension, rule: Check) -> Check:

@@ -76,7 +76,7 @@ class MotorOwner(Service, ABC):
         self.on_stop(self._barred_file.close)
         self._deadline: Timer | None = None  # stops the motors unless a command arrives; None: they are stopped
         self._guard_timer: Timer | None = None
-        self.announced = True  # that it latches, to operators
+        self.announced_latching = True  # that it latches, to operators
         self._estop_note = Reported(self.notifier.feature, "estop", True)
         self._control_note = Reported(self.notifier.feature, "control", True)
 
@@ -286,20 +286,23 @@ class MotorOwner(Service, ABC):
 
     @every(_CHECK_S)
     def check_subscriptions(self) -> None:
-        """Withdraw the emergency stop while its topics are refused. TransportError for a refused drive topic."""
+        """Tell operators whether an emergency stop latches here: not while the broker refuses its topics.
+
+        Raises TransportError while the drive topic is refused: nothing could drive this robot.
+        """
         if self.refused(c.DRIVE):
             raise TransportError(
                 f"the broker refuses the subscription to {self.addresses[c.DRIVE].topic}: nothing can drive this robot."
                 " Permit the user in local_mqtt to subscribe to it"
             )
-        if self._latches is not self.announced:
-            self.announced = self._latches
-            self._announce()
+        if self._latches is not self.announced_latching:
+            self.announced_latching = self._latches
+            self._announce_latching()
         self._control_note.report("control", not self.refused(c.CONTROL))
-        self._estop_note.report("estop", self.announced)
+        self._estop_note.report("estop", self.announced_latching)
 
-    def _announce(self) -> None:
-        if self.announced:
+    def _announce_latching(self) -> None:
+        if self.announced_latching:
             self.log.warning("the subscriptions to the emergency stop are granted again: a stop latches")
             self.repeat_state()
             return

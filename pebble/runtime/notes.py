@@ -20,7 +20,7 @@ class Alive(Struct, frozen=True, tag_field="note", tag="alive"):
 
 
 class Wanted(Struct, frozen=True, tag_field="note", tag="wanted"):
-    """A request to run an on-demand program, first with ``encoding`` (empty: as configured), or its end."""
+    """A request to run an on-demand program, which begins with ``encoding`` (empty: as configured), or to end it."""
 
     program: _Name
     on: bool

@@ -73,7 +73,7 @@ def end_with_parent(number: int | None = None) -> None:
 
 
 class ProgramRequest(NamedTuple):
-    """A request to run an on-demand program, first with ``encoding`` (empty: as configured), or to end it."""
+    """A request to run an on-demand program, which begins with ``encoding`` (empty: as configured), or to end it."""
 
     on: bool
     encoding: str = ""

@@ -46,7 +46,7 @@ class Observer:
         self._names, self.view = names, RobotView(self.base)
         self.records: deque[Record] = deque(maxlen=_MOST)
         self.listeners: list[Callable[[Message, float], None]] = []  # get each message, and when it arrived (monotonic)
-        #: When its wheels changed (monotonic), and to what, left and right: from where it is seen besides.
+        #: Returns when the wheels changed (monotonic), and to what, left and right, as seen from outside; else nothing.
         self.eyes: Callable[[], list[tuple[float, list[float]]]] = list
         self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))
         self._slowest_s = ANSWER_S / 4  # of its answers

@@ -16,9 +16,10 @@ SECURITY = "dynamic-security.json"
 
 
 def convert(folder: Path, fleet: Fleet) -> tuple[Fleet, list[str]]:
-    """Write the plugin's passwords and the table's rules as files; return the fleet and the accounts left out.
+    """Write the plugin's passwords, and the access rules of ``fleet``, as files, and save the fleet.
 
-    Raises FleetError. The plugin's own file stays; mosquitto uses it until its configuration is changed.
+    Return the fleet as saved, and a line for each account that was left out. Raises FleetError. The plugin's own file
+    stays; mosquitto uses it until its configuration is changed.
     """
     file = folder / SECURITY
     try:

@@ -76,7 +76,7 @@ class LinkReport:
 
 
 class MediaHold:
-    """Requests to the launcher that programs with pictures or sound wait while a person drives over the same modem.
+    """A pause of the programs with pictures or sound while a person drives over the same modem. The launcher keeps it.
 
     ``send_one`` returns False if the launcher is busy.
     """

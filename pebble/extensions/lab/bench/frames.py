@@ -113,7 +113,7 @@ def measure(variant: str, condition: Params, seconds: float) -> Cell:
             if is_gstreamer and role == "writer":  # its readers fail without a writer; the others wait
                 worker.answer(_READY_S)
         workers = processes.workers
-        for worker in workers[is_gstreamer:]:
+        for worker in workers[1:] if is_gstreamer else workers:  # that writer has answered
             worker.answer(_READY_S)
         pids = [process.pid for process in (*workers, *([broker] if broker else []))]
         time.sleep(_STARTUP_S)
@@ -124,12 +124,13 @@ def measure(variant: str, condition: Params, seconds: float) -> Cell:
         time.sleep(_LATE_S)
         writer, *readers = (worker.ask("", _ANSWER_S) for worker in workers)
         memory_mb = [pss_mb(worker.pid) for worker in workers]
+        cpu_writer, *cpu_readers = cpu[: len(workers)]
     latencies_us = [(ns - stamp) / 1000 for reader in readers for stamp, ns in reader["arrived"] if stamp in window]
     return round_cell(
         variant, "frame", "us", latencies_us, condition,
         sent=sum(stamp in window for stamp in writer["stamps"]) * len(readers),  # each frame to each reader
         torn=sum(reader["torn"] for reader in readers),
-        cpu_writer=cpu[0], cpu_reader=fmean(cpu[1 : len(workers)]), memory_writer_mb=memory_mb[0],
+        cpu_writer=cpu_writer, cpu_reader=fmean(cpu_readers), memory_writer_mb=memory_mb[0],
         memory_reader_mb=fmean(memory_mb[1:]), **({} if broker is None else {"cpu_broker": cpu[-1]}),
     )  # fmt: skip
 

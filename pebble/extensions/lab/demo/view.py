@@ -53,7 +53,7 @@ class View:
 
     @contextmanager
     def _until_closed(self) -> Iterator[None]:
-        """End the demo in order if its terminal is closed before the ``with`` block has written to it."""
+        """End the demo if its terminal is closed. Then an OSError of the ``with`` block, which prints there, is none."""
         self._notice_closed_terminal()
         try:
             yield

@@ -42,12 +42,13 @@ class MediaReceiver:
 
     def request(self, medium: Medium, encoding: str | None = None) -> None:
         """Request a medium in ``encoding``, or as configured. Raises PebbleError if the robot does not offer it."""
-        request = self.requests.get(medium) or ViewerRequest(self.robot.base, medium, self.robot.capabilities)
-        request.want(encoding, time.monotonic())
-        if medium not in self.requests:
+        request = self.requests.get(medium)
+        if request is None:
+            request = ViewerRequest(self.robot.base, medium, self.robot.capabilities)
+            request.want(encoding, time.monotonic())  # raises before anything is subscribed to
             self.requests[medium] = request
             self._subscribe(medium, request)
-            request.want(encoding, time.monotonic())  # from now on a retained flag, and what flows already, arrives
+        request.want(encoding, time.monotonic())  # its time to wait begins here, when payloads can arrive
         while not request.settled:
             send(self._transport, request.tick(time.monotonic()))
             time.sleep(_STEP_S)

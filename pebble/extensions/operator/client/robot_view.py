@@ -158,7 +158,7 @@ class RobotView:
                 self.liveness.heartbeat(now, wall - payload.t / 1000, online=payload.online is not False, t=payload.t)
 
     def _take_announced(self, payload: bytes) -> None:
-        """Use the subscriptions in a heartbeat or status, unless the robot publishes capabilities."""
+        """Derive capabilities from the subscriptions in a heartbeat or status, unless the robot publishes its own."""
         if not self.capabilities or "announced" in self.capabilities:
             value = announced(self.base, payload)
             self.capabilities = self.capabilities if value == self.capabilities else value or self.capabilities

@@ -118,7 +118,7 @@ class Drivers:
         return bool(commands) and commands[0].drive.moves, ""
 
     def accompany(self, tab: Tab, ref: str, channel: Channel, message: Message) -> bool:
-        """Keep lights for the next drive command of this page's gesture, and return True; False: send them now.
+        """Keep lights for the next drive command, if this page's gesture moves the robot; else return False: send them.
 
         Lights and command share a message, so the robot must list both as members of a group.
         """
