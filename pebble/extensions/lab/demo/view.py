@@ -53,7 +53,7 @@ class View:
 
     @contextmanager
     def _until_closed(self) -> Iterator[None]:
-        """End the demo if its terminal is closed. Then an OSError of the ``with`` block, which prints there, is none."""
+        """End the demo if its terminal is closed; then an OSError of the ``with`` block is ignored."""
         self._notice_closed_terminal()
         try:
             yield
