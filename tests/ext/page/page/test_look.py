@@ -239,7 +239,7 @@ SCREENS = [
     Screen("replay-timeline", "replay", _timeline, ("desktop", "phone", "landscape", "small")),
     Screen("replay-days", "replay", _timeline, hold=press("[data-test=open-days]")),
     Screen("replay-marked", "replay-gap", _timeline, hold=press("[data-test=open-download]", "[data-test=mark-in]")),
-    Screen("recordings-link", "driving-recorded", _until("a:text-is('Recordings')"), ("desktop",)),
+    Screen("recordings-link", "driving-recorded", _until("role=link[name='Recordings']"), ("desktop",)),
 ]
 CASES = [(screen, size) for screen in SCREENS for size in screen.sizes]
 
