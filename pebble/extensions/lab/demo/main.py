@@ -9,9 +9,11 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
 from typing import Any
+from urllib.request import urlopen
 
 from rich.console import Console
 
@@ -41,6 +43,7 @@ Goob also with inertial sensor, loudspeaker and scripts, in a room with tags.
 MiniLAMP and BenJr are MCUs that use MQTT themselves: their firmware, on
 simulated pins."""
 _GOOB = Identity("pebble", "robots", "goob")
+_INDEX_S = 40.0
 _RECORDED = ("--keep", "256M", "--rotate", "5min")
 
 
@@ -85,6 +88,8 @@ class Demo:
         self._broker_url = f"mqtt://{HOST}:{testbed.broker_port}"
         self._invite()
         testbed.start_robots()
+        if opened is None and self._seconds is None:
+            threading.Thread(target=self._index, name="pebble-demo-index", daemon=True).start()
         self._operator = Operator(testbed.broker_port)
         self._operator.connect()
 
@@ -126,6 +131,13 @@ class Demo:
         print_line(console, f"Its Recordings show what they do, from {recordings}, which the demo deletes at its end.")
         if opened is not None:
             opened.show(self._page_url, console)
+
+    def _index(self) -> None:
+        """Request the data that Recordings shows first, now and then, so that the server has it ready for visitors."""
+        while not self._ending.wait(_INDEX_S):
+            path = f"archive/timeline?day={datetime.now(UTC):%Y-%m-%d}&robot={_GOOB.base}"
+            with suppress(OSError), urlopen(self._page_url + path, timeout=_INDEX_S):  # noqa: S310 - its own page
+                pass
 
     def _invite(self) -> None:
         """Print the broker's address, and commands to paste into another terminal in this folder."""
