@@ -29,12 +29,13 @@ class Plan(msgspec.Struct):
     filters: list[str] = []
     retain: bool = False
     will: str = ""
-    flood: Literal["", "hellos", "queries", "states"] = ""
+    flood: Literal["", "messages", "hellos", "queries", "states"] = ""
 
 
 def flood(session: zenoh.Session, plan: Plan) -> None:
     """What has the first priority and waits for room, as no client of ours sends it; a line once it flows."""
     first: dict[str, Any] = {"priority": zenoh.Priority.REAL_TIME, "congestion_control": zenoh.CongestionControl.BLOCK}
+    publishers = [session.declare_publisher(one, **first) for one in plan.topics]
     own = dict.fromkeys(map(str, range(12_000)), 1)
     hello = wire.encode(wire.Hello(f"{plan.name}{wire.OF}1", 0, None, own))
     asked: dict[str, tuple[str, bytes]] = {
@@ -45,6 +46,8 @@ def flood(session: zenoh.Session, plan: Plan) -> None:
     stamp = wire.Stamp(QoS.DELIVERED, 0, f"{plan.name}{wire.OF}1").pack()
     ignore = zenoh.handlers.Callback(lambda _reply: None, indirect=False)
     for number in itertools.count():
+        for one in publishers:
+            one.put(b"[" * 60)
         if plan.flood in asked:
             key, payload = asked[plan.flood]
             session.get(key, ignore, payload=payload, timeout=0.5, **first)

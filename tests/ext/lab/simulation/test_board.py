@@ -62,4 +62,5 @@ def test_a_long_turn_reports_each_change_within_it() -> None:
     clock.advance(3.0)
     body.end_turn()
     assert changes == [(50.0, (1.0, 1.0)), (52.0, (0.0, 0.0))]
-    assert body.state().pose.x_mm == pytest.approx(2.0 * FULL_SPEED_MM_S, rel=0.01), "it rolled two seconds, not five"
+    body.advance()
+    assert body.motion.pose.x_mm == pytest.approx(2.0 * FULL_SPEED_MM_S, rel=0.01), "it rolled two seconds, not five"

@@ -44,7 +44,7 @@ def test_the_watchdog_counts_and_starves(board: Board, clock: VirtualClock) -> N
 
 def test_reading_more_than_there_is_would_hang(board: Board) -> None:
     sys = board.firmware.module("sys")
-    board.type(b"ab")
+    board.console.type(b"ab")
     with pytest.raises(WouldHang, match="waits for input"):
         sys.stdin.buffer.read(3)
     with pytest.raises(WouldHang):
