@@ -1,4 +1,4 @@
-"""What a broker does with the small messages of an account."""
+"""Tests of what a broker does with the small messages of an account."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class SecuredHub:
         )
 
     def settings(self, name: str) -> ZenohSettings:
-        """Those of a client with the certificate of this account."""
+        """Return the settings of a client with the certificate of this account."""
         place = self.folder / certificates.ACCOUNTS
         tls = self._tls(place / f"{name}.pem", place / f"{name}.key")
         run_dir = self.folder / f"run-{name}"

@@ -1,4 +1,4 @@
-"""What pages get, and do, while an attacker publishes what is large and odd."""
+"""Tests of pages while an attacker publishes large and odd messages."""
 
 from __future__ import annotations
 

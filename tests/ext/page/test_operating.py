@@ -92,7 +92,7 @@ def test_flags_are_those_of_the_broker(page, robot, broker) -> None:
 
 
 class Opened:
-    """What is received of one robot while pages open and close it; its broker unsubscribes when the test lets it."""
+    """A robot whose page is opened and closed, with what is received; its broker unsubscribes when the test lets it."""
 
     base, connected = "pebble/robots/rig", True
 

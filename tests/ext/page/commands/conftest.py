@@ -1,4 +1,4 @@
-"""Where commands keep what they store, for each test."""
+"""Fixtures: folders in which commands keep what they store, anew for each test."""
 
 from __future__ import annotations
 

@@ -165,7 +165,7 @@ def test_users(run: Run, monkeypatch: pytest.MonkeyPatch, state: Path) -> None:
 
 
 def test_mistakes_with_users(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a name and a password may be is tested where people are kept."""
+    """Refuse at the prompt; the rules for names and passwords are tested where people are kept."""
     for given, why in (("short\n", "a password has 8 to 256 characters"), ("", "no password: enter it at the prompt")):
         give(monkeypatch, given)
         assert run("web", "user", "add", "alice") == 1
