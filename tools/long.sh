@@ -39,7 +39,7 @@ esac
 
 case "$1" in
 stops) $python -m tests.kit.schedules robot --log build/stops ;;
-soak) both tests.robot.soak --minutes "${MINUTES:-5}" ;;
+soak) for transport in zenoh mqtt; do $python -m tests.robot.soak --minutes "${MINUTES:-5}" --transport $transport; done ;;
 schedules) # the shortest schedule that violates a rule is printed, or the seed of a sequence that does
     $python -m tests.kit.schedules motion --schedules 10000
     $python -m tests.kit.schedules services --schedules 20000 --jobs 2
