@@ -102,8 +102,8 @@ lowest)
     ;;
 packages)
     sh tools/setup.sh tools
-    tool -m pip_audit --requirement requirements.txt --require-hashes --disable-pip --vulnerability-service osv
     tool tools/sbom.py
+    tool -m pip_audit --requirement requirements.txt --require-hashes --disable-pip --vulnerability-service osv
     ;;
 *)
     list
