@@ -487,8 +487,8 @@ class TestClock:
 _CHILD = """
 import sys, time
 from pathlib import Path
-from pebble.recordings.recorder.recorder import Recorder
-from pebble.recordings.recorder.settings import Options
+from pebble.extensions.recordings.recorder.recorder import Recorder
+from pebble.extensions.recordings.recorder.settings import Options
 recorder = Recorder(Path(sys.argv[1]), Options(free_bytes=0))
 recorder.start()
 number = 0
