@@ -57,8 +57,6 @@ class NeighboursService(Service):
         self._received_at: dict[str, float] = {}
         self._state: Neighbours | None = None
 
-    # -- its life
-
     def start(self) -> None:
         self._lan.open(timeout=0.0)
         self.on_stop(self._lan.close)

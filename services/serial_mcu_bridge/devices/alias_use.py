@@ -24,7 +24,7 @@ class AliasUse:
         self.permitted = False  # other devices have had time to object
         self._device: Device | None = None
         self.used: dict[str, tuple[Alias, Subscription | None]] = {}  # by claim
-        self._rivals: dict[str, list[str]] = {}  # by claim, as last logged
+        self._rivals: dict[str, list[str]] = {}  # other devices with the same claim, by claim, as last logged
 
     def __contains__(self, alias: Alias) -> bool:
         return alias.claim in self.used
@@ -56,9 +56,9 @@ class AliasUse:
 
     def _update(self, device: Device, route: Route, alias: Alias) -> None:
         owner = self._owners.get(alias.claim.partition("/")[2])
-        rivals = self._peers.claimants(alias.claim) if owner is None else [owner]
-        if owner == device.uid:
-            rivals = []
+        rivals = self._peers.claimants(alias.claim)
+        if owner is not None:
+            rivals = [] if owner == device.uid else [owner]
         self._log_conflict(device, alias.claim, rivals, owner)
         if rivals:
             self._release(alias.claim)

@@ -5,6 +5,7 @@ at a bridge that starts late it nearly always happens. So no value of an MCU pas
 """
 
 import threading
+from itertools import chain
 from typing import Any
 
 from pebble.contract import MCU_COMMAND, MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, codec, is_reserved
@@ -47,7 +48,7 @@ class LocalOnly(PrivateTopics):
             if message.topic.startswith(self._values) and message.topic.endswith(_LIST):
                 self._learn(message.topic.removeprefix(self._values).removesuffix(_LIST), message.payload)
                 waiting, self._waiting = self._waiting, {}
-                return [admitted for held in waiting.values() for admitted in self._judge(held)]
+                return list(chain.from_iterable(map(self._judge, waiting.values())))
             return self._judge(message)
 
     def _learn(self, uid: str, payload: bytes) -> None:
@@ -58,12 +59,12 @@ class LocalOnly(PrivateTopics):
         except PayloadError:
             return
         if uid in self._private or len(self._private) < _DEVICES:
-            metrics = {topic: topic.partition("/")[2] for topic in listed.topics}
-            usable = (topic for topic, metric in metrics.items() if not is_reserved(metric))  # a stop must pass
+            usable = (topic for topic in listed.topics if not is_reserved(topic.partition("/")[2]))  # a stop must pass
             self._private[uid] = frozenset(f"{self.base}/{topic}" for topic in usable)
             self._listed.add(uid)
 
     def _judge(self, message: Message) -> list[Message]:
+        """Return ``message`` if it may pass. A retained value of an MCU without a list is kept until there is one."""
         if self.stays(message.topic):
             return []
         uid = self._uid_of(message)
