@@ -330,7 +330,7 @@ class Trial:
 
 
 def report(file: str, possible: int, records: list[dict[str, Any]]) -> None:
-    """Print how many mutants were killed, those in calls that log separately, and all that were not killed."""
+    """Print how many mutants were killed, with a count of their own for calls that log, and list the others."""
     results = [f"log {record['result']}" if ":log:" in record["name"] else record["result"] for record in records]
     counts = Counter(results)
     seconds = sum(record["seconds"] for record in records) / max(1, len(records))

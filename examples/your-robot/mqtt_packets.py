@@ -87,7 +87,7 @@ class Reader:
         return True
 
     def length(self):
-        """Return the size of the next packet's content, and its beginning: 0 if that has not arrived yet."""
+        """Return the size of the next packet's content, and where it begins: 0 if that is not known yet."""
         size = 0
         for index in range(1, len(self.data)):
             size |= (self.data[index] & 127) << 7 * (index - 1)

@@ -53,7 +53,7 @@ class Lease:
             self.changed = True
 
     def holds(self, key: str, by: str) -> bool:
-        """True if a command of this account is from the holder; ``key`` may list those of several motor owners."""
+        """True if a command of this account is from the holder; ``key`` may list the keys of several motor owners."""
         if not self.key or self.holder[:1] != (by,):
             return False
         return key == self.key or (len(key) < 80 and self.key in key.split(" "))  # nobody can try many keys at once

@@ -18,7 +18,7 @@ _PIPE_BYTES = 1 << 20  # what an unprivileged process may have
 
 
 class LibcameraCamera(CaptureProgram):
-    """A camera whose pictures stay as it has compressed them."""
+    """A camera that compresses its pictures; they are shared unchanged."""
 
     def __init__(self, options: AvDaemon) -> None:
         video = options.video

@@ -21,7 +21,7 @@ _PASSED_ON = {"MJPG": "mjpeg", "YUYV": "yuyv"}  # frames that may travel as the 
 
 
 class V4l2Camera:
-    """A camera by its device. Its MJPEG is shared unchanged, unless ``capture_format`` is ``raw``.
+    """A camera by the name of its device. Its MJPEG is shared unchanged, unless ``capture_format`` is ``raw``.
 
     A read that hangs cannot be interrupted; OpenCV's timeout ends it after 3 s.
     """

@@ -37,7 +37,7 @@ def object_id(base: str) -> str:
     """Return a unique name of the robot that has only letters, digits and underscores or hyphens."""
     plain = base.replace("/", "_")
     allowed = re.sub(r"[^A-Za-z0-9_-]", "_", plain)
-    exact = allowed == plain and base.count("_") == 0
+    exact = allowed == plain and base.count("_") == 0  # else two robots might have one name
     return f"pebble_{allowed}" if exact else f"pebble_{allowed}_{crc32(base.encode()):08x}"
 
 

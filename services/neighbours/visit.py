@@ -16,7 +16,7 @@ LOCAL, PERSON = "a script of its own runs", "a person drives it"
 
 
 class Visit:
-    """The run of another robot here. ``publish`` drives. One thread; times are of one clock.
+    """The run of another robot here. ``publish`` drives this robot. For one thread; times are of one clock.
 
     ``begin`` returns why a run cannot begin, ``number`` a number for it; ``local_runs``: a script of this robot runs.
     """

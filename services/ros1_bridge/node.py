@@ -131,7 +131,7 @@ class Node:
     # -- what its API asks, on threads of its own
 
     def publishers_are(self, topic: str, uris: list[str]) -> None:
-        """Note the publishers of a topic. Connected ones stay: a master that has restarted lists none of them."""
+        """Note the publishers of a topic. Connected ones stay: a restarted master lists no publishers at first."""
         subscription = self._subscriptions.get(topic)
         if subscription is not None:
             self._in_sockets(lambda: self._update(subscription, uris))
@@ -228,7 +228,7 @@ class Node:
             return ""
 
     def _revive(self, publishers: Mapping[str, list[str]], subscribers: Mapping[str, list[str]]) -> None:
-        """Tell subscribers that are not connected about this node. Otherwise one that was cut off waits for minutes."""
+        """Tell subscribers that are not connected about this node. They would wait for minutes after a cut."""
         now = time.monotonic()
         missing: dict[tuple[str, str], float] = {}
         for topic, publication in self._publications.items():

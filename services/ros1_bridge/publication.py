@@ -1,4 +1,4 @@
-"""A topic that the node publishes, and its subscribers. A message that one cannot take now is dropped, never late."""
+"""A topic that the node publishes, and its subscribers. What a subscriber cannot take now is dropped, never late."""
 
 from __future__ import annotations
 

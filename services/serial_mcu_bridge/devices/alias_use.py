@@ -9,7 +9,7 @@ from pebble.transports import Subscription
 
 
 class AliasUse:
-    """The aliases in use. ``begin`` starts the use of one and returns its subscription, if any; ``end`` ends it."""
+    """The aliases in use. ``begin`` starts to use an alias and returns its subscription, if any; ``end`` ends that."""
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class AliasUse:
             self.update()
 
     def update(self) -> None:
-        """Use the aliases that no other device claims, and release the others. If two claim one, neither uses it."""
+        """Use the aliases that no other device claims, and release the rest: of two devices neither uses it."""
         if self._device is None:
             return
         for route in self._device.routes.values():

@@ -5,7 +5,6 @@ at a bridge that starts late it nearly always happens. So no value of an MCU pas
 """
 
 import threading
-from itertools import chain
 from typing import Any
 
 from pebble.contract import MCU_COMMAND, MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, codec, is_reserved
@@ -48,7 +47,10 @@ class LocalOnly(PrivateTopics):
             if message.topic.startswith(self._values) and message.topic.endswith(_LIST):
                 self._learn(message.topic.removeprefix(self._values).removesuffix(_LIST), message.payload)
                 waiting, self._waiting = self._waiting, {}
-                return list(chain.from_iterable(map(self._judge, waiting.values())))
+                admitted: list[Message] = []
+                for held in waiting.values():  # those of other MCUs go on waiting
+                    admitted += self._judge(held)
+                return admitted
             return self._judge(message)
 
     def _learn(self, uid: str, payload: bytes) -> None:
@@ -80,7 +82,7 @@ class LocalOnly(PrivateTopics):
         if message.topic.startswith(self._values):
             uid = message.topic.removeprefix(self._values).partition("/")[0]
             return None if message.topic.endswith(_QUESTION) else uid
-        sample = _object(message.payload) if _MARK in message.payload else {}
+        sample = _object(message.payload) if _MARK in message.payload else {}  # under an alias
         sender = sample.get("device_uid")
         return sender if isinstance(sender, str) and isinstance(sample.get("interface"), str) else None
 

@@ -1,4 +1,4 @@
-"""Finds other programs that use a serial device: each of two misses bytes that the other reads, and both send."""
+"""Finds other programs that use a serial device. Of two programs neither reads all bytes, and both send."""
 
 import os
 from contextlib import suppress
