@@ -93,7 +93,8 @@ class V4l2Camera:
         width, height = (
             int(self._capture.get(prop)) for prop in (self._cv2.CAP_PROP_FRAME_WIDTH, self._cv2.CAP_PROP_FRAME_HEIGHT)
         )
-        return FrameInfo(format=self._format, width=width, height=height, stride=2 * width * (self._format == "yuyv"))
+        stride = 2 * width if self._format == "yuyv" else 0  # a JPEG has no rows
+        return FrameInfo(format=self._format, width=width, height=height, stride=stride)
 
     def _wait(self) -> None:
         if not self._capture.grab():

@@ -123,7 +123,7 @@ class Session:
         self._too_long = 0
         self._by_id: dict[int, Interface] = {}
         self.known: OrderedDict[Hello, Manifest] = OrderedDict()
-        self._commands: OrderedDict[int, _Command] = OrderedDict()
+        self._commands: OrderedDict[int, _Command] = OrderedDict()  # without an answer yet; the first is due first
         self._slots: dict[str, int] = {}  # number of the newest command, below WAITING: by interface, or "group"
         self._sequence = 0
         self._ask_at: float | None = None  # when to ask for the manifest; None: it is known, or there is no line
