@@ -56,7 +56,7 @@ class NamedTopics:
         elif not why_not("", self.account):
             payload = _without_claim(message.payload, self.account)
             yield Message(with_name(message.topic, self.account), payload, message.qos)
-        elif command.metric == DRIVE.metric and not _moves(message.payload):
+        elif command.metric == DRIVE.metric and not moves(message.payload):
             yield message
         elif not is_stop:
             raise NoNameError(command.identity.id, self.account)
@@ -67,8 +67,10 @@ class NamedTopics:
         if command is None or not self._is_named(command.identity.base):
             return payload
         plain = _object(payload)
-        body = plain.get("value") if plain is not None and isinstance(plain.get("value"), dict) else plain
-        if plain is None or body is None or "by" in body:
+        if plain is None:
+            return payload
+        body = plain["value"] if isinstance(plain.get("value"), dict) else plain
+        if "by" in body:
             return payload
         body["by"] = person
         return msgspec.json.encode(plain)
@@ -77,11 +79,13 @@ class NamedTopics:
 def _command(topic: str) -> ParsedTopic | None:
     """Return the parts of a command's topic, if it has no account yet."""
     parsed = parse_topic(topic)
-    incoming = parsed is not None and parsed.direction is Direction.INCOMING
-    return parsed if parsed is not None and incoming and not parsed.metric.startswith(f"{BY}/") else None
+    if parsed is None or parsed.direction is not Direction.INCOMING or parsed.metric.startswith(f"{BY}/"):
+        return None
+    return parsed
 
 
-def _moves(payload: bytes) -> bool:
+def moves(payload: bytes) -> bool:
+    """True if a drive command moves a robot, or cannot be read here."""
     try:
         return bool(codec.decode(DRIVE, payload).moves)
     except PayloadError:  # the robot refuses it, or has other rules
