@@ -173,7 +173,7 @@ def capabilities(robot: Observer) -> CheckResult:
         return failed("it publishes none: pages offer nothing of it", "publish outgoing/capabilities, retained")
     try:
         msgspec.convert(published[-1].value.value, CapabilitiesValue)
-    except (msgspec.ValidationError, ValueError, AttributeError) as error:
+    except (msgspec.ValidationError, ValueError, AttributeError) as error:  # AttributeError: it could not be decoded
         return failed(str(published[-1].wrong or error), "CapabilitiesValue in `pebble topic contract --json-schema`")
     return ok(some_of(sorted(available(robot.view.capabilities)), 20) or "nothing is offered")
 

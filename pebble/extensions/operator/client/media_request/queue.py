@@ -215,9 +215,9 @@ def assess(viewers: Collection[ViewerQueue], encoding: str, now: float, *, can_r
         if can_rescue and not viewer.rescued and (viewer.is_thin or not viewer.decodes(encoding)):
             viewer.rescue(now)
     direct = [viewer for viewer in viewers if not viewer.rescued and viewer.decodes(encoding)]
-    patience = 0.0 if encoding == "h264" else _JPEG_PATIENCE_S
-    waiting = [viewer for viewer in direct if viewer.waiting and viewer.waiting_s(now) >= patience]
-    most_wait = 0 < len(direct) <= 2 * len(waiting)
+    patience_s = 0.0 if encoding == "h264" else _JPEG_PATIENCE_S
+    waiting = [viewer for viewer in direct if viewer.waiting and viewer.waiting_s(now) >= patience_s]
+    most_wait = bool(direct) and 2 * len(waiting) >= len(direct)
     if most_wait or encoding != "h264":
         return most_wait
     for viewer in waiting:
