@@ -69,7 +69,8 @@ def _allowed(field: FieldInfo) -> str:
         return " A list."
     if get_origin(kind) is dict:
         return " An object."
-    if kind in (bool, str) and not any(set(meta.extra or ()) - {"parse"} for meta in metas):
+    has_limits = any(set(meta.extra or ()) - {"parse"} for meta in metas)
+    if kind in (bool, str) and not has_limits:
         return ""
     text = expected(kind, metas).partition(":")[0]  # the rules of topics are in the text above
     return f" {text[:1].upper()}{text[1:]}."

@@ -95,12 +95,7 @@ class Observer:
 
     def wait(self, condition: Callable[[], object], seconds: float) -> bool:
         """Read messages until ``condition`` holds; return False if it does not within ``seconds``."""
-
-        def holds() -> object:
-            self.read()
-            return condition()
-
-        return wait_for(holds, seconds)
+        return wait_for(condition, seconds, self.read)
 
     def look(self, seconds: float) -> float:
         """Read messages for ``seconds``; return the time when that began."""

@@ -1,5 +1,6 @@
 """The newest value of every metric of every component, and which of them each page still needs.
 
+A component is a robot, a board or a program with topics of its own; a metric is what follows the direction in a topic.
 There is no queue: a slow page gets newest values less often. A page that connects again gets all of them.
 """
 

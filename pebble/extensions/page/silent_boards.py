@@ -116,9 +116,9 @@ class SilentBoards:
             self._robots.set_server_metric(ref, _METRIC, view)
 
     def _permission(self, ref: str) -> Permission:
-        """Return the permission by the config, or else by a person."""
+        """Return the permission that the config gives or refuses, or else the one that a person has stored."""
         listed = self._listed.get(ref, ListedRobot())
-        if self._refusal(ref):
+        if self._refusal(ref):  # the config decides
             is_allowed = listed.drive and (listed.plain or not self._is_named)
             return Permission("the config", listed.axes) if is_allowed else Permission()
         try:

@@ -19,7 +19,7 @@ _PAIRS = 5
 _PING_TRIES = 3  # an answer that comes too early may by chance come last
 _PING_S = 2.0  # after which a robot gives a connection up
 _WILL_S = 1.0
-REFUSED = 0x80
+REFUSED = 0x80  # the least code of a refusal, in the answers to SUBSCRIBE and of MQTT 5
 
 #: What a name of a robot or of a channel may contain, below a topic of our own.
 _ODD_TOPICS = {

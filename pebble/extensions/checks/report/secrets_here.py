@@ -102,7 +102,7 @@ def values_in(name: str, raw: bytes) -> Iterator[str]:
 
 
 def _long_ones(parts: Iterable[str]) -> Iterator[str]:
-    """Yield those parts of a key or hash that no other text contains."""
+    """Yield the parts of a key or hash that are so long that no other text contains them."""
     return (part.strip() for part in parts if len(part.strip()) >= 4 * _SHORTEST)
 
 

@@ -186,8 +186,13 @@ def battery(robot: RobotUnderTest) -> CheckResult:
     volts, cells = robot.view.volts, robot.config.robot.battery_cells
     if volts is None:
         return skipped("it reports no voltage")
+    least = (cells or 0) * _LEAST_CELL_V
+
+    def is_enough() -> bool:
+        return (robot.view.volts or 0.0) >= least
+
     charging = ", on the charger" if robot.view.charging else ""
-    if cells and not charging and not robot.wait(lambda: (robot.view.volts or 0.0) >= cells * _LEAST_CELL_V, _LOW_S):
+    if cells and not charging and not robot.wait(is_enough, _LOW_S):
         volts = robot.view.volts or 0.0
         return failed(f"{volts:.2f} V, {volts / cells:.2f} V a cell: it is nearly empty", "charge it")
     return ok(f"{robot.view.volts:.2f} V{charging}")

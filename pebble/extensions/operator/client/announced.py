@@ -15,10 +15,10 @@ from pebble.contract.capabilities import (
     SystemOffer,
     VideoOffer,
 )
+from pebble.extensions.operator.client.named_topics import json_object
 from pebble.extensions.operator.client.robot_topics import section_of
 
 _LARGEST = 4096  # bytes of a heartbeat or status that are looked at
-_decode = msgspec.json.Decoder().decode
 
 
 def announced(base: str, payload: bytes) -> dict[str, Any]:
@@ -29,12 +29,7 @@ def announced(base: str, payload: bytes) -> dict[str, Any]:
     """
     if len(payload) > _LARGEST or b'"subscribes"' not in payload:
         return {}
-    try:
-        decoded = _decode(payload)
-    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
-        return {}
-    if not isinstance(decoded, dict):
-        return {}
+    decoded = json_object(payload) or {}
     subscribes = decoded.get("subscribes")
     if subscribes is None:  # a status has it inside its value
         subscribes = section_of(decoded, "value").get("subscribes")

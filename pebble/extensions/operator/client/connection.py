@@ -193,11 +193,13 @@ def subscribed_stop(transport: Transport, base: str) -> RobotEstop:
     return robot
 
 
-def wait_for(condition: Callable[[], object], seconds: float) -> bool:
-    """Wait until ``condition`` is true; return False if it is not within ``seconds``."""
+def wait_for(condition: Callable[[], object], seconds: float, read: Callable[[], None] = lambda: None) -> bool:
+    """Wait until ``condition`` is true, with ``read`` before each look; return False after ``seconds``."""
     end = time.monotonic() + seconds
-    while not condition():
+    while True:
+        read()
+        if condition():
+            return True
         if time.monotonic() >= end:
             return False
         time.sleep(_STEP_S)
-    return True

@@ -133,7 +133,8 @@ def words(
 def person(by: str, *, login: bool = True) -> str:
     """Return the sender ``by`` in words for people.
 
-    ``local`` is a user without a login, perhaps with a device. ``login``: this server requires logins.
+    ``local`` is a user without a login, perhaps with a device. ``login``: this server requires logins, so that user is
+    at another one.
     """
     if by.partition(" ")[0] != "local":
         return by

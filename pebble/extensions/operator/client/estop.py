@@ -52,7 +52,7 @@ class Order(NamedTuple):
 
     name: str
     payload: bytes
-    named: bool  # robots, by who presses; False: all that publish anything
+    named: bool  # it is for the robots that its sender names; False: for all that publish anything
     hold: bool  # it lasts until it is ended
     own_only: bool  # topics that a robot's capabilities name are used only if they are incoming ones of its own
 
@@ -192,7 +192,7 @@ class RobotStop:
         self._given_up = True
 
     def _survives(self, owner: str) -> bool:
-        """True if a power cut changes nothing for this owner, or nothing can be done about it."""
+        """True if a power cut would change nothing for this owner, or if it cannot save anything."""
         state = self.estop.states.get(owner)
         return state is not None and (state.persisted is not False or not state.latched)
 

@@ -66,7 +66,7 @@ class NamedTopics:
         command = _command(topic) if person else None
         if command is None or not self._is_named(command.identity.base):
             return payload
-        plain = _object(payload)
+        plain = json_object(payload)
         if plain is None:
             return payload
         body = plain["value"] if isinstance(plain.get("value"), dict) else plain
@@ -96,13 +96,14 @@ def _without_claim(payload: bytes, account: str) -> bytes:
     """Return the payload without a sender, as the account alone identifies the sender."""
     if f'"{account}'.encode() not in payload:
         return payload
-    command = _object(payload)
+    command = json_object(payload)
     if command is None or str(command.get("by")).partition("@")[0] != account:
         return payload
     return msgspec.json.encode({key: value for key, value in command.items() if key != "by"})
 
 
-def _object(payload: bytes) -> dict[str, Any] | None:
+def json_object(payload: bytes) -> dict[str, Any] | None:
+    """Return the JSON object in a payload; None if it has none."""
     try:
         plain = _decoder.decode(payload)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):

@@ -107,9 +107,9 @@ def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
 
 
 def options_of(setting: forms.Setting) -> list[tuple[str, bool | None]]:
-    """Return the option names of a setting, the script's before those made from its key.
+    """Return the options of a setting by name, each with the value that a flag sets, or None if a value follows.
 
-    For a flag: each option with its value.
+    The script's own names come before those made from the setting's key.
     """
     key = setting.key.replace("_", "-")
     on = _distinct(setting.arg, f"--{key}")

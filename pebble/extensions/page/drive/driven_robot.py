@@ -169,7 +169,7 @@ class DrivenRobot:
         return self.tab is tab or tab in self._wishes
 
     def awaits(self, token: str, now: float) -> bool:
-        """True, once, if a page with this token recently had control and no other client has it now."""
+        """True if a page with this token recently had control, and no client has it now. It is said only once."""
         awaited, until = self._awaited
         if awaited != token:
             return False

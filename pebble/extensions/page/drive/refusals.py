@@ -30,7 +30,7 @@ class Refusals:
         self.is_stopping: Callable[[str], bool] = lambda _ref: False
 
     def of_driving(self, ref: str) -> str:
-        """Return why no page may move this component."""
+        """Return why no page may move this component; empty if one may."""
         robot = self._robot_of(ref) or RobotView(ref)
         why = self._words(robot, first_reason(self._situation(robot), SERVER_ORDER)) or self.nameless(robot)
         if not why and robot.parked:
@@ -38,7 +38,7 @@ class Refusals:
         return why
 
     def nameless(self, robot: RobotView) -> str:
-        """Return why the component takes no commands of this server, which has no account."""
+        """Return why a component that takes only commands with a name takes none of this server; empty if it does."""
         return why_not(robot.name, self._broker.names.account) if robot.named else ""
 
     def of_op(self, op: m.RobotOp) -> str:

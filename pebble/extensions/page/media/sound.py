@@ -37,7 +37,7 @@ NoteTalk = Callable[[str, Session, str, str], None]  # component, session, devic
 
 
 class SoundQueue:
-    """The packets that wait for one page; a newer one replaces the oldest. Pure."""
+    """The packets that wait for one page; if there are too many, the oldest goes. Pure."""
 
     def __init__(self) -> None:
         self._queue: deque[bytes] = deque()

@@ -81,7 +81,7 @@ class Link:
         self._write(BINARY, MEDIUM.pack(what, at_ms) + payload)
 
     def read(self, seconds: float) -> list[m.FromReplay]:
-        """Return the page's messages that arrive in time. Raises EOFError once the page is gone."""
+        """Return the page's messages that arrive within ``seconds``. Raises EOFError once the page is gone."""
         readable, _, _ = select.select([self._connection], [], [], seconds)
         if not readable:
             return []

@@ -173,7 +173,7 @@ class HallWheel:
 
     @property
     def mm(self) -> float:
-        """Distance so far; reverse is negative."""
+        """Return the distance so far; reverse is negative."""
         return self._counts.rad / math.pi * self.mm_per_step
 
     @property
@@ -182,7 +182,7 @@ class HallWheel:
 
     @property
     def unknown(self) -> int:
-        """Steps in an unknown direction, which count in no distance."""
+        """Return the number of steps in an unknown direction, which count in no distance."""
         return int(self._counts.unknown_rad / math.pi)
 
     @property
@@ -195,14 +195,14 @@ class HallWheel:
 
     def update(self, sample: HallSample) -> float:
         """Return the distance since the last sample, in mm. Until :attr:`ready` it may correct earlier results."""
-        extrema = self._range.extrema
+        extrema_before = self._range.extrema
         self._range.update(sample.value)
         if sample.quadrature is not None:
             self._second.update(sample.quadrature)
         before = self.mm
         if self._warm_up is not None:
             self._warm_up.append(sample)
-            if self._range.extrema > extrema:
+            if self._range.extrema > extrema_before:
                 self._replay(self._warm_up)
                 return self.mm - before
             self._bound_warm_up(self._warm_up)

@@ -53,10 +53,8 @@ class Neighbour:
     def latest(self, channel: Channel, max_age: float = 1.0) -> Any:
         """Return the newest payload of ``channel`` that arrived within the last ``max_age`` seconds, or None.
 
-        Does not wait.
-
-        The first call subscribes, and mostly returns None. The other robot's config has to list it in ``shares``, and
-        this one's in ``listens``.
+        Does not wait. The first call subscribes, and mostly returns None. The other robot's config has to list it in
+        ``shares``, and this one's in ``listens``.
         """
         self._own.check()
         return self._own.latest(channel, max_age)

@@ -141,9 +141,7 @@ class Robot:
     def latest(self, channel: Channel, max_age: float = 1.0) -> Any:
         """Return the newest payload of ``channel`` that arrived within the last ``max_age`` seconds, or None.
 
-        Does not wait.
-
-        The first call subscribes, and mostly returns None.
+        Does not wait. The first call subscribes, and mostly returns None.
         """
         self._check()
         return self._latest.of(channel, max_age)

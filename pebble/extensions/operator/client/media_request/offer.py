@@ -21,8 +21,8 @@ BEST_FIRST: Final[dict[Medium, tuple[str, ...]]] = {"video": ("h264", "pbvd", "j
 class Words(NamedTuple):
     """The words for a medium in messages to people."""
 
-    lacking: str
-    fixed: str
+    lacking: str  # the robot does not have it
+    fixed: str  # the robot has it, and takes no requests for it
     name: str
 
 

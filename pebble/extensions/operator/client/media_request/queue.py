@@ -2,7 +2,8 @@
 
 A page acknowledges each frame when it has drawn it, and few frames are under way at a time: otherwise a slow connection
 would show what happened seconds ago. A difference is of no use without everything before it since the last key frame,
-so if one is left out, all are until the next key frame.
+so if one is left out, all are until the next key frame. A page that cannot use the robot's own pictures gets the rescue
+stream instead: small JPEGs that the server makes of them.
 """
 
 from collections import deque
@@ -39,10 +40,7 @@ class Frame:
 
 
 class ViewerQueue:
-    """The frames that wait for one page, and those sent and not yet acknowledged.
-
-    They are the robot's own pictures or, if the page cannot use them, those of the rescue stream.
-    """
+    """The frames of either stream that wait for one page, and those sent and not yet acknowledged."""
 
     def __init__(self, can: frozenset[str], now: float) -> None:
         self.can = can

@@ -142,7 +142,7 @@ class SharedRequest:
             await self._broker.unsubscribe(subscription)
 
     def _is_over(self) -> bool:
-        """True if the request was withdrawn while the broker was connected; otherwise the robot would go on sending."""
+        """True if the medium was not wanted for a while, and the robot can be told so; else it would go on sending."""
         idle = not self._wanted and time.monotonic() - self._wanted_at >= LINGER_S
         return idle and (self._broker.connected or self._request is None)
 

@@ -38,8 +38,8 @@ class Terminal:
 
         tty.setcbreak(self._fd, self._termios.TCSAFLUSH)
         mode = self._termios.tcgetattr(self._fd)
-        mode[0] &= ~self._termios.IXON
-        mode[6][self._termios.VSUSP] = b"\0"
+        mode[0] &= ~self._termios.IXON  # of the input flags: Ctrl-S
+        mode[6][self._termios.VSUSP] = b"\0"  # of the special characters: Ctrl-Z
         self._termios.tcsetattr(self._fd, self._termios.TCSANOW, mode)
         _write(_HIDE_CURSOR)
 
