@@ -97,9 +97,12 @@ def publication(op: m.RobotOp, capabilities: dict[str, Any]) -> Message:
 
 def _action_topic(op: m.ActionOp, channel: Channel, capabilities: dict[str, Any]) -> str:
     """Return the topic of an action: the first one that the capabilities name."""
-    sections = (section_of(capabilities, section) for section in _sections(op))
-    topics = (section.get(key) for section in sections for key in ("flag_topic", "topic"))
-    return next((str(topic) for topic in topics if names(op.ref, topic, channel)), channel.topic(op.ref))
+    for section in _sections(op):
+        for key in ("flag_topic", "topic"):
+            topic = section_of(capabilities, section).get(key)
+            if names(op.ref, topic, channel):
+                return str(topic)
+    return channel.topic(op.ref)
 
 
 def _sections(op: m.ActionOp) -> list[str]:

@@ -194,12 +194,11 @@ def _scripts(payload: Any) -> Any:
     listed = _object(_Scripts, _inner(payload))
     if not listed:
         return {}
-    files = [{**entry, "configs": _settings(entry.get("configs"))} for entry in _readable(_Script, listed["files"])]
-    return {**listed, "files": files}
-
-
-def _settings(configs: object) -> list[dict[str, Any]]:
-    return [setting.entry() for setting in forms.listed(configs)[: forms.MAX_SETTINGS]]
+    scripts = []
+    for script in _readable(_Script, listed["files"]):
+        settings = forms.listed(script.get("configs"))[: forms.MAX_SETTINGS]
+        scripts.append({**script, "configs": [setting.entry() for setting in settings]})
+    return {**listed, "files": scripts}
 
 
 def _manifest(payload: Any) -> Any:

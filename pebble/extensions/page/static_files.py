@@ -57,7 +57,8 @@ class StaticFiles:
         self._policy = CONTENT_SECURITY_POLICY.replace("script-src", f"script-src {hashed}")
         index = self.files.pop("index.html").replace(_START, start)
         for name, screen in _SCREENS.items():
-            links = [_link(module_name) for module_name in (screen, *self._imported("main.js", screen))]
+            modules = (screen, *self._imported("main.js", screen))
+            links = [b'<link rel="modulepreload" href="{root}static/{version}/%s">' % path.encode() for path in modules]
             if name in _SHEETS:
                 sheet = _SHEETS[name].encode()
                 links.insert(0, b'<link rel="preload" as="style" href="{root}static/{version}/%s">' % sheet)
@@ -131,10 +132,6 @@ def _response(request: Request, name: str, content: bytes, packed: bytes | None,
     if packed is not None and "gzip" in request.headers.get("accept-encoding", ""):
         content, headers["content-encoding"] = packed, "gzip"
     return Response(content, media_type=_TYPES[name.rpartition(".")[2]], headers=headers)
-
-
-def _link(module: str) -> bytes:
-    return b'<link rel="modulepreload" href="{root}static/{version}/%s">' % module.encode()
 
 
 def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:

@@ -243,7 +243,8 @@ def _is_of_serial_line(channel: Channel, config: Config) -> bool:
     line = config.services.serial_mcu_bridge
     if channel is TOUCH_SENSORS and not line.telemetry.publish_touch_sensors:
         return False
-    return channel.metric.startswith("sensors/") == (not SERIAL_PROTOCOLS[line.protocol].drives)
+    is_sensor, drives = channel.metric.startswith("sensors/"), SERIAL_PROTOCOLS[line.protocol].drives
+    return is_sensor != drives  # a board that drives has the other topics, any other board only these
 
 
 def _transport(config: Config) -> str:

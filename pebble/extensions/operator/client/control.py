@@ -136,7 +136,8 @@ class ControlClient:
         self.held, self.decided = False, ""
         if state.asks_id:  # of this client, or of another, for whose turn this one waits
             self._answered_at = now
-        if state.id and self._has_any_owner():  # the other client gets the rest of the robot
+        has_another_owner = any(owner.id == self.id for owner in self.robot.states)
+        if state.id and has_another_owner:  # the other client gets the rest of the robot
             self._out = [self._message(CONTROL, want="release")]
             self._due_at = max(self._due_at, now + APART * self._pace_of().control_s)
 
@@ -180,9 +181,6 @@ class ControlClient:
     def _give_up(self, why: str) -> None:
         self.release()
         self.failed = why
-
-    def _has_any_owner(self) -> bool:
-        return any(state.id == self.id for state in self.robot.states)
 
     def _hopeless(self, now: float) -> str:
         """Return why to give up the request; empty to continue."""

@@ -138,7 +138,7 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
         report = _Report(sender, outbox)
         try:
             with _heartbeats(target, every=every) as heartbeats, listening(target, transport) as second:
-                listener, subscribing = _listen(second, _filters(names.base))
+                listener, subscribing = _listen(second, names.base)
                 while not sender.finished:
                     for message in heartbeats.take() if heartbeats else ():
                         sender.receive(message, time.monotonic())
@@ -169,8 +169,9 @@ def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
         yield heartbeats
 
 
-def _listen(transport: Transport, filters: list[str]) -> tuple[Listener, threading.Thread]:
+def _listen(transport: Transport, base: str) -> tuple[Listener, threading.Thread]:
     """Subscribe on a thread, so that a slow network does not delay the stop; return the listener and the thread."""
+    filters = [channel.filter(base) for channel in (ESTOP_STATE, CAPABILITIES, STATUS, ONLINE, *SYNONYMS)]
     listener = Listener(transport, ())
 
     def subscribe() -> None:
@@ -180,10 +181,6 @@ def _listen(transport: Transport, filters: list[str]) -> tuple[Listener, threadi
     subscribing = threading.Thread(target=subscribe, name="pebble-estop-subscribe", daemon=True)
     subscribing.start()
     return listener, subscribing
-
-
-def _filters(base: str) -> list[str]:
-    return [channel.filter(base) for channel in (ESTOP_STATE, CAPABILITIES, STATUS, ONLINE, *SYNONYMS)]
 
 
 def _until_due(sender: StopSender, *, has_heartbeats: bool) -> float:
@@ -223,7 +220,7 @@ class _Outbox:
     def _accepts(self, topic: str, payload: bytes, *, qos: QoS) -> bool:
         accepted = self._transport.publish(topic, payload, qos=qos, urgent=True)
         if accepted and topic.count("/") > 2:
-            self._waiting.add("/".join(topic.split("/", 3)[:3]))
+            self._waiting.add("/".join(topic.split("/", 3)[:3]))  # the robot's base topic
         return accepted
 
 
