@@ -283,10 +283,10 @@ class StopSender:
         if address is None or address.direction is not Direction.OUTGOING:
             return
         base = address.identity.base
-        if (robot := self.robots.get(base)) is not None:
-            robot.receive(message, now)
-        # An empty message removes what was retained: it is no sign of a robot.
-        elif self.collecting and message.payload and not address.identity.is_server:
+        is_sign_of_robot = message.payload and not address.identity.is_server  # empty: it removes a retained one
+        if base in self.robots:
+            self.robots[base].receive(message, now)
+        elif self.collecting and is_sign_of_robot:
             self._receive_first(base, message, now)
 
     def tick(self, now: float, *, again: bool = True) -> list[Message]:

@@ -44,19 +44,19 @@ class ViewerQueue:
 
     def __init__(self, can: frozenset[str], now: float) -> None:
         self.can = can
-        self.rescued = False
+        self.rescued = False  # it gets the rescue stream
         self.new = True  # it has received no picture, and no key frame was requested for it
         self.waiting = True  # for a key frame
         self.overflowed = False  # waiting because the page is too slow
-        self.window = WINDOW
+        self.window = WINDOW  # so many frames may be under way
         self.ack_s = 0.0  # how long the last frame took to be drawn and acknowledged
         self.late_acks = 0  # in a row; of frames that were under way together one counts
-        self._late_at = float("-inf")  # the newest of them
+        self._late_at = float("-inf")  # when the newest of them came
         self._queue: deque[Frame] = deque()
-        self._under_way: dict[int, tuple[float, Frame]] = {}
-        self._undecodable: set[str] = set()
+        self._under_way: dict[int, tuple[float, Frame]] = {}  # by number: when it was sent, and the frame
+        self._undecodable: set[str] = set()  # encodings that the page could not decode after all
         self._waiting_since = now
-        self._retry_at = 0.0
+        self._retry_at = 0.0  # when a rescued page gets the robot's own pictures again
 
     def offer(self, frame: Frame) -> None:
         """Queue a frame, or skip it."""
