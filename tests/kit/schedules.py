@@ -119,7 +119,7 @@ class Engine:
     jobs: int = 1  # processes
     repeats: bool = True  # the same schedule violates the same rule, so it can be made short
 
-    def run(self, kind: str, seed: int, numbers: Iterable[int], *, verbose: bool = False) -> Iterator[Result]:
+    def run(self, kind: str, seed: int, numbers: Iterable[int]) -> Iterator[Result]:
         """Perform these schedules in as few worlds as possible: after a violation a new world is made."""
         waiting = deque(numbers)
         while waiting:
@@ -128,7 +128,7 @@ class Engine:
                     number = waiting.popleft()
                     began = time.monotonic()
                     one = self._outcome(world, self.draw(kind, seed, number))
-                    log = one.log() if one.problems or verbose else ""
+                    log = one.log() if one.problems else ""
                     yield Result(kind, number, time.monotonic() - began, one.problems, one.counts, log)
                     if one.problems:
                         break
@@ -195,20 +195,16 @@ def _schedules(options: argparse.Namespace, engine: Engine, module: str) -> int:
     kinds = [kind for kind in engine.kinds if kind == options.kind] or [k for k in engine.kinds if options.kind in k]
     results: list[Result] = []
     rules, began, shown = Counter[str](), time.monotonic(), 0.0
-    for part in _map(
-        options.jobs, _part, repeat((module, options.seed, options.verbose)), _parts(options, kinds, engine)
-    ):
+    for part in _map(options.jobs, _part, repeat((module, options.seed)), _parts(options, kinds, engine)):
         for one in part:
             results.append(one)
             rules.update(one.problems)
-            if one.problems or options.verbose:
+            if one.problems:
                 _show(options, engine, one, new=any(rules[rule] == 1 for rule in one.problems))
             took = time.monotonic() - began
             if took > shown + _PROGRESS_S or len(results) == options.schedules:
                 shown = took
                 print(f"{len(results):>6} of {options.schedules}, {took:.0f} s: {one}, {one.seconds:.2f} s", flush=True)
-            if one.problems and options.first:
-                return 1
     print(f"\n{options.engine}, seed {options.seed}, {time.monotonic() - began:.0f} s\n{table(results)}")
     print(*(f"{times:>6}  {rule}" for rule, times in rules.most_common()), sep="\n")
     return 1 if rules else 0
@@ -222,14 +218,14 @@ def _parts(options: argparse.Namespace, kinds: list[str], engine: Engine) -> Ite
         yield from ((kind, numbers[at : at + engine.per_world]) for at in range(0, share, engine.per_world))
 
 
-def _part(what: tuple[str, int, bool], part: tuple[str, range]) -> Iterable[Result]:
-    module, seed, verbose = what
+def _part(what: tuple[str, int], part: tuple[str, range]) -> Iterable[Result]:
+    module, seed = what
     logging.disable(logging.CRITICAL)
     engine: Engine = import_module(module).ENGINE
-    return engine.run(part[0], seed, part[1], verbose=verbose)
+    return engine.run(part[0], seed, part[1])
 
 
-def _whole_part(what: tuple[str, int, bool], part: tuple[str, range]) -> list[Result]:
+def _whole_part(what: tuple[str, int], part: tuple[str, range]) -> list[Result]:
     return list(_part(what, part))
 
 
@@ -276,9 +272,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--number", type=int, default=0, help="of the first schedule")
     parser.add_argument("--kind", default="", help="only worlds whose kind contains this")
     parser.add_argument("--jobs", type=int, help="processes")
-    parser.add_argument("--first", action="store_true", help="end at the first violation")
     parser.add_argument("--log", type=Path, help="folder for what happened in schedules with a violation")
-    parser.add_argument("--verbose", action="store_true", help="print what happened in each")
     return parser
 
 

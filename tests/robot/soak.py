@@ -28,7 +28,7 @@ from tests.own_memory import own_mb
 from tests.robot import faults
 from tests.robot.faults import Drive, Fault
 from tests.robot.flood import FLOODS, flooding
-from tests.robot.rig import Rig, descendants
+from tests.robot.rig import Rig, descendants, restore, saved_by
 from tests.small_disk import SmallDisk
 from tests.support import Broker, process_name, quarters
 
@@ -78,7 +78,7 @@ class Soak:
             "full disks": Fault(self._full, 3.0),
             "a broker of before": Fault(self._restored),
         }
-        self._older = self._saved()
+        self._older = saved_by(self.remote)
 
     @property
     def processes(self) -> dict[str, int]:
@@ -98,16 +98,11 @@ class Soak:
                 ends.enter_context(disk.full())
             yield
 
-    def _saved(self) -> dict[Path, bytes]:
-        self.remote.save()
-        return {file: file.read_bytes() for file in self.remote.store.iterdir()}
-
     @contextmanager
     def _restored(self, _rig: Rig) -> Iterator[None]:
-        newer = self._saved()
+        newer = saved_by(self.remote)
         self.remote.kill()
-        for file, saved in self._older.items():
-            file.write_bytes(saved)
+        restore(self._older)
         yield
         self.remote.start()
         self._older = newer

@@ -33,9 +33,3 @@ def test_what_threads_count_while_others_look_is_exact() -> None:
     for thread in looking:
         thread.join()
     assert counters["sent"] == counters.snapshot()["sent"] == 4 * 3 * one
-
-
-def test_what_was_never_counted_is_zero_and_not_listed() -> None:
-    counters = Counters()
-    assert counters["sent"] == counters["lost"] == 0
-    assert counters.snapshot() == {}
