@@ -109,10 +109,10 @@ def _obey_again(drill: Drill) -> None:
     since = drill.seconds
     while drill.robot.stops.latch.latched or drill.state()["latched"]:
         drill.reset()
-        drill.run(drill.seconds + 1.0)
+        drill.wait(1.0)
         if drill.seconds > since + BACK_S:
             raise ViolatedError(f"it cannot be reset: {drill.state()}")
-    drill.run(drill.seconds + LIMIT_S)
+    drill.wait(LIMIT_S)
     start, moves = drill.seconds, drill.seen.moves
     for number in range(5):
         drill.at(start + 0.1 * number, _command(drill, (0.0, 0.5 if number % 2 else -0.5, 0.0), 1))
