@@ -31,7 +31,7 @@ from pebble.runtime.process import view_of
 from pebble.transports import Message, QoS
 from tests.kit.schedules import RandomSteps
 from tests.robot.lockstep.bridge import Bridge, Outside
-from tests.robot.lockstep.commands import Command, Commands
+from tests.robot.lockstep.commands import Commands
 from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Driver
 from tests.robot.lockstep.holders import Holders
 from tests.robot.lockstep.network import Network
@@ -154,7 +154,7 @@ class TwoOwners:
             self.stops.learns(message)
 
     def _turned(self, owner: Owner) -> None:
-        late = self.scheduler.now > owner.wheels.deadline + owner.slack + _MS
+        late = self.scheduler.now > owner.wheels.deadline + _MS
         self.scheduler.check(not late or owner.wheels.speeds is None, "a wheel turns after its command's deadline")
         self._check_lights(owner.wheels)
         self.check()
@@ -179,18 +179,11 @@ class TwoOwners:
         return next((driver.name for driver in self.drivers.values() if driver.id == self._shown[1]), "")
 
     def driver_of(self, name: str) -> str:
-        """Who moves this owner; empty: it stands still."""
-        command = self._command(self.owners[name])
-        return "" if command is None else command.sender
-
-    def _command(self, owner: Owner) -> Command | None:
-        """By which an owner moves; not after its deadline, when only the board's own stops a frozen one."""
-        speeds = owner.wheels.speeds
-        if speeds is None or self.scheduler.now > owner.wheels.deadline:
-            return None
-        command = self.commands.of(speeds)
-        assert command is not None
-        return command
+        """Who moves this owner; empty: it stands still, or only the board's own deadline stops a frozen one."""
+        wheels = self.owners[name].wheels
+        if wheels.speeds is None or self.scheduler.now > wheels.deadline:
+            return ""
+        return self.commands.sender_of(wheels.speeds)
 
     def check(self) -> None:
         drivers = {name: self.driver_of(name) for name in self.owners}
@@ -202,7 +195,7 @@ class TwoOwners:
         if drivers[FIRST] and first.alive and not first.frozen:
             self.scheduler.check(self._named(drivers[FIRST], newest), "the first obeys who has no control")
         if drivers[SECOND] and second.alive and not second.frozen:
-            since = self.scheduler.now - FOLLOWS_S - second.slack - _MS
+            since = self.scheduler.now - FOLLOWS_S - _MS
             recent = [granted for granted in self._granted if granted[0] >= since]
             self.scheduler.check(self._named(drivers[SECOND], recent), "the second obeys whom the first does not name")
 
