@@ -82,13 +82,11 @@ class ServiceProcess(Process):
         super().__init__(name, scheduler)
         self._make = make
         self.service: Service | None = None
-        self.lives = 0
 
     def start(self) -> None:
         if self.alive:
             return
         self.alive = True
-        self.lives += 1
         self.service = self._make(self)
         # Here all work waits for a turn of the process: a frozen one gets messages, and does nothing.
         self.service.run_if_idle = lambda _job: False  # type: ignore[method-assign]

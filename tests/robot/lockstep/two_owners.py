@@ -5,6 +5,7 @@ Every step is possible at any time, and does nothing where it has no meaning, so
 * No two drivers move the two owners at once: persons with a key, and all commands without one as one more.
 * The first owner, by name, is moved only by who has control of it, or without a key while nobody has.
 * The second one is moved only by whom the first has named less than 1.5 s ago.
+* A script moves neither within 1.2 s after a person's command is over, that is, 2 s after it was sent.
 * In the end, when everything works, who takes control drives both.
 * Lights of a group shine with its drive command, in one write, or not at all; copies of its members have no effect.
 
@@ -42,6 +43,7 @@ from tests.robot.lockstep.stop_rules import StopRules
 
 FIRST, SECOND = "arm", "serial"  # in the config the second comes first
 FOLLOWS_S = 1.5
+_HELD_S = 1.2
 _MS = 0.0021
 _CHECK_S = 0.05
 
@@ -100,6 +102,7 @@ class TwoOwners:
         groups = config.services.mqtt_bridge.link.groups
         self.drivers = {name: Driver(name, net, self.commands, groups=groups) for name, net in networks.items()}
         self.moved: set[tuple[str, str]] = set()  # (owner, driver)
+        self._person_at: dict[str, float] = {}  # by owner: when a person moved it last
         self._granted: list[tuple[float, str]] = []  # when, and to whose id; what the first tells the second
         self._shown = (0.0, "")  # the same; what it tells everybody: both are lost while it has no connection
         self._recorded: list[Message] = []  # turns of the first
@@ -188,6 +191,12 @@ class TwoOwners:
     def check(self) -> None:
         drivers = {name: self.driver_of(name) for name in self.owners}
         self.moved.update(drivers.items())
+        for name, driver in drivers.items():
+            if driver == SCRIPT:
+                held = self.scheduler.now - self._person_at.get(name, 0.0) < _HELD_S
+                self.scheduler.check(not held, "a script moves an owner soon after a person")
+            elif driver:
+                self._person_at[name] = self.scheduler.now
         persons = {driver for driver in drivers.values() if driver not in ("", SCRIPT)}
         self.scheduler.check(len(persons) < 2, "two drivers move the two owners")
         first, second = self.owners.values()
