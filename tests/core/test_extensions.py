@@ -324,11 +324,6 @@ def test_the_core_alone_reads_a_config_with_sections_of_extensions() -> None:
     assert names == ["zenoh_hub", "serial_mcu_bridge", "mqtt_bridge"]
 
 
-def test_a_robot_starts_though_a_section_of_what_is_missing_is_there(tmp_path: Path) -> None:
-    path = write(tmp_path, {"lamp": {}}, {"enabled": True})
-    assert load(path, lenient=True).warnings[0].startswith("extensions.lamp: no installed package offers it")
-
-
 def test_an_owner_of_motors_is_a_device(tmp_path: Path) -> None:
     lamp_file(tmp_path, "wheels", drives=True)
     config = load(write(tmp_path, {"wheels.py": {"drives": True}}, {"enabled": True}))

@@ -84,10 +84,10 @@ class RandomSteps:
 
 @dataclass
 class Outcome:
-    """The outcome of a schedule. ``counts`` are for the table; ``log`` says what happened."""
+    """The outcome of a schedule. ``counts`` are summed and printed; ``log`` says what happened."""
 
     problems: list[str] = field(default_factory=list)
-    counts: dict[str, float] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
     log: Callable[[], str] = str
 
 
@@ -99,7 +99,7 @@ class Result:
     number: int
     seconds: float
     problems: list[str]
-    counts: dict[str, float]
+    counts: dict[str, int]
     log: str
 
     def __str__(self) -> str:
@@ -193,19 +193,21 @@ def main(arguments: list[str]) -> int:
 
 def _schedules(options: argparse.Namespace, engine: Engine, module: str) -> int:
     kinds = [kind for kind in engine.kinds if kind == options.kind] or [k for k in engine.kinds if options.kind in k]
-    results: list[Result] = []
-    rules, began, shown = Counter[str](), time.monotonic(), 0.0
+    rules, counts, began, shown, number = Counter[str](), Counter[str](), time.monotonic(), 0.0, 0
     for part in _map(options.jobs, _part, repeat((module, options.seed)), _parts(options, kinds, engine)):
         for one in part:
-            results.append(one)
+            number += 1
             rules.update(one.problems)
+            counts.update(one.counts)
             if one.problems:
                 _show(options, engine, one, new=any(rules[rule] == 1 for rule in one.problems))
             took = time.monotonic() - began
-            if took > shown + _PROGRESS_S or len(results) == options.schedules:
+            if took > shown + _PROGRESS_S or number == options.schedules:
                 shown = took
-                print(f"{len(results):>6} of {options.schedules}, {took:.0f} s: {one}, {one.seconds:.2f} s", flush=True)
-    print(f"\n{options.engine}, seed {options.seed}, {time.monotonic() - began:.0f} s\n{table(results)}")
+                print(f"{number:>6} of {options.schedules}, {took:.0f} s: {one}, {one.seconds:.2f} s", flush=True)
+    print(
+        f"\n{options.engine}, seed {options.seed}, {number} schedules, {time.monotonic() - began:.0f} s", dict(counts)
+    )
     print(*(f"{times:>6}  {rule}" for rule, times in rules.most_common()), sep="\n")
     return 1 if rules else 0
 
@@ -247,21 +249,6 @@ def _map(jobs: int, work: Callable[..., Any], *arguments: Iterable[Any]) -> Iter
         return
     with ProcessPoolExecutor(jobs) as pool:
         yield from pool.map(_whole_part if work is _part else work, *arguments)
-
-
-def table(results: list[Result]) -> str:
-    """Return a line for each kind of world, and one for all; counts are summed, or those of the slowest."""
-    groups: dict[str, list[Result]] = {}
-    for name, one in [(one.kind, one) for one in results if one.kind] + [("all", one) for one in results]:
-        groups.setdefault(name, []).append(one)
-    names = list(dict.fromkeys(name for one in results for name in one.counts))
-    rows = [("", "schedules", *names, "violations", "slowest")]
-    for name, group in groups.items():
-        totals = ((max if count.startswith("slowest") else sum, count) for count in names)
-        counts = (f"{total(one.counts.get(count, 0) for one in group):g}" for total, count in totals)
-        bad, slowest = sum(len(one.problems) for one in group), max(one.seconds for one in group)
-        rows.append((name, str(len(group)), *counts, str(bad), f"{slowest:.2f} s"))
-    return "\n".join(f"{row[0]:36}" + "".join(f"{cell:>13}" for cell in row[1:]) for row in rows)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -179,16 +179,14 @@ class World:
         seen = Seen(self.history, lines, motors, states, list(self.alive.overlaps), SPEEDS, self._planted)
         stalls = [*self._stalls.found, *self.rig.mcu.late(began)]
         found = seen.problems(stalls)
-        allowed = len(seen.problems()) - len(found)
-        found += self._out_of_turn(began)
         counts = {
-            "lines": float(len(lines)),
-            "passed on": float(len(self._holders(began, ended))),
-            "stops": float(len(self.history.events("estop"))),
-            "stalled s": round(lost_s(stalls, began, ended), 2),
-            "allowed": float(allowed),
+            "lines": len(lines),
+            "passed on": len(self._holders(began, ended)),
+            "stops": len(self.history.events("estop")),
+            "stalled ms": round(1000 * lost_s(stalls, began, ended)),
+            "allowed": len(seen.problems()) - len(found),
         }
-        return Outcome(found + left, counts, log=lambda: self._log(began))
+        return Outcome([*found, *self._out_of_turn(began), *left], counts, log=lambda: self._log(began))
 
     # -- what people do; what is short or long with the number ``b``
 
