@@ -134,7 +134,7 @@ def test_a_robot_is_started_driven_and_stopped_and_its_line_ends(core: Path, kin
             assert until(lambda: driveable().get("state") == "unknown", 20)
             noise = b"\xff\x00\x80\n>>> \nM 0.000 0.000\nT a0=\n"
             assert until(lambda: shows(noise, "unknown", "what its board sends is not understood"), 10, step=0.1)
-            assert until(lambda: shows(b"Done!\n", "yes"), 10, step=0.1)
+            assert until(lambda: shows(b"OK M\n", "yes"), 10, step=0.1)
             assert until(lambda: driven("M 0.500 0.500"), 10)
             begun = time.monotonic()
             assert until(lambda: line.read()[-1] == "M 0.000 0.000", 5)
