@@ -97,9 +97,6 @@ class Driver(Process):
                 self.drive(key, **fields)
             self.scheduler.after(PERIOD_S, lambda: self._steer(gesture, until, key, fields))
 
-    def steer_by_old_key(self, seconds: float) -> None:
-        self.steer(seconds, self.old_keys[-1])
-
     def zero(self, *, final: bool = False) -> None:
         self._publish_drive({"x": 0, "z": 0} | ({"valid_ms": 0} if final else {}))
 
