@@ -28,7 +28,7 @@ from tests.own_memory import own_mb
 from tests.robot import faults
 from tests.robot.faults import Drive, Fault
 from tests.robot.flood import FLOODS, flooding
-from tests.robot.rig import Rig, descendants
+from tests.robot.rig import Rig, descendants, restore, saved_by
 from tests.small_disk import SmallDisk
 from tests.support import Broker, process_name, quarters
 
@@ -79,7 +79,7 @@ class Soak:
             "a broker of before": Fault(self._restored),
         }
         del self.faults["the run directory is removed"]  # here it is a disk
-        self._older = self._saved()
+        self._older = saved_by(self.remote)
 
     @property
     def processes(self) -> dict[str, int]:
@@ -99,16 +99,11 @@ class Soak:
                 ends.enter_context(disk.full())
             yield
 
-    def _saved(self) -> dict[Path, bytes]:
-        self.remote.save()
-        return {file: file.read_bytes() for file in self.remote.store.iterdir()}
-
     @contextmanager
     def _restored(self, _rig: Rig) -> Iterator[None]:
-        newer = self._saved()
+        newer = saved_by(self.remote)
         self.remote.kill()
-        for file, saved in self._older.items():
-            file.write_bytes(saved)
+        restore(self._older)
         yield
         self.remote.start()
         self._older = newer

@@ -179,6 +179,7 @@ def test_an_end_stops_the_wheels_and_nothing_is_started_again(bench: Bench, code
     walk = bench.start("walk")
     walk.end(code)
     assert bench.becomes(**{**IDLE, "error": error})
+    assert "stopped" not in bench.status
     bench.advance(0.11)
     bench.advance(0.2)
     bench.advance(60)
