@@ -23,7 +23,7 @@ class Run(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """The rms errors of the measured truth."""
+    """The rms errors with which the true movement is measured."""
 
     mm: float
     straight_rad: float

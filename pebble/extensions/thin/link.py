@@ -66,7 +66,7 @@ class ShortestTrip:
 
 
 class Crowd:
-    """Detects a standing queue. Operators and streams then send less until it has drained."""
+    """A detector of a standing queue. Operators and streams then send less until it has drained."""
 
     def __init__(self) -> None:
         self.stands = False

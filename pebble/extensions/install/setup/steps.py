@@ -155,7 +155,7 @@ class Job:
                 yield self._new_password("password of the page at the robot's broker", page)
 
     def _new_password(self, what: str, file: Path, *, known: bool = True) -> Step:
-        """Return the step that writes a new password. ``known``: the one in the file is of this broker, so it stays."""
+        """Return the step that writes a new password. ``known``: one in the file is of this broker, and stays."""
         write = partial(self.system.write, file)
         return Step(what, lambda: known and file.exists(), lambda: write(f"{new_password()}\n".encode()))
 
