@@ -46,11 +46,11 @@ class Section:
 
 
 SECTIONS: Final = (
-    Section("control", "Service to service", 500, 40),
+    Section("control", "Service to service", 250, 25),
     Section("bridge", "Operator to wheels, and back", 2200, 30),
     Section("startup", "Start-up", 240, 60),
     Section("cost", "Memory and CPU", 180, 20),
-    Section("frames", "Camera frames inside the robot", 200, 12),
+    Section("frames", "Camera frames inside the robot", 240, 15),
     Section("scale", "Many boards", 150, 25),
     Section("traffic", "Traffic of robots, as in the paper", 140, 19),
     Section("impair", "On an impaired network", 900, 150, needs_root=True),
