@@ -70,7 +70,7 @@ class Robot:
         with suppress(PayloadError, msgspec.ValidationError):
             if channel is c.CHARGING_LEVEL:
                 level = codec.decode(channel, message.payload)
-                unit = codec.plain(channel, message.payload).get("unit")  # decoded, a missing one is that of volts
+                unit = codec.plain(channel, message.payload).get("unit")  # the decoded level has volts in place of none
                 self._battery = (_BATTERY[unit], level.value) if unit in _BATTERY else None
             elif channel is c.STATUS:
                 services = codec.decode(channel, message.payload).value.get("services")

@@ -52,7 +52,7 @@ class WirelessRobot:
         clock = RealClock()
         uid = hashlib.sha256(identity.base.encode()).digest()[:6]
         self.network = HostNetwork(clock, platform=OF_ROBOT[kind].platform)
-        self.board = Board(clock, self.network, uid, seed=secrets.randbits(64))  # another one at each start
+        self.board = Board(clock, self.network, uid, seed=secrets.randbits(64))  # other random numbers at each start
         self.board.files = Files(files)
         self.body = body_of(kind, self.board)
         self.body.on_motors = self._moved

@@ -126,7 +126,7 @@ class SimulatedRobot(Robot):
 
     def camera(self, *, width: int | None = None, views: bool = False, timeout: float | None = None) -> Iterator[Image]:
         """Yield each picture once. Time passes while there is none."""
-        del width, views, timeout
+        del width, views, timeout  # without effect here
         while True:
             self._pass_step()
             picture = self._body.picture()
