@@ -122,17 +122,19 @@ def _export(
     return f"{target}: {count:,} messages"
 
 
-def _import(found: Iterable[Recorded | BadLine], copy: Copy) -> Counter[str]:
+def _import(lines: Iterable[Recorded | BadLine], copy: Copy) -> Counter[str]:
+    """Add the messages of the lines to a recording; return how many there were, bad lines and cut payloads."""
     counted = Counter[str]()
-    for item in found:
-        if isinstance(item, BadLine):
+    for line in lines:
+        if isinstance(line, BadLine):
             counted["bad"] += 1
             if counted["bad"] <= 3:
-                typer.echo(f"pebble: line {item.number}: {shown(item.problem)}", err=True)
+                typer.echo(f"pebble: line {line.number}: {shown(line.problem)}", err=True)
             continue
-        copy.add(item)
+        copy.add(line)
         counted["messages"] += 1
-        counted["truncated"] += TRUNCATED in item.channel.metadata
+        if TRUNCATED in line.channel.metadata:
+            counted["truncated"] += 1
     return counted
 
 

@@ -9,12 +9,11 @@ from typing import Any, Final
 
 from pebble.contract import OUTGOING
 from pebble.extensions.media import pyav
-from pebble.extensions.media.packets import PBAT
 from pebble.extensions.recordings.exports.film_sound import RATE, SoundResult, SoundTrack
 from pebble.extensions.recordings.exports.lines import Progress
 from pebble.extensions.recordings.exports.unfinished import unfinished
 from pebble.extensions.recordings.files.recorded import Recorded, RecordingError
-from pebble.extensions.recordings.stamps import is_picture
+from pebble.extensions.recordings.stamps import is_media, is_picture
 
 #: By the ending of the film: FFmpeg's names of the container and of the encoder of its sound.
 _FORMATS: Final = {".mkv": ("matroska", "libopus"), ".mp4": ("mp4", "aac")}
@@ -99,16 +98,19 @@ def write_wav(
 
 def _media(messages: Iterable[Recorded], robot: str, on_time: Progress) -> Iterator[tuple[int, bytes]]:
     """Yield the messages of one topic of pictures and one of sound, with milliseconds since the first message."""
-    below, topics, first_ms = f"{robot}/{OUTGOING}/", dict[bool, str](), None
+    first_ms = None
+    first_topics: dict[str, str] = {}  # of pictures, and of sound: the topic that counts
     for message in messages:
         on_time(message.log_ns)
         topic, payload = message.channel.topic, message.payload
-        if topic.startswith(below) and message.channel.metadata.get("retained") != "1":
-            picture = is_picture(payload)
-            if (picture or payload.startswith(PBAT)) and topics.setdefault(picture, topic) == topic:
-                log_ms = message.log_ns // 10**6
-                first_ms = log_ms if first_ms is None else first_ms
-                yield log_ms - first_ms, payload
+        is_old = message.channel.metadata.get("retained") == "1"
+        if is_old or not topic.startswith(f"{robot}/{OUTGOING}/") or not is_media(payload):
+            continue
+        kind = "pictures" if is_picture(payload) else "sound"
+        if first_topics.setdefault(kind, topic) == topic:
+            log_ms = message.log_ns // 10**6
+            first_ms = log_ms if first_ms is None else first_ms
+            yield log_ms - first_ms, payload
 
 
 def _sound_packets(av: Any, path: Path, out: Any, codec: str) -> Iterator[Any]:

@@ -82,7 +82,8 @@ def read_lines(file: BinaryIO) -> Iterator[Recorded | BadLine]:
 
     Raises RecordingError at a line that is too long for memory.
     """
-    for number, line in enumerate(iter(partial(file.readline, LONGEST_LINE + 1), b""), 1):
+    bounded_lines = iter(partial(file.readline, LONGEST_LINE + 1), b"")  # until it returns no bytes
+    for number, line in enumerate(bounded_lines, 1):
         if len(line) > LONGEST_LINE:
             raise RecordingError(f"{file.name}: line {number} is longer than {LONGEST_LINE:,} bytes")
         if not line.isspace():

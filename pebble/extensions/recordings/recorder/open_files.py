@@ -28,7 +28,8 @@ class RetainedValues:
         stored = self._values.get(key)
         if item.retained and stored is not None and not stored.retained:
             return  # fetched by another connection, while a newer one had come
-        if not item.retain and not (item.retain is None and stored is not None):
+        is_retained = stored is not None if item.retain is None else item.retain
+        if not is_retained:
             return
         if item.payload:
             self._values[key] = item._replace(retain=True)

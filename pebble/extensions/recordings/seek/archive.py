@@ -41,7 +41,7 @@ class Archive:
         self._named: list[_Named] = []
         self._listed_at = float("-inf")
         self._open: dict[Path, RecordingFile] = {}
-        self._failed: dict[Path, str] = {}  # those that cannot be opened, and why
+        self._failed: dict[Path, str] = {}  # why a file cannot be opened
 
     def close(self) -> None:
         while self._open:
@@ -75,9 +75,7 @@ class Archive:
             missing = topics - newest.keys()
             if not missing:
                 break
-            if chunk.channels and not any(
-                file.channels[number].topic in missing for number in chunk.channels if number in file.channels
-            ):
+            if not _may_hold(file, chunk, missing):
                 continue
             for message in reversed(file.messages(chunk)):
                 topic = message.channel.topic
@@ -134,10 +132,10 @@ class Archive:
 
     def files(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[RecordingFile]:
         """Return the files that may hold messages of a robot in a period, opened, in the order of time."""
-        lane = lane_of(f"{robot}/", is_media=True)
+        media_lanes = (lane_of(f"{robot}/", is_media=True), OTHER_MEDIA) if media else ()
         files = []
         for named in self._list():
-            if named.lane.startswith(MEDIA) and (not media or named.lane not in (lane, OTHER_MEDIA)):
+            if named.lane.startswith(MEDIA) and named.lane not in media_lanes:
                 continue
             if named.begins_ns and not since_ns - _LONGEST_FILE_NS <= named.begins_ns < until_ns:
                 continue
@@ -165,7 +163,7 @@ class Archive:
             self._named = sorted(_named(path) for path in paths if path.is_file())
             self._listed_at = now
             there = {named.path for named in self._named}
-            for path in [path for path in self._open if path not in there]:
+            for path in self._open.keys() - there:
                 self._open.pop(path).close()
             self._failed = {path: why for path, why in self._failed.items() if path in there}
         return self._named
@@ -209,6 +207,7 @@ def metric_of(topic: str) -> tuple[str, bool]:
 
 
 def _first(file: RecordingFile, robot: str, at_ns: int) -> int | None:
+    """Return the time of a file's first message of the robot from ``at_ns`` on; None if there is none."""
     for chunk in _within(file, _channels_of(file, robot), at_ns, 1 << 63):
         for message in file.messages(chunk):
             if message.log_ns >= at_ns and _is_of(message.channel, robot) and not _is_carried(message.channel):
@@ -225,6 +224,12 @@ def _within(file: RecordingFile, channels: frozenset[int], since_ns: int, until_
         and chunk.start_ns < until_ns
         and (not chunk.channels or not chunk.channels.isdisjoint(channels))
     ]
+
+
+def _may_hold(file: RecordingFile, chunk: Chunk, topics: set[str]) -> bool:
+    """True if the chunk has a message of one of the topics, or if its channels are not known."""
+    channels = (file.channels[number] for number in chunk.channels if number in file.channels)
+    return not chunk.channels or any(channel.topic in topics for channel in channels)
 
 
 def _channels_of(file: RecordingFile, robot: str) -> frozenset[int]:

@@ -155,7 +155,9 @@ def _class(column: int) -> str:
 
 
 def _formatted(value: str | float | None) -> str:
-    return "–" if value is None else _text(value) if isinstance(value, str) else f"{value:,.2f}"
+    if isinstance(value, str):
+        return _text(value)
+    return "–" if value is None else f"{value:,.2f}"
 
 
 def _id(robot: RobotTraffic) -> str:
