@@ -105,6 +105,7 @@ def _is_address(host: str) -> bool:
 
 
 def _check_permitted(authority: Authority, hosts: Sequence[str]) -> None:
+    """Raise CertificateError for a host outside of the authority's name constraints."""
     constraints = authority.certificate.extensions.get_extension_for_class(x509.NameConstraints).value
     permitted = constraints.permitted_subtrees or ()
     domains = [f".{name.value}" for name in permitted if isinstance(name, x509.DNSName)]

@@ -155,22 +155,13 @@ class People:
         """Start a session; return its token, which is stored nowhere."""
         token = secrets.token_urlsafe(32)
         now = self._clock()
+        values = (_digest(token), secrets.token_hex(4), user.name, address, now, now + SESSION_S)
         self._change("DELETE FROM sessions WHERE expires <= ?", now)
+        newest = "SELECT digest FROM sessions WHERE name = ? ORDER BY started DESC LIMIT ?"
+        others = f"DELETE FROM sessions WHERE name = ? AND digest NOT IN ({newest})"  # noqa: S608
+        self._change(others, user.name, user.name, _SESSIONS_EACH - 1)
         self._change(
-            "DELETE FROM sessions WHERE name = ? AND digest NOT IN "
-            "(SELECT digest FROM sessions WHERE name = ? ORDER BY started DESC LIMIT ?)",
-            user.name,
-            user.name,
-            _SESSIONS_EACH - 1,
-        )
-        self._change(
-            "INSERT INTO sessions (digest, id, name, address, started, expires) VALUES (?, ?, ?, ?, ?, ?)",
-            _digest(token),
-            secrets.token_hex(4),
-            user.name,
-            address,
-            now,
-            now + SESSION_S,
+            "INSERT INTO sessions (digest, id, name, address, started, expires) VALUES (?, ?, ?, ?, ?, ?)", *values
         )
         return token
 

@@ -92,6 +92,7 @@ class RowWriter:
             self._store_all()
 
     def _store_all(self) -> None:
+        """Store the waiting rows, and how many are lost; if that fails, they go on waiting."""
         with self._lock:
             waiting, lost = len(self._rows), self._lost
             rows = [*self._rows]

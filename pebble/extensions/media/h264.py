@@ -69,7 +69,9 @@ class H264Encoder:
         height, width = picture.shape[0] & ~1, picture.shape[1] & ~1
         if min(height, width) < SMALLEST_EDGE:
             raise PebbleError(f"h264: a picture of {picture.shape[1]}x{picture.shape[0]} is too small")
-        context = self._ready(width, height, quality, rests=self._rests(picture))
+        settings = (width, height, quality, self._rests(picture))
+        if self._context is None or self._opened_for != settings:
+            self._context, self._opened_for = self._open(*settings), settings
         self._i420 = cast(Pixels, cv2.cvtColor(picture[:height, :width], cv2.COLOR_BGR2YUV_I420, self._i420))
         frame = self._av.VideoFrame.from_ndarray(self._i420, "yuv420p")
         frame.pts = self._count
@@ -77,7 +79,7 @@ class H264Encoder:
         if keyframe:
             frame.pict_type = self._av.video.frame.PictureType.I
         try:
-            packets = context.encode(frame)
+            packets = self._context.encode(frame)
         except self._av.error.FFmpegError as error:
             self._context = None
             raise PebbleError(f"h264: {error}") from None
@@ -92,14 +94,7 @@ class H264Encoder:
         self._resting += 1
         return self._resting > self._rate * _REST_S
 
-    def _ready(self, width: int, height: int, quality: float, *, rests: bool) -> av.VideoCodecContext:
-        """Return an encoder with these settings: the present one, or else a new one."""
-        settings = (width, height, quality, rests)
-        if self._context is None or self._opened_for != settings:
-            self._context, self._opened_for = self._open(width, height, quality, rests=rests), settings
-        return self._context
-
-    def _open(self, width: int, height: int, quality: float, *, rests: bool) -> av.VideoCodecContext:
+    def _open(self, width: int, height: int, quality: float, rests: bool) -> av.VideoCodecContext:
         context: av.VideoCodecContext = self._av.CodecContext.create("libx264", "w")
         context.width, context.height, context.pix_fmt = width, height, "yuv420p"
         context.time_base, context.framerate = 1 / self._rate, self._rate

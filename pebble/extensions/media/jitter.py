@@ -167,6 +167,7 @@ class JitterBuffer:
         return max(0.0, self._due - now)
 
     def take(self, now: float) -> Chunk | None:
+        """Return the sound to play now; None if none is due yet, or the buffer has run out."""
         if not self._playing and not self._begin(now):
             return None
         if now < self._due:
@@ -191,6 +192,7 @@ class JitterBuffer:
         return True
 
     def _next(self, now: float) -> Chunk | None:
+        """Return the next packet's sound, or estimated sound for a gap before it; None if that is used up."""
         if not self._waiting:
             if self._last is not None and not self._concealed:
                 self.counters.add("underruns")

@@ -1,6 +1,6 @@
 """One stream of messages, in the order of time, from any number of recordings."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -65,6 +65,13 @@ def merged(
                 reading = partial(_messages, path, since_ns, until_ns, chooses, damages)
                 due.append((max(file.first_ns, since_ns), reading))
     yield from in_time_order(due)
+
+
+def reported(messages: Iterable[Recorded], on_time: Callable[[int], None]) -> Iterator[Recorded]:
+    """Yield the messages; call ``on_time`` with the log time of each."""
+    for message in messages:
+        on_time(message.log_ns)
+        yield message
 
 
 def problems(damages: Damages) -> list[str]:

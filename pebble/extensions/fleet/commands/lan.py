@@ -166,6 +166,7 @@ def _accounts(fleet: Fleet, robots: list[str], boards: list[str]) -> Fleet:
 
 
 def _write_boards(place: Path, fleet: Fleet, boards: list[str], passwords: dict[str, str]) -> None:
+    """Write the boards' configs, and the file and password of their gateway."""
     for name in boards:
         piece = pieces.of_broker(fleet, name, passwords[name], board=True)
         piece["robot"]["platform"] = "esp32"
@@ -178,14 +179,13 @@ def _write_boards(place: Path, fleet: Fleet, boards: list[str], passwords: dict[
 
 
 def _write_robot(place: Path, fleet: Fleet, name: str, others: list[str]) -> None:
+    """Write a robot's folder: its config, in which it listens to the ``others``, and its certificate."""
     piece = pieces.of_certificate(fleet, _neighbour(name))
     section = piece["services"]["neighbours"]
     section |= {"shares": list(_SHARED), "listens": {other: list(_SHARED) for other in others}}
     robot_folder = _folder_of(place, name)
-    _write(
-        robot_folder / f"{name}.json",
-        {"robot": piece["robot"], "transport": {"kind": "zenoh"}, "services": piece["services"]},
-    )
+    config = {"robot": piece["robot"], "transport": {"kind": "zenoh"}, "services": piece["services"]}
+    _write(robot_folder / f"{name}.json", config)
     for suffix, mode in ((".pem", 0o644), (".key", 0o600)):
         file = place / certificates.ACCOUNTS / f"{_neighbour(name)}{suffix}"
         write(robot_folder / file.name, read_plain(file), mode, FleetError)

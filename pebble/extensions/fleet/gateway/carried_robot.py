@@ -37,6 +37,7 @@ class NamedSubjects(Subjects):
     """A robot's subjects without renamed topics. Topics with an account's name are forwarded unchanged."""
 
     def _find(self, topic: str) -> Subject | None:
+        """Return the subject of a topic; behind an account's name it is the one of the same topic without a name."""
         if not topic.startswith(f"{self._base}/{INCOMING}/{BY}/"):
             return super()._find(topic)
         named = without_name(topic)
@@ -96,6 +97,7 @@ def begin(robots: Sequence["CarriedRobot"], hub: Transport, broker: Transport) -
 
 
 def _subscribe(robots: Sequence["CarriedRobot"], side: Side, transport: Transport, *below: str) -> None:
+    """Subscribe on one side to filters ``below`` the base of each robot, and wait for the retained messages."""
     handlers: dict[str, Handler] = {}
     for robot in robots:
         handlers |= robot.subscribing(side, *below)
@@ -169,6 +171,7 @@ class CarriedRobot:
     # -- the transports' threads
 
     def receive(self, side: Side, message: Message) -> None:
+        """Forward a message, unless it is too large, a medium that is not wanted, or a stop that comes another way."""
         subject = self.subjects[message.topic]
         if subject is None:
             return

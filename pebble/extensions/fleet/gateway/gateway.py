@@ -154,12 +154,9 @@ class Gateway:
             robot.tick(now)
         if now - self._published_at >= HEARTBEAT_S and self._presence.state is State.CONNECTED:
             self._published_at = now
-            heartbeat = GatewayHeartbeat(
-                t=int(time.time() * 1000), run=self._others.run, robots=tuple(sorted(self._carried))
-            )
-            self._presence.publish(
-                will(self._name).topic, _encode(heartbeat), qos=QoS.DELIVERED, retain=True, remember=False
-            )
+            topic, robots = will(self._name).topic, tuple(sorted(self._carried))
+            heartbeat = GatewayHeartbeat(t=int(time.time() * 1000), run=self._others.run, robots=robots)
+            self._presence.publish(topic, _encode(heartbeat), qos=QoS.DELIVERED, retain=True, remember=False)
 
     @property
     def _is_connected(self) -> bool:

@@ -210,6 +210,7 @@ class FrameReader:
         return info.sequence - number - 1 if info.writer == writer else 0
 
     def _on_writer(self, sample: zenoh.Sample) -> None:
+        """Note that a writer begins or ends; let the session be reopened if sharing memory with it changes."""
         try:
             writer_id, size, segment = self._names.writer_of(str(sample.key_expr))
         except ValueError:

@@ -6,7 +6,7 @@ cuts payloads at 8192 bytes unless asked otherwise. We add ``retained``: the log
 messages that are from before them only, ours as they were published.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from decimal import Decimal
 from functools import partial
@@ -25,8 +25,6 @@ TRUNCATED: Final = "truncated"  # of a channel: its payloads were cut before the
 LONGEST_LINE: Final = 96 << 20  # bytes; the largest message of a recording takes less
 _TEXT_MOST: Final = 1 << 16  # bytes of a payload that is written as text, too
 _LATEST_NS: Final = (1 << 63) - 1
-
-Progress = Callable[[int], None]  # called with the log time of each message
 
 
 class BadLine(Struct, frozen=True):
@@ -63,7 +61,7 @@ _encoder = msgspec.json.Encoder()
 _decoder = msgspec.json.Decoder(_Line)
 
 
-def write_lines(messages: Iterable[Recorded], out: BinaryIO, *, on_time: Progress = lambda _log_ns: None) -> int:
+def write_lines(messages: Iterable[Recorded], out: BinaryIO) -> int:
     """Write a line for each message; return their number.
 
     Stamps have nine decimals, so that reading the lines restores the same nanoseconds. Payloads of up to 64 KiB are
@@ -73,7 +71,6 @@ def write_lines(messages: Iterable[Recorded], out: BinaryIO, *, on_time: Progres
     for message in messages:
         out.write(_encoder.encode(_line(message)) + b"\n")
         count += 1
-        on_time(message.log_ns)
     return count
 
 

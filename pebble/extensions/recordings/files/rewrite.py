@@ -81,14 +81,13 @@ class Copy:
         return self._writer.channel(channel.topic, channel.encoding, channel.metadata, number)
 
 
-def write_copy(messages: Iterable[Recorded], out: File, *, on_time: Callable[[int], None]) -> int:
-    """Write ``messages`` as a recording; return their number. ``on_time`` gets the time of each."""
+def write_copy(messages: Iterable[Recorded], out: File) -> int:
+    """Write ``messages`` as a recording; return their number."""
     writer = RecordingWriter(out)
     writer.metadata("pebble.recording", {"format": "1", "exported": "1"})
     copy = Copy(writer)
     for message in messages:
         copy.add(message)
-        on_time(message.log_ns)
     writer.finish()
     return writer.messages
 

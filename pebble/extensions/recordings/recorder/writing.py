@@ -11,9 +11,8 @@ from typing import Final, NamedTuple
 
 from pebble.extensions.recordings.files.recorded import RecordingError
 from pebble.extensions.recordings.recorder.background import Background
-from pebble.extensions.recordings.recorder.clock import RecordingClock
+from pebble.extensions.recordings.recorder.clock import Due, RecordingClock
 from pebble.extensions.recordings.recorder.disk_space import Disk, outdated, surplus
-from pebble.extensions.recordings.recorder.due import Due
 from pebble.extensions.recordings.recorder.finisher import Finisher
 from pebble.extensions.recordings.recorder.folder import STATE, Folder
 from pebble.extensions.recordings.recorder.intake import EVENTS, FORGET, Intake
@@ -76,7 +75,7 @@ class Writing:
 
         Without a lock they may be another recorder's; then they stay as they are.
         """
-        open_paths = self._files.paths
+        open_paths = {file.path for file in self._files.by_lane.values()}
         leftovers = [entry.path for entry in self._folder.entries() if entry.is_active and entry.path not in open_paths]
         if self._folder.is_locked:
             for path in leftovers:

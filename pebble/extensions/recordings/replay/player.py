@@ -229,6 +229,7 @@ class Player:
         self._pace.go_on_from(position_ns)
 
     def _step(self) -> None:
+        """Wait, send one message, or end: what is due now."""
         now, reading = self._now(), self._reading
         if now - self._waited > _TICK_S:
             self._pass(0.0)
@@ -244,6 +245,7 @@ class Player:
             self._play(reading.next, now)
 
     def _play(self, message: Recorded, now: float) -> None:
+        """Send the next message if it is due, else wait for a moment."""
         due_s = self._pace.due_s(message.log_ns, now)
         if message.log_ns - self._pace.reached_ns > self._longest_gap_ns:
             self._pace.go_on_from(message.log_ns)

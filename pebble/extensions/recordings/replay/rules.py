@@ -148,6 +148,7 @@ class Rules:
         return None if command.signed else command.moves
 
     def _add(self, channel: Channel) -> None:
+        """Note the robot of a channel. Raises ReplayError if its new base is its old one, or another robot's."""
         address = self._address(channel)
         if address is None:
             return

@@ -11,9 +11,10 @@ from msgspec import Struct, field
 from pebble.contract import DRIVE
 from pebble.extensions.recordings.catalogue import event_in
 from pebble.extensions.recordings.files.reader import Chunk, RecordingFile
+from pebble.extensions.recordings.files.recorded import FOREVER_NS
 from pebble.extensions.recordings.library import robot_of, robots_of
 from pebble.extensions.recordings.recorder.intake import EVENTS
-from pebble.extensions.recordings.seek.archive import Archive
+from pebble.extensions.recordings.seek.archive import Archive, messages_of
 
 DAY_NS: Final = 86_400 * 10**9
 _MOST_DAYS: Final = 31  # of one chunk
@@ -123,13 +124,8 @@ def _merge(day: Day, other: Day) -> None:
 
 def _gaps(file: RecordingFile) -> list[int]:
     """Return the times of the gaps that the recorder noted."""
-    numbers = {number for number, channel in file.channels.items() if channel.topic == EVENTS}
-    times = []
-    for chunk in file.chunks if numbers else []:
-        if not chunk.channels.isdisjoint(numbers):
-            times += [
-                message.log_ns
-                for message in file.messages(chunk)
-                if message.channel.id in numbers and event_in(message.payload).get("event") == "gap"
-            ]
-    return times
+    numbers = frozenset(number for number, channel in file.channels.items() if channel.topic == EVENTS)
+    if not numbers:
+        return []
+    noted = messages_of(file, numbers, 0, FOREVER_NS)
+    return [message.log_ns for message in noted if event_in(message.payload).get("event") == "gap"]

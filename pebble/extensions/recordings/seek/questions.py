@@ -24,7 +24,7 @@ from pebble.extensions.recordings.exports.film import write_film
 from pebble.extensions.recordings.exports.unfinished import unfinished
 from pebble.extensions.recordings.files.recorded import ACTIVE
 from pebble.extensions.recordings.files.rewrite import write_copy
-from pebble.extensions.recordings.library import Damages, merged, problems, robot_of
+from pebble.extensions.recordings.library import Damages, merged, problems, reported, robot_of
 from pebble.extensions.recordings.seek.archive import Archive
 from pebble.extensions.recordings.seek.days import Days
 from pebble.extensions.recordings.traffic.timeline import timeline as make_timeline
@@ -111,7 +111,7 @@ def export_job(
             write_film(read, target, robot, on_time=on_time)
         else:
             with unfinished(target) as path, path.open("wb") as out:
-                if not write_copy(read(), out, on_time=on_time):
+                if not write_copy(reported(read(), on_time), out):
                     raise PebbleError(f"there is no message of {robot} in this stretch")
         return "; ".join(problems(damages))
 
