@@ -92,7 +92,7 @@ def passwords_in(text: str) -> dict[str, Hashed]:
 
 
 def rules_in(acl: str) -> Iterator[str]:
-    """Yield each rule after its account's name. Rules before the first account apply to everybody."""
+    """Yield each rule behind its account's name, or behind ``everybody`` if it is before the first account."""
     name = "everybody"
     for line in filter(None, map(str.strip, acl.splitlines())):
         word, _, rest = line.partition(" ")

@@ -206,7 +206,7 @@ class Gateway:
             self._carried.pop(base).end()
             log.info("carries %s no more", base)
 
-    # -- called by the transports' threads: the last two by the rules of pebble.transports.base.TopicPolicy
+    # -- on the transports' threads; the last two are rules of pebble.transports.base.TopicPolicy
 
     def _on_state(self, state: State) -> None:
         if state is not State.CONNECTED:
