@@ -109,7 +109,8 @@ class _Output(BufferedIOBase):
     def write(self, data: bytes) -> int:  # type: ignore[override]
         unwritten = memoryview(data)
         while unwritten:
-            unwritten = unwritten[self._file.write(unwritten) :]
+            taken = self._file.write(unwritten)  # None: nothing
+            unwritten = unwritten[taken or 0 :]
         self.size += len(data)
         if data[:1] == _CHUNK:  # the package writes a chunk in one call, and holds back no message
             self.messages = self._writer.messages

@@ -161,8 +161,8 @@ class Rules:
             )
 
 
-def harmless(payload: bytes, recorded: str, base: str) -> bytes:
-    """Return capabilities with their topics below ``base``, without offers that a replay cannot serve.
+def harmless(payload: bytes, old_base: str, new_base: str) -> bytes:
+    """Return capabilities with their topics below ``new_base``, without offers that a replay cannot serve.
 
     Pages publish to the topics that they find here: unchanged, they would drive the real robot. Unreadable capabilities
     become b"".
@@ -173,12 +173,12 @@ def harmless(payload: bytes, recorded: str, base: str) -> bytes:
         return b""
     if not isinstance(plain, dict) or not isinstance(plain.get("value"), dict):
         return b""
-    value = {name: _section(name, section, recorded, base) for name, section in plain["value"].items()}
+    value = {name: _section(name, section, old_base, new_base) for name, section in plain["value"].items()}
     return msgspec.json.encode({**plain, "value": value})
 
 
-def _section(name: str, section: Any, recorded: str, base: str) -> Any:
-    section = _rebased(section, f"{recorded}/", f"{base}/")
+def _section(name: str, section: Any, old_base: str, new_base: str) -> Any:
+    section = _rebased(section, f"{old_base}/", f"{new_base}/")
     return section if name in _WATCHED else _without_controls(section, drives=name == "drive")
 
 
