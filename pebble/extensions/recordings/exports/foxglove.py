@@ -73,7 +73,7 @@ class _Export:
         if topic not in self._channels:
             schema = Schema(protobuf.DESCRIPTOR.full_name, "protobuf", self._schemas.descriptors(protobuf))
             self._channels[topic] = Channel(0, topic, "protobuf", {}, schema)
-        stamp = _time_of(message)
+        stamp = time_of(message.payload, message.log_ns, message.publish_ns)
         self._copy.add(Recorded(self._channels[topic], 0, message.log_ns, stamp, stamped(protobuf, stamp)))
         self.counts[protobuf.DESCRIPTOR.name] += 1
 
@@ -82,9 +82,6 @@ class _Export:
         if payload is None:
             self.counts[LEFT_OUT] += 1
             return
-        self._copy.add(Recorded(Channel(0, topic, JSON), 0, message.log_ns, _time_of(message), payload))
+        stamp = time_of(message.payload, message.log_ns, message.publish_ns)
+        self._copy.add(Recorded(Channel(0, topic, JSON), 0, message.log_ns, stamp, payload))
         self.counts[JSON] += 1
-
-
-def _time_of(message: Recorded) -> int:
-    return time_of(message.payload, message.log_ns, message.publish_ns)

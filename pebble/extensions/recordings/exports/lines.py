@@ -101,16 +101,10 @@ def _line(message: Recorded) -> _Written:
         payload_b64=payload,
     )
     if len(payload) <= _TEXT_MOST:
-        _add_text(line, payload)
+        with suppress(UnicodeDecodeError, msgspec.DecodeError, RecursionError):
+            line.payload_text = payload.decode()
+            line.payload_json = msgspec.json.decode(payload)
     return line
-
-
-def _add_text(line: _Written, payload: bytes) -> None:
-    try:
-        line.payload_text = payload.decode()
-        line.payload_json = msgspec.json.decode(payload)
-    except (UnicodeDecodeError, msgspec.DecodeError, RecursionError):
-        pass
 
 
 def _message(number: int, line: bytes) -> Recorded | BadLine:
