@@ -126,7 +126,7 @@ def refused(fleet: Fleet, name: str, account: Account) -> str:
         return why
     is_gateway = any(role in account.roles for role in (ProgramRole.GATEWAY, ProgramRole.BOARDS))
     is_robot = any(role in account.roles for role in (ProgramRole.ROBOT, ProgramRole.NEIGHBOUR))
-    if is_robot != (len(account.bases) == 1) and not is_gateway:
+    if not is_gateway and len(account.bases) != (1 if is_robot else 0):
         return "a robot, or a neighbour, has one base (--base pebble/robots/goob), and no other account has any"
     if account.plain and not is_robot:
         return "only a robot can be plain"
