@@ -31,7 +31,7 @@ from pebble.errors import PayloadError
 MOST_MEMBERS, MOST_BYTES = 8, 2048  # of a group: one packet of a thin link, and one write at a board
 MEMBERS = (DRIVE, LIGHTS_SOLID, LIGHTS_FLASH, SOUNDBOARD_COMMAND, OUTLET_COMMAND, MCU_COMMAND)
 _SHOWN = 40  # characters of a metric
-MARK = "group"  # of a copy: true
+MARK = "group"  # a field of a member's copy for programs that take no groups: true
 
 
 class Member(Struct, frozen=True):
@@ -78,12 +78,14 @@ def _unique_keys(text: bytes) -> Any:
     import json  # the only reader that shows it, and only robots with groups pay for it
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(fields := dict(pairs)) < len(pairs):
+        fields = dict(pairs)
+        if len(fields) < len(pairs):
             raise PayloadError(f"{GROUP.metric}: a key is there twice")
         return fields
 
     def finite(number: str) -> float:
-        if not math.isfinite(value := float(number)):
+        value = float(number)
+        if not math.isfinite(value):
             raise PayloadError(f"{GROUP.metric}: {number[:_SHOWN]} is not a finite number")
         return value
 
