@@ -45,7 +45,7 @@ class Admission:
             return Drop.TOO_OFTEN
         if subject.kind is not Kind.FLAG or subject.channel is not None:
             return None
-        if not message.payload:  # a removal: a million of unknown flags cost the robot nothing
+        if not message.payload:  # a removal, which needs no room
             if side is Side.REMOTE and topic not in self._flags:
                 return Drop.KNOWN
             self._flags.discard(topic)
@@ -60,6 +60,7 @@ class Admission:
         return len(self._flags) >= MAX_UNKNOWN_FLAGS and topic.decode(errors="replace") not in self._flags
 
     def _is_too_often(self, subject: Subject, message: Message, named: bool) -> bool:
+        """Count an action or unknown command; True if this second has had too many of them."""
         if subject.kind is Kind.ACTION and subject.channel is not None:
             key: Kind | Channel = subject.channel
             most = MAX_ACTIONS

@@ -17,6 +17,8 @@ RESEND_S = 3.0
 
 
 class _Event(Struct, eq=False):
+    """An event, with the time when it was sent."""
+
     message: Message
     sent_at: float = 0.0
 
@@ -35,7 +37,7 @@ class EventBuffer:
         self._transport, self._counters, self._clock, self._limit = transport, counters, clock, limit
         self._lock = threading.Lock()
         self._waiting: deque[_Event] = deque()
-        self._recent: deque[_Event] = deque(maxlen=limit)
+        self._recent: deque[_Event] = deque(maxlen=limit)  # sent on this connection, which may have lost the last ones
         self._lost_at: float | None = None  # when the connection was lost, until flush()
         #: True if a message may be sent now, where the link is thin; others wait.
         self.has_room: Callable[[Message], bool] | None = None

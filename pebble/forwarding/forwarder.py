@@ -43,6 +43,7 @@ _BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCUL
 _WARNED = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN)
 
 
+#: Publishes an admitted message on the other side, or returns why not, as :meth:`Forwarder.pass_now`.
 Pass = Callable[[SideState, Subject, Message, Forward, str], Forward | Drop]
 
 
@@ -66,7 +67,9 @@ class Mirroring:
         self._sides, self._was_refused = sides, False
 
     def switch(self, *, on: bool) -> None:
-        self.on, self._was_refused = on, on and self._was_refused
+        self.on = on
+        if not on:
+            self._was_refused = False  # the next refusal is logged again
 
     def is_possible(self) -> bool:
         """True if no side sends our own messages back. Otherwise commands would be repeated, even after a stop."""
@@ -108,7 +111,7 @@ class Forwarder:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.counters, self._steps = Counters(), steps
-        self.stays: Callable[[str], bool] = lambda _topic: False  # True: obeyed only inside the robot
+        self.stays: Callable[[str], bool] = lambda _topic: False  # True for topics obeyed only inside the robot
         self.subjects, self._rules, self._names, self._clock = subjects, rules, names, clock
         self._pass_stop = pass_stop
         self.sides = Sides(
@@ -127,7 +130,7 @@ class Forwarder:
         self.mirroring = Mirroring(self.sides)
         #: Publishes a message that is admitted, at once; an extension may put in its place what lets some wait.
         self.pass_on: Pass = self.pass_now
-        #: Is told of each command whose age matters, and that does not tell its own, whether it was late.
+        #: Is told whether each drive command, and request for control, from outside was late.
         self.note_age: Callable[[bool], None] = lambda _late: None
         for transport in transports.values():
             transport.policy.is_stop = self._is_stop
@@ -207,18 +210,18 @@ class Forwarder:
     def _receive_named(self, source: SideState, names: Names, message: Message) -> Routed:
         """Forward a message whose sender is checked: the name moves from the topic into the payload."""
         sender = names[message.topic]
-        subject, by = sender.subject, sender.account  # sign() adds the person for whom an account acts
+        subject, by = sender.subject, sender.account  # sign() may add to this the person for whom the account acts
         outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
         if subject is None:
             outcome = sender.foreign
         elif isinstance(outcome, Forward):
             match names.sign(sender, message):
-                case Signed(signed, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:
+                case Signed(signed, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:  # set on both sides
                     outcome = self.retained.change(subject, signed)
                 case Signed(signed, by):
                     outcome = self.pass_on(source, subject, signed, outcome, sender.account)
                 case Drop.UNNAMED if outcome.retain:  # it may be a retained message of the robot itself
-                    outcome = self.retained.receive(source, subject, message, outcome, old=True)
+                    outcome = self.retained.receive(source, subject, message, outcome, only_old=True)
                 case Drop() as drop:
                     outcome = drop
         if isinstance(outcome, Drop) and outcome in _NAMES:
@@ -318,11 +321,11 @@ class Forwarder:
 
     def _is_late(self, subject: Subject, message: Message, forward: Forward, account: str) -> bool:
         """True if a command or action has waited for too long, unless it only ends something."""
-        waited_s = message.waited_s
-        if forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload:
-            waited_s = self.ages.waited_s(subject, message, account)
+        tells_age = forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload
+        waited_s = self.ages.waited_s(subject, message, account) if tells_age else message.waited_s
         late = waited_s > subject.waits_s and not ends_something(subject, message)
-        if forward.stamped and not (late and STAMP in message.payload):  # who tells it keeps to the pace of the link
+        # A late one that tells its age is no sign of a flood: its sender keeps to the pace of the link.
+        if forward.stamped and not (late and tells_age):
             self.note_age(late)
         return late
 
@@ -374,8 +377,11 @@ class Forwarder:
         if self.gate is Gate.SHUT:
             return Drop.CLOSED
         target.events.hold(message)
-        if self.gate is not Gate.WAITING:  # it was opened or shut meanwhile, perhaps before this event was there
-            (target.events.resume if self.gate is Gate.OPEN else target.events.clear)()
+        gate = self.sides.gate  # it may have been opened or shut meanwhile, perhaps before this event was there
+        if gate is Gate.OPEN:
+            target.events.resume()
+        elif gate is Gate.SHUT:
+            target.events.clear()
         return Drop.HELD
 
     def _is_stop(self, topic: str) -> bool:

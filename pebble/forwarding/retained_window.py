@@ -23,7 +23,9 @@ class RetainedWindow:
 
     def __init__(self, transport: Transport, clock: Callable[[], float]) -> None:
         self._transport, self._clock = transport, clock
-        self._subscribed_at = self._until = self._stops_until = float("inf")
+        self._subscribed_at = float("inf")
+        self._until = float("inf")  # when messages with the retain flag count as live ones again,
+        self._stops_until = float("inf")  # and when stops do
         self._newest_at = float("-inf")  # of the messages that may be old
 
     @property
