@@ -54,12 +54,13 @@ class Arbiter:
         self.tick(now)
         lease = self.lease
         local = by is None
-        if by and run != PERSON and not lease.holds(key, by):  # of a script elsewhere only a zero counts
+        if by and run != PERSON and not lease.holds(key, by):  # of a script elsewhere only a zero counts, as a person's
             if moves:
                 return REFUSED
             run = PERSON
         if lease.refuses(moves, run != PERSON or local, key, "" if local else by, now):
             return REFUSED
+        # A script, the client that has control, or any client while control is free.
         ours = run != PERSON or not lease.key or lease.holds(key, by)
         if newer(run, self.barred) and run != self._newest:  # it has begun, even if this command is refused
             self._newest = run

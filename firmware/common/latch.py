@@ -75,6 +75,7 @@ class Latch:
         senders.insert(0, sender)
         self.recent = [name] + self.recent  # a new list: states that were returned have the old one
         if len(senders) > self.names:
+            # The oldest name from before the start, or else of the sender with the most names.
             place = max([(other is None, senders.count(other), at) for at, other in enumerate(senders)])[2]
             del self.recent[place], senders[place]
         self.latched = True
@@ -91,9 +92,13 @@ class Latch:
 
         Then persons are refused until one sends a zero, or all pause for half a second.
         """
-        self.reset_refused = (
-            "boot" if boot != self.boot else "count" if count != self.count else "old" if age >= 1000 else None
-        )
+        self.reset_refused = None
+        if boot != self.boot:
+            self.reset_refused = "boot"
+        elif count != self.count:
+            self.reset_refused = "count"
+        elif age >= 1000:
+            self.reset_refused = "old"
         if self.reset_refused or not self.latched:
             return False
         self.latched = False

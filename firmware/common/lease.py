@@ -23,8 +23,10 @@ class Lease:
         self.strangers = strangers
         self._diff = diff
         self._random = random
+        # Times: of the holder's newest request or command, of its newest command that moved something, of the asker's
+        # newest request, and of the newest command without a key that moved something.
         self._since = self._held_from = self._asked = self._received = now
-        self._limit_ms = self._wait = 0  # of the holder, and of the asker
+        self._limit_ms = self._wait = 0  # how long control, and the asker's request, last after those times
         self._held = False  # in the last 5 s the holder moved something: others have to ask
 
     def hold(self, client: tuple, ms: int, urgent: bool, now: int) -> None:
@@ -115,7 +117,7 @@ def request_of(fields: dict) -> tuple[str, str, str, int] | None:
     ms = fields.get("for_ms", 3000)
     if not (isinstance(name, str) and isinstance(by, str) and isinstance(device, str)):
         return None
-    if len(name) != 8 or name.strip("0123456789abcdefABCDEF"):  # other letters would be left
+    if len(name) != 8 or name.strip("0123456789abcdefABCDEF"):  # of 8 hex digits strip leaves nothing
         return None
     if want not in ("hold", "release") or type(ms) not in (int, float):
         return None
