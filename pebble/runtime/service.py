@@ -107,7 +107,7 @@ class Service:
         self._remarks = RateLimitedLog(self.log, period_s=60.0, most=_SENDERS)
         self._inbox = Inbox()
         self._work = WorkLock()
-        self._states: dict[str, tuple[Channel, bytes]] = {}
+        self._states: dict[str, tuple[Channel, bytes]] = {}  # the newest ones, by topic, to be published again
         self._handled: dict[Channel, Subscription] = {}  # of methods marked with @on
         self._on_stop = ExitStack()
         self.running = True
@@ -226,7 +226,8 @@ class Service:
                 self.set_up()
             ready()
             while self.running:
-                self.turn(None if self._work.wakes_at == inf else max(0.0, self._work.wakes_at - self.clock()))
+                wakes_at = self._work.wakes_at
+                self.turn(None if wakes_at == inf else max(0.0, wakes_at - self.clock()))
         finally:
             self._tear_down()
 
