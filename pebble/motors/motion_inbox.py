@@ -107,10 +107,11 @@ class MotionInbox:
             sender = self._control.sender(request)
             waiting = self._requests.pop(sender, None)
             if len(self._requests) >= _REQUESTS:
-                knows = self._control.knows
+                knows = self._control.knows  # who neither has control nor asks first gives way
                 del self._requests[next(key for key, received in self._requests.items() if not knows(received.request))]
                 self.dropped += 1
-            over = not request.ends() and (over or (waiting is not None and waiting.over))
+            waiting_takes_over = waiting is not None and waiting.over  # a renewal must not undo that
+            over = not request.ends() and (over or waiting_takes_over)
             self._requests[sender] = ReceivedRequest(request, over, now)
             return was_empty
 
@@ -183,4 +184,6 @@ def _replaced(waiting: list[ReceivedDrive], newest: ReceivedDrive) -> list[Recei
     if newest.drive.moves or not zeros:
         return [*zeros, newest]
     final = next((received for received in zeros if received.drive.valid_ms == 0), None)
-    return [newest if final is None else ReceivedDrive(final.drive, newest.at, newest.company)]
+    if final is None:
+        return [newest]
+    return [ReceivedDrive(final.drive, newest.at, newest.company)]

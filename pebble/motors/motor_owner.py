@@ -10,7 +10,6 @@ from pebble import contract as c
 from pebble.contract import groups
 from pebble.contract.payloads import (
     ControlRequest,
-    ControlState,
     ControlTurn,
     ControlVouched,
     Drive,
@@ -20,7 +19,7 @@ from pebble.contract.payloads import (
     LightsSolid,
 )
 from pebble.errors import PayloadError, TransportError
-from pebble.motors.control import Control
+from pebble.motors.control import Control, earliest
 from pebble.motors.motion_inbox import MotionInbox, ReceivedDrive, ReceivedRequest
 from pebble.motors.motor_guard import MotorGuard
 from pebble.motors.state_file import StateFile
@@ -53,7 +52,7 @@ class MotorOwner(Service, ABC):
         self.notifier = Notifier()
         self._control = Control(
             self.config.security,
-            self._publish_control,
+            lambda state: self.publish(c.CONTROL_STATE, state, owner=self.owner),
             self.clock(),
             self.owner,
             self.config.motor_owners,
@@ -76,7 +75,7 @@ class MotorOwner(Service, ABC):
         self.on_stop(self._barred_file.close)
         self._deadline: Timer | None = None  # stops the motors unless a command arrives; None: they are stopped
         self._guard_timer: Timer | None = None
-        self.announced_latching = True  # that it latches, to operators
+        self.announced_latching = True  # operators were told that a stop latches here
         self._estop_note = Reported(self.notifier.feature, "estop", True)
         self._control_note = Reported(self.notifier.feature, "control", True)
 
@@ -126,7 +125,7 @@ class MotorOwner(Service, ABC):
 
     @on(c.ESTOP, direct=True)
     def receive_stop(self, stop: EstopCommand, _arrived: float) -> None:
-        if stop.owner not in self._control.peers:  # the bridge repeats it for one that has not confirmed it
+        if stop.owner not in self._control.peers:  # else the bridge repeats it only for another owner
             self._judge_soon(self._waiting.put_stop(stop))
 
     @on(c.ESTOP_RESET, direct=True)
@@ -193,7 +192,7 @@ class MotorOwner(Service, ABC):
     def judge(self) -> None:
         """Judge all waiting messages, stops first, because a stop voids the drive commands that wait with it."""
         batch = self._waiting.take()
-        latches = not batch.stops or self._latches  # without a stop nothing here depends on it
+        latches = not batch.stops or self._latches  # asked only if there are stops
         for stop in batch.stops:
             self._halt()
             if latches:
@@ -320,7 +319,7 @@ class MotorOwner(Service, ABC):
     # -- the guard
 
     def _arm_guard(self) -> None:
-        due = min((at for at in (self._guard.due, self._control.due) if at is not None), default=None)
+        due = earliest(self._guard.due, self._control.due)
         if due is None or (self._guard_timer is not None and self._guard_timer.due <= due):
             return
         if self._guard_timer is not None:
@@ -354,9 +353,6 @@ class MotorOwner(Service, ABC):
             self.publish(c.ESTOP_STATE, state, owner=self.owner)
         else:
             self.clear(c.ESTOP_STATE, owner=self.owner)
-
-    def _publish_control(self, state: ControlState) -> None:
-        self.publish(c.CONTROL_STATE, state, owner=self.owner)
 
     def _show_turn(self) -> None:
         turn = self._control.turn(self._guard.barred, self.clock())

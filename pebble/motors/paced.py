@@ -11,8 +11,8 @@ class Paced:
 
     def __init__(self, publish: Callable[[], object], per_s: int = STATES_PER_S) -> None:
         self._publish = publish
-        self._published = deque([float("-inf")] * per_s, maxlen=per_s)
-        self.due: float | None = None  # when a state is published that could not be before
+        self._published = deque([float("-inf")] * per_s, maxlen=per_s)  # the times of the newest ones
+        self.due: float | None = None  # when a state that has to wait is published
 
     @property
     def last(self) -> float:
