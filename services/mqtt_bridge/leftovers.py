@@ -26,14 +26,14 @@ class Leftovers:
         """
         self._remote, self._sparing = remote, sparing
         self._on_robot: set[str] | None = set()  # topics that the robot retains; None: the search is over
-        self._at_remote: set[str] = set()
+        self._at_remote: set[str] = set()  # topics that the broker retains
         self._subscriptions: list[Subscription] = []
         states = [channel for channel in CHANNELS if channel.kind is Kind.STATE and channel.direction == OUTGOING]
         wanted = [state for state in states if state not in (*_EXCEPTED, *channels) and state.synonym_of is None]
         patterns = [state.filter(base) for state in wanted if state.is_pattern]
         named = subjects.topics(*(state for state in wanted if not state.is_pattern))
         self._filters = [MCU_VALUE.filter(base), *patterns, *named]
-        self._next = 0  # of the filters
+        self._next = 0  # the index of the filter to ask for next
 
     @property
     def done(self) -> bool:
@@ -42,7 +42,10 @@ class Leftovers:
     def note_local(self, message: Message) -> None:
         on_robot = self._on_robot
         if on_robot is not None and len(on_robot) <= _TOPICS:
-            (on_robot.add if message.payload else on_robot.discard)(message.topic)
+            if message.payload:
+                on_robot.add(message.topic)
+            else:
+                on_robot.discard(message.topic)
 
     def begin(self) -> None:
         """Start again, because a connection was lost."""
@@ -51,10 +54,11 @@ class Leftovers:
         self._at_remote.clear()
 
     def ask_next(self) -> bool:
-        """Ask the broker for the next few topics, and wait for the answer; False if all were asked for."""
+        """Ask the broker for the topics of the next filter, and wait for the answer; False if none is left."""
         on_robot = self._on_robot or set()
-        while self._sparing and self._next < len(self._filters) and self._filters[self._next] in on_robot:
-            self._next += 1
+        if self._sparing:
+            while self._next < len(self._filters) and self._filters[self._next] in on_robot:
+                self._next += 1
         if self._next == len(self._filters):
             return False
         filter_ = self._filters[self._next]

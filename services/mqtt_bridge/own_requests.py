@@ -42,13 +42,14 @@ class OwnRequests:
             for place in extension.requests:
                 with logged(extension.name):
                     self._requests.append(part(place)(service))
+        # Who carries out the requests on a channel, by the channel's suffix.
         self._takers = {channel.suffix: requests for requests in self._requests for channel in requests.channels}
 
     def message(self, channel: Channel, payload: bytes) -> None:
         """Handle a message that is not a flag."""
         if channel is DRIVE:
             self._note_drive(payload)
-        elif channel.kind is not Kind.FLAG and (value := self._decoded(channel, payload)) is not None:
+        elif channel.kind is not Kind.FLAG and (value := self._decode_for_taker(channel, payload)) is not None:
             self._take(channel, value)
 
     def flag(self, channel: Channel, payload: bytes) -> None:
@@ -56,7 +57,7 @@ class OwnRequests:
         if channel is REMOTE_MIRROR:
             self._mirroring.switch(on=bool(payload and self._decode(channel, payload)))
         else:
-            self._take(channel, bool(payload and self._decoded(channel, payload)))
+            self._take(channel, bool(payload and self._decode_for_taker(channel, payload)))
 
     def repeat(self) -> None:
         """Try again all requests that have failed."""
@@ -68,8 +69,8 @@ class OwnRequests:
         if taker is not None:
             self._service.post_message(channel, partial(taker.take, channel, value), newest_of=channel.metric)
 
-    def _decoded(self, channel: Channel, payload: bytes) -> Any:
-        """Return the value of a message that an extension handles; None if it is malformed, or none does."""
+    def _decode_for_taker(self, channel: Channel, payload: bytes) -> Any:
+        """Return the value of a message that an extension handles; None if none does, or it is malformed."""
         return self._decode(channel, payload) if channel.suffix in self._takers else None
 
     def _decode(self, channel: Channel, payload: bytes) -> Any:

@@ -27,7 +27,7 @@ from pebble.forwarding.names import Names
 from pebble.forwarding.observer import ROBOT, Observers, Step, steps_of
 from pebble.forwarding.private_topics import PrivateTopics
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
-from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
+from pebble.forwarding.routing import TABLE_A1, Drop, Side
 from pebble.forwarding.service import CHECK_SOON_S, ForwardingService
 from pebble.forwarding.side import Gate
 from pebble.forwarding.subjects import Subject
@@ -55,7 +55,8 @@ _RETRY_S = 1.0
 _IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a program requests of the bridge now
 LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later
 _LOGGED = 200  # characters of a topic
-_CHECK_STOPS_S, _NOTICED_S = 1.0, 1.0
+_CHECK_STOPS_S = 1.0
+_NOTICED_S = 1.0  # by so much later than its limit a silence is noticed
 _ARRIVAL_S = 0.25  # between two looks whether a probe has arrived, for which the mirror waits
 _THIN_GRACE_S = 30.0  # over a thin link, while a client floods it
 ASK_S = 0.2  # between two questions about what is left at the remote broker
@@ -80,8 +81,8 @@ class MqttBridge(ForwardingService):
         self._owners = MotorOwners(self.config.base, self.config.motor_owners, notifier)
         self._passed_stops = PassedStops(self.config.motor_owners, self.clock)
         self._observers = Observers(self.config, self.clock)
-        decides = min(self.config.motor_owners, default="")
-        self._control_topic = CONTROL_STATE.topic(self.config.base, owner=decides) if decides else ""
+        deciding_owner = min(self.config.motor_owners, default="")
+        self._control_topic = CONTROL_STATE.topic(self.config.base, owner=deciding_owner) if deciding_owner else ""
         private = next((extension.private for extension in self.config.installed if extension.private), "")
         self._private = (part(private) if private else PrivateTopics)(self.config.base)
         self.forwarder.stays = self._private.stays
@@ -92,9 +93,9 @@ class MqttBridge(ForwardingService):
             self.config.base, self.subjects, self.remote, *self._uplink.channels, sparing=self._is_thin
         )
         self._leftover_timer: Timer | None = None
-        asks = section.remote is None or section.remote.kind == "mqtt"
-        self._vouching = Vouching(self.remote, self.clock(), None if asks else self._silence_s)
-        self._local_changes = 0  # of the connection
+        sends_pings = section.remote is None or section.remote.kind == "mqtt"
+        self._vouching = Vouching(self.remote, self.clock(), None if sends_pings else self._silence_s)
+        self._local_changes = 0  # how often the local connection was made or lost
         self._stop_topic = ESTOP.topic(self.config.base)
         self._stops = self._make_stops()
         self.transport.policy.is_invented = lambda topic: self.subjects.invented(topic.encode()) is not None
@@ -196,10 +197,11 @@ class MqttBridge(ForwardingService):
         if self.forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
             self._look_later()
             return
-        is_waiting = self._leftovers.ask_next()
-        pause = self._uplink.pause(ASK_S)
-        wait, then = (pause, self._look_for_leftovers) if is_waiting else (INITIAL_SYNC_S, self._remove_leftovers)
-        self._leftover_timer = self.call_at(self.clock() + wait, then)
+        has_asked = self._leftovers.ask_next()
+        wait_s, then = INITIAL_SYNC_S, self._remove_leftovers
+        if has_asked:  # more may be left
+            wait_s, then = self._uplink.pause(ASK_S), self._look_for_leftovers
+        self._leftover_timer = self.call_at(self.clock() + wait_s, then)
 
     def _remove_leftovers(self) -> None:
         if self.forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
@@ -282,9 +284,8 @@ class MqttBridge(ForwardingService):
             "the local and the remote side are one broker, or something else forwards outgoing/# to the local one: "
             "nothing is mirrored"
         )
-        self.forwarder.retained.synchronize(
-            Side.REMOTE
-        )  # retained local flags wait for remote ones, which will not come
+        # The robot's retained flags would wait for those of the remote side, which will not come.
+        self.forwarder.retained.synchronize(Side.REMOTE)
 
     def check_again(self, epoch: int) -> None:  # noqa: ARG002  (a round of probes notices a reconnect)
         self._check_brokers()
@@ -303,8 +304,9 @@ class MqttBridge(ForwardingService):
         passes = self._same_broker.both_connected and (
             gate is Gate.SHUT or (gate is Gate.OPEN and bool(self.subscriptions[Side.REMOTE]))
         )
-        dropped = counters[f"{Side.REMOTE.value}: {Drop.LATE.value}"], self.transport.counters["dropped"]
-        losses = gate, self.epoch, self._local_changes, counters[f"{Side.LOCAL.value}: refused"], *dropped
+        late, refused = counters[f"{Side.REMOTE.value}: {Drop.LATE.value}"], counters[f"{Side.LOCAL.value}: refused"]
+        # Any change of these may mean that a message was lost.
+        losses = gate, self.epoch, self._local_changes, refused, late, self.transport.counters["dropped"]
         self.publish(CONTROL_VOUCHED, self._vouching.check(passes, losses, self.clock()))
 
     @every(CHECK_S)
@@ -395,23 +397,24 @@ class MqttBridge(ForwardingService):
             self._receive_stop(message)
 
     def _react(self, side: Side, message: Message, routed: Routed) -> None:
-        """Handle a message with a request to the bridge itself, whether or not a remote side is connected.
+        """Tell the observers of a message, and handle a request to the bridge itself.
 
-        The bridge does not receive messages that it forwards to the local side, so this is the only occasion.
+        Requests of the robot's programs count even while nothing is forwarded. The bridge does not receive what it
+        forwards to the local side, so requests from the remote side are handled here, too.
         """
         channel = routed.subject.channel if routed.subject is not None else None
-        local = side is Side.LOCAL
-        if not local and isinstance(routed.outcome, Drop):
+        is_local = side is Side.LOCAL
+        if not is_local and isinstance(routed.outcome, Drop):
             self._observers.refused(routed.outcome, channel, routed.by)
         if routed.outcome is Drop.STALE:
             self.refusals.stale("a command" if channel is None else channel.metric)
             return
-        if not isinstance(routed.outcome, Forward) and (routed.outcome in _IGNORED or not local):
+        if isinstance(routed.outcome, Drop) and (routed.outcome in _IGNORED or not is_local):
             return
         if channel is None or codec.is_blank(message.payload):
             return
         if not message.retain and routed.outcome is not Drop.KNOWN:
-            by_robot = local and self.forwarder.gate is Gate.OPEN
+            by_robot = is_local and self.forwarder.gate is Gate.OPEN
             self._observers.passed(channel, ROBOT if by_robot else routed.by, message.payload)
         self._requests.message(channel, message.payload)
 

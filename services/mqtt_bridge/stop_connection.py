@@ -45,14 +45,14 @@ class Copies:
         """Store the arguments; ``notices_s``: seconds after which a lost connection is noticed."""
         self._clock, self._notices_s = clock, notices_s
         self._lock = threading.Lock()
-        #: By the way on which the copy is to come: hashes, and until when.
+        #: By the way on which a copy is to come: the hash of each such stop, and the time until which it may come.
         self._expected = {way: deque[tuple[int, float]](maxlen=_COPIES) for way in Way}
-        self._dropped = deque[tuple[float, Message]](maxlen=_DROPPED)
+        self._dropped = deque[tuple[float, Message]](maxlen=_DROPPED)  # copies on the main connection, and their times
 
-    def is_copy(self, way: Way, message: Message, *, other: bool) -> bool:
+    def is_copy(self, way: Way, message: Message, *, comes_both_ways: bool) -> bool:
         """True if this stop came the other way before; then forget it, else remember it.
 
-        ``other``: the stop can come the other way now.
+        ``comes_both_ways``: the other connection receives stops now.
         """
         key, now, expected = hash((message.topic, message.payload)), self._clock(), self._expected[way]
         with self._lock:
@@ -65,7 +65,7 @@ class Copies:
                     short = message.payload[:MAX_COMMAND_BYTES]  # a stop as well: it cannot be read
                     self._dropped.append((now, Message(message.topic, short, message.qos)))
                 return True
-            if other and not message.retain:  # one with the retain flag may be an old one, of which there is no copy
+            if comes_both_ways and not message.retain:  # with the flag it may be an old one, of which there is no copy
                 other_way, wait_s = (Way.STOPS, _PROMPT_S) if way is Way.MAIN else (Way.MAIN, _BEHIND_S)
                 self._expected[other_way].append((key, now + wait_s))
             return False
@@ -113,9 +113,10 @@ class StopConnection:
         self._transport, self._filters, self._clock = transport, tuple(filters), clock
         self._pass_on, self._main = pass_on, main
         self._copies = Copies(clock, notices_s)
-        self._failing_since = self._off_until = float("-inf")
+        self._failing_since = float("-inf")  # when stops arrived on it last, or it was not needed
+        self._off_until = float("-inf")  # when it is tried again
         self._connected_at = float("inf")
-        self._kicks = 0
+        self._kicks = 0  # how often in a row the main connection was lost for it
         transport.policy.is_stop = lambda _topic: True  # it is subscribed to nothing else
         self._reported: bool | None = None  # the log says that it is there, or that it is not
         transport.on_state(self._on_state)
@@ -127,7 +128,7 @@ class StopConnection:
 
     def is_copy(self, message: Message) -> bool:
         """True if a stop without a name on the main connection has passed already. Remembers or forgets the stop."""
-        return not is_named(message.payload) and self._copies.is_copy(Way.MAIN, message, other=self.listens)
+        return not is_named(message.payload) and self._copies.is_copy(Way.MAIN, message, comes_both_ways=self.listens)
 
     def check(self) -> None:
         now = self._clock()
@@ -181,7 +182,7 @@ class StopConnection:
     def _receive(self, message: Message) -> None:
         if message.retain:  # an old one: live ones have no such mark on this connection
             return
-        if is_named(message.payload) or not self._copies.is_copy(Way.STOPS, message, other=self._main()):
+        if is_named(message.payload) or not self._copies.is_copy(Way.STOPS, message, comes_both_ways=self._main()):
             self._pass_on(message)
 
     def _on_state(self, state: State) -> None:
