@@ -186,13 +186,13 @@ class MemoryTransport(Transport):
     def _work(self) -> None:
         """React to the hub's start or stop, or deliver the message that has waited longest."""
         with self._hub.lock:
-            changed = self._attached != self._hub.era
-            delivery = self._inbox.popleft() if self._inbox and not changed else None
+            hub_changed = self._attached != self._hub.era
+            delivery = self._inbox.popleft() if self._inbox and not hub_changed else None
         if delivery is not None:
             self._deliver(delivery)
-        elif changed and self._attached is not None:
+        elif hub_changed and self._attached is not None:
             self._on_hub_stopped()
-        elif changed:
+        elif hub_changed:
             self._connect()
 
     def _deliver(self, delivery: _Delivery) -> None:

@@ -8,12 +8,16 @@ from enum import Enum
 
 
 class Attempt(Enum):
+    """A way to connect."""
+
     BRIDGE = "bridge"  # connect in bridge mode
     PROBE = "probe"  # connect without it, only to see whether that is accepted
     PLAIN = "plain"  # connect without it
 
 
 class Result(Enum):
+    """The outcome of a CONNECT."""
+
     ACCEPTED = "accepted"
     PROTOCOL_REFUSED = "unacceptable protocol version"
     HUNG_UP = "closed without an answer"
@@ -31,7 +35,7 @@ class BridgeMode:
         self._lacking = False  # a broker at this address had no bridge mode: one hang-up is enough from then on
 
     def note(self, result: Result) -> None:
-        """Note that the next attempt has ended with ``result``."""
+        """Note that the attempt which ``next_attempt`` named has ended with ``result``, and choose the next one."""
         attempt, self.next_attempt = self.next_attempt, Attempt.BRIDGE
         if attempt is Attempt.PROBE:
             self._probed = result is Result.ACCEPTED

@@ -9,9 +9,9 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from pebble.transports import clock, hosts
 from pebble.transports.base import Answer, Message, Outgoing, QoS
@@ -20,7 +20,7 @@ from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, Limits
 from pebble.transports.mqtt.client import Client, Opening, TlsLateError, keep_unsent
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
-from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Sink
+from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Owner
 from pebble.transports.mqtt.outgoing import (
     Backlog,
     InFlightTable,
@@ -45,13 +45,6 @@ _BY_SYSTEM = 0  # as the system has it
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
 _ONCE = 2  # of TCP_QUICKACK: what is due now; the next one again waits a moment for MQTT's own, to go along with it
 _ABORT = struct.pack("ii", 1, 0)  # SO_LINGER that makes close() drop what was not sent
-
-
-class Owner(Sink, Protocol):
-    """The transport that owns a connection."""
-
-    def note_answers(self, refused: Mapping[str, bool]) -> None:
-        """Note for each filter whether the broker refuses it (T21). Called on the network thread."""
 
 
 def ignore(_messages: list[Message]) -> None:
@@ -118,7 +111,7 @@ class Connection:
         except Refused:
             raise
         except Lost as lost:
-            if self._client.socket is None:
+            if self._client.socket is None:  # the broker closed it
                 raise Refused(f"{self.where} hung up on our CONNECT", Result.HUNG_UP) from None
             raise lost from None
         self.max_packet = accepted.max_packet
@@ -201,7 +194,7 @@ class Connection:
         """Return whether the socket is readable, and the time when this was known.
 
         Bytes that are already in the socket have come at an unknown time, unless it was empty just before. So it is
-        first polled without a wait, unless that was done a moment ago.
+        first polled without a wait, unless it was found empty a moment ago. Each time when it is empty is noted.
         """
         if not self._poll.registered:
             self._register()
@@ -221,7 +214,7 @@ class Connection:
             ready = self._poll.wait(max(wait, 0.0), write=blocked)
             now = clock.since_boot()
             if now - began <= wait + OVERSLEPT_S:
-                waiting.empty(now)  # until just now
+                waiting.empty(now)  # what is there has come just now: this process did not sleep
         readable, writable, _woken = ready
         if writable:
             self.incoming.answered_at = now  # the other side's TCP accepted some bytes: slow, but alive
@@ -290,6 +283,7 @@ class Connection:
         return _OVERHEAD + len(message.topic.encode()) + len(message.payload) <= self.max_packet
 
     def _is_full(self, message: Message) -> bool:
+        """True if no message beyond the limit may be sent, or only stops may, and this is none."""
         beyond = self._in_flight.unacked - UNACKED_LIMIT
         return beyond >= UNACKED_RESERVE or not self._owner.policy.is_stop(message.topic)
 
@@ -313,7 +307,10 @@ class Connection:
         return self._request(self._client.unsubscribe, filters, [])
 
     def _request(self, send: Callable[[Sequence[T]], int], filters: Sequence[T], asked: Sequence[str]) -> PendingAck:
-        """Send a few filters in each packet; return the pending answer to the last packet, which comes last."""
+        """Send a few filters in each packet; return the pending answer to the last packet, which comes last.
+
+        ``asked``: the texts of filters to which a SUBACK is expected.
+        """
         ack = PendingAck()
         with self._lock:
             for at in range(0, len(filters), FILTERS):
@@ -359,7 +356,8 @@ class Connection:
                 return Outgoing()
             waiting = self._backlog.size + self._client.unwritten + unconfirmed_bytes(sock)
             round_trip_s, since = shortest_round_trip_s(sock), self._in_flight.waiting_since
-            # TCP may end before the broker; and brokers without TCP_NODELAY send an answer after that to the one before
+            # Of two round trips: TCP's may end at a proxy; and a broker without TCP_NODELAY holds an answer back until
+            # the one before it is acknowledged.
             usual_s = 2 * max(round_trip_s, self._in_flight.round_trip_s)
             stalled_s = 0.0 if since is None else max(0.0, clock.since_boot() - since - usual_s)
             return Outgoing(waiting, round_trip_s, stalled_s)

@@ -12,8 +12,9 @@ from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits
 from pebble.transports.mqtt.client import Client, Opening
-from pebble.transports.mqtt.connection import Connection, Owner
+from pebble.transports.mqtt.connection import Connection
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
+from pebble.transports.mqtt.incoming import Owner
 from pebble.transports.settings import MqttSettings
 
 _ENDING_S = 1.0  # so long a broker that ends may still accept connections, and hang up on them
@@ -124,6 +125,7 @@ class Dialler:
 
     @property
     def _is_last_attempt(self) -> bool:
+        """True unless another attempt has to show whether the broker has bridge mode."""
         return not self._asks_for_bridge_mode or self._bridge_mode.next_attempt is Attempt.BRIDGE
 
     def _note_result(self, result: Result) -> None:

@@ -96,8 +96,8 @@ class OwnMessageFilter:
     """
 
     def __init__(self) -> None:
-        # Digests by topic: of our newest payload, until another client publishes another one,
-        self._own = BoundedTable[bytes](_LIMIT, _BYTES, len)
+        # Digests by topic:
+        self._own = BoundedTable[bytes](_LIMIT, _BYTES, len)  # of our newest payload, until another client publishes,
         self._seen = BoundedTable[bytes](_LIMIT, _BYTES, len)  # and of the newest payload received
         self._repeats: set[str] = set()  # topics whose retained message will come a second time
 
@@ -112,8 +112,10 @@ class OwnMessageFilter:
 
     def subscribe_again(self, filter_: str) -> None:
         """Expect the retained messages that ``filter_`` matches to be sent once more."""
-        topics = list(self._seen) if is_pattern(filter_) else [filter_] if self._seen.has(filter_) else []
-        self._repeats.update(topic for topic in topics if overlap(topic, filter_))
+        if is_pattern(filter_):
+            self._repeats.update(topic for topic in list(self._seen) if overlap(topic, filter_))
+        elif self._seen.has(filter_):
+            self._repeats.add(filter_)
 
     def is_echo(self, message: Message) -> bool:
         """True if this is our own retained message, sent back to us; else forget ours, which is outdated."""

@@ -63,8 +63,8 @@ class BrokerDelay:
         self._shortest = _FAR_S
         self._newest = 0.0  # seconds until the newest answer
         self._came_at = 0.0  # when something was received last
-        self._stall = 0.0  # seconds for which the broker stood still,
-        self._until = 0.0  # which counts until then
+        self._stall = 0.0  # seconds for which the broker stood still; messages count as having waited so long
+        self._until = 0.0  # until this time
         self._prompt = 0  # answers in a row that came right after the newest of several pings
 
     def usual(self, seconds: float) -> None:
@@ -122,8 +122,10 @@ class BrokerDelay:
         The longest counts, less the time of the way itself.
         """
         since = sent_at = now
-        if self._asked:  # the oldest that says something
-            since, sent_at = next(((since, sent_at) for since, sent_at, clear in self._asked if clear), (now, now))
+        for ping_since, ping_sent_at, clear in self._asked:
+            if clear:  # the oldest ping that tells anything
+                since, sent_at = ping_since, ping_sent_at
+                break
         if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:  # nothing came: it stood still
             self._stall, self._until = now - sent_at, now + _BACKLOG_S
         self._came_at = now

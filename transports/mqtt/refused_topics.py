@@ -49,7 +49,7 @@ class RefusedTopics:
         self._losses: dict[str, int] = {}  # in a row, by topic
         self.withheld: dict[str, Withheld] = {}
         self._trial: Trial | None = None
-        self._quiet_at = -inf  # from then on other messages were accepted, so that a trial shows something
+        self._quiet_at = -inf  # no trial before it: only after a time without a loss it shows something
         #: Topics on which the broker takes no messages: why, and when that was last in the log.
         self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)
 
@@ -88,13 +88,14 @@ class RefusedTopics:
         """Note a lost connection. ``written``: bytes by topic before the loss; None if no message was the reason."""
         written, trial, self._trial = written or {}, self._trial, None
         self._quiet_at = now + QUIET_S
-        if trial is not None and {topic for topic in written if not self._is_vital(topic)} == {trial.topic}:
+        if trial is not None and [topic for topic in written if not self._is_vital(topic)] == [trial.topic]:
             self._blame(where, trial.topic, written[trial.topic], now)
             return
         self._losses = {topic: self._losses.get(topic, 0) + 1 for topic in written}
         often = {topic: written[topic] for topic, losses in self._losses.items() if losses >= LOSSES}
-        large = {topic: size for topic, size in often.items() if size >= LARGE}
-        suspects = large or {topic: size for topic, size in often.items() if not self._is_vital(topic)}
+        suspects = {topic: size for topic, size in often.items() if size >= LARGE}
+        if not suspects:  # no large message: it may be any topic but the vital ones
+            suspects = {topic: size for topic, size in often.items() if not self._is_vital(topic)}
         if len(suspects) == 1:
             self._blame(where, *suspects.popitem(), now)
         elif suspects:

@@ -294,9 +294,9 @@ class MqttTransport(Transport):
         with self._filters.lock:
             self._connection = connection
             subscribed = connection.subscribe([(filter_, self._no_local(filter_)) for filter_ in self._filters])
-            copied = connection.ping()
+            after_retained = connection.ping()  # its answer follows the retained messages
         self._await(connection, subscribed, stopping, self._deliver_all)
-        self._await(connection, copied, stopping, self._deliver_all)
+        self._await(connection, after_retained, stopping, self._deliver_all)
         self._initial_sync(known_topics)
 
     def _let_catch_up(self, connection: Connection, stopping: threading.Event) -> None:
@@ -352,6 +352,7 @@ class MqttTransport(Transport):
         stopping: threading.Event,
         receive: Callable[[list[Message]], None],
     ) -> None:
+        """Run the connection until ``ack`` is done; ``receive`` gets the messages. Raises Lost, also when closing."""
         asked_at = clock.since_boot()
         while not ack.done:
             if stopping.is_set():
@@ -389,16 +390,14 @@ class MqttTransport(Transport):
     def note_refusal(self, topic: str, why: str) -> None:
         self._refused.report(self._dialler.where, topic, why, time.monotonic())
 
-    def _finish(
-        self, connection: Connection, will: Message | None, receive: Callable[[list[Message]], None] = ignore
-    ) -> None:
+    def _finish(self, connection: Connection, will: Message | None) -> None:
         """Publish the will, wait (bounded) until everything is acknowledged, then send DISCONNECT."""
         if will is not None:
             connection.publish(will)
         last = connection.ping()
         deadline = time.monotonic() + _CLOSING_S
         while time.monotonic() < deadline and not (last.done and connection.drained):
-            connection.pump(deadline - time.monotonic(), receive)
+            connection.pump(deadline - time.monotonic(), ignore)
         connection.disconnect()
 
     def _keep_unconfirmed(self, connection: Connection) -> None:

@@ -42,22 +42,24 @@ ensure_state = ctypes.pythonapi.PyGILState_Ensure
 
 
 class Calls:
-    """Counters of one thread: callbacks begun, callbacks ended, and the number begun when the guard last looked."""
+    """Counters of one thread: callbacks begun and ended, and what the guard saw when it looked last."""
 
-    __slots__ = ("begun", "ended", "known", "ran")
+    __slots__ = ("begun", "begun_before", "ended", "ran")
 
     def __init__(self) -> None:
-        self.begun = self.ended = self.known = 0
-        self.ran = False  # when the guard looked last, a callback was running
+        self.begun = self.ended = 0
+        self.begun_before = 0  # `begun` when the guard looked last
+        self.ran = False  # a callback was running then
 
 
 class Guard:
     """A watch for callbacks that take long: it makes another of Zenoh's threads wait for the sockets instead."""
 
     def __init__(self) -> None:
-        self.rests = True
+        self.rests = True  # it sleeps until a callback wakes it
         self.helped = 0  # times
-        self._suspects = self._warned = False
+        self._suspects = False  # it found a running callback when it looked last
+        self._warned = False
         self._wakeup, self._lock = Wakeup(), threading.Lock()
         self._thread: threading.Thread | None = None
         self._calls: list[Calls] = []
@@ -109,15 +111,15 @@ class Guard:
             self.rests, quiet = False, 0
 
     def _look(self) -> bool:
-        """Help if a callback takes long; True if any has begun since the last check, or still runs."""
+        """Help if a callback takes long; return True if any has begun since the last look, or still runs."""
         active = self._suspects = False
         for calls in self._calls:
             begun, runs = calls.begun, calls.begun != calls.ended
-            active = active or runs or begun != calls.known
+            active = active or runs or begun != calls.begun_before
             if runs and calls.ran:  # the same one, or many without a pause
                 self._help()
             self._suspects = self._suspects or runs
-            calls.known, calls.ran = begun, runs
+            calls.begun_before, calls.ran = begun, runs
         return active
 
     def _help(self) -> None:
@@ -135,13 +137,13 @@ class Guard:
 
 guard = Guard()
 _nothing: zenoh.handlers.Callback[Any] = zenoh.handlers.Callback(lambda _reply: None, indirect=False)
-_own = threading.local()  # part of a thread's state: empty in a new one
+_local = threading.local()  # part of a thread's state: empty in a new thread
 use, forget = guard.use, guard.forget
 
 
 def _begin() -> Calls:
     """Note the first callback on this thread; return the thread's counters."""
-    calls = _own.calls = Calls()
+    calls = _local.calls = Calls()
     # A thread of Python's has its state, and waits for no sockets: it publishes to a handler of its own session.
     if isinstance(threading.current_thread(), threading._DummyThread) and guard.watch(calls):
         ensure_state()
@@ -155,7 +157,7 @@ def direct(function: Callable[[Any], None], at_end: Callable[[], None] | None = 
     """
 
     def run(received: Any) -> None:
-        calls = _own.calls if hasattr(_own, "calls") else _begin()
+        calls = _local.calls if hasattr(_local, "calls") else _begin()
         calls.begun += 1
         try:
             if guard.rests:

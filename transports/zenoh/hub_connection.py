@@ -36,7 +36,7 @@ class HubConnection:
         self.name = ""
         self.watch = HubWatch()
         self.lock = threading.Lock()  # no answer of a connection is offered after the next one began
-        self._connection = 0
+        self._connection = 0  # its number
 
     def open(self) -> None:
         """Begin a connection for a client that was opened, perhaps again."""

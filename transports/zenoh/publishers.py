@@ -25,8 +25,8 @@ class Publishers:
     def __init__(self, is_invented: Callable[[str], bool]) -> None:
         self._is_invented = is_invented
         self.declared: dict[tuple[str, QoS], zenoh.Publisher] = {}
-        self.thread = 0  # that is inside `put`
-        # By topic: with two priorities, messages of a topic would overtake each other (T3).
+        self.thread = 0  # the identifier of the thread that is inside `put`
+        # Of each topic, by its first message: with two priorities, its messages would overtake each other (T3).
         self._urgent: dict[str, bool] = {}
 
     def put(self, session: zenoh.Session, message: Message, urgent: bool) -> None:

@@ -52,7 +52,7 @@ class ZenohTransport(Transport):
     def __init__(self, client_id: str, settings: ZenohSettings, *, will: Message | None = None) -> None:
         super().__init__(client_id, will=will)
         self.settings = settings
-        self._elsewhere = bool(settings.client and settings.connect)  # its hub is, with siblings that it does not know
+        self._elsewhere = bool(settings.client and settings.connect)  # its hub and siblings are on other machines
         self._connecting = threading.RLock()  # held while subscribing, and while a connection is made
         self._subscribers: dict[Subscription, zenoh.Subscriber[None]] = {}
         self._publishers = Publishers(lambda topic: self.policy.is_invented(topic))
@@ -171,7 +171,8 @@ class ZenohTransport(Transport):
     def _run(self) -> None:
         if self.settings.client and not self._start_client():
             return
-        version, linked = 0, 0  # version of the newest view handled; its connection that works, 0: none
+        version = 0  # of the newest view that was handled
+        linked = 0  # the number of the hub connection that works; 0: none does
         self._wait_for_siblings_once()
         watch = self._hub.watch
         while (view := watch.wait(version, _RETRY_S if watch.hubs and not linked else None)) is not None:
@@ -312,7 +313,7 @@ class ZenohTransport(Transport):
         if subscription in self._subscribers:
             return
         origin = zenoh.Locality.ANY if subscription.echo else zenoh.Locality.REMOTE
-        only = None if is_pattern(subscription.filter) else subscription.filter
+        only_topic = None if is_pattern(subscription.filter) else subscription.filter
         may_be_ours = subscription.direct and subscription.echo
         late_s, publishers = self._ages.late_s, self._publishers
 
@@ -324,7 +325,7 @@ class ZenohTransport(Transport):
             since = stamp.sent_ns / 1e9 if stamp.boot == wire.BOOT else None
             if (since is None or read_at - since > late_s) and self._is_late(sample, stamp, read_at):
                 return
-            topic, payload = only or key_to_topic(str(sample.key_expr)), sample.payload.to_bytes()
+            topic, payload = only_topic or key_to_topic(str(sample.key_expr)), sample.payload.to_bytes()
             qos = min(stamp.qos, subscription.qos)
             message = Message(topic, payload, qos, False, stamp.retain_requested, read_at if since is None else since)
             if may_be_ours and publishers.thread == threading.get_ident():

@@ -155,10 +155,10 @@ def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> byt
 
     Where a hub has just died, the query ends for others long after the next hub has answered it.
     """
-    came: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
+    replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()  # None: the query has ended
     session.get(
         key,
-        direct(came.put, lambda: came.put(None)),
+        direct(replies.put, lambda: replies.put(None)),
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
         timeout=timeout,
@@ -167,7 +167,7 @@ def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> byt
     )
     end = time.monotonic() + timeout + _LATE_S
     with contextlib.suppress(queue.Empty):
-        while (reply := came.get(timeout=max(0.0, end - time.monotonic()))) is not None:
+        while (reply := replies.get(timeout=max(0.0, end - time.monotonic()))) is not None:
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
     return None

@@ -32,8 +32,10 @@ class Intake:
         self._lock = threading.Lock()
         self._changed, self._room = threading.Condition(self._lock), threading.Condition(self._lock)
         self._tasks, self._queries = deque[tuple[Task, int]](), deque[Task]()
-        self._bytes = self._outside = 0  # of the tasks; senders that wait for room
-        self._ended = self._was_task = False
+        self._bytes = 0  # of the tasks
+        self._outside = 0  # senders that wait for room
+        self._was_task = False  # a task was taken last, so it is the queries' turn
+        self._ended = False
 
     def put(self, task: Task) -> None:
         """Queue a task of the hub itself, or the arrival or departure of a client."""

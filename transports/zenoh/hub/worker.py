@@ -41,7 +41,7 @@ class HubWorker:
         self._store, self._journal, self._counters, self._admission = store, journal, counters, admission
         self.alive_clients: set[str] = set()
         self._name, self._wills = name, WillTimes()
-        self._has_met = False  # another hub
+        self._has_met = False  # another hub was there
         self._token: zenoh.LivelinessToken | None = None
         self._waiting, self._intake = WaitingQueries(), Intake()
         self._session: zenoh.Session | None = None
@@ -140,13 +140,14 @@ class HubWorker:
                 query.reply(wire.RETAINED + retained.key, retained.payload, attachment=retained.stamp.pack())
 
     def _selected(self, wanted: zenoh.KeyExpr) -> list[Retained]:
+        """Return the stored messages whose keys, under `wire.RETAINED`, a query asks for."""
         text = str(wanted)
         if "*" not in text:
             retained = self._store.get(text.removeprefix(wire.RETAINED))
             return [] if retained is None else [retained]
         begin = text.partition("*")[0].rstrip("$/")  # rules most keys of a fleet out, quickly
-        keys = ((wire.RETAINED + retained.key, retained) for retained in self._store.retained())
-        return [retained for key, retained in keys if key.startswith(begin) and wanted.intersects(key)]
+        keyed = ((wire.RETAINED + retained.key, retained) for retained in self._store.retained())
+        return [retained for key, retained in keyed if key.startswith(begin) and wanted.intersects(key)]
 
     # -- clients
 
