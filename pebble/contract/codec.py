@@ -9,18 +9,7 @@ import msgspec
 from msgspec import UNSET
 
 from pebble.contract import INCOMING, Channel
-from pebble.contract.payloads import (
-    LARGEST_MS,
-    LAST_RUN,
-    SCRIPT,
-    AutonomyCommand,
-    Drive,
-    EstopCommand,
-    LightsFlash,
-    LightsSolid,
-    MediaRequest,
-    SoundboardCommand,
-)
+from pebble.contract import payloads as p
 from pebble.errors import PayloadError
 from pebble.motion.latch import fields, stop_of
 
@@ -74,7 +63,7 @@ def decode(channel: Channel, raw: bytes, remark: Remark | None = None) -> Any:
     """
     if channel.payload is bytes:
         return raw
-    if channel.payload is EstopCommand:
+    if channel.payload is p.EstopCommand:
         return _stop(channel, raw)
     decoded = plain(channel, raw)
     if channel.payload is bool:
@@ -84,7 +73,7 @@ def decode(channel: Channel, raw: bytes, remark: Remark | None = None) -> Any:
     try:
         return msgspec.convert(decoded, channel.payload)
     except (msgspec.ValidationError, ValueError, OverflowError) as error:
-        if issubclass(channel.payload, LightsSolid):  # read again: numbers may be text, and a wrong `group` is left out
+        if issubclass(channel.payload, p.LightsSolid):  # again: numbers may be text, and a wrong `group` is left out
             decoded = {key: value for key, value in decoded.items() if key != "group" or isinstance(value, bool)}
             return msgspec.convert(decoded | _numbers(channel, decoded, remark or _ignore), channel.payload)
         raise PayloadError(f"{channel.metric}: {error}") from None
@@ -117,17 +106,17 @@ def trim(raw: bytes) -> bytes:
     return raw.lstrip(_AROUND).partition(b"\0")[0].rstrip(_AROUND)
 
 
-def _stop(channel: Channel, raw: bytes) -> EstopCommand:
+def _stop(channel: Channel, raw: bytes) -> p.EstopCommand:
     """Return the stop in ``raw``, nameless if it cannot be read. Raises PayloadError only for an empty payload."""
     if not raw:
         raise PayloadError(f"{channel.metric}: empty")
     try:
         body = plain(channel, raw)
     except PayloadError:
-        return EstopCommand()
+        return p.EstopCommand()
     name, by, why = stop_of(body)
     owner = fields(body).get("owner")
-    return EstopCommand(stop=name or UNSET, by=by, why=why, owner=owner if isinstance(owner, str) else UNSET)
+    return p.EstopCommand(stop=name or UNSET, by=by, why=why, owner=owner if isinstance(owner, str) else UNSET)
 
 
 def is_blank(raw: bytes) -> bool:
@@ -151,14 +140,14 @@ def _ignore(_channel: Channel, _sender: str, _text: str) -> None:
 
 def _unwrap(channel: Channel, command: Any, remark: Remark) -> Any:
     """Return the fields of a command: the object under ``value`` if there is one, else the root (paper A.4.5)."""
-    if channel.payload in (SoundboardCommand, AutonomyCommand):
+    if channel.payload in (p.SoundboardCommand, p.AutonomyCommand):
         return _switch(command)
-    if channel.payload is MediaRequest:
+    if channel.payload is p.MediaRequest:
         return _request(channel, command)
     if not isinstance(command, dict):
         raise PayloadError(f"{channel.metric}: an object is needed, not {_name_of(command)}")
     inner = command["value"] if isinstance(command.get("value"), dict) else command
-    return _drive(channel, inner, remark) if channel.payload is Drive else inner
+    return _drive(channel, inner, remark) if channel.payload is p.Drive else inner
 
 
 def _switch(command: Any) -> Any:
@@ -194,7 +183,7 @@ def _drive(channel: Channel, command: dict[str, Any], remark: Remark) -> dict[st
     wrong = [key for key, value in given.items() if not _DRIVE_RULES[key].fits(value)]
     if moves and wrong:
         raise PayloadError(f"{channel.metric}: {wrong[0]} is not {_DRIVE_RULES[wrong[0]].expected}")
-    if moves and given.get("source") == SCRIPT and "run" not in given:
+    if moves and given.get("source") == p.SCRIPT and "run" not in given:
         raise PayloadError(f"{channel.metric}: run is missing, which a script's command needs")
     if moves and "valid_ms" in given and given["valid_ms"] < 1:
         raise PayloadError(f"{channel.metric}: valid_ms is less than 1, so it moves nothing")
@@ -215,14 +204,14 @@ class _Rule(NamedTuple):
 _DRIVE_RULES: dict[str, _Rule] = {
     "source": _Rule(lambda value: isinstance(value, str), "a string"),
     "key": _Rule(lambda value: isinstance(value, str), "a string"),
-    "run": _Rule(lambda value: type(value) is int and 1 <= value <= LAST_RUN, f"an integer from 1 to {LAST_RUN}"),
+    "run": _Rule(lambda value: type(value) is int and 1 <= value <= p.LAST_RUN, f"an integer from 1 to {p.LAST_RUN}"),
     "valid_ms": _Rule(
         lambda value: type(value) in (int, float) and 0 <= value < _LONGEST_MS, "a number of milliseconds"
     ),
 }
 #: Its other fields, each with its rule; a wrong value is the same as absent, because none of them decides about motion.
 _DRIVE_MORE: dict[str, Callable[[Any], bool]] = {
-    "t": lambda value: type(value) is int and 0 <= value <= LARGEST_MS,
+    "t": lambda value: type(value) is int and 0 <= value <= p.LARGEST_MS,
     "by": lambda value: isinstance(value, str),
     "group": lambda value: isinstance(value, bool),
 }
@@ -230,9 +219,9 @@ _DRIVE_MORE: dict[str, Callable[[Any], bool]] = {
 
 #: The numbers in a command, by its payload type, each with the value that it has if it cannot be read.
 _NUMBERS: dict[Any, dict[str, float]] = {
-    Drive: {"x": 0.0, "z": 0.0, "y": 0.0},
-    LightsSolid: {"b": 0.0, "g": 0.0, "r": 0.0},
-    LightsFlash: {"b": 0.0, "g": 0.0, "r": 0.0, "period": LightsFlash().period},
+    p.Drive: {"x": 0.0, "z": 0.0, "y": 0.0},
+    p.LightsSolid: {"b": 0.0, "g": 0.0, "r": 0.0},
+    p.LightsFlash: {"b": 0.0, "g": 0.0, "r": 0.0, "period": p.LightsFlash().period},
 }
 
 

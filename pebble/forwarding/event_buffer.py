@@ -1,7 +1,6 @@
 """Buffers events (QoS 1, not retained) during an outage, a bounded number of them."""
 
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 
@@ -31,7 +30,7 @@ class EventBuffer:
         transport: Transport,
         counters: Counters,
         *,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float],
         limit: int = LIMIT,
     ) -> None:
         self._transport, self._counters, self._clock, self._limit = transport, counters, clock, limit
@@ -54,7 +53,10 @@ class EventBuffer:
     def hold(self, message: Message) -> None:
         """Keep ``message`` until the next :meth:`resume` or :meth:`flush`."""
         with self._lock:
-            self._append(_Event(message))
+            self._waiting.append(_Event(message))
+            if len(self._waiting) > self._limit:
+                self._waiting.popleft()
+                self._counters.add("events_dropped")
 
     def resume(self) -> None:
         """Send the waiting events, in order, unless a new connection has to be flushed first."""
@@ -78,12 +80,6 @@ class EventBuffer:
         with self._lock:
             self._waiting.clear()
             self._recent.clear()
-
-    def _append(self, event: _Event) -> None:
-        self._waiting.append(event)
-        if len(self._waiting) > self._limit:
-            self._waiting.popleft()
-            self._counters.add("events_dropped")
 
     def _drain(self) -> None:
         while self._waiting:

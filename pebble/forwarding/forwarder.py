@@ -11,7 +11,6 @@ have waited, in a process that was stopped or stuck, or at the broker; one that 
 
 import itertools
 import logging
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 
@@ -108,7 +107,7 @@ class Forwarder:
         on_value: Callable[[Subject, bytes], None] = lambda _subject, _payload: None,
         pass_stop: Callable[[Side, bytes], Iterable[bytes]] = lambda _side, payload: (payload,),
         steps: Mapping[str, Step] = {},
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float],
     ) -> None:
         self.counters, self._steps = Counters(), steps
         self.stays: Callable[[str], bool] = lambda _topic: False  # True for topics obeyed only inside the robot
@@ -233,7 +232,7 @@ class Forwarder:
     ) -> Forward | Drop:
         """Return how to forward ``message``, or why it does not pass. Hot.
 
-        Reasons: no subject, no route, or those of `_ADMISSION`. ``topic`` is the topic on the other side.
+        ``topic`` is the topic on the other side.
         """
         if subject is None or not subject.is_stop:
             if message.retain:  # while such messages arrive, a stop among them is an old one
@@ -245,10 +244,15 @@ class Forwarder:
         forward = self._route(source.side, subject, message)
         if isinstance(forward, Drop):
             return forward
-        for reason in self._ADMISSION:
-            if (drop := reason(self, source, subject, message, forward, topic, named)) is not None:
-                return drop
-        return forward
+        # A message beyond a bound is neither compared with what we have sent nor examined for cycles, an echo is no
+        # cycle, and extensions are asked last.
+        return (
+            self._beyond_bound(source, subject, message, topic, named)
+            or self._echo(source, subject, message)
+            or self._cycle(source, subject, message, forward)
+            or self._refused_by_step(source, subject, message)
+            or forward
+        )
 
     def _route(self, side: Side, subject: Subject, message: Message) -> Forward | Drop:
         """Return the result of :func:`route`, which is computed once per kind of message."""
@@ -260,29 +264,28 @@ class Forwarder:
         return forward
 
     def _beyond_bound(
-        self, source: SideState, subject: Subject, message: Message, _forward: Forward, topic: str, named: bool
+        self, source: SideState, subject: Subject, message: Message, topic: str, named: bool
     ) -> Drop | None:
         drop = self._admission.refuse(source.side, subject, message, topic, named=named)
         if drop in _WARNED:
             self._warn(drop, message.topic[:_LOGGED])
         return drop
 
-    def _echo(self, source: SideState, subject: Subject, message: Message, *_: object) -> Drop | None:
+    def _echo(self, source: SideState, subject: Subject, message: Message) -> Drop | None:
         if not self.cycles.closed_ways and source.transport.exact_echo:
             return None
         return Drop.ECHO if self.publisher.is_echo(source, subject, message) else None
 
-    def _cycle(
-        self, source: SideState, subject: Subject, message: Message, forward: Forward, *_: object
-    ) -> Drop | None:
+    def _cycle(self, source: SideState, subject: Subject, message: Message, forward: Forward) -> Drop | None:
         if self.sides.gate is not Gate.OPEN:
             return None
         finding = self.cycles.examine(source.side, subject, message)
         return None if finding is Finding.PASS else self._act_on(finding, source.side, subject, message, forward)
 
-    def _refused_by_step(self, source: SideState, subject: Subject, message: Message, *_: object) -> Drop | None:
-        steps = {} if subject.is_stop else self._steps
-        for name, step in steps.items():
+    def _refused_by_step(self, source: SideState, subject: Subject, message: Message) -> Drop | None:
+        if subject.is_stop:
+            return None
+        for name, step in self._steps.items():
             try:
                 why = step(source.side, subject, message)
             except Exception as error:  # noqa: BLE001 - whatever a stranger's code raises: it is no refusal
@@ -292,10 +295,6 @@ class Forwarder:
                 self._quiet_log.warning(name, "%s is not forwarded: %s: %s", message.topic[:_LOGGED], name, why)
                 return Drop.REFUSED
         return None
-
-    #: Checks of a message that has a route, in this order: one beyond a bound is neither compared with messages that we
-    #: have sent nor examined for cycles, an echo is no cycle, and extensions are asked last.
-    _ADMISSION = (_beyond_bound, _echo, _cycle, _refused_by_step)
 
     def pass_now(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str = ""
@@ -317,7 +316,9 @@ class Forwarder:
         """Return an admitted message as it may pass, or why not: it is too late, or a script elsewhere sent it."""
         if subject.kind.one_shot and self._is_late(subject, message, forward, account):
             return Drop.LATE
-        return (self._without_script(source, message) or Drop.SIGNED) if forward.unsigned else message
+        if not forward.unsigned:
+            return message
+        return self._without_script(source, message) or Drop.SIGNED
 
     def _is_late(self, subject: Subject, message: Message, forward: Forward, account: str) -> bool:
         """True if a command or action has waited for too long, unless it only ends something."""

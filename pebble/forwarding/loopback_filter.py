@@ -1,7 +1,6 @@
 """Recognises our own messages that come back, from a broker without bridge mode or through another bridge."""
 
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from hashlib import blake2b
@@ -15,7 +14,7 @@ EXPIRY_S = 10.0  # an echo that has not arrived by then never will
 class LoopbackFilter:
     """A memory of published messages, by topic and in order, until they come back."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic, expiry_s: float = EXPIRY_S) -> None:
+    def __init__(self, clock: Callable[[], float], expiry_s: float = EXPIRY_S) -> None:
         self._clock, self._expiry_s = clock, expiry_s
         self._lock = threading.Lock()
         self._out: dict[str, deque[tuple[float, bytes]]] = {}  # by topic: when each was published, and its digest

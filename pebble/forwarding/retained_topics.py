@@ -136,11 +136,9 @@ class RetainedTopics:
             other_away=not self._sides[side.other].connected,
             went_back=source.has_gone_back,
         )
-        if resolution is Resolution.PASS:
-            self._on_value(subject, payload)
-            return None
         if resolution is Resolution.RESTORE:
             self._publish_value(side, topic, payload)
+        if resolution in (Resolution.PASS, Resolution.RESTORE):
             self._on_value(subject, payload)
             return None
         if resolution is Resolution.CORRECT:

@@ -171,9 +171,8 @@ class ForwardingService(Service, ABC):
         self.synchronize_later(Side.REMOTE)
 
     def unsubscribe(self, side: Side) -> None:
-        subscriptions, self.subscriptions[side] = self.subscriptions[side], []
-        for subscription in subscriptions:
-            subscription.close()
+        while self.subscriptions[side]:
+            self.subscriptions[side].pop().close()
 
     def synchronize_later(self, side: Side) -> None:
         """Exchange the values in which the sides differ, once the retained messages of ``side`` have arrived."""

@@ -8,16 +8,7 @@ from typing import Any, ClassVar
 
 from pebble import contract as c
 from pebble.contract import groups
-from pebble.contract.payloads import (
-    ControlRequest,
-    ControlTurn,
-    ControlVouched,
-    Drive,
-    EstopCommand,
-    EstopReset,
-    EstopState,
-    LightsSolid,
-)
+from pebble.contract import payloads as p
 from pebble.errors import PayloadError, TransportError
 from pebble.motors.control import Control, earliest
 from pebble.motors.motion_inbox import MotionInbox, ReceivedDrive, ReceivedRequest
@@ -31,7 +22,7 @@ from pebble.transports import Message, QoS
 _SAVE_AGAIN_S = 1.0
 _REPEAT_S = 5.0  # as often as boards repeat their reports
 _CHECK_S = 1.0  # an answer to a subscription may come later than the connection
-_FINAL_ZERO = Drive(x=0.0, z=0.0, valid_ms=0)
+_FINAL_ZERO = p.Drive(x=0.0, z=0.0, valid_ms=0)
 
 
 class MotorOwner(Service, ABC):
@@ -95,14 +86,14 @@ class MotorOwner(Service, ABC):
         return self._guard.latched
 
     @abstractmethod
-    def move(self, drive: Drive, valid_s: float) -> None:
+    def move(self, drive: p.Drive, valid_s: float) -> None:
         """Move the motors: ``drive.x`` steers and ``drive.z`` is the throttle, both -1..1; for ``valid_s`` seconds."""
 
     @abstractmethod
     def halt(self) -> None:
         """Stop the motors now. This is called again and again while the motors stand still."""
 
-    def move_with(self, drive: Drive, valid_s: float, company: tuple[groups.Member, ...]) -> None:  # noqa: ARG002
+    def move_with(self, drive: p.Drive, valid_s: float, company: tuple[groups.Member, ...]) -> None:  # noqa: ARG002
         """Carry out a drive command, or a zero, and at once the members of its group on channels in :attr:`company`.
 
         A subclass with such channels overrides this method.
@@ -124,20 +115,20 @@ class MotorOwner(Service, ABC):
     # -- on the transport's threads; the stop is subscribed to before the drive commands
 
     @on(c.ESTOP, direct=True)
-    def receive_stop(self, stop: EstopCommand, _arrived: float) -> None:
+    def receive_stop(self, stop: p.EstopCommand, _arrived: float) -> None:
         if stop.owner not in self._control.peers:  # else the bridge repeats it only for another owner
             self._judge_soon(self._waiting.put_stop(stop))
 
     @on(c.ESTOP_RESET, direct=True)
-    def receive_reset(self, reset: EstopReset, arrived: float) -> None:
+    def receive_reset(self, reset: p.EstopReset, arrived: float) -> None:
         self._judge_soon(self._waiting.put_reset(reset, arrived))
 
     @on(c.CONTROL, direct=True)
-    def receive_request(self, request: ControlRequest, arrived: float) -> None:
+    def receive_request(self, request: p.ControlRequest, arrived: float) -> None:
         self._judge_soon(self._waiting.put_request(request, False, arrived))
 
     @on(c.CONTROL_TAKE, direct=True)
-    def receive_take(self, request: ControlRequest, arrived: float) -> None:
+    def receive_take(self, request: p.ControlRequest, arrived: float) -> None:
         self._judge_soon(self._waiting.put_request(request, True, arrived))
 
     def set_up(self) -> None:
@@ -152,16 +143,16 @@ class MotorOwner(Service, ABC):
             receive = self.refusals.reader(c.GROUP, self._receive_group)
             self.transport.subscribe(self.addresses[c.GROUP].topic, receive, qos=QoS.DELIVERED, direct=True)
 
-    def _receive_turn(self, message: Message, turn: ControlTurn, names: dict[str, str]) -> None:
+    def _receive_turn(self, message: Message, turn: p.ControlTurn, names: dict[str, str]) -> None:
         if not message.retain:
             self._judge_soon(self._waiting.put_turn(names["owner"], turn))
 
     @on(c.DRIVE, direct=True)
-    def receive_drive(self, drive: Drive, arrived: float) -> None:
+    def receive_drive(self, drive: p.Drive, arrived: float) -> None:
         if not (drive.moves and self.is_copy(drive)):
             self._judge_soon(self._waiting.put_drive(drive, arrived))
 
-    def is_copy(self, command: Drive | LightsSolid) -> bool:
+    def is_copy(self, command: p.Drive | p.LightsSolid) -> bool:
         """True if ``command`` is the copy of a group's member: this motor owner takes the group itself."""
         return self._takes_groups and command.group is True
 
@@ -180,7 +171,7 @@ class MotorOwner(Service, ABC):
             self.post_message(c.GROUP, partial(self.accompany, company), newest_of=c.GROUP.metric)
 
     @on(c.CONTROL_VOUCHED, direct=True)
-    def receive_vouched(self, vouched: ControlVouched, _arrived: float) -> None:
+    def receive_vouched(self, vouched: p.ControlVouched, _arrived: float) -> None:
         self._judge_soon(self._waiting.put_vouched(vouched))
 
     def _judge_soon(self, was_empty: bool) -> None:
@@ -347,7 +338,7 @@ class MotorOwner(Service, ABC):
         self._control.repeat_state(self.clock())
         self._arm_guard()
 
-    def _publish_state(self, state: EstopState) -> None:
+    def _publish_state(self, state: p.EstopState) -> None:
         """Publish the state. While a stop does not latch, remove it, repeatedly: a bridge may have missed that."""
         if self._latches:
             self.publish(c.ESTOP_STATE, state, owner=self.owner)

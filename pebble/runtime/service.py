@@ -272,14 +272,9 @@ class Service:
         for name in _marked(type(self), "period"):
             method = getattr(self, name)
             self.timers.add(now, method, period=method.period)
-        interval = self.republish_interval_s
+        interval = self.config.services.defaults.retained_publish_interval_seconds
         if interval > 0:
             self.timers.add(now + interval, self.republish, period=interval)
-
-    @property
-    def republish_interval_s(self) -> float:
-        """Seconds after which retained states are published again; 0: they are not repeated."""
-        return self.config.services.defaults.retained_publish_interval_seconds
 
     def _begin_connection(self) -> None:
         self.on_connected()

@@ -17,9 +17,7 @@ _EXCEPTED = (ONLINE, MCU_DESCRIBE)  # the bridge's own, and one that MCU_VALUE c
 class Leftovers:
     """The topics that robot and broker retain. Transports call :meth:`note_local` on their threads."""
 
-    def __init__(
-        self, base: str, subjects: Subjects, remote: Transport, *channels: Channel, sparing: bool = False
-    ) -> None:
+    def __init__(self, base: str, subjects: Subjects, remote: Transport, *channels: Channel, sparing: bool) -> None:
         """Store the arguments; ``channels`` are more channels that the bridge itself publishes on the remote side.
 
         ``sparing``: do not ask for topics that the robot has, because the answers would delay messages to it.
@@ -84,9 +82,8 @@ class Leftovers:
         return topic in on_robot or max(len(on_robot), len(self._at_remote)) > _TOPICS
 
     def _close(self) -> None:
-        subscriptions, self._subscriptions = self._subscriptions, []
-        for subscription in subscriptions:
-            subscription.close()
+        while self._subscriptions:
+            self._subscriptions.pop().close()
 
     def _note_remote(self, message: Message) -> None:
         if message.retain and message.payload and len(self._at_remote) <= _TOPICS:

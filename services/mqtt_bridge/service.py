@@ -7,16 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from pebble.contract import (
-    BRIDGE_PROBE,
-    CONTROL_STATE,
-    CONTROL_VOUCHED,
-    DRIVE,
-    ESTOP,
-    ESTOP_STATE,
-    ONLINE,
-    codec,
-)
+from pebble import contract as c
+from pebble.contract import codec
 from pebble.contract.levels import LEVELS
 from pebble.contract.names import with_name
 from pebble.contract.payloads import ControlState
@@ -66,7 +58,7 @@ class MqttBridge(ForwardingService):
     """The bridge: it forwards by Table A.1, once it knows that its two sides are not one broker."""
 
     name = "mqtt_bridge"
-    publishes = (ONLINE, BRIDGE_PROBE, CONTROL_VOUCHED)
+    publishes = (c.ONLINE, c.BRIDGE_PROBE, c.CONTROL_VOUCHED)
     client_name = "local-bridge"
     rules = TABLE_A1
     probed_sides = (Side.REMOTE,)
@@ -75,14 +67,14 @@ class MqttBridge(ForwardingService):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         section = self.config.services.mqtt_bridge
-        self._heartbeat = Heartbeat(self.addresses[ONLINE]) if section.heartbeat.enabled else None
+        self._heartbeat = Heartbeat(self.addresses[c.ONLINE]) if section.heartbeat.enabled else None
         self._same_broker = SameBrokerProbe(self.config, self.transport, self.remote, self.clock)
         notifier = Notifier()
         self._owners = MotorOwners(self.config.base, self.config.motor_owners, notifier)
         self._passed_stops = PassedStops(self.config.motor_owners, self.clock)
         self._observers = Observers(self.config, self.clock)
         deciding_owner = min(self.config.motor_owners, default="")
-        self._control_topic = CONTROL_STATE.topic(self.config.base, owner=deciding_owner) if deciding_owner else ""
+        self._control_topic = c.CONTROL_STATE.topic(self.config.base, owner=deciding_owner) if deciding_owner else ""
         private = next((extension.private for extension in self.config.installed if extension.private), "")
         self._private = (part(private) if private else PrivateTopics)(self.config.base)
         self.forwarder.stays = self._private.stays
@@ -96,7 +88,7 @@ class MqttBridge(ForwardingService):
         sends_pings = section.remote is None or section.remote.kind == "mqtt"
         self._vouching = Vouching(self.remote, self.clock(), None if sends_pings else self._silence_s)
         self._local_changes = 0  # how often the local connection was made or lost
-        self._stop_topic = ESTOP.topic(self.config.base)
+        self._stop_topic = c.ESTOP.topic(self.config.base)
         self._stops = self._make_stops()
         self.transport.policy.is_invented = lambda topic: self.subjects.invented(topic.encode()) is not None
         self.remote.policy.skips_retained = partial(self.forwarder.skips_retained, Side.REMOTE)
@@ -106,10 +98,6 @@ class MqttBridge(ForwardingService):
     def winner(self) -> Side:
         """Side whose retained messages count: where names are checked the local one, as flags are the robot's own."""
         return Side.LOCAL if self.config.security.named else Side.REMOTE
-
-    @property
-    def _stop_filters(self) -> list[str]:
-        return [self._stop_topic, *([with_name(self._stop_topic, "+")] if self.config.security.named else [])]
 
     @property
     def _silence_s(self) -> float:
@@ -132,7 +120,7 @@ class MqttBridge(ForwardingService):
 
     def make_remote(self) -> Transport:
         enabled = self.config.services.mqtt_bridge.heartbeat.enabled
-        will = Heartbeat(self.addresses[ONLINE]).will(now_ms()) if enabled else None
+        will = Heartbeat(self.addresses[c.ONLINE]).will(now_ms()) if enabled else None
         return remote_transport(self.config, "remote-bridge", will=will)
 
     def _make_stops(self) -> "StopConnection | None":
@@ -141,7 +129,10 @@ class MqttBridge(ForwardingService):
             return None
         from pebble.services.mqtt_bridge.stop_connection import StopConnection  # only who needs it pays for it
 
-        make = partial(StopConnection, transport, self._stop_filters, self._pass_stop, self._forwards, self.clock)
+        filters = [self._stop_topic]
+        if self.config.security.named:
+            filters.append(with_name(self._stop_topic, "+"))
+        make = partial(StopConnection, transport, filters, self._pass_stop, self._forwards, self.clock)
         if not self._is_thin:
             return make(notices_s=self._silence_s + _NOTICED_S)
         transport.suit_link(thin=True)
@@ -254,7 +245,7 @@ class MqttBridge(ForwardingService):
             self._open()
         if self.forwarder.gate is Gate.OPEN or not self._same_broker.both_connected:
             return
-        round_ = self._same_broker.begin_round(self.subjects.topics(DRIVE)[0])
+        round_ = self._same_broker.begin_round(self.subjects.topics(c.DRIVE)[0])
         if round_ is not None:
             wait_s = _PROBE_WAIT_S if self.forwarder.gate is Gate.WAITING else _AGAIN_WAIT_S
             self.call_at(self.clock() + wait_s, partial(self._end_round, round_))
@@ -307,7 +298,7 @@ class MqttBridge(ForwardingService):
         late, refused = counters[f"{Side.REMOTE.value}: {Drop.LATE.value}"], counters[f"{Side.LOCAL.value}: refused"]
         # Any change of these may mean that a message was lost.
         losses = gate, self.epoch, self._local_changes, refused, late, self.transport.counters["dropped"]
-        self.publish(CONTROL_VOUCHED, self._vouching.check(passes, losses, self.clock()))
+        self.publish(c.CONTROL_VOUCHED, self._vouching.check(passes, losses, self.clock()))
 
     @every(CHECK_S)
     def _check_owners(self) -> None:
@@ -336,7 +327,7 @@ class MqttBridge(ForwardingService):
         if self._heartbeat is not None and message.topic == self._heartbeat.topic:
             if self._heartbeat.is_ours(message) and self.forwarder.gate is Gate.OPEN:
                 # one broker after all, or another program's heartbeat of the same millisecond
-                self.post_message(BRIDGE_PROBE, self._same_broker.send_again, newest_of="suspect")
+                self.post_message(c.BRIDGE_PROBE, self._same_broker.send_again, newest_of="suspect")
             return
         if message.topic in self._owners.topics:
             self._owners.receive(message.topic)
@@ -351,7 +342,7 @@ class MqttBridge(ForwardingService):
         """Note who has control, and the present key, which decides whether a command has an age."""
         keys = None
         with suppress(PayloadError):
-            state: ControlState = codec.decode(CONTROL_STATE, payload)
+            state: ControlState = codec.decode(c.CONTROL_STATE, payload)
             keys = frozenset([state.key.encode()]) - {b""}
             self._observers.control(state)
         self.forwarder.ages.keys = keys
@@ -360,7 +351,7 @@ class MqttBridge(ForwardingService):
         if self._same_broker.proves_same_broker(message):
             self.shut()
         elif self._same_broker.is_request(message):
-            self.post_message(BRIDGE_PROBE, self._same_broker.answer_request, newest_of="request")
+            self.post_message(c.BRIDGE_PROBE, self._same_broker.answer_request, newest_of="request")
 
     def receive_remote(self, epoch: int, message: Message) -> None:
         topic = message.topic if self.names is None else self.names[message.topic].topic
@@ -382,7 +373,7 @@ class MqttBridge(ForwardingService):
 
     def _follow_owner(self, owner: str, payload: bytes) -> None:
         with suppress(PayloadError):
-            self._passed_stops.follow(owner, codec.decode(ESTOP_STATE, payload) if payload else None)
+            self._passed_stops.follow(owner, codec.decode(c.ESTOP_STATE, payload) if payload else None)
 
     def _has_passed(self, message: Message) -> bool:
         """True if the stops' own connection has passed this stop on already. Otherwise remembers it."""

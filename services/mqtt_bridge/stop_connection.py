@@ -139,7 +139,8 @@ class StopConnection:
         elif self._transport.state is State.CLOSED:
             if now >= self._off_until:
                 self._failing_since = now
-                self._open()
+                self._transport.open(timeout=0.0)
+                self._transport.subscribe_all(dict.fromkeys(self._filters, self._receive), direct=True)
         elif self.listens:
             self._failing_since = now
             self._report(True)
@@ -158,10 +159,6 @@ class StopConnection:
 
     def close(self) -> None:
         self._transport.close()
-
-    def _open(self) -> None:
-        self._transport.open(timeout=0.0)
-        self._transport.subscribe_all(dict.fromkeys(self._filters, self._receive), direct=True)
 
     def _give_up(self, why: str, seconds: float) -> None:
         self._off_until = self._clock() + seconds

@@ -1,8 +1,7 @@
 """A client of an MQTT broker for one connection: its socket, the bytes that wait to be written, and message ids.
 
 It has neither a lock nor a thread: the connection has both. One `recv` takes everything that has come, and one `send`
-writes a message, or all acknowledgements of what was read. A general client library needs several calls for each, and
-makes objects that are not used here.
+writes a message, or all acknowledgements of what was read.
 """
 
 import socket

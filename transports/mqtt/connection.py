@@ -75,9 +75,9 @@ class Connection:
         self._owner, self._settings, self._counters = owner, opening.settings, counters
         self._lock = threading.RLock()
         self._backlog = Backlog()
-        self._in_flight = InFlightTable()
+        self.in_flight = InFlightTable()
         self.incoming = Incoming(
-            opening.settings, owner, counters, self._in_flight, where=where, as_published=as_published
+            opening.settings, owner, counters, self.in_flight, where=where, as_published=as_published
         )
         self.pings = self.incoming.pings
         self._poll = SocketPoll()
@@ -129,7 +129,7 @@ class Connection:
                     sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _ABORT)
                 sock.close()
             self._poll.close()
-            self._in_flight.end()
+            self.in_flight.end()
 
     def disconnect(self) -> None:
         """Send DISCONNECT, which makes the broker discard our will."""
@@ -187,8 +187,8 @@ class Connection:
         incoming.age.delay.delivered()
         if incoming.age.has_retained:
             incoming.age.note_handled()
-        if self._in_flight.answered:
-            self._in_flight.complete()
+        if self.in_flight.answered:
+            self.in_flight.complete()
 
     def _wait(self, timeout: float) -> tuple[bool, float]:
         """Return whether the socket is readable, and the time when this was known.
@@ -197,7 +197,9 @@ class Connection:
         first polled without a wait, unless it was found empty a moment ago. Each time when it is empty is noted.
         """
         if not self._poll.registered:
-            self._register()
+            with self._lock:
+                if self._client.socket is not None:
+                    self._poll.register(self._client.socket)
         if self._client.socket is None:
             raise self.incoming.lost
         blocked, waiting = bool(self._client.waiting), self.incoming.age.waiting
@@ -219,12 +221,6 @@ class Connection:
         if writable:
             self.incoming.answered_at = now  # the other side's TCP accepted some bytes: slow, but alive
         return readable, now
-
-    def _register(self) -> None:
-        with self._lock:
-            if self._client.socket is None:
-                raise self.incoming.lost
-            self._poll.register(self._client.socket)
 
     def _write(self) -> None:
         self._client.write()
@@ -259,12 +255,12 @@ class Connection:
             client, limits = self._client, self.limits
             if client.socket is None:
                 return False
-            if message.qos is QoS.DELIVERED and self._in_flight.unacked >= UNACKED_LIMIT and self._is_full(message):
+            if message.qos is QoS.DELIVERED and self.in_flight.unacked >= UNACKED_LIMIT and self._is_full(message):
                 return False
             if not limits.qos and client.unwritten > _UNWRITTEN and not self._owner.policy.is_stop(message.topic):
                 return False
             if message.retain and limits.retain:
-                self._in_flight.accept(message)
+                self.in_flight.accept(message)
             if message.qos is QoS.LATEST and client.waiting:
                 self._counters.add("dropped", self._backlog.put(message))
             else:
@@ -284,7 +280,7 @@ class Connection:
 
     def _is_full(self, message: Message) -> bool:
         """True if no message beyond the limit may be sent, or only stops may, and this is none."""
-        beyond = self._in_flight.unacked - UNACKED_LIMIT
+        beyond = self.in_flight.unacked - UNACKED_LIMIT
         return beyond >= UNACKED_RESERVE or not self._owner.policy.is_stop(message.topic)
 
     def _write_publish(self, message: Message, expires_s: int | None) -> None:
@@ -293,7 +289,7 @@ class Connection:
         mid = self._client.publish(
             message.topic, message.payload, int(message.qos), retain=message.retain, expires_s=expires_s
         )
-        self._in_flight.sent(message, mid, clock.since_boot())
+        self.in_flight.sent(message, mid, clock.since_boot())
 
     def subscribe(self, filters: Iterable[tuple[str, bool]], qos: QoS = QoS.DELIVERED) -> PendingAck:
         """Subscribe to filters, each with its noLocal option (MQTT 5 only)."""
@@ -316,7 +312,7 @@ class Connection:
             for at in range(0, len(filters), FILTERS):
                 if self._client.socket is not None:
                     ack = PendingAck()
-                    self._in_flight.ask(send(filters[at : at + FILTERS]), ack, asked[at : at + FILTERS])
+                    self.in_flight.ask(send(filters[at : at + FILTERS]), ack, asked[at : at + FILTERS])
             if not filters or self._client.socket is None:
                 ack.complete()
         self.wake()
@@ -336,17 +332,17 @@ class Connection:
 
     @property
     def has_room(self) -> bool:
-        return self._in_flight.unacked < UNACKED_LIMIT // 2
+        return self.in_flight.unacked < UNACKED_LIMIT // 2
 
     @property
     def drained(self) -> bool:
         """True if all accepted messages are written, and acknowledged if they have QoS 1."""
         with self._lock:
-            return not (self._in_flight.unacked or self._backlog.waiting or self._client.waiting)
+            return not (self.in_flight.unacked or self._backlog.waiting or self._client.waiting)
 
     @property
     def unacked(self) -> int:
-        return self._in_flight.unacked
+        return self.in_flight.unacked
 
     @property
     def outgoing(self) -> Outgoing:
@@ -355,10 +351,10 @@ class Connection:
             if sock is None:
                 return Outgoing()
             waiting = self._backlog.size + self._client.unwritten + unconfirmed_bytes(sock)
-            round_trip_s, since = shortest_round_trip_s(sock), self._in_flight.waiting_since
+            round_trip_s, since = shortest_round_trip_s(sock), self.in_flight.waiting_since
             # Of two round trips: TCP's may end at a proxy; and a broker without TCP_NODELAY holds an answer back until
             # the one before it is acknowledged.
-            usual_s = 2 * max(round_trip_s, self._in_flight.round_trip_s)
+            usual_s = 2 * max(round_trip_s, self.in_flight.round_trip_s)
             stalled_s = 0.0 if since is None else max(0.0, clock.since_boot() - since - usual_s)
             return Outgoing(waiting, round_trip_s, stalled_s)
 
@@ -368,7 +364,7 @@ class Connection:
             sock = self._client.socket
             if sock is None:
                 return None
-            number, seconds = self._in_flight.newest_answer(clock.since_boot())
+            number, seconds = self.in_flight.newest_answer(clock.since_boot())
             shortest, present = shortest_round_trip_s(sock), present_round_trip_s(sock)
             queue_s = max(0.0, present - shortest) if shortest else None
             delivered_s, late_s = self.incoming.age.delay.delivery(clock.since_boot())
@@ -377,12 +373,7 @@ class Connection:
     def unconfirmed_retained(self) -> list[Message]:
         """Return the retained messages that the broker may not have received, oldest first."""
         with self._lock:
-            return self._in_flight.unconfirmed_retained()
-
-    @property
-    def lost_bytes(self) -> int:
-        """Bytes of the largest message after which the broker was silent until the connection ended."""
-        return self._in_flight.lost_bytes
+            return self.in_flight.unconfirmed_retained()
 
     def written_before_loss(self) -> dict[str, int] | None:
         """Return the bytes by topic that may be why the broker closed the connection; None for another reason."""
@@ -390,4 +381,4 @@ class Connection:
             incoming = self.incoming
             if not (incoming.may_concern_message or (self._client.hung_up and not incoming.reason)):
                 return None
-            return self._in_flight.first_written(clock.since_boot())
+            return self.in_flight.first_written(clock.since_boot())

@@ -6,7 +6,7 @@ them; the messages that it matches in excess are sorted out by exact matching on
 """
 
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from hashlib import blake2b
 
 from pebble.transports.base import Message
@@ -74,16 +74,12 @@ class BrokerFilters:
         self._subscribed = [*(existing for existing in self._subscribed if existing not in merged), wanted]
         return wanted, sorted(merged - {wanted})
 
-    def prune(self, unwanted: str, wanted: Iterable[str]) -> list[str]:
-        """Remove and return the subscribed filters that overlap ``unwanted`` but none of ``wanted``.
-
-        ``unwanted`` is a filter that is no longer needed.
-        """
-        needs = list(wanted)
+    def prune(self, unwanted: str, wanted: Sequence[str]) -> list[str]:
+        """Remove and return the subscribed filters that overlap ``unwanted`` and none that is still ``wanted``."""
         idle = [
             existing
             for existing in self._subscribed
-            if overlap(existing, unwanted) and not any(overlap(existing, need) for need in needs)
+            if overlap(existing, unwanted) and not any(overlap(existing, filter_) for filter_ in wanted)
         ]
         self._subscribed = [existing for existing in self._subscribed if existing not in idle]
         return idle

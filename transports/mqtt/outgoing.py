@@ -148,7 +148,7 @@ class InFlightTable:
         self._accepted: dict[str, tuple[float, int]] = {}
         self._written: dict[str, tuple[float, int]] = {}  # and of those since the newest ping, if it is larger
         self._ping_number = self._pong_number = 0  # how many were sent, and answered
-        self.lost_bytes = 0  # of the largest message for which the other side was silent to the end
+        self.lost_bytes = 0  # of the largest message after which the other side was silent until the connection ended
         self._newest_s = 0.0  # how long the newest answer to a ping took
 
     # -- messages

@@ -98,13 +98,8 @@ def publish(
 
 
 def subscribe(mid: int, filters: Iterable[Filter], *, modern: bool) -> bytes:
-    options = _options if modern else _qos
-    wanted = [_text(filter_.text) + bytes((options(filter_),)) for filter_ in filters]
+    wanted = [_text(filter_.text) + bytes((_options(filter_) if modern else filter_.qos,)) for filter_ in filters]
     return _packet(_SUBSCRIBE, mid.to_bytes(2, "big"), b"\0" if modern else b"", *wanted)
-
-
-def _qos(filter_: Filter) -> int:
-    return filter_.qos
 
 
 def _options(filter_: Filter) -> int:
@@ -182,10 +177,7 @@ class Listener(Protocol):
 
 
 class SendQuota:
-    """A limit on unacknowledged messages of QoS 1 (the broker's Receive Maximum). Messages beyond it wait here.
-
-    The reader calls it before the listener.
-    """
+    """A limit on unacknowledged messages of QoS 1 (the broker's Receive Maximum). Messages beyond it wait here."""
 
     def __init__(self, send: Callable[[bytes], None]) -> None:
         self._send = send

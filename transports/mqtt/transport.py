@@ -202,7 +202,7 @@ class MqttTransport(Transport):
                 self.was_ended = self._dialler.is_gone(lost, connected=connected, was_ended=self.was_ended)
                 if self._dialler.note_end(lost):
                     text = "the way there seems to lose large packets (a wrong MTU?): from now on they are small"
-                    log.warning("%s: %s: %s", self.client_id, self._dialler.where, text)
+                    log.warning("%s: %s: %s", self.client_id, self._dialler.addresses.where, text)
                 problem = str(lost)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 log.exception("%s: unexpected failure of the connection", self.client_id)
@@ -388,7 +388,7 @@ class MqttTransport(Transport):
                     subscription.refused = is_refused
 
     def note_refusal(self, topic: str, why: str) -> None:
-        self._refused.report(self._dialler.where, topic, why, time.monotonic())
+        self._refused.report(self._dialler.addresses.where, topic, why, time.monotonic())
 
     def _finish(self, connection: Connection, will: Message | None) -> None:
         """Publish the will, wait (bounded) until everything is acknowledged, then send DISCONNECT."""

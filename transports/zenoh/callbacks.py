@@ -2,18 +2,16 @@
 
 Two problems of these threads, which are Rust's, are solved here.
 
-1. Python's state. For each callback Python makes a state for such a thread, with memory from the kernel, and frees it
-afterwards: an mmap, an munmap and the faults of new pages for each message (Python 3.11), 5 % of its cost. If the state
-is requested once more than it is released (PyGILState_Ensure of Python's C API), it stays, also when its thread ends:
-some 17 KB. Zenoh has a few threads for all sessions of a process, and seldom a new one (forty sessions, one after the
-other: five). Even so, only the first threads keep their state.
+1. Python's state. For each callback Python makes a state for such a thread, and frees it afterwards, which takes 5 % of
+a message's cost (Python 3.11). A state that is requested once more than it is released (PyGILState_Ensure of Python's C
+API) stays, also when its thread ends: some 17 KB. Zenoh seldom makes a new thread (forty sessions, one after the other:
+five). Even so, only the first threads keep their state.
 
 2. Blocking. One of these threads at a time waits for all sockets. It runs the callbacks itself, and meanwhile no other
-thread waits for the sockets unless it is given something to do. A callback that has to wait, for room for its own
-message or for another thread that waits for room, would wait until Zenoh closes that connection, because no thread
-notices that there is room again. So where a callback takes long, a guard gives another of Zenoh's threads something to
-do. Measured with 1.10.2: of 2,000 messages of 1 KB that a callback publishes 1,000 are lost without the guard, and none
-with it.
+thread waits for the sockets unless it is given something to do. So a callback that waits for room would wait until
+Zenoh closes that connection, because no thread notices that there is room again. Where a callback takes long, a guard
+gives another of Zenoh's threads something to do. Measured with 1.10.2: of 2,000 messages of 1 KB that a callback
+publishes 1,000 are lost without the guard, and none with it.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ class HubConnection:
     """The connection to a hub. Each hub that `watch` sees begins a new one. ``name``: this client's session."""
 
     def __init__(
-        self, client_id: str, will: Message | None, own: OwnRetained, count: Callable[[], object], account: str = ""
+        self, client_id: str, will: Message | None, own: OwnRetained, count: Callable[[], object], account: str
     ) -> None:
         self._account = account
         self._will = None if will is None else wire.Will.of(will, client_id)

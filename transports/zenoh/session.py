@@ -20,8 +20,7 @@ from pebble.transports.settings import TlsSettings, ZenohSettings
 from pebble.transports.zenoh import callbacks, wire
 
 # By default connections are accepted, opened and read on separate runtimes: a received message wakes a thread that only
-# wakes another one (11.3 wake-ups in a round trip instead of 7.1, 1.15 times the time one way at 20 Hz). Sending has
-# its own runtime, because a callback may send.
+# wakes another one (1.15 times the time one way at 20 Hz). Sending has its own runtime, because a callback may send.
 # There are more threads than connections, so that one is left to wait for the sockets when all others are in callbacks
 # that wait (.callbacks); each takes 15 KB.
 _RUNTIME = "(acc: (handover: rx), net: (handover: rx), rx: (worker_threads: 16))"

@@ -29,10 +29,6 @@ class _Paho(paho.Client):
     ahead = b""  # bytes that were taken out of the socket
     begin = 0  # of these, how many paho has read
 
-    @property
-    def unwritten(self) -> int:
-        return sum(packet["to_process"] for packet in self._out_packet)
-
     def _create_socket_connection(self) -> socket.socket:
         return dial(self.opening.address)  # paho would try all of the host's in one attempt
 
@@ -171,7 +167,7 @@ class PahoClient:
 
     @property
     def unwritten(self) -> int:
-        return self._paho.unwritten
+        return sum(packet["to_process"] for packet in self._paho._out_packet)
 
     @property
     def waiting(self) -> bool:

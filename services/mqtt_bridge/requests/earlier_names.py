@@ -170,9 +170,8 @@ class _Removal:
         self._call_in(wait_s, then)
 
     def _end(self) -> None:
-        subscriptions, self._subscriptions = self._subscriptions, []
-        for subscription in subscriptions:
-            subscription.close()
+        while self._subscriptions:
+            self._subscriptions.pop().close()
 
 
 def _note_heartbeat(heartbeats: set[str], message: Message) -> None:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 import zenoh
@@ -61,7 +60,8 @@ class HubWorker:
         for what, work in ((wire.HELLO, self._on_hello), (wire.BYE, self._on_bye)):
             for key in (what, f"{what}/*"):
                 session.declare_queryable(key, direct(partial(self._intake.greet, work)))
-        session.liveliness().declare_subscriber(wire.LIVE + "*", self._queued(self._on_client), history=True)
+        note_client = direct(lambda sample: self.post(partial(self._on_client, sample)))
+        session.liveliness().declare_subscriber(wire.LIVE + "*", note_client, history=True)
         session.liveliness().declare_subscriber(wire.UP + "*", direct(self._on_hub), history=True)
         self._token = session.liveliness().declare_token(wire.UP + self._name)
         if not self._thread.is_alive():
@@ -76,9 +76,6 @@ class HubWorker:
             self._journal.close()
 
     # -- the thread
-
-    def _queued(self, work: Callable[[Any], None]) -> zenoh.handlers.Callback[Any]:
-        return direct(lambda event: self.post(lambda: work(event)))
 
     def post(self, task: Task) -> None:
         """Run ``task`` on the hub's thread."""
