@@ -55,8 +55,7 @@ class Answer(Struct, frozen=True):
     number: int  # of answers on this connection
     seconds: float  # that it took, or has taken so far
     queue_s: float | None  # by so much TCP's own round trips are longer than the shortest; None: the system cannot tell
-    #: All messages that waited for us when this answer was asked for, so many seconds ago, have been delivered.
-    delivered_s: float = 0.0
+    delivered_s: float = 0.0  # so long ago the newest ping was sent before whose answer everything is delivered
     late_s: float = 0.0  # by so much longer than usual it took, or the next answer takes
 
 

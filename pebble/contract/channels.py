@@ -15,8 +15,7 @@ from msgspec import Struct
 from pebble.contract import payloads as p
 
 INCOMING, OUTGOING = "incoming", "outgoing"
-# So long a one-shot message may wait in a process or at a broker; in the connection another 2 s at most.
-WAITS_S = 0.5
+WAITS_S = 0.5  # so long a one-shot message may wait in a process or at a broker; in the connection another 2 s
 _PATIENT_S = 2.0  # for one that moves nothing
 _HOLD_S = 3.0  # for requests for control, which last for 3 s and are repeated every second,
 _HOLD_THIN_S = 10.0  # and where the link may be thin: control lasts for as long at most

@@ -36,7 +36,8 @@ class Admission:
         Counts the message if its kind is limited, and remembers an unknown flag. ``named`` False: the message has no
         sender where others have one. Such messages have a limit of their own.
         """
-        if side is Side.REMOTE and len(message.payload) > MAX_COMMAND_BYTES and _is_bounded(subject):
+        is_large = side is Side.REMOTE and len(message.payload) > MAX_COMMAND_BYTES
+        if is_large and subject.kind.direction == INCOMING and not subject.is_stop:  # any payload is a stop
             return Drop.TOO_LARGE
         return self._count(side, subject, message, topic, named) if subject.counted else None
 
@@ -76,7 +77,3 @@ class Admission:
             self._counts.clear()
         count = self._counts[key, named] = self._counts.get((key, named), 0) + 1
         return count > most
-
-
-def _is_bounded(subject: Subject) -> bool:
-    return subject.kind.direction == INCOMING and not subject.is_stop  # any payload is a stop

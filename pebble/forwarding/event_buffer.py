@@ -16,8 +16,6 @@ RESEND_S = 3.0
 
 
 class _Event(Struct, eq=False):
-    """An event, with the time when it was sent."""
-
     message: Message
     sent_at: float = 0.0
 

@@ -126,7 +126,8 @@ class RetainedTopics:
         retained = self._sides.gate is not Gate.SHUT and self._is_retained(source, message)
         if only_old and not retained:
             return Drop.UNNAMED
-        if not retained and self._may_be_ours and self._reconciliation.value(topic) == payload:
+        may_come_back = not any(state.transport.exact_echo for state in self._sides.values())  # ours, unrecognised
+        if not retained and may_come_back and self._reconciliation.value(topic) == payload:
             return Drop.KNOWN
         resolution = self._reconciliation.receive(
             side,
@@ -144,11 +145,6 @@ class RetainedTopics:
         if resolution is Resolution.CORRECT:
             self._publish_value(side, topic, self._reconciliation.value(topic) or b"")
         return _DROPS.get(resolution, Drop.OVERRULED)
-
-    @property
-    def _may_be_ours(self) -> bool:
-        """True if a message may be one of ours that came back, and was not recognised."""
-        return not any(state.transport.exact_echo for state in self._sides.values())
 
     def _is_retained(self, source: SideState, message: Message) -> bool:
         """True if a message is, or may be, an old one that a subscription brought."""

@@ -54,9 +54,8 @@ class Leftovers:
     def ask_next(self) -> bool:
         """Ask the broker for the topics of the next filter, and wait for the answer; False if none is left."""
         on_robot = self._on_robot or set()
-        if self._sparing:
-            while self._next < len(self._filters) and self._filters[self._next] in on_robot:
-                self._next += 1
+        while self._sparing and self._next < len(self._filters) and self._filters[self._next] in on_robot:
+            self._next += 1
         if self._next == len(self._filters):
             return False
         filter_ = self._filters[self._next]

@@ -11,6 +11,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable
 from enum import Enum
+from typing import NamedTuple
 
 from pebble.contract.codec import MAX_COMMAND_BYTES
 from pebble.services.mqtt_bridge.passed_stops import is_named
@@ -34,6 +35,13 @@ class Way(Enum):
     STOPS = "stops"
 
 
+class _Expected(NamedTuple):
+    """A stop whose copy may come, until a time."""
+
+    key: int  # a hash of its topic and payload
+    until: float
+
+
 class Copies:
     """A memory that recognises the second copy of a stop without a name, which comes both ways; thread-safe.
 
@@ -45,8 +53,7 @@ class Copies:
         """Store the arguments; ``notices_s``: seconds after which a lost connection is noticed."""
         self._clock, self._notices_s = clock, notices_s
         self._lock = threading.Lock()
-        #: By the way on which a copy is to come: the hash of each such stop, and the time until which it may come.
-        self._expected = {way: deque[tuple[int, float]](maxlen=_COPIES) for way in Way}
+        self._expected = {way: deque[_Expected](maxlen=_COPIES) for way in Way}  # by the way on which the copy comes
         self._dropped = deque[tuple[float, Message]](maxlen=_DROPPED)  # copies on the main connection, and their times
 
     def is_copy(self, way: Way, message: Message, *, comes_both_ways: bool) -> bool:
@@ -56,9 +63,9 @@ class Copies:
         """
         key, now, expected = hash((message.topic, message.payload)), self._clock(), self._expected[way]
         with self._lock:
-            while expected and expected[0][1] < now:
+            while expected and expected[0].until < now:
                 expected.popleft()
-            copy = next((entry for entry in expected if entry[0] == key), None)
+            copy = next((entry for entry in expected if entry.key == key), None)
             if copy is not None:
                 expected.remove(copy)
                 if way is Way.MAIN:
@@ -67,7 +74,7 @@ class Copies:
                 return True
             if comes_both_ways and not message.retain:  # with the flag it may be an old one, of which there is no copy
                 other_way, wait_s = (Way.STOPS, _PROMPT_S) if way is Way.MAIN else (Way.MAIN, _BEHIND_S)
-                self._expected[other_way].append((key, now + wait_s))
+                self._expected[other_way].append(_Expected(key, now + wait_s))
             return False
 
     def forget(self) -> None:

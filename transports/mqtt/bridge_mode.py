@@ -8,16 +8,12 @@ from enum import Enum
 
 
 class Attempt(Enum):
-    """A way to connect."""
-
     BRIDGE = "bridge"  # connect in bridge mode
     PROBE = "probe"  # connect without it, only to see whether that is accepted
     PLAIN = "plain"  # connect without it
 
 
 class Result(Enum):
-    """The outcome of a CONNECT."""
-
     ACCEPTED = "accepted"
     PROTOCOL_REFUSED = "unacceptable protocol version"
     HUNG_UP = "closed without an answer"

@@ -303,10 +303,7 @@ class Connection:
         return self._request(self._client.unsubscribe, filters, [])
 
     def _request(self, send: Callable[[Sequence[T]], int], filters: Sequence[T], asked: Sequence[str]) -> PendingAck:
-        """Send a few filters in each packet; return the pending answer to the last packet, which comes last.
-
-        ``asked``: the texts of filters to which a SUBACK is expected.
-        """
+        """Send a few filters in each packet; return the pending answer to the last. ``asked``: texts of a SUBSCRIBE."""
         ack = PendingAck()
         with self._lock:
             for at in range(0, len(filters), FILTERS):

@@ -107,7 +107,9 @@ class Incoming:
 
         Afterwards `more` is True if there may be more packets. Raises Lost.
         """
-        unread = self._left or self._receive(client, now)
+        unread = self._left
+        if not unread:
+            unread = self._receive(client, now)
         self.age.update(now, client.socket)
         try:
             self._left = bytes_left = client.read(most)

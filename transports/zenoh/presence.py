@@ -11,7 +11,7 @@ import msgspec
 import zenoh
 
 from pebble.transports.zenoh.callbacks import direct
-from pebble.transports.zenoh.wire import LIVE, SYNC, UP, pack_count, unpack_count
+from pebble.transports.zenoh.wire import LIVE, SYNC, UP
 
 log = logging.getLogger(__name__)
 
@@ -140,7 +140,8 @@ class Barrier:
 
         def take(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                answers[str(reply.ok.key_expr).removeprefix(SYNC)] = unpack_count(reply.ok.payload.to_bytes())
+                sibling = str(reply.ok.key_expr).removeprefix(SYNC)
+                answers[sibling] = int.from_bytes(reply.ok.payload.to_bytes(), "big")
                 if wanted <= set(answers):
                     done.set()
 
@@ -162,4 +163,4 @@ class Barrier:
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
-            query.reply(SYNC + self._name, pack_count(self._retained_count()))
+            query.reply(SYNC + self._name, self._retained_count().to_bytes(8, "big"))

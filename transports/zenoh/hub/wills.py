@@ -13,7 +13,7 @@ class WillTimes:
         self._due: dict[str, float] = {}
 
     def on_hello(self, name: str, now: float, *, alive: bool, has_will: bool) -> None:
-        """Note a client's hello. If its token is not there yet (``alive``) and does not follow, its will is due."""
+        """Note a client's hello. ``alive``: its token is there; if not, and none follows, its will is due."""
         if alive:
             self._due.pop(name, None)
         elif has_will:

@@ -86,7 +86,8 @@ class HubWorker:
             if (task := self._intake.take(self._pause())) is None:
                 return
             self._do(task)
-            self._answer_waiting()
+            for query in self._waiting.take(time.monotonic()):
+                self._intake.ask(self._answer, query)
             self._publish_due_wills()
             if self._journal is not None and time.monotonic() >= self._journal.rewrite_at:
                 self._write_journal(self._journal)
@@ -126,10 +127,6 @@ class HubWorker:
             raise
         if not self._waiting.add(needs, query, time.monotonic()):
             self._answer(query)
-
-    def _answer_waiting(self) -> None:
-        for query in self._waiting.take(time.monotonic()):
-            self._intake.ask(self._answer, query)
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
