@@ -2,7 +2,7 @@
 
 Control orders people; it is no safety function. A stop and a zero need none. Each drive command carries the key of the
 control under which it is sent. The key is new whenever another client gets control, so earlier commands have no effect.
-A client is ``(account, id, by, device)``; the account is "" where names are not checked.
+A client is ``(account, id, by, device)``, known by the first two; the account is "" where names are not checked.
 """
 
 

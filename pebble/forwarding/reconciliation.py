@@ -95,7 +95,7 @@ class Reconciliation:
     def __init__(self, winner: Side) -> None:
         self._winner = winner
         self._last = BoundedTable[LastValue](TOPICS, BYTES, lambda last: len(last.payload))
-        self._held = BoundedTable[bytes](TOPICS, BYTES, len)  # of the other side, until the winner's have arrived
+        self._held = BoundedTable[bytes](TOPICS, BYTES, len)  # the loser's values, until the winner's have arrived
         self._published = {side: BoundedTable[bytes](TOPICS, BYTES, len) for side in Side}
         self._received: dict[Side, set[str]] = {side: set() for side in Side}  # since the connection began
         # Of topics on which the winner has published nothing since its connection began, as far as has arrived:
@@ -173,11 +173,11 @@ class Reconciliation:
                 self._set(topic, payload, side.other)
                 due.append((side, topic, payload))
             self._held.clear()
-        fresh = {topic for _, topic, _ in due}
+        released = {topic for _, topic, _ in due}
         due += [
             (side, topic, last.payload)
             for topic, last in self._last.items()
-            if topic not in fresh and self._is_missing(side, topic, last)
+            if topic not in released and self._is_missing(side, topic, last)
         ]
         if side is self._winner:
             self._offered.update(topic for _, topic, _ in due)

@@ -51,8 +51,8 @@ class RetainedWindow:
             return
         self._newest_at = now
         if until < float("inf"):
-            end = self._subscribed_at + _RETAINED_STOPS_S
-            self._stops_until = min(max(now + INITIAL_SYNC_S, until), end)
+            latest = self._subscribed_at + _RETAINED_STOPS_S
+            self._stops_until = min(max(now + INITIAL_SYNC_S, until), latest)
 
     def is_old_stop(self, message: Message) -> bool:
         return message.retain and (not self._transport.as_published or self._clock() < self._stops_until)

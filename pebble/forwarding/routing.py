@@ -134,6 +134,6 @@ def _retain(subject: Subject, message: Message) -> bool:
         return False
     if subject.kind is Kind.FLAG and subject.retain:
         return True
-    if message.retain or message.retain_requested is not None:
-        return message.retain or bool(message.retain_requested)
-    return subject.retain
+    if message.retain or message.retain_requested:
+        return True
+    return message.retain_requested is None and subject.retain

@@ -64,7 +64,7 @@ class SideState:
             # Known before its retained messages come, which may be before it counts as connected.
             self._went_back = not self._wins and self.transport.was_ended
         elif self._wins:
-            self._went_back = self._was_brief and self.transport.went_back
+            self._went_back = self._was_brief and self.transport.went_back  # it has compared what we published
 
     @property
     def has_gone_back(self) -> bool:

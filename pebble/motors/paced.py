@@ -20,6 +20,7 @@ class Paced:
         return self._published[-1]
 
     def changed(self, now: float) -> None:
+        """Publish the changed state now, or let it wait until :attr:`due`."""
         allowed_at = self._published[0] + 1.0
         if now < allowed_at:
             self.due = allowed_at

@@ -74,7 +74,8 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
     """Return a connection to operators, not yet opened: to ``remote`` if it is set, else to ``remote_mqtt``."""
     bridge = config.services.mqtt_bridge
     if bridge.remote is None:
-        remote, program = bridge.remote_mqtt, "" if name == _BRIDGE else name
+        remote = bridge.remote_mqtt
+        program = "" if name == _BRIDGE else name
         settings = mqtt_settings(remote, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S, program=program)
         settings = replace_settings(settings, vital=(*_VITAL_STATES, *_renamed_vital(config)))
         if bridge.link.profile != "wide":

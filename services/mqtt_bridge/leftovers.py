@@ -66,13 +66,13 @@ class Leftovers:
             self._next = len(self._filters)
         return True
 
-    def remove(self, remove: Callable[..., bool]) -> list[str]:
+    def remove(self, remove_topic: Callable[..., bool]) -> list[str]:
         """Remove messages that only the broker retains; return their topics. Nothing is noted afterwards.
 
-        ``remove(topic, unless=stays)`` removes one message unless ``stays(topic)``, and returns True if it did.
+        ``remove_topic(topic, unless=stays)`` removes a message unless ``stays(topic)``, and returns True if it did.
         """
         self._close()
-        removed = [topic for topic in sorted(self._at_remote) if remove(topic, unless=self._stays)]
+        removed = [topic for topic in sorted(self._at_remote) if remove_topic(topic, unless=self._stays)]
         self._on_robot = None
         return removed
 

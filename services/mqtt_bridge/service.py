@@ -213,11 +213,10 @@ class MqttBridge(ForwardingService):
             self.synchronize_later(Side.LOCAL)
         if self.forwarder.gate is not Gate.OPEN:
             self._check_brokers()
-        elif side is Side.REMOTE and epoch == self.epoch:
-            self._same_broker.send()
+            return
+        self._same_broker.send()
+        if side is Side.REMOTE and epoch == self.epoch:
             self.subscribe_remote()
-        else:
-            self._same_broker.send()
 
     def subscribe_remote(self) -> None:
         super().subscribe_remote()

@@ -159,9 +159,10 @@ class MqttMirror(ForwardingService):
             self.forwarder.receive(Side.LOCAL, message)
         elif message.topic == self._probe_topic:
             self._under_way = message.payload != NO_PROBE
-            self._announced |= self._under_way
-            if self._under_way and self._probes.announce(message.payload):
-                self.shut()
+            if self._under_way:
+                self._announced = True
+                if self._probes.announce(message.payload):
+                    self.shut()
         # else a heartbeat: only the bridge publishes it; one from the broker is a reason to request a probe
 
     def receive_remote(self, epoch: int, message: Message) -> None:

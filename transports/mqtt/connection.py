@@ -338,10 +338,6 @@ class Connection:
             return not (self.in_flight.unacked or self._backlog.waiting or self._client.waiting)
 
     @property
-    def unacked(self) -> int:
-        return self.in_flight.unacked
-
-    @property
     def outgoing(self) -> Outgoing:
         with self._lock:
             sock = self._client.socket

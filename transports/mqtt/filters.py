@@ -69,7 +69,7 @@ class BrokerFilters:
             if not overlapping:
                 break
             for existing in overlapping:
-                wanted = cover(wanted, existing)
+                wanted = cover(wanted, existing)  # wider: it may overlap more of them
                 merged.add(existing)
         self._subscribed = [*(existing for existing in self._subscribed if existing not in merged), wanted]
         return wanted, sorted(merged - {wanted})

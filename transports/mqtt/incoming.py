@@ -142,9 +142,10 @@ class Incoming:
     @property
     def lost(self) -> Lost:
         """Error for a connection that the other side has closed, with the reason."""
-        why, id_ = self.reason or f"{self.where} closed the connection", self._settings.client_id
-        if id_ is not None and self.accepted is not None and self._taken_over:
-            why += f' (does another client use the client id "{id_}"? a broker lets in only the newest)'
+        why = self.reason or f"{self.where} closed the connection"
+        client_id = self._settings.client_id
+        if client_id is not None and self.accepted is not None and self._taken_over:
+            why += f' (does another client use the client id "{client_id}"? a broker lets in only the newest)'
         if filters := self._in_flight.asked:
             more = f" and {len(filters) - _SHOWN} more" if len(filters) > _SHOWN else ""
             why += f", asked to deliver {', '.join(filters[:_SHOWN])}{more}"

@@ -38,7 +38,8 @@ class SocketPoll:
                 if descriptor == self._wake:
                     woken = True
                 else:
-                    readable, writable = bool(events & ~select.POLLOUT), bool(events & select.POLLOUT)
+                    readable = bool(events & ~select.POLLOUT)  # also with an error, as reading it says
+                    writable = bool(events & select.POLLOUT)
         if woken:
             self._wakeup.clear()
         return readable, writable, woken

@@ -402,7 +402,7 @@ class MqttTransport(Transport):
 
     def _keep_unconfirmed(self, connection: Connection) -> None:
         """Mark retained messages that the broker may not have received as pending."""
-        self.counters.add("unconfirmed", connection.unacked)
+        self.counters.add("unconfirmed", connection.in_flight.unacked)
         with self._publishing:
             for message in connection.unconfirmed_retained():
                 if message.topic not in self._own.pending:

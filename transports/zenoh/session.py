@@ -55,7 +55,7 @@ def unix_endpoint(path: Path) -> str:
 
 
 def _numbered(endpoint: str) -> str:
-    """Return an endpoint with a network card's number in place of its name, which Zenoh does not accept."""
+    """Return an endpoint, as tls/[fe80::1%eth0]:7447, with the number of the card, whose name Zenoh does not accept."""
     start, zone, rest = endpoint.partition("%")
     name, bracket, port = rest.partition("]")
     try:

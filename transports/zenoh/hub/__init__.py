@@ -10,7 +10,6 @@ import errno
 import logging
 import socket
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -37,6 +36,7 @@ class ZenohHub:
         self.name = new_name()
         self.counters = Counters()
         self._settings = settings
+        self._socket = settings.run_dir / HUB_SOCKET
         self._lock: FileLock | None = None
         self._session: zenoh.Session | None = None
         self._worker: HubWorker | None = None
@@ -48,10 +48,6 @@ class ZenohHub:
 
             self._certificates = renewed_context(settings.tls)
         self._used = self._newest  # the certificates and rules of the session
-
-    @property
-    def _socket(self) -> Path:
-        return self._settings.run_dir / HUB_SOCKET
 
     @property
     def retained(self) -> dict[str, bytes]:
@@ -144,7 +140,7 @@ class ZenohHub:
             self._session = open_session(config)
         except zenoh.ZError as error:
             raise TransportError(f"the hub cannot open {self._socket}: {error}") from None
-        Barrier(self._session, self.name, lambda: 0)
+        Barrier(self._session, self.name, lambda: 0)  # answers the clients that wait for this hub
         worker.serve(self._session)
 
     def _is_free(self, endpoint: str) -> bool:

@@ -95,7 +95,7 @@ class Intake:
         with self._lock:
             if not (self._tasks or self._queries or self._ended) and not self._changed.wait(timeout):
                 return _nothing
-            if self._queries and (self._was_task or not self._tasks):
+            if self._queries and (self._was_task or not self._tasks):  # it is their turn
                 self._was_task = False
                 return self._queries.popleft()
             if not self._tasks:
