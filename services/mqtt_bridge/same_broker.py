@@ -28,7 +28,8 @@ class SameBrokerProbe:
     def __init__(self, config: Config, local: Transport, remote: Transport, clock: Callable[[], float]) -> None:
         section = config.services.mqtt_bridge.remote
         self.topic = BRIDGE_PROBE.topic(config.base)
-        self.possible = config.transport.kind == ("mqtt" if section is None else section.kind)
+        remote_kind = "mqtt" if section is None else section.kind
+        self.possible = config.transport.kind == remote_kind  # the two sides may be one broker
         self.announces = config.transport.mqtt_mirror is not None
         self._local, self._remote, self._clock = local, remote, clock
         self._sent: deque[bytes] = deque(maxlen=_REMEMBERED)

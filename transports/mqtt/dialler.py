@@ -69,7 +69,8 @@ class Dialler:
         as_published = self._settings.as_published and not plain
         connection = self._make(self.limits.limits.fit_will(self._will), owner, counters, as_published=as_published)
         try:
-            self.stalled |= connection.connect(stopping) > _HESITATION_S
+            if connection.connect(stopping) > _HESITATION_S:
+                self.stalled = True
         except Lost as lost:
             self._note_result(lost.result if isinstance(lost, Refused) else Result.FAILED)
             raise
@@ -156,7 +157,8 @@ class Dialler:
     def note_end(self, lost: Lost) -> bool:
         """Note how a connection, or an attempt, has ended; return True if segments are small from now on."""
         silent, late = isinstance(lost, Silent), isinstance(lost, TlsLate)
-        self.stalled |= silent
+        if silent:
+            self.stalled = True
         if late:
             self.addresses.was_slow()
         if self.loses_large or not (silent or late):

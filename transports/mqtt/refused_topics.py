@@ -115,7 +115,8 @@ class RefusedTopics:
 
     def report(self, where: str, topic: str, why: str, now: float, level: int = logging.WARNING) -> None:
         """Log a refused topic, at most once in a while for each topic, because many messages may follow."""
-        if now - self.not_taken.get(topic, ("", -inf))[1] >= _NOT_TAKEN_S:
+        _, logged_at = self.not_taken.get(topic, ("", -inf))
+        if now - logged_at >= _NOT_TAKEN_S:
             self.not_taken[topic] = why, now
             log.log(level, "%s: %s does not take a message on %s: %s", self._client_id, where, topic, why)
 
