@@ -23,8 +23,7 @@ class Lease:
         self.strangers = strangers
         self._diff = diff
         self._random = random
-        # Times: of the holder's newest request or command, of its newest command that moved something, of the asker's
-        # newest request, and of the newest command without a key that moved something.
+        # times of the last renewal, of the holder's last motion, of the request, and of a command without a key
         self._since = self._held_from = self._asked = self._received = now
         self._limit_ms = self._wait = 0  # how long control, and the asker's request, last after those times
         self._held = False  # in the last 5 s the holder moved something: others have to ask
