@@ -72,7 +72,7 @@ class _Way(Struct):
 
 
 class Cycles:
-    """The topics whose messages circulate, by the side from which they come. Two threads may call it at once."""
+    """The topics whose messages circulate, and from which side. Two threads may call it at once."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock

@@ -1,4 +1,4 @@
-"""Topics on which a broker accepts no messages: it says so on MQTT 5; on 3.1.1 it can only hang up.
+"""Topics on which a broker accepts no messages: on MQTT 5 the broker says so, on 3.1.1 it can only hang up.
 
 A topic is withheld after three losses in a row, each soon after a message on it. If several topics are withheld, they
 are tried one at a time from then on, so that only the topic at fault stays withheld. Pure but for the log.

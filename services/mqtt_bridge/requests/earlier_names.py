@@ -106,10 +106,7 @@ class Renaming(Requests):
 
 
 class _Removal:
-    """The removal of one earlier name: watches for a living robot of that name; without one it cleans the brokers.
-
-    It removes the messages that brokers retain under the name, and checks that they are gone.
-    """
+    """The removal of what brokers retain under an earlier name, unless a living robot has that name now."""
 
     def __init__(self, name: str, sides: list[Transport], call_in: CallIn, done: Callable[[], None]) -> None:
         self._name, self._sides, self._call_in, self._done = name, sides, call_in, done

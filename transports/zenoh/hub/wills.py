@@ -24,7 +24,7 @@ class WillTimes:
         self._due[name] = now + GONE_S
 
     def on_restart(self, names: Iterable[str], now: float) -> None:
-        """Set the times of the wills that were stored before a restart, so that their clients can come back before."""
+        """Give the clients of these stored wills time to come back after a restart, before the wills are published."""
         for name in names:
             self._due.setdefault(name, now + RETURN_S)
 
