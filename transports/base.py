@@ -467,18 +467,18 @@ class Transport(ABC):
         for subscription in self._subscriptions:
             subscription.renew()
 
-    def _sync_retained(self, known: Collection[str]) -> None:
-        """Send the pending retained messages, then our others that are not in ``known`` (T9)."""
+    def _sync_retained(self, known_topics: Collection[str]) -> None:
+        """Send the pending retained messages, then our others, except those of topics that the other end has (T9)."""
         with self._publishing:
-            self._own.send_again(known, lambda message: self._send(message, False))
+            self._own.send_again(known_topics, lambda message: self._send(message, False))
 
-    def _initial_sync(self, known: Collection[str]) -> None:
+    def _initial_sync(self, known_topics: Collection[str]) -> None:
         """Finish a new connection that has its subscriptions: send the retained messages it lacks, and set CONNECTED.
 
         Until then the ``_send`` of a backend that calls this accepts messages only while ``_own.syncing``: retained
         messages that are published in the meantime are pending, and sent last.
         """
-        self._sync_retained(known)
+        self._sync_retained(known_topics)
         self._set_state(State.CONNECTED)
         self._sync_retained(self._own.keys())
 

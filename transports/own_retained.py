@@ -40,10 +40,10 @@ class OwnRetained(BoundedTable[Message]):
             self.pending[message.topic] = None
         return True
 
-    def send_again(self, known: Collection[str], send: Callable[[Message], bool]) -> None:
-        """Send the pending messages, then the others whose topics are not in ``known``."""
+    def send_again(self, known_topics: Collection[str], send: Callable[[Message], bool]) -> None:
+        """Send the pending messages, then the others, except those of ``known_topics``."""
         pending = [self[topic] for topic in self.pending]
-        others = [message for topic, message in self.items() if topic not in self.pending and topic not in known]
+        others = [message for topic, message in self.items() if topic not in self.pending and topic not in known_topics]
         self.syncing = True
         try:
             for message in pending + others:

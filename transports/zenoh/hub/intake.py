@@ -68,10 +68,10 @@ class Intake:
 
     def ask(self, work: _OnQuery, query: zenoh.Query) -> None:
         """Queue a query. It gets no answer if too many wait, or once its client no longer waits."""
-        came = monotonic()
+        asked_at = monotonic()
 
         def answer() -> None:
-            if monotonic() - came < wire.RETAINED_ANSWER_S:
+            if monotonic() - asked_at < wire.RETAINED_ANSWER_S:
                 work(query)
             else:
                 query.drop()  # type: ignore[no-untyped-call]
