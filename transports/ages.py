@@ -44,7 +44,7 @@ class _Clock:
         self.least = now - sent  # the difference of the fastest message
         self.proved = -inf  # a message without any delay has at least this difference
         self.patience_s = patience_s
-        self.other: _Clock | None = None  # the clock as changed, if the messages since were not late
+        self.other: _Clock | None = None  # the clock if it was changed, and the messages since then were not late
 
     def receive(self, sent: float, now: float) -> None:
         drift = _DRIFT * (now - self.received_at)
@@ -82,7 +82,8 @@ class SenderClocks(Generic[K]):
         with self._lock:
             clock = self._clocks.get(key)
             if clock is None or now - clock.received_at > self._patience.silent_s or now - sent < clock.least - _JUMP_S:
-                clock = self._clocks[key] = self._begin(key, _Clock(sent, now))
+                self._make_room(key, now)
+                clock = self._clocks[key] = _Clock(sent, now)
             else:
                 clock.receive(sent, now)
                 clock = self._clock_to_use(key, clock, sent, now, late_s)
@@ -104,14 +105,14 @@ class SenderClocks(Generic[K]):
             if clock is not None and sent - clock.newest < now - clock.received_at + _JUMP_S:
                 clock.newest = max(clock.newest, sent)
 
-    def _begin(self, key: K, clock: _Clock) -> _Clock:
+    def _make_room(self, key: K, now: float) -> None:
+        """Forget a clock if there is no room for another sender."""
         clocks = self._clocks
         if key not in clocks and len(clocks) >= self._most:
             replaced = min(clocks, key=lambda sender: clocks[sender].received_at)
-            if clock.began - clocks[replaced].received_at <= _IDLE_S:
+            if now - clocks[replaced].received_at <= _IDLE_S:
                 replaced = min(clocks, key=lambda sender: clocks[sender].standing)
             del clocks[replaced]
-        return clock
 
     def _clock_to_use(self, key: K, clock: _Clock, sent: float, now: float, late_s: float) -> _Clock:
         """Return the sender's clock, corrected if all its messages have seemed late for long enough."""
@@ -120,7 +121,7 @@ class SenderClocks(Generic[K]):
             return clock
         candidate, patience = clock.other, self._patience
         patience_s = patience.set_back_s if sent < clock.newest - _JUMP_S else patience.believed_s
-        # begin with a new candidate: there is none, or after a pause, or less patience is due now
+        # A new candidate begins: if there was none, after a pause, or if less patience is due now.
         if candidate is None or now - candidate.received_at > patience.gap_s or patience_s < candidate.patience_s:
             clock.other = _Clock(sent, now, patience_s)
             return clock

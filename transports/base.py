@@ -33,7 +33,7 @@ _MATCHED = 512  # topics whose subscriptions are remembered
 _DELIVERED_TOPICS_LIMIT = 65_536  # topics a subscription remembers as delivered, per connection
 _DELIVERED_TOPICS_BYTES = 4 << 20
 _HANDLER_END_S = 1.0  # how long closing waits for handlers that are running
-_TURN_S = 0.02  # how soon the end of a turn is noticed
+_TRIED_S = 0.02  # how soon `open` notices that all addresses were tried
 _NAMED = 3  # subscriptions in one line
 _WARNING_PERIOD_S = 5.0  # between two log lines about the same overflowing subscription
 
@@ -55,9 +55,8 @@ class Answer(Struct, frozen=True):
     number: int  # of answers on this connection
     seconds: float  # that it took, or has taken so far
     queue_s: float | None  # by so much TCP's own round trips are longer than the shortest; None: the system cannot tell
-    #: All messages that waited for us when this answer was asked for, so many seconds ago, have been delivered.
-    delivered_s: float = 0.0
-    late_s: float = 0.0  # by so much longer than usual it took, or the next one takes
+    delivered_s: float = 0.0  # so long ago the newest ping was sent before whose answer everything is delivered
+    late_s: float = 0.0  # by so much longer than usual it took, or the next answer takes
 
 
 Handler = Callable[[Message], None]
@@ -258,7 +257,8 @@ class Transport(ABC):
         self.client_id, self.will = client_id, will
         self.policy = TopicPolicy()
         self.counters = Counters()
-        self._count_sent, self.count_received = map(self.counters.adder, ("sent", "received"))
+        self._count_sent = self.counters.adder("sent")
+        self.count_received = self.counters.adder("received")
         #: One line that explains why there is no connection; empty while there is one.
         self.problem = ""
         self._state = State.CLOSED
@@ -326,7 +326,7 @@ class Transport(ABC):
             raise
         connected = self._changes.await_connected(timeout)
         while timeout and not connected and self.untried and self.state is State.CONNECTING:
-            connected = self._changes.await_connected(_TURN_S)
+            connected = self._changes.await_connected(_TRIED_S)
         return self
 
     def close(self) -> None:
@@ -371,8 +371,8 @@ class Transport(ABC):
         message = Message(topic, payload, qos if type(qos) is QoS else QoS(qos), retain)
         if (forms := self.policy.forms) is None:
             return self._publish(message, urgent=urgent, remember=remember, shared=shared)
-        first, *_ = [self._publish(form, urgent=urgent, remember=remember, shared=shared) for form in forms(message)]
-        return first
+        outcomes = [self._publish(form, urgent=urgent, remember=remember, shared=shared) for form in forms(message)]
+        return outcomes[0]
 
     def _publish(self, message: Message, *, urgent: bool, remember: bool, shared: bool) -> bool:
         with self._publishing:
@@ -467,18 +467,18 @@ class Transport(ABC):
         for subscription in self._subscriptions:
             subscription.renew()
 
-    def _sync_retained(self, known: Collection[str]) -> None:
-        """Send the pending retained messages, then our others that are not in ``known`` (T9)."""
+    def _sync_retained(self, known_topics: Collection[str]) -> None:
+        """Send the pending retained messages, then our others, except those of topics that the other end has (T9)."""
         with self._publishing:
-            self._own.send_again(known, lambda message: self._send(message, False))
+            self._own.send_again(known_topics, lambda message: self._send(message, False))
 
-    def _initial_sync(self, known: Collection[str]) -> None:
+    def _initial_sync(self, known_topics: Collection[str]) -> None:
         """Finish a new connection that has its subscriptions: send the retained messages it lacks, and set CONNECTED.
 
         Until then the ``_send`` of a backend that calls this accepts messages only while ``_own.syncing``: retained
         messages that are published in the meantime are pending, and sent last.
         """
-        self._sync_retained(known)
+        self._sync_retained(known_topics)
         self._set_state(State.CONNECTED)
         self._sync_retained(self._own.keys())
 

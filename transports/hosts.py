@@ -72,9 +72,9 @@ class AddressRound:
     def __init__(self, host_port: HostPort, resolve: Callable[[str, int], list[Address]] = addresses_of) -> None:
         self.host_port, self._resolve = host_port, resolve
         self._left: list[Address] = []  # of this round; it is the turn of the first one
-        self.several = False  # addresses: after a failure the next one has its turn without a pause
-        self._steady: Address | None = None  # an address that has lost a connection that held for long: it begins again
-        self._is_first = True  # round
+        self.several = False  # the host has several addresses: after a failure the next has its turn without a pause
+        self._steady: Address | None = None  # an address that held a connection for long: it begins the next round
+        self._is_first = True  # this is the first round
         self._failures: dict[str, str] = {}  # why each address failed last, without a success since
         self._slow: set[Address] = set()  # addresses where TLS took long, or was not there in time
 
@@ -84,7 +84,7 @@ class AddressRound:
             addresses = self._resolve(*self.host_port)
             if not addresses:
                 raise OSError("it has no address")
-            self._left = sorted(addresses, key=lambda address: address != self._steady)
+            self._left = sorted(addresses, key=lambda address: address != self._steady)  # False is less: it comes first
             self._steady, self.several = None, len(addresses) > 1
             self._slow &= set(addresses)
             texts = {address.text for address in addresses}
@@ -124,13 +124,15 @@ class AddressRound:
         if not self._left:  # the name was not resolved
             return why
         address = self._left.pop(0)
-        self._failures.pop(address.text, None)
+        self._failures.pop(address.text, None)  # so that the newest failure is the last
         self._failures[address.text] = why
         if held_s >= STEADY_S:
             self._steady, self._left = address, []
-        self._is_first &= not self.is_over
+        if self.is_over:
+            self._is_first = False
         return described(self._failures)
 
     @property
     def is_over(self) -> bool:
+        """True if the round is over, so that a pause is due."""
         return not self._left

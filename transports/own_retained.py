@@ -17,11 +17,11 @@ class OwnRetained(BoundedTable[Message]):
         super().__init__(LIMIT, BYTES, lambda message: len(message.payload))
         self.pending: dict[str, None] = {}  # topics whose message is not sent yet, oldest first
         self.shared: set[str] = set()  # topics that others publish on, too
-        self.syncing = False  # True while these are sent again
+        self.syncing = False  # True while messages are sent again
         self._counters = counters
 
     def remember(self, message: Message, *, sent: bool, shared: bool | None = None) -> bool:
-        """Store a message, to send it again; return False if there is no room: then an older message is forgotten, too.
+        """Store a message, to send it again; return False if there is no room: then its topic is forgotten.
 
         ``sent``: it need not be sent now. ``shared``: others publish on the topic as well; None: as before.
         """
@@ -40,13 +40,13 @@ class OwnRetained(BoundedTable[Message]):
             self.pending[message.topic] = None
         return True
 
-    def send_again(self, known: Collection[str], send: Callable[[Message], bool]) -> None:
-        """Send the pending messages, then the others whose topics are not in ``known``."""
-        changed = [self[topic] for topic in self.pending]
-        others = [m for topic, m in self.items() if topic not in self.pending and topic not in known]
+    def send_again(self, known_topics: Collection[str], send: Callable[[Message], bool]) -> None:
+        """Send the pending messages, then the others, except those of ``known_topics``."""
+        pending = [self[topic] for topic in self.pending]
+        others = [message for topic, message in self.items() if topic not in self.pending and topic not in known_topics]
         self.syncing = True
         try:
-            for message in changed + others:
+            for message in pending + others:
                 self.remember(message, sent=send(message))
         finally:
             self.syncing = False

@@ -7,17 +7,20 @@ from pathlib import Path
 
 _SHOWN = 60  # characters of a command
 _LISTENS = "0A"  # in /proc/net/tcp
+_PREFIX = "socket:["  # of the target of a link in /proc/PID/fd, before the inode and a bracket
 
 
 def _processes_with(inodes: Collection[str]) -> Iterator[tuple[Path, set[str]]]:
-    """Yield each process that holds some of these sockets: its folder in /proc, and the sockets."""
+    """Yield each process that holds some of these sockets: its folder in /proc, and their inodes."""
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             links = []
             for entry in (process / "fd").iterdir():
                 with suppress(OSError):  # closed meanwhile
                     links.append(str(entry.readlink()))
-            if held := {link[8:-1] for link in links if link.startswith("socket:[")}.intersection(inodes):
+            sockets = {link.removeprefix(_PREFIX).rstrip("]") for link in links if link.startswith(_PREFIX)}
+            held = sockets.intersection(inodes)
+            if held:
                 yield process, held
 
 
@@ -37,7 +40,7 @@ def why_not(error: OSError, port: int) -> str:
 
 def port_holder(port: int) -> str:
     """Return who listens at a port, or "": `` (by process 12 of user 1000: 'nc -l 8080')``, with the blank."""
-    users = {}
+    users = {}  # of listening sockets at the port, by their inodes
     for name in ("tcp", "tcp6"):
         with suppress(OSError):
             for line in Path("/proc/net", name).read_text(encoding="ascii").splitlines()[1:]:

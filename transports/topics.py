@@ -32,6 +32,7 @@ def remembered(translate: Callable[[str], str]) -> Callable[[str], str]:
 
 
 def _check(what: str, text: str) -> None:
+    """Raise TransportError if ``text``, a topic or a filter as ``what`` says, is beyond the limits of both."""
     if not isinstance(text, str) or not text:
         raise TransportError(f"{what} must be a non-empty string, not {text!r}")
     try:
@@ -91,12 +92,12 @@ def matches(filter_: str, topic: str) -> bool:
         return True
     if not topic.startswith(beginning(filter_)):
         return False
-    want, have = filter_.split("/"), topic.split("/")
-    if topic.startswith("$") and want[0] in ("+", "#"):
+    filter_levels, topic_levels = filter_.split("/"), topic.split("/")
+    if topic.startswith("$") and filter_levels[0] in ("+", "#"):
         return False
-    for index, level in enumerate(want):
+    for index, level in enumerate(filter_levels):
         if level == "#":
             return True
-        if index >= len(have) or level not in ("+", have[index]):
+        if index >= len(topic_levels) or level not in ("+", topic_levels[index]):
             return False
-    return len(want) == len(have)
+    return len(filter_levels) == len(topic_levels)

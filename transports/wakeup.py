@@ -10,9 +10,8 @@ class Wakeup:
     """An event that resets itself: any thread or signal handler sets it, one thread waits. A set before a wait counts.
 
     It is a bare lock that is free while the event is set. A Condition takes ten times as long, and a signal handler
-    that notifies it may interrupt its own thread inside. ``queue.SimpleQueue.get(timeout=…)`` can wait for ever: if the
-    timeout ends between two of its checks, the remainder is negative, which its lock takes for no timeout at all
-    (Python 3.11: within a second, with timeouts of some µs, as a timer that is nearly due has them).
+    that notifies it may interrupt its own thread inside. ``queue.SimpleQueue.get`` with a timeout of some µs can wait
+    for ever (Python 3.11): the time that remains may become negative, which its lock takes for no timeout.
     """
 
     def __init__(self) -> None:

@@ -54,7 +54,7 @@ class Arbiter:
         self.tick(now)
         lease = self.lease
         local = by is None
-        if by and run != PERSON and not lease.holds(key, by):  # of a script elsewhere only a zero counts
+        if by and run != PERSON and not lease.holds(key, by):  # of a script elsewhere only a zero counts, as a person's
             if moves:
                 return REFUSED
             run = PERSON

@@ -91,9 +91,13 @@ class Latch:
 
         Then persons are refused until one sends a zero, or all pause for half a second.
         """
-        self.reset_refused = (
-            "boot" if boot != self.boot else "count" if count != self.count else "old" if age >= 1000 else None
-        )
+        self.reset_refused = None
+        if boot != self.boot:
+            self.reset_refused = "boot"
+        elif count != self.count:
+            self.reset_refused = "count"
+        elif age >= 1000:
+            self.reset_refused = "old"
         if self.reset_refused or not self.latched:
             return False
         self.latched = False

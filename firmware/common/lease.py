@@ -2,7 +2,7 @@
 
 Control orders people; it is no safety function. A stop and a zero need none. Each drive command carries the key of the
 control under which it is sent. The key is new whenever another client gets control, so earlier commands have no effect.
-A client is ``(account, id, by, device)``; the account is "" where names are not checked.
+A client is ``(account, id, by, device)``, known by the first two; the account is "" where names are not checked.
 """
 
 
@@ -25,7 +25,7 @@ class Lease:
         self._random = random
         # times of the last renewal, of the holder's last motion, of the request, and of a command without a key
         self._since = self._held_from = self._asked = self._received = now
-        self._limit_ms = self._wait = 0  # of the holder, and of the asker
+        self._limit_ms = self._wait = 0  # how long control, and the asker's request, last after those times
         self._held = False  # in the last 5 s the holder moved something: others have to ask
 
     def hold(self, client: tuple, ms: int, urgent: bool, now: int) -> None:
@@ -116,7 +116,7 @@ def request_of(fields: dict) -> tuple[str, str, str, int] | None:
     ms = fields.get("for_ms", 3000)
     if not (isinstance(name, str) and isinstance(by, str) and isinstance(device, str)):
         return None
-    if len(name) != 8 or name.strip("0123456789abcdefABCDEF"):  # other letters would be left
+    if len(name) != 8 or name.strip("0123456789abcdefABCDEF"):  # of 8 hex digits strip leaves nothing
         return None
     if want not in ("hold", "release") or type(ms) not in (int, float):
         return None

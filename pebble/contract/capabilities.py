@@ -93,8 +93,8 @@ class DriveOffer(Offer, frozen=True, kw_only=True):
 
     topic: str | UnsetType = UNSET  # of drive commands
     axes: list[Literal["x", "y", "z"]] | UnsetType = UNSET  # that move anything; without it all of them
-    arbitrates: bool | UnsetType = UNSET  # people go before scripts; without it a script is stopped before one drives
-    control: bool | UnsetType = UNSET  # it says who drives (docs/control.md); without it servers agree on that
+    arbitrates: bool | UnsetType = UNSET  # people go before scripts; without it stop the script, then drive
+    control: bool | UnsetType = UNSET  # it publishes who drives (docs/control.md); without it servers agree on that
 
 
 class EstopOffer(Payload, frozen=True, kw_only=True):
@@ -167,5 +167,5 @@ class CapabilitiesValue(Payload, frozen=True, kw_only=True):
 
 
 def offered(offer: Any, enabled: bool) -> Any:
-    """Return an offer that is available and obeys commands if ``enabled``."""
+    """Return ``offer`` with ``enabled`` as its ``available`` and its ``controls``."""
     return replace(offer, available=enabled, controls=enabled)

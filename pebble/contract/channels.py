@@ -15,10 +15,10 @@ from msgspec import Struct
 from pebble.contract import payloads as p
 
 INCOMING, OUTGOING = "incoming", "outgoing"
-WAITS_S = 0.5  # a one-shot message may wait for so long; in the connection another 2 s at most
-_PATIENT_S = 2.0  # the same, if it moves nothing
-_HOLD_S = 3.0  # the same, if it is repeated every second and lasts for 3 s
-_HOLD_THIN_S = 10.0  # the same, if the link may be thin: control lasts for as long at most
+WAITS_S = 0.5  # so long a one-shot message may wait in a process or at a broker; in the connection another 2 s
+_PATIENT_S = 2.0  # for one that moves nothing
+_HOLD_S = 3.0  # for requests for control, which last for 3 s and are repeated every second,
+_HOLD_THIN_S = 10.0  # and where the link may be thin: control lasts for as long at most
 
 
 class Kind(Enum):
@@ -106,7 +106,8 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
 
     def names(self, topic: str) -> dict[str, str]:
         """Return the values of this pattern's placeholders in ``topic``: ``{"program": "camera_publisher"}``."""
-        match = re.search(re.sub(r"{([^}]*)}", r"(?P<\1>[^/]+)", self.suffix) + r"\Z", topic)
+        pattern = re.sub(r"{([^}]*)}", r"(?P<\1>[^/]+)", self.suffix)  # each placeholder becomes a group of its name
+        match = re.search(pattern + r"\Z", topic)
         return match.groupdict() if match is not None else {}
 
 
@@ -190,7 +191,7 @@ CONTROL_VOUCHED = _c("control-vouched", Kind.EVENT, p.ControlVouched,
                      rate_hz=2, remote=False)  # fmt: skip
 STREAMS = _c("group", Kind.STREAM, bytes, "The newest of several streams; deflated with a dictionary of `wire`.")
 WIRE = _c("wire", Kind.STATE, p.Wire, "How the streams in a group are written.")
-SHORT = "~/"  # in front of a robot's short name, for groups of streams
+SHORT = "~/"  # begins the topic of groups of streams, before a robot's short name
 LINK = _c("link", Kind.STATE, p.LinkState, "What the link to the remote broker carries; only where it may be thin.")
 BRIDGE_PROBE = _c(
     "bridge-probe",

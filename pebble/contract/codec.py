@@ -3,24 +3,13 @@
 import math
 import re
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 from msgspec import UNSET
 
 from pebble.contract import INCOMING, Channel
-from pebble.contract.payloads import (
-    LARGEST_MS,
-    LAST_RUN,
-    SCRIPT,
-    AutonomyCommand,
-    Drive,
-    EstopCommand,
-    LightsFlash,
-    LightsSolid,
-    MediaRequest,
-    SoundboardCommand,
-)
+from pebble.contract import payloads as p
 from pebble.errors import PayloadError
 from pebble.motion.latch import fields, stop_of
 
@@ -30,8 +19,9 @@ _LONGEST_MS = 1e12  # of a command's validity; far beyond every watchdog
 
 # Narrower than float(), which also takes "1_0", digits of other scripts and the names of NaN and infinity.
 _numeric = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII).fullmatch
-#: The bytes of UTF-8 except printable ASCII, with which every JSON text begins and ends: a byte order mark, a C
-#: string's NUL, white space. Bytes above these are in no UTF-8, so a payload with them is no text.
+#: Bytes that are removed before and after a JSON text, which begins and ends with printable ASCII: all others of UTF-8,
+#: such as those of a byte order mark, a C string's NUL and white space. Bytes that UTF-8 does not have stay: a payload
+#: with them is no text.
 _AROUND = bytes(byte for byte in range(0xF5) if not 0x21 <= byte <= 0x7E)
 _KEYS_SHOWN, _SHOWN = 8, 20  # keys of a payload that is not understood, and characters of each
 _encoder = msgspec.json.Encoder()
@@ -52,12 +42,13 @@ def encode(channel: Channel, value: Any) -> bytes:
         return _encoder.encode(_encodable(msgspec.to_builtins(body)))
 
 
-def _encodable(plain: Any) -> Any:
-    if isinstance(plain, dict):
-        return {_encodable(key): _encodable(value) for key, value in plain.items()}
-    if isinstance(plain, list):
-        return [_encodable(value) for value in plain]
-    return plain.encode(errors="backslashreplace").decode() if isinstance(plain, str) else plain
+def _encodable(value: Any) -> Any:
+    """Return a JSON value in which codes stand for the characters that UTF-8 cannot write."""
+    if isinstance(value, dict):
+        return {_encodable(key): _encodable(field) for key, field in value.items()}
+    if isinstance(value, list):
+        return [_encodable(item) for item in value]
+    return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
 
 
 #: Takes a command's channel, its sender if the command names one, and a remark on an effect that may be unwanted.
@@ -72,7 +63,7 @@ def decode(channel: Channel, raw: bytes, remark: Remark | None = None) -> Any:
     """
     if channel.payload is bytes:
         return raw
-    if channel.payload is EstopCommand:
+    if channel.payload is p.EstopCommand:
         return _stop(channel, raw)
     decoded = plain(channel, raw)
     if channel.payload is bool:
@@ -82,7 +73,7 @@ def decode(channel: Channel, raw: bytes, remark: Remark | None = None) -> Any:
     try:
         return msgspec.convert(decoded, channel.payload)
     except (msgspec.ValidationError, ValueError, OverflowError) as error:
-        if issubclass(channel.payload, LightsSolid):
+        if issubclass(channel.payload, p.LightsSolid):  # again: numbers may be text, and a wrong `group` is left out
             decoded = {key: value for key, value in decoded.items() if key != "group" or isinstance(value, bool)}
             return msgspec.convert(decoded | _numbers(channel, decoded, remark or _ignore), channel.payload)
         raise PayloadError(f"{channel.metric}: {error}") from None
@@ -115,17 +106,17 @@ def trim(raw: bytes) -> bytes:
     return raw.lstrip(_AROUND).partition(b"\0")[0].rstrip(_AROUND)
 
 
-def _stop(channel: Channel, raw: bytes) -> EstopCommand:
+def _stop(channel: Channel, raw: bytes) -> p.EstopCommand:
     """Return the stop in ``raw``, nameless if it cannot be read. Raises PayloadError only for an empty payload."""
     if not raw:
         raise PayloadError(f"{channel.metric}: empty")
     try:
         body = plain(channel, raw)
     except PayloadError:
-        return EstopCommand()
+        return p.EstopCommand()
     name, by, why = stop_of(body)
     owner = fields(body).get("owner")
-    return EstopCommand(stop=name or UNSET, by=by, why=why, owner=owner if isinstance(owner, str) else UNSET)
+    return p.EstopCommand(stop=name or UNSET, by=by, why=why, owner=owner if isinstance(owner, str) else UNSET)
 
 
 def is_blank(raw: bytes) -> bool:
@@ -133,13 +124,13 @@ def is_blank(raw: bytes) -> bool:
     return bool(raw) and raw.isspace()
 
 
-def _boolean(channel: Channel, plain: Any) -> bool:
-    if isinstance(plain, bool):
-        return plain
-    if isinstance(plain, dict):
+def _boolean(channel: Channel, control: Any) -> bool:
+    if isinstance(control, bool):
+        return control
+    if isinstance(control, dict):
         for key in ("value", "enabled"):
-            if isinstance(plain.get(key), bool):
-                return bool(plain[key])
+            if isinstance(control.get(key), bool):
+                return bool(control[key])
     raise PayloadError(f'{channel.metric}: only true, false, {{"value": bool}} or {{"enabled": bool}} switch it')
 
 
@@ -147,103 +138,113 @@ def _ignore(_channel: Channel, _sender: str, _text: str) -> None:
     """Do nothing, for a caller that wants no remarks."""
 
 
-def _unwrap(channel: Channel, plain: Any, remark: Remark) -> Any:
+def _unwrap(channel: Channel, command: Any, remark: Remark) -> Any:
     """Return the fields of a command: the object under ``value`` if there is one, else the root (paper A.4.5)."""
-    if channel.payload in (SoundboardCommand, AutonomyCommand):
-        return _switch(plain)
-    if channel.payload is MediaRequest:
-        return _request(channel, plain)
-    if not isinstance(plain, dict):
-        raise PayloadError(f"{channel.metric}: an object is needed, not {_name_of(plain)}")
-    inner = plain["value"] if isinstance(plain.get("value"), dict) else plain
-    return _drive(channel, inner, remark) if channel.payload is Drive else inner
+    if channel.payload in (p.SoundboardCommand, p.AutonomyCommand):
+        return _switch(command)
+    if channel.payload is p.MediaRequest:
+        return _request(channel, command)
+    if not isinstance(command, dict):
+        raise PayloadError(f"{channel.metric}: an object is needed, not {_name_of(command)}")
+    inner = command["value"] if isinstance(command.get("value"), dict) else command
+    return _drive(channel, inner, remark) if channel.payload is p.Drive else inner
 
 
-def _switch(plain: Any) -> Any:
+def _switch(command: Any) -> Any:
     """Return the fields of a start or stop command: it may be a boolean or an object, bare or under ``value``."""
-    if isinstance(plain, bool):
-        return {"enabled": plain}
-    if isinstance(plain, dict):
-        value = plain.get("value")
+    if isinstance(command, bool):
+        return {"enabled": command}
+    if isinstance(command, dict):
+        value = command.get("value")
         if isinstance(value, bool):
-            return {**plain, "enabled": value}
+            return {**command, "enabled": value}
         if isinstance(value, dict):
-            outer = {key: plain[key] for key in ("file", "config", "repeat") if key in plain}
+            outer = {key: command[key] for key in ("file", "config", "repeat") if key in command}
             return {**outer, **value}
-    return plain
+    return command
 
 
-def _request(channel: Channel, plain: Any) -> Any:
+def _request(channel: Channel, request: Any) -> Any:
     """Return the fields of a media request, which may have any form of a boolean control; ``enabled`` is its state."""
-    inner = plain["value"] if isinstance(plain, dict) and isinstance(plain.get("value"), dict) else plain
-    return {**(inner if isinstance(inner, dict) else {}), "enabled": _boolean(channel, inner)}
+    inner = request["value"] if isinstance(request, dict) and isinstance(request.get("value"), dict) else request
+    given = inner if isinstance(inner, dict) else {}
+    return {**given, "enabled": _boolean(channel, inner)}
 
 
-def _drive(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str, Any]:
+def _drive(channel: Channel, command: dict[str, Any], remark: Remark) -> dict[str, Any]:
     """Return the valid fields of a drive command. Raises PayloadError for wrong ones, unless it moves nothing."""
-    axes = _numbers(channel, plain, remark)
+    axes = _numbers(channel, command, remark)
     if not axes:
-        keys = ", ".join([_shown(key) for key in plain][:_KEYS_SHOWN]) or "nothing"
+        keys = ", ".join([_shown(key) for key in command][:_KEYS_SHOWN]) or "nothing"
         expected = 'expected {"x": steering, "z": throttle}, each -1 to 1'
-        remark(channel, _sender(plain), f"none of x, z and y is in it, but {keys}: so it is a stop; {expected}")
+        remark(channel, _sender(command), f"none of x, z and y is in it, but {keys}: so it is a stop; {expected}")
     moves = any(axes.values())
-    checked = {key: plain[key] for key in _DRIVE_CHECKS if plain.get(key) is not None}
-    wrong = [key for key, value in checked.items() if not _DRIVE_CHECKS[key][0](value)]
+    given = {key: command[key] for key in _DRIVE_RULES if command.get(key) is not None}
+    wrong = [key for key, value in given.items() if not _DRIVE_RULES[key].fits(value)]
     if moves and wrong:
-        raise PayloadError(f"{channel.metric}: {wrong[0]} is not {_DRIVE_CHECKS[wrong[0]][1]}")
-    if moves and checked.get("source") == SCRIPT and "run" not in checked:
+        raise PayloadError(f"{channel.metric}: {wrong[0]} is not {_DRIVE_RULES[wrong[0]].expected}")
+    if moves and given.get("source") == p.SCRIPT and "run" not in given:
         raise PayloadError(f"{channel.metric}: run is missing, which a script's command needs")
-    if moves and "valid_ms" in checked and checked["valid_ms"] < 1:
+    if moves and "valid_ms" in given and given["valid_ms"] < 1:
         raise PayloadError(f"{channel.metric}: valid_ms is less than 1, so it moves nothing")
-    valid = {key: value for key, value in checked.items() if key not in wrong}
+    valid = {key: value for key, value in given.items() if key not in wrong}
     if "valid_ms" in valid:
         valid["valid_ms"] = int(valid["valid_ms"])
-    return axes | valid | {key: plain[key] for key, fits in _DRIVE_MORE.items() if fits(plain.get(key))}
+    return axes | valid | {key: command[key] for key, fits in _DRIVE_MORE.items() if fits(command.get(key))}
+
+
+class _Rule(NamedTuple):
+    """A rule for the value of a field, and what it expects, in words."""
+
+    fits: Callable[[Any], bool]
+    expected: str
 
 
 #: Fields of a drive command besides its axes; null is the same as absent.
-_DRIVE_CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "source": (lambda value: isinstance(value, str), "a string"),
-    "key": (lambda value: isinstance(value, str), "a string"),
-    "run": (lambda value: type(value) is int and 1 <= value <= LAST_RUN, f"an integer from 1 to {LAST_RUN}"),
-    "valid_ms": (lambda value: type(value) in (int, float) and 0 <= value < _LONGEST_MS, "a number of milliseconds"),
+_DRIVE_RULES: dict[str, _Rule] = {
+    "source": _Rule(lambda value: isinstance(value, str), "a string"),
+    "key": _Rule(lambda value: isinstance(value, str), "a string"),
+    "run": _Rule(lambda value: type(value) is int and 1 <= value <= p.LAST_RUN, f"an integer from 1 to {p.LAST_RUN}"),
+    "valid_ms": _Rule(
+        lambda value: type(value) in (int, float) and 0 <= value < _LONGEST_MS, "a number of milliseconds"
+    ),
 }
-#: Its other fields; a wrong value is the same as absent, because none of them decides about motion.
+#: Its other fields, each with its rule; a wrong value is the same as absent, because none of them decides about motion.
 _DRIVE_MORE: dict[str, Callable[[Any], bool]] = {
-    "t": lambda value: type(value) is int and 0 <= value <= LARGEST_MS,
+    "t": lambda value: type(value) is int and 0 <= value <= p.LARGEST_MS,
     "by": lambda value: isinstance(value, str),
     "group": lambda value: isinstance(value, bool),
 }
 
 
-#: The numbers of a command, with the value of one that cannot be read, by payload.
+#: The numbers in a command, by its payload type, each with the value that it has if it cannot be read.
 _NUMBERS: dict[Any, dict[str, float]] = {
-    Drive: {"x": 0.0, "z": 0.0, "y": 0.0},
-    LightsSolid: {"b": 0.0, "g": 0.0, "r": 0.0},
-    LightsFlash: {"b": 0.0, "g": 0.0, "r": 0.0, "period": LightsFlash().period},
+    p.Drive: {"x": 0.0, "z": 0.0, "y": 0.0},
+    p.LightsSolid: {"b": 0.0, "g": 0.0, "r": 0.0},
+    p.LightsFlash: {"b": 0.0, "g": 0.0, "r": 0.0, "period": p.LightsFlash().period},
 }
 
 
-def _numbers(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str, float]:
+def _numbers(channel: Channel, command: dict[str, Any], remark: Remark) -> dict[str, float]:
     """Return the numbers in a command, also those written as text. A value that is no number becomes its default.
 
     The original reads commands in the same way. Raises PayloadError for NaN and infinity.
     """
     numbers = {}
     for name, default in _NUMBERS[channel.payload].items():
-        if name in plain:
-            number = _number(channel, name, plain[name])
+        if name in command:
+            number = _number(channel, name, command[name])
             numbers[name] = default if number is None else number
-            if number is None and plain[name] is not None:
-                text = f"{name} is {_shown(plain[name])}, which is no number: it counts as {default:g}"
-                remark(channel, _sender(plain), text)
+            if number is None and command[name] is not None:
+                text = f"{name} is {_shown(command[name])}, which is no number: it counts as {default:g}"
+                remark(channel, _sender(command), text)
     return numbers
 
 
 def _number(channel: Channel, name: str, value: Any) -> float | None:
-    """Return the number in ``value``, perhaps text, or None; PayloadError for NaN and infinity. As in firmware."""
+    """Return the number in ``value``, perhaps as text; None if it is none. Raises PayloadError for NaN and infinity."""
     if isinstance(value, str):
-        if "nan" in (word := value.lower()) or "inf" in word:
+        if "nan" in value.lower() or "inf" in value.lower():
             raise PayloadError(f"{channel.metric}: {name} is not a finite number")
         if not _numeric(value):
             return None
@@ -258,8 +259,8 @@ def _number(channel: Channel, name: str, value: Any) -> float | None:
     return number
 
 
-def _sender(plain: dict[str, Any]) -> str:
-    source = plain.get("source")
+def _sender(command: dict[str, Any]) -> str:
+    source = command.get("source")
     return source if isinstance(source, str) else ""
 
 

@@ -12,32 +12,21 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from pebble.contract import (
-    DRIVE,
-    GROUP,
-    INCOMING,
-    LIGHTS_FLASH,
-    LIGHTS_SOLID,
-    MCU_COMMAND,
-    OUTLET_COMMAND,
-    SOUNDBOARD_COMMAND,
-    Channel,
-    channel_of,
-    codec,
-)
+from pebble import contract as c
+from pebble.contract import codec
 from pebble.contract.names import BY
 from pebble.errors import PayloadError
 
 MOST_MEMBERS, MOST_BYTES = 8, 2048  # of a group: one packet of a thin link, and one write at a board
-MEMBERS = (DRIVE, LIGHTS_SOLID, LIGHTS_FLASH, SOUNDBOARD_COMMAND, OUTLET_COMMAND, MCU_COMMAND)
+MEMBERS = (c.DRIVE, c.LIGHTS_SOLID, c.LIGHTS_FLASH, c.SOUNDBOARD_COMMAND, c.OUTLET_COMMAND, c.MCU_COMMAND)
 _SHOWN = 40  # characters of a metric
-MARK = "group"  # of a copy: true
+MARK = "group"  # a field of a member's copy for programs that take no groups: true
 
 
 class Member(Struct, frozen=True):
     """A command of a group: its channel, metric, decoded value and JSON."""
 
-    channel: Channel
+    channel: c.Channel
     metric: str
     value: Any
     payload: bytes
@@ -46,30 +35,30 @@ class Member(Struct, frozen=True):
 def decode(raw: bytes) -> tuple[Member, ...]:
     """Return the members of a group. Raises PayloadError if a member is not allowed, or cannot be read."""
     if len(raw) > MOST_BYTES:
-        raise PayloadError(f"{GROUP.metric}: {len(raw)} bytes, more than {MOST_BYTES}")
-    codec.plain(GROUP, raw)  # within the limits of all commands
+        raise PayloadError(f"{c.GROUP.metric}: {len(raw)} bytes, more than {MOST_BYTES}")
+    codec.plain(c.GROUP, raw)  # within the limits of all commands
     commands = _unique_keys(codec.trim(raw))
     by = commands.pop(BY, None) if isinstance(commands, dict) else None
     if not isinstance(commands, dict) or not 1 <= len(commands) <= MOST_MEMBERS:
-        raise PayloadError(f"{GROUP.metric}: an object of 1 to {MOST_MEMBERS} commands is needed")
-    if {LIGHTS_SOLID.metric, LIGHTS_FLASH.metric} <= commands.keys():
-        raise PayloadError(f"{GROUP.metric}: {LIGHTS_SOLID.metric} and {LIGHTS_FLASH.metric} exclude one another")
+        raise PayloadError(f"{c.GROUP.metric}: an object of 1 to {MOST_MEMBERS} commands is needed")
+    if {c.LIGHTS_SOLID.metric, c.LIGHTS_FLASH.metric} <= commands.keys():
+        raise PayloadError(f"{c.GROUP.metric}: {c.LIGHTS_SOLID.metric} and {c.LIGHTS_FLASH.metric} exclude one another")
     return tuple(_member(metric, command, by) for metric, command in commands.items())
 
 
 def _member(metric: str, command: Any, by: Any) -> Member:
-    channel = channel_of(f"{INCOMING}/{metric}")
+    channel = c.channel_of(f"{c.INCOMING}/{metric}")
     if channel not in MEMBERS:
-        raise PayloadError(f"{GROUP.metric}: {metric[:_SHOWN]!a} may not be in a group")
+        raise PayloadError(f"{c.GROUP.metric}: {metric[:_SHOWN]!a} may not be in a group")
     if not isinstance(command, dict) or isinstance(command.get("value"), dict):
-        raise PayloadError(f"{GROUP.metric}: {metric}: a bare object is needed")
+        raise PayloadError(f"{c.GROUP.metric}: {metric}: a bare object is needed")
     command.pop(MARK, None)
     if by is not None:
         command[BY] = by
     try:
         payload = msgspec.json.encode(command)
     except OverflowError:
-        raise PayloadError(f"{GROUP.metric}: {metric}: a number is too large") from None
+        raise PayloadError(f"{c.GROUP.metric}: {metric}: a number is too large") from None
     return Member(channel, metric, codec.decode(channel, payload), payload)
 
 
@@ -78,13 +67,15 @@ def _unique_keys(text: bytes) -> Any:
     import json  # the only reader that shows it, and only robots with groups pay for it
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(fields := dict(pairs)) < len(pairs):
-            raise PayloadError(f"{GROUP.metric}: a key is there twice")
+        fields = dict(pairs)
+        if len(fields) < len(pairs):
+            raise PayloadError(f"{c.GROUP.metric}: a key is there twice")
         return fields
 
     def finite(number: str) -> float:
-        if not math.isfinite(value := float(number)):
-            raise PayloadError(f"{GROUP.metric}: {number[:_SHOWN]} is not a finite number")
+        value = float(number)
+        if not math.isfinite(value):
+            raise PayloadError(f"{c.GROUP.metric}: {number[:_SHOWN]} is not a finite number")
         return value
 
     return json.loads(text, object_pairs_hook=unique, parse_float=finite)

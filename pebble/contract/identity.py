@@ -94,7 +94,7 @@ def composed(name: str) -> str:
 
 
 def untypeable(name: str) -> str:
-    """Return why people cannot type this name, and what to write instead; "" if they can."""
+    """Return why people cannot type this name, and what to write instead, to follow the name; "" if they can."""
     if name in (".", ".."):
         return "is a folder, and no name: write another"
     return "" if composed(name) == name else f"has a letter that no keyboard writes: write {json.dumps(composed(name))}"
@@ -105,7 +105,9 @@ def meant(names: Iterable[str], typed: str) -> str:
     if typed.isascii():
         return typed
     alike = [name for name in names if composed(name) == composed(typed)]
-    return typed if typed in alike or not alike else alike[0]
+    if typed in alike or not alike:
+        return typed
+    return alike[0]
 
 
 def parse_topic(topic: str) -> ParsedTopic | None:

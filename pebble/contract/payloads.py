@@ -153,7 +153,9 @@ class Switch(Payload, frozen=True, kw_only=True):
     file: str | None = None
 
     def ends(self) -> bool:
-        return self.action.strip().lower() in STOP_WORDS if self.action else self.enabled is False
+        if self.action:
+            return self.action.strip().lower() in STOP_WORDS
+        return self.enabled is False
 
 
 class SoundboardCommand(Switch, frozen=True, kw_only=True):
@@ -226,9 +228,9 @@ class Neighbours(Payload, frozen=True, kw_only=True):
 
     shares: list[str] = []  # metrics that the others may receive
     commanded: dict[str, list[str]] = {}  # metrics that a script of this robot may command
-    receives: dict[str, bool] = {}  # whether this robot receives what that one sends, now
+    receives: dict[str, bool] = {}  # by robot: whether its messages arrive here now
     driven_by: str = ""  # whose script drives this robot, or did last and has not ended; empty: none
-    refused: dict[str, NeighbourRefusal] = {}  # the newest run of that one, while it has no effect
+    refused: dict[str, NeighbourRefusal] = {}  # by robot: its newest run, while that has no effect
 
 
 class ChargingStatus(Payload, frozen=True, kw_only=True):
@@ -260,7 +262,7 @@ class TouchSensors(Payload, frozen=True, kw_only=True):
 
 
 class Capabilities(Payload, frozen=True, kw_only=True):
-    """The capabilities of a robot, with its effective topics (paper A.8.6); again whenever they change.
+    """The capabilities of a robot, with its effective topics (paper A.8.6); published again when they change.
 
     Send ``value`` as CapabilitiesValue has it. One section that is wrong does not make the others unreadable.
     """
@@ -286,7 +288,7 @@ class EstopState(Payload, frozen=True, kw_only=True):
 
     @property
     def last_barred(self) -> int:
-        """The newest run that moves nothing any more, nor any run before it; 0 if no run is barred."""
+        """The newest barred run: it and all runs before it move nothing any more; 0 if no run is barred."""
         return self.barred if isinstance(self.barred, int) else 0
 
 
@@ -296,7 +298,7 @@ class ControlState(Payload, frozen=True, kw_only=True):
     Where a robot has several owners, the first one by name decides who drives.
     """
 
-    by: str  # as that request has it
+    by: str  # who has control, as its request says
     id: str
     key: str  # random, new whenever another one gets control; for the drive commands of who has it
     device: str = ""
@@ -325,7 +327,7 @@ class ControlTurn(Payload, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class ControlVouched(Payload, frozen=True, kw_only=True):
-    """A time, by the machine's clock since its start, in which the bridge has passed on all that it was to."""
+    """A period in which the bridge has forwarded all messages in time; milliseconds since the machine's start."""
 
     begin: Annotated[int, Meta(ge=0, le=LARGEST_MS)] = field(name="from")
     end: Annotated[int, Meta(ge=0, le=LARGEST_MS)] = field(name="to")

@@ -36,7 +36,8 @@ class Admission:
         Counts the message if its kind is limited, and remembers an unknown flag. ``named`` False: the message has no
         sender where others have one. Such messages have a limit of their own.
         """
-        if side is Side.REMOTE and len(message.payload) > MAX_COMMAND_BYTES and _is_bounded(subject):
+        is_large = side is Side.REMOTE and len(message.payload) > MAX_COMMAND_BYTES
+        if is_large and subject.kind.direction == INCOMING and not subject.is_stop:  # any payload is a stop
             return Drop.TOO_LARGE
         return self._count(side, subject, message, topic, named) if subject.counted else None
 
@@ -45,7 +46,7 @@ class Admission:
             return Drop.TOO_OFTEN
         if subject.kind is not Kind.FLAG or subject.channel is not None:
             return None
-        if not message.payload:  # a removal: a million of unknown flags cost the robot nothing
+        if not message.payload:  # a removal, which needs no room
             if side is Side.REMOTE and topic not in self._flags:
                 return Drop.KNOWN
             self._flags.discard(topic)
@@ -60,6 +61,7 @@ class Admission:
         return len(self._flags) >= MAX_UNKNOWN_FLAGS and topic.decode(errors="replace") not in self._flags
 
     def _is_too_often(self, subject: Subject, message: Message, named: bool) -> bool:
+        """Count an action or unknown command; True if this second has had too many of them."""
         if subject.kind is Kind.ACTION and subject.channel is not None:
             key: Kind | Channel = subject.channel
             most = MAX_ACTIONS
@@ -75,7 +77,3 @@ class Admission:
             self._counts.clear()
         count = self._counts[key, named] = self._counts.get((key, named), 0) + 1
         return count > most
-
-
-def _is_bounded(subject: Subject) -> bool:
-    return subject.kind.direction == INCOMING and not subject.is_stop  # any payload is a stop

@@ -30,8 +30,9 @@ class CommandAges:
 
     def __init__(self) -> None:
         self.keys: frozenset[bytes] | None = None
-        self._drivers = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
-        self._asking = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
+        # By account and key, and by account and id:
+        self._drive_clocks = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
+        self._request_clocks = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
 
     def waited_s(self, subject: Subject, message: Message, account: str) -> float:
         """Return the seconds for which a message with a time stamp has waited; remember the sender's clock.
@@ -45,20 +46,21 @@ class CommandAges:
         except PayloadError:
             return waited_s
         if isinstance(command, Drive):
-            clocks, key = self._drivers, self._key(command)
+            clocks, key = self._drive_clocks, self._key(command)
         else:
-            clocks, key = self._asking, command.id
+            clocks, key = self._request_clocks, command.id
         if not isinstance(command.t, int) or not key:
             return waited_s
-        if command.ends():  # it may come another way
-            clocks.pass_over((account, key), command.t / 1000, clock.since_boot())
+        sender, sent_s, now = (account, key), command.t / 1000, clock.since_boot()
+        if command.ends():  # it may come another way, so it says nothing about the way of the others
+            clocks.pass_over(sender, sent_s, now)
             return waited_s
-        if clocks.is_passed((account, key), command.t / 1000):
+        if clocks.is_passed(sender, sent_s):
             return inf  # it was sent again, with QoS 2 for example, after a newer one
-        return clocks.age_s((account, key), command.t / 1000, waited_s, clock.since_boot(), subject.waits_s)
+        return clocks.age_s(sender, sent_s, waited_s, now, subject.waits_s)
 
     def _key(self, command: Drive) -> str:
-        """Return the key or id that identifies the sender of a command; empty if there is no valid key."""
+        """Return the key of control in a drive command, the first one in :attr:`keys`; empty if it has none of them."""
         text, keys = command.key, self.keys
         if not isinstance(text, str) or len(text) > _LONGEST:
             return ""

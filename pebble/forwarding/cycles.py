@@ -57,10 +57,11 @@ class _Way(Struct):
     began: float
     counts: dict[int, int] = {}  # of payloads, by their hash, since then
     probed_at: float = float("-inf")
-    unanswered: int = 0
-    closed: bool = False  # something else leads back
+    unanswered: int = 0  # probes since the last one that came back
+    closed: bool = False  # what is forwarded this way comes back
 
     def count(self, payload: bytes, now: float) -> int:
+        """Count a message; return how often its payload came since ``began``, 0 if there are too many payloads."""
         if now - self.began > _WINDOW_S:
             self.began, self.counts = now, {}
         key = hash(payload)
@@ -71,7 +72,7 @@ class _Way(Struct):
 
 
 class Cycles:
-    """The topics whose messages circulate, by the side from which they come. Two threads may call it at once."""
+    """The topics whose messages circulate, and from which side. Two threads may call it at once."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -79,7 +80,7 @@ class Cycles:
         self._ways: dict[tuple[Side, str], _Way] = {}
         self._ours: dict[bytes, Side] = {}  # our probes, and the side each was sent to
         self._others: dict[tuple[Side, bytes], bool] = {}  # probes of other bridges that were relayed
-        self._stops: dict[tuple[Side, bytes], float] = {}
+        self._stops: dict[tuple[Side, bytes], float] = {}  # when each was received last, by side and payload
         #: Messages from this side on this topic come back there if they are forwarded.
         self.closed_ways: Final[set[tuple[Side, str]]] = set()
 
@@ -133,11 +134,14 @@ class Cycles:
         """Allow topics that no longer circulate; return the topics that need another probe. Call this once a second."""
         with self._lock:
             now, due = self._clock(), []
-            for key in [key for key in self.closed_ways if now - self._ways[key].probed_at >= PROBE_PERIOD_S / 2]:
-                if self._ways[key].unanswered >= UNANSWERED:
-                    self._open(*key)
+            for side, topic in list(self.closed_ways):
+                way = self._ways[side, topic]
+                if now - way.probed_at < PROBE_PERIOD_S / 2:
+                    continue
+                if way.unanswered >= UNANSWERED:
+                    self._open(side, topic)
                 else:
-                    due.append(key)
+                    due.append((side, topic))
             return due
 
     # -- with the lock held
@@ -156,6 +160,7 @@ class Cycles:
         return Finding.RELAY
 
     def _close(self, side: Side, topic: str) -> None:
+        """Note that what is forwarded from ``side`` on ``topic`` comes back there."""
         way = self._way(side, topic)
         way.unanswered = 0
         if way.closed or len(self.closed_ways) >= _MOST_CLOSED:
@@ -174,6 +179,7 @@ class Cycles:
         self.closed_ways.add((side, topic))
 
     def _open(self, side: Side, topic: str) -> None:
+        """Note that it comes back no more."""
         self._ways[side, topic].closed = False
         self.closed_ways.discard((side, topic))
         if not self.closed_ways:

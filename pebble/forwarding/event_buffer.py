@@ -1,7 +1,6 @@
 """Buffers events (QoS 1, not retained) during an outage, a bounded number of them."""
 
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 
@@ -29,13 +28,13 @@ class EventBuffer:
         transport: Transport,
         counters: Counters,
         *,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float],
         limit: int = LIMIT,
     ) -> None:
         self._transport, self._counters, self._clock, self._limit = transport, counters, clock, limit
         self._lock = threading.Lock()
         self._waiting: deque[_Event] = deque()
-        self._recent: deque[_Event] = deque(maxlen=limit)
+        self._recent: deque[_Event] = deque(maxlen=limit)  # sent on this connection, which may have lost the last ones
         self._lost_at: float | None = None  # when the connection was lost, until flush()
         #: True if a message may be sent now, where the link is thin; others wait.
         self.has_room: Callable[[Message], bool] | None = None
@@ -52,7 +51,10 @@ class EventBuffer:
     def hold(self, message: Message) -> None:
         """Keep ``message`` until the next :meth:`resume` or :meth:`flush`."""
         with self._lock:
-            self._append(_Event(message))
+            self._waiting.append(_Event(message))
+            if len(self._waiting) > self._limit:
+                self._waiting.popleft()
+                self._counters.add("events_dropped")
 
     def resume(self) -> None:
         """Send the waiting events, in order, unless a new connection has to be flushed first."""
@@ -76,12 +78,6 @@ class EventBuffer:
         with self._lock:
             self._waiting.clear()
             self._recent.clear()
-
-    def _append(self, event: _Event) -> None:
-        self._waiting.append(event)
-        if len(self._waiting) > self._limit:
-            self._waiting.popleft()
-            self._counters.add("events_dropped")
 
     def _drain(self) -> None:
         while self._waiting:

@@ -11,7 +11,6 @@ have waited, in a process that was stopped or stuck, or at the broker; one that 
 
 import itertools
 import logging
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 
@@ -43,6 +42,7 @@ _BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCUL
 _WARNED = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN)
 
 
+#: Publishes an admitted message on the other side, or returns why not, as :meth:`Forwarder.pass_now`.
 Pass = Callable[[SideState, Subject, Message, Forward, str], Forward | Drop]
 
 
@@ -66,7 +66,9 @@ class Mirroring:
         self._sides, self._was_refused = sides, False
 
     def switch(self, *, on: bool) -> None:
-        self.on, self._was_refused = on, on and self._was_refused
+        self.on = on
+        if not on:
+            self._was_refused = False  # the next refusal is logged again
 
     def is_possible(self) -> bool:
         """True if no side sends our own messages back. Otherwise commands would be repeated, even after a stop."""
@@ -105,10 +107,10 @@ class Forwarder:
         on_value: Callable[[Subject, bytes], None] = lambda _subject, _payload: None,
         pass_stop: Callable[[Side, bytes], Iterable[bytes]] = lambda _side, payload: (payload,),
         steps: Mapping[str, Step] = {},
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float],
     ) -> None:
         self.counters, self._steps = Counters(), steps
-        self.stays: Callable[[str], bool] = lambda _topic: False  # True: obeyed only inside the robot
+        self.stays: Callable[[str], bool] = lambda _topic: False  # True for topics obeyed only inside the robot
         self.subjects, self._rules, self._names, self._clock = subjects, rules, names, clock
         self._pass_stop = pass_stop
         self.sides = Sides(
@@ -127,7 +129,7 @@ class Forwarder:
         self.mirroring = Mirroring(self.sides)
         #: Publishes a message that is admitted, at once; an extension may put in its place what lets some wait.
         self.pass_on: Pass = self.pass_now
-        #: Is told of each command whose age matters, and that does not tell its own, whether it was late.
+        #: Is told whether each drive command, and request for control, from outside was late.
         self.note_age: Callable[[bool], None] = lambda _late: None
         for transport in transports.values():
             transport.policy.is_stop = self._is_stop
@@ -207,18 +209,18 @@ class Forwarder:
     def _receive_named(self, source: SideState, names: Names, message: Message) -> Routed:
         """Forward a message whose sender is checked: the name moves from the topic into the payload."""
         sender = names[message.topic]
-        subject, by = sender.subject, sender.account  # sign() adds the person for whom an account acts
+        subject, by = sender.subject, sender.account  # sign() may add to this the person for whom the account acts
         outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
         if subject is None:
             outcome = sender.foreign
         elif isinstance(outcome, Forward):
             match names.sign(sender, message):
-                case Signed(signed, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:
+                case Signed(signed, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:  # set on both sides
                     outcome = self.retained.change(subject, signed)
                 case Signed(signed, by):
                     outcome = self.pass_on(source, subject, signed, outcome, sender.account)
                 case Drop.UNNAMED if outcome.retain:  # it may be a retained message of the robot itself
-                    outcome = self.retained.receive(source, subject, message, outcome, old=True)
+                    outcome = self.retained.receive(source, subject, message, outcome, only_old=True)
                 case Drop() as drop:
                     outcome = drop
         if isinstance(outcome, Drop) and outcome in _NAMES:
@@ -230,7 +232,7 @@ class Forwarder:
     ) -> Forward | Drop:
         """Return how to forward ``message``, or why it does not pass. Hot.
 
-        Reasons: no subject, no route, or those of `_ADMISSION`. ``topic`` is the topic on the other side.
+        ``topic`` is the topic on the other side.
         """
         if subject is None or not subject.is_stop:
             if message.retain:  # while such messages arrive, a stop among them is an old one
@@ -242,10 +244,15 @@ class Forwarder:
         forward = self._route(source.side, subject, message)
         if isinstance(forward, Drop):
             return forward
-        for reason in self._ADMISSION:
-            if (drop := reason(self, source, subject, message, forward, topic, named)) is not None:
-                return drop
-        return forward
+        # A message beyond a bound is neither compared with what we have sent nor examined for cycles, an echo is no
+        # cycle, and extensions are asked last.
+        return (
+            self._beyond_bound(source, subject, message, topic, named)
+            or self._echo(source, subject, message)
+            or self._cycle(source, subject, message, forward)
+            or self._refused_by_step(source, subject, message)
+            or forward
+        )
 
     def _route(self, side: Side, subject: Subject, message: Message) -> Forward | Drop:
         """Return the result of :func:`route`, which is computed once per kind of message."""
@@ -257,29 +264,28 @@ class Forwarder:
         return forward
 
     def _beyond_bound(
-        self, source: SideState, subject: Subject, message: Message, _forward: Forward, topic: str, named: bool
+        self, source: SideState, subject: Subject, message: Message, topic: str, named: bool
     ) -> Drop | None:
         drop = self._admission.refuse(source.side, subject, message, topic, named=named)
         if drop in _WARNED:
             self._warn(drop, message.topic[:_LOGGED])
         return drop
 
-    def _echo(self, source: SideState, subject: Subject, message: Message, *_: object) -> Drop | None:
+    def _echo(self, source: SideState, subject: Subject, message: Message) -> Drop | None:
         if not self.cycles.closed_ways and source.transport.exact_echo:
             return None
         return Drop.ECHO if self.publisher.is_echo(source, subject, message) else None
 
-    def _cycle(
-        self, source: SideState, subject: Subject, message: Message, forward: Forward, *_: object
-    ) -> Drop | None:
+    def _cycle(self, source: SideState, subject: Subject, message: Message, forward: Forward) -> Drop | None:
         if self.sides.gate is not Gate.OPEN:
             return None
         finding = self.cycles.examine(source.side, subject, message)
         return None if finding is Finding.PASS else self._act_on(finding, source.side, subject, message, forward)
 
-    def _refused_by_step(self, source: SideState, subject: Subject, message: Message, *_: object) -> Drop | None:
-        steps = {} if subject.is_stop else self._steps
-        for name, step in steps.items():
+    def _refused_by_step(self, source: SideState, subject: Subject, message: Message) -> Drop | None:
+        if subject.is_stop:
+            return None
+        for name, step in self._steps.items():
             try:
                 why = step(source.side, subject, message)
             except Exception as error:  # noqa: BLE001 - whatever a stranger's code raises: it is no refusal
@@ -289,10 +295,6 @@ class Forwarder:
                 self._quiet_log.warning(name, "%s is not forwarded: %s: %s", message.topic[:_LOGGED], name, why)
                 return Drop.REFUSED
         return None
-
-    #: Checks of a message that has a route, in this order: one beyond a bound is neither compared with messages that we
-    #: have sent nor examined for cycles, an echo is no cycle, and extensions are asked last.
-    _ADMISSION = (_beyond_bound, _echo, _cycle, _refused_by_step)
 
     def pass_now(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str = ""
@@ -314,15 +316,17 @@ class Forwarder:
         """Return an admitted message as it may pass, or why not: it is too late, or a script elsewhere sent it."""
         if subject.kind.one_shot and self._is_late(subject, message, forward, account):
             return Drop.LATE
-        return (self._without_script(source, message) or Drop.SIGNED) if forward.unsigned else message
+        if not forward.unsigned:
+            return message
+        return self._without_script(source, message) or Drop.SIGNED
 
     def _is_late(self, subject: Subject, message: Message, forward: Forward, account: str) -> bool:
         """True if a command or action has waited for too long, unless it only ends something."""
-        waited_s = message.waited_s
-        if forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload:
-            waited_s = self.ages.waited_s(subject, message, account)
+        tells_age = forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload
+        waited_s = self.ages.waited_s(subject, message, account) if tells_age else message.waited_s
         late = waited_s > subject.waits_s and not ends_something(subject, message)
-        if forward.stamped and not (late and STAMP in message.payload):  # who tells it keeps to the pace of the link
+        # A late one that tells its age is no sign of a flood: its sender keeps to the pace of the link.
+        if forward.stamped and not (late and tells_age):
             self.note_age(late)
         return late
 
@@ -374,8 +378,11 @@ class Forwarder:
         if self.gate is Gate.SHUT:
             return Drop.CLOSED
         target.events.hold(message)
-        if self.gate is not Gate.WAITING:  # it was opened or shut meanwhile, perhaps before this event was there
-            (target.events.resume if self.gate is Gate.OPEN else target.events.clear)()
+        gate = self.sides.gate  # it may have been opened or shut meanwhile, perhaps before this event was there
+        if gate is Gate.OPEN:
+            target.events.resume()
+        elif gate is Gate.SHUT:
+            target.events.clear()
         return Drop.HELD
 
     def _is_stop(self, topic: str) -> bool:

@@ -1,7 +1,6 @@
 """Recognises our own messages that come back, from a broker without bridge mode or through another bridge."""
 
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from hashlib import blake2b
@@ -15,11 +14,11 @@ EXPIRY_S = 10.0  # an echo that has not arrived by then never will
 class LoopbackFilter:
     """A memory of published messages, by topic and in order, until they come back."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic, expiry_s: float = EXPIRY_S) -> None:
+    def __init__(self, clock: Callable[[], float], expiry_s: float = EXPIRY_S) -> None:
         self._clock, self._expiry_s = clock, expiry_s
         self._lock = threading.Lock()
-        self._out: dict[str, deque[tuple[float, bytes]]] = {}  # when, and a digest
-        self._messages = 0
+        self._out: dict[str, deque[tuple[float, bytes]]] = {}  # by topic: when each was published, and its digest
+        self._messages = 0  # of all topics
 
     def __len__(self) -> int:
         """Return the number of topics with messages that have not come back yet."""
@@ -56,8 +55,8 @@ class LoopbackFilter:
             while out and self._clock() - out[0][0] > self._expiry_s:
                 self._drop_first(out)
             digest = _digest(payload)
-            for index, (_, earlier) in enumerate(out):
-                if earlier == digest:
+            for index, (_, published_digest) in enumerate(out):
+                if published_digest == digest:
                     for _ in range(index + 1):
                         self._drop_first(out)
                     self._tidy(topic)

@@ -95,8 +95,9 @@ class Publisher:
         subject, target = self._subjects[topic], self._sides[side.other]
         if subject is None or not target.connected:
             return
+        before = b"" if subject.kind.one_shot else value  # a probe follows the topic's value, which it does not change
         if subject.kind.one_shot or _is_json(value):
-            probe = (b"" if subject.kind.one_shot else value) + self._cycles.probe(side, topic)
+            probe = before + self._cycles.probe(side, topic)
             target.transport.publish(topic, probe, qos=QoS.DELIVERED, urgent=subject.kind in URGENT)
 
 

@@ -43,7 +43,7 @@ class LastValue(Struct, frozen=True):
         return LastValue(payload, side, (*self.earlier, hash(self.payload))[-_EARLIER:])
 
 
-class Known(NamedTuple):
+class Facts(NamedTuple):
     """The facts about a topic at the moment when one side sends a retained message on it."""
 
     last: LastValue | None  # the newest value, whichever side published it
@@ -54,7 +54,7 @@ class Known(NamedTuple):
     awaits_winner: bool = False  # the winner's retained messages have not arrived
 
 
-def resolve(sender: Side, payload: bytes, known: Known) -> Resolution:
+def resolve(sender: Side, payload: bytes, facts: Facts) -> Resolution:
     """Return the resolution for a retained message. The first line that fits counts; a live message always passes.
 
     | sender | known of the topic                                | value             | then      |
@@ -71,22 +71,22 @@ def resolve(sender: Side, payload: bytes, known: Known) -> Resolution:
     | loser  | the loser went back                               | an earlier one    | CORRECT   |
     | loser  | the newest one is the loser's                     | another one       | PASS      |
     """
-    last = known.last
+    last = facts.last
     is_newest = last is not None and last.payload == payload
-    is_earlier = known.went_back and not is_newest and last is not None and hash(payload) in last.earlier
-    if sender is known.winner:
-        if known.overtaken:
+    is_earlier = facts.went_back and not is_newest and last is not None and hash(payload) in last.earlier
+    if sender is facts.winner:
+        if facts.overtaken:
             return Resolution.OVERTAKEN
         if is_earlier:
             return Resolution.CORRECT
         if is_newest:
             return Resolution.KNOWN
-        return Resolution.RESTORE if known.offered else Resolution.PASS
+        return Resolution.RESTORE if facts.offered else Resolution.PASS
     if last is None:
-        return Resolution.HOLD if known.awaits_winner else Resolution.PASS
+        return Resolution.HOLD if facts.awaits_winner else Resolution.PASS
     if is_newest:
         return Resolution.KNOWN
-    return Resolution.CORRECT if last.side is known.winner or is_earlier else Resolution.PASS
+    return Resolution.CORRECT if last.side is facts.winner or is_earlier else Resolution.PASS
 
 
 class Reconciliation:
@@ -95,7 +95,7 @@ class Reconciliation:
     def __init__(self, winner: Side) -> None:
         self._winner = winner
         self._last = BoundedTable[LastValue](TOPICS, BYTES, lambda last: len(last.payload))
-        self._held = BoundedTable[bytes](TOPICS, BYTES, len)  # of the other side, until the winner's have arrived
+        self._held = BoundedTable[bytes](TOPICS, BYTES, len)  # the loser's values, until the winner's have arrived
         self._published = {side: BoundedTable[bytes](TOPICS, BYTES, len) for side in Side}
         self._received: dict[Side, set[str]] = {side: set() for side in Side}  # since the connection began
         # Of topics on which the winner has published nothing since its connection began, as far as has arrived:
@@ -143,7 +143,7 @@ class Reconciliation:
             self._received[side].add(topic)
         resolution = Resolution.PASS
         if retained:
-            resolution = resolve(side, payload, self._known(topic, went_back=went_back))
+            resolution = resolve(side, payload, self._facts(topic, went_back=went_back))
         if resolution is Resolution.HOLD:
             self._held[topic] = payload
         elif resolution in (Resolution.PASS, Resolution.RESTORE):
@@ -173,11 +173,11 @@ class Reconciliation:
                 self._set(topic, payload, side.other)
                 due.append((side, topic, payload))
             self._held.clear()
-        fresh = {topic for _, topic, _ in due}
+        released = {topic for _, topic, _ in due}
         due += [
             (side, topic, last.payload)
             for topic, last in self._last.items()
-            if topic not in fresh and self._is_missing(side, topic, last)
+            if topic not in released and self._is_missing(side, topic, last)
         ]
         if side is self._winner:
             self._offered.update(topic for _, topic, _ in due)
@@ -187,8 +187,8 @@ class Reconciliation:
         last = self._last.get(topic)
         self._last[topic] = LastValue(payload, side) if last is None else last.then(payload, side)
 
-    def _known(self, topic: str, *, went_back: bool) -> Known:
-        return Known(
+    def _facts(self, topic: str, *, went_back: bool) -> Facts:
+        return Facts(
             self._last.get(topic),
             winner=self._winner,
             went_back=went_back,

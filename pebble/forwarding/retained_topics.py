@@ -37,13 +37,13 @@ class RetainedTopics:
         self._waiting: dict[str, tuple[Subject, Message, Forward]] = {}
 
     def receive(
-        self, source: SideState, subject: Subject, message: Message, forward: Forward, *, old: bool = False
+        self, source: SideState, subject: Subject, message: Message, forward: Forward, *, only_old: bool = False
     ) -> Forward | Drop:
-        """Forward a message that will be retained, or return why not. ``old``: ignore it if it is a live one."""
+        """Forward a message that will be retained, or return why not. ``only_old``: not if it is a live one."""
         with self._lock:
             self._begin_restarted()
             if subject.kind in self._both_ways:
-                drop = self._reconcile(source, subject, message, old=old)
+                drop = self._reconcile(source, subject, message, only_old=only_old)
                 if drop is not None:
                     return drop
             gate = self._sides.gate
@@ -116,17 +116,18 @@ class RetainedTopics:
 
     # -- with the lock held
 
-    def _reconcile(self, source: SideState, subject: Subject, message: Message, *, old: bool) -> Drop | None:
-        """Return why a two-way message must not pass; None if it may. ``old``: a live one must not."""
+    def _reconcile(self, source: SideState, subject: Subject, message: Message, *, only_old: bool) -> Drop | None:
+        """Return why a two-way message must not pass; None if it may. ``only_old``: a live one must not."""
         side, topic, payload, transport = source.side, message.topic, message.payload, source.transport
         if message.retain and topic in source.seen and transport.policy.delivers_late and not transport.as_published:
-            return Drop.KNOWN  # older than what was seen
+            return Drop.KNOWN  # it came late, after a live one, and is older
         if len(source.seen) < _MAX_WAITING:
             source.seen.add(topic)
         retained = self._sides.gate is not Gate.SHUT and self._is_retained(source, message)
-        if old and not retained:
+        if only_old and not retained:
             return Drop.UNNAMED
-        if not retained and self._own_return and self._reconciliation.value(topic) == payload:
+        may_come_back = not any(state.transport.exact_echo for state in self._sides.values())  # ours, unrecognised
+        if not retained and may_come_back and self._reconciliation.value(topic) == payload:
             return Drop.KNOWN
         resolution = self._reconciliation.receive(
             side,
@@ -136,23 +137,17 @@ class RetainedTopics:
             other_away=not self._sides[side.other].connected,
             went_back=source.has_gone_back,
         )
-        if resolution is Resolution.PASS:
-            self._on_value(subject, payload)
-            return None
         if resolution is Resolution.RESTORE:
             self._publish_value(side, topic, payload)
+        if resolution in (Resolution.PASS, Resolution.RESTORE):
             self._on_value(subject, payload)
             return None
         if resolution is Resolution.CORRECT:
             self._publish_value(side, topic, self._reconciliation.value(topic) or b"")
         return _DROPS.get(resolution, Drop.OVERRULED)
 
-    @property
-    def _own_return(self) -> bool:
-        """True if messages of our own may come back from a side without being recognised."""
-        return not any(state.transport.exact_echo for state in self._sides.values())
-
     def _is_retained(self, source: SideState, message: Message) -> bool:
+        """True if a message is, or may be, an old one that a subscription brought."""
         if not source.transport.as_published:
             return message.retain
         return source.window.may_be_old(message) and not self._reconciliation.has_received(source.side, message.topic)

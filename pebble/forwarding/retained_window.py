@@ -23,7 +23,9 @@ class RetainedWindow:
 
     def __init__(self, transport: Transport, clock: Callable[[], float]) -> None:
         self._transport, self._clock = transport, clock
-        self._subscribed_at = self._until = self._stops_until = float("inf")
+        self._subscribed_at = float("inf")
+        self._until = float("inf")  # when messages with the retain flag count as live ones again,
+        self._stops_until = float("inf")  # and when stops do
         self._newest_at = float("-inf")  # of the messages that may be old
 
     @property
@@ -49,8 +51,8 @@ class RetainedWindow:
             return
         self._newest_at = now
         if until < float("inf"):
-            end = self._subscribed_at + _RETAINED_STOPS_S
-            self._stops_until = min(max(now + INITIAL_SYNC_S, until), end)
+            latest = self._subscribed_at + _RETAINED_STOPS_S
+            self._stops_until = min(max(now + INITIAL_SYNC_S, until), latest)
 
     def is_old_stop(self, message: Message) -> bool:
         return message.retain and (not self._transport.as_published or self._clock() < self._stops_until)

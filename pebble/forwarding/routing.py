@@ -16,6 +16,8 @@ URGENT: Final = frozenset({Kind.COMMAND, Kind.ACTION, Kind.FLAG})
 
 
 class Side(Enum):
+    """A side of a forwarder, with a transport of its own."""
+
     LOCAL = "local"  # the robot's own transport
     REMOTE = "remote"  # the other one: for the bridge the operators', for the mirror the broker on the robot
 
@@ -103,19 +105,19 @@ def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *
     if subject.stays and rules.leaves_robot:
         return Drop.STAYS
     if subject.kind.one_shot and (message.retain or message.retain_requested):
-        return Drop.STALE  # or was published to be retained: some brokers hide which
+        return Drop.STALE  # also a live one that was published to be retained: some brokers hide which it is
     if subject.kind not in rules.passes[side]:
         if subject.kind not in rules.mirrored.get(side, ()):
             return Drop.ONE_WAY
         if not mirroring:
             return Drop.NOT_MIRRORED
-    outside = side is Side.REMOTE and rules.leaves_robot
+    from_outside = side is Side.REMOTE and rules.leaves_robot
     return Forward(
         _qos(subject, message),
         _retain(subject, message),
-        subject.kind in URGENT,
-        outside and subject.drives,
-        outside and subject.stamped,
+        urgent=subject.kind in URGENT,
+        unsigned=from_outside and subject.drives,
+        stamped=from_outside and subject.stamped,
     )
 
 
@@ -132,6 +134,6 @@ def _retain(subject: Subject, message: Message) -> bool:
         return False
     if subject.kind is Kind.FLAG and subject.retain:
         return True
-    if message.retain or message.retain_requested is not None:
-        return message.retain or bool(message.retain_requested)
-    return subject.retain
+    if message.retain or message.retain_requested:
+        return True
+    return message.retain_requested is None and subject.retain

@@ -73,9 +73,9 @@ class ForwardingService(Service, ABC):
         return Status(
             gate=forwarder.gate,
             mirroring=forwarder.mirroring.on,
-            synchronized=frozenset(filter(forwarder.retained.synchronized, Side)),
+            synchronized=frozenset(side for side in Side if forwarder.retained.synchronized(side)),
             epoch=self.epoch,
-            subscribed=frozenset(filter(self.subscriptions.get, Side)),
+            subscribed=frozenset(side for side in Side if self.subscriptions[side]),
             counts=forwarder.counters.snapshot(),
         )
 
@@ -171,16 +171,16 @@ class ForwardingService(Service, ABC):
         self.synchronize_later(Side.REMOTE)
 
     def unsubscribe(self, side: Side) -> None:
-        subscriptions, self.subscriptions[side] = self.subscriptions[side], []
-        for subscription in subscriptions:
-            subscription.close()
+        while self.subscriptions[side]:
+            self.subscriptions[side].pop().close()
 
     def synchronize_later(self, side: Side) -> None:
+        """Exchange the values in which the sides differ, once the retained messages of ``side`` have arrived."""
         epoch, end = self.epoch, self.clock() + self.arriving_s
 
         def synchronize() -> None:
             if side is Side.REMOTE and self.forwarder.sides[side].window.is_arriving and self.clock() < end:
-                self.call_at(self.clock() + QUIET_S, synchronize)
+                self.call_at(self.clock() + QUIET_S, synchronize)  # more may come
             elif side is Side.LOCAL or epoch == self.epoch:
                 self.forwarder.retained.synchronize(side)
                 if side is Side.REMOTE or self.rules.leaves_robot:
@@ -192,12 +192,12 @@ class ForwardingService(Service, ABC):
     def _probe_again(self) -> None:
         self.forwarder.publisher.probe_again(self.probed_sides, self.forwarder.retained.value)
 
+    @abstractmethod
     def found_one_broker(self) -> None:
-        """Stop forwarding: a probe shows that the two sides are, or may be, one broker."""
-        self.forward_nothing()
+        """React to a probe which shows that the two sides are, or may be, one broker; forwarding is stopped."""
 
-    def forward_nothing(self, seconds: float = CHECK_AGAIN_S) -> None:
-        """Forward nothing until the next check, which comes at a reconnect or after a fixed time."""
+    def forward_nothing(self, seconds: float) -> None:
+        """Forward nothing until the next check, which comes at a reconnect or after ``seconds``."""
         self.forwarder.shut()  # again: it may just have been opened
         self.unsubscribe(Side.REMOTE)
         self.check_later(seconds)

@@ -17,6 +17,8 @@ _RETURN_S = 2.0
 
 
 class Gate(Enum):
+    """The gate between the sides: messages pass both ways, or neither."""
+
     WAITING = "waiting"  # nothing passes yet; retained messages and events wait
     OPEN = "open"
     SHUT = "shut"  # nothing passes
@@ -41,7 +43,7 @@ class SideState:
         self.restarted = False  # its retained messages come again, and the reconciliation has not been told
         self._clock, self._wins = clock, wins
         self._lost_at = float("-inf")  # -inf: before the first connection, too
-        self._went_back = False
+        self._went_back = False  # until its messages have arrived: its values are older than ours (a loser: may be)
 
     @property
     def connected(self) -> bool:
@@ -62,14 +64,14 @@ class SideState:
             # Known before its retained messages come, which may be before it counts as connected.
             self._went_back = not self._wins and self.transport.was_ended
         elif self._wins:
-            self._went_back = self._was_brief and self.transport.went_back
+            self._went_back = self._was_brief and self.transport.went_back  # it has compared what we published
 
     @property
     def has_gone_back(self) -> bool:
         """True if older retained values of this side are from a restored save, and not set again by a program."""
-        if self._wins or not self._went_back:
-            return self._went_back
-        return self._was_brief or self.transport.was_ended
+        if not self._went_back:
+            return False
+        return self._wins or self._was_brief or self.transport.was_ended
 
     def arrived(self) -> None:
         """Note that the retained messages of this side have arrived.

@@ -105,12 +105,12 @@ class Subjects(dict[str, Subject | None]):
             self._addresses = [Addresses(config)]
         else:
             self._base, self._thin = config.base, config.services.mqtt_bridge.link.profile != "wide"
-            names = dict.fromkeys(["", *config.serial_instances()])
-            self._addresses = [Addresses(view_of(config, name)) for name in names]
+            instances = dict.fromkeys(["", *config.serial_instances()])  # "": the section of all serial lines
+            self._addresses = [Addresses(view_of(config, instance)) for instance in instances]
         self._between_robots = tuple(f"{self._base}/{family}" for family in BETWEEN_ROBOTS)
         self._incoming = f"{self._base}/{INCOMING}/".encode()
-        named = (addresses[channel].topic.encode() for addresses in self._addresses for channel in CHANNELS)
-        self._named = frozenset(topic.removeprefix(self._incoming) for topic in named)
+        topics = (topic.encode() for topic in self.topics(*CHANNELS))
+        self._known_metrics = frozenset(topic.removeprefix(self._incoming) for topic in topics)
 
     def __missing__(self, topic: str) -> Subject | None:
         if len(self) >= _REMEMBERED:
@@ -123,7 +123,7 @@ class Subjects(dict[str, Subject | None]):
         if not topic.startswith(self._incoming):
             return None
         metric = topic[len(self._incoming) :]
-        if metric in self._named:
+        if metric in self._known_metrics:
             return None
         return Kind.FLAG if metric.startswith(b"flags/") else Kind.COMMAND
 

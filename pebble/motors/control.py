@@ -3,13 +3,12 @@
 import logging
 import operator
 import secrets
-import sys
 from collections.abc import Callable
 
 from pebble.config import Security
 from pebble.contract.payloads import ControlRequest, ControlState, ControlTurn, ControlVouched, Drive
 from pebble.motors.paced import Paced
-from pebble.motors.shared_lease import SharedLease, lease_of
+from pebble.motors.shared_lease import lease_of
 from pebble.runtime.rate_limit import RateLimitedLog
 
 log = logging.getLogger(__name__)
@@ -44,17 +43,17 @@ class Control:
         self.boot = secrets.token_hex(4)  # of this life of the motor owner
         self._named = security.named
         strangers = ("drive", "free", "refuse").index(security.unnamed)
-        self.lease = lease_of(owner, owners, self.boot, _ms(now), operator.sub, secrets.token_hex, strangers)
-        self.lease.vouched = (_ms(now), _ms(now)) if bridged else None
-        self._shared = self.lease if isinstance(self.lease, SharedLease) else None
+        self.lease = lease_of(owner, owners, self.boot, ms(now), operator.sub, secrets.token_hex, strangers)
+        self.lease.vouched = (ms(now), ms(now)) if bridged else None
         self._turns = Paced(show_turn, _TURNS_PER_S)
-        self._turn_due = None if self._shared is None else now
+        self._turn_due = now if self.peers else None  # when the turn is sent again
         self._state = Paced(lambda: publish(self.state()))
         self._log = RateLimitedLog(log, burst=5)
         self._next: float | None = None  # the next tick
 
     def state(self) -> ControlState:
-        (_, name, by, device), (_, asks_id, asks, _) = self.lease.holder or _NO_CLIENT, self.lease.asker or _NO_CLIENT
+        _, name, by, device = self.lease.holder or _NO_CLIENT
+        _, asks_id, asks, _ = self.lease.asker or _NO_CLIENT
         return ControlState(
             by=by, id=name, key=self.lease.key, device=device, asks=asks, asks_id=asks_id,
             others=self.lease.others, named=self._named, boot=self.boot,
@@ -77,17 +76,17 @@ class Control:
         """Handle a request for control, or its release; ``over``: take control without asking its holder."""
         client = self._client(request)
         if request.ends():
-            self.lease.release(client, _ms(now))
+            self.lease.release(client, ms(now))
         else:
-            self.lease.hold(client, int(request.for_ms), over, _ms(now))
+            self.lease.hold(client, int(request.for_ms), over, ms(now))
 
     def vouch(self, vouched: ControlVouched, now: float) -> None:
         """Note the period for which the bridge vouches that it has forwarded every message."""
-        self.lease.vouch(vouched.begin, vouched.end, _ms(now))
+        self.lease.vouch(vouched.begin, vouched.end, ms(now))
 
     def doubt(self, now: float) -> None:
         """Note that messages may be lost here: the bridge vouches only for what it has sent."""
-        self.lease.doubt(_ms(now))
+        self.lease.doubt(ms(now))
 
     def account(self, drive: Drive) -> str | None:
         """Return the account of a command, "" where names are not checked; None for a program of the robot."""
@@ -102,24 +101,23 @@ class Control:
     @property
     def peers(self) -> frozenset[str]:
         """Names of the other motor owners, whose turns this one needs."""
-        return frozenset() if self._shared is None else self._shared.peers
+        return self.lease.peers
 
     def receive_turn(self, owner: str, turn: ControlTurn, now: float) -> None:
         """Handle the grant of control that another motor owner has sent. Call :meth:`note` afterwards."""
-        if self._shared is not None:
-            self._shared.receive(owner, turn, _ms(now))
+        self.lease.receive(owner, turn, ms(now))
 
     def turn(self, barred: int, now: float) -> ControlTurn | None:
         """Return the grant for the other owners, or None; ``barred``: the newest script run that the arbiter bars."""
-        return None if self._shared is None else self._shared.shown(barred, _ms(now))
+        return self.lease.shown(barred, ms(now))
 
     def waits(self, now: float) -> bool:
         """True if nothing may move, because the robot's motor owners may follow different holders of control."""
-        return self._shared is not None and self._shared.waits(_ms(now))
+        return self.lease.waits(ms(now))
 
     def left_ms(self, now: float) -> int:
         """Return for how long the motors may move without another grant; a longer command must be cut to that."""
-        return sys.maxsize if self._shared is None else max(0, self._shared.until - _ms(now))
+        return max(0, self.lease.until - ms(now))
 
     def note(self, now: float) -> bool:
         """Publish the state if it has changed; return True, once, if control has passed to another client or ended.
@@ -130,7 +128,7 @@ class Control:
         if lease.changed:
             lease.changed = False
             self._state.changed(now)
-            self._turn_due = None if self._shared is None else now
+            self._turn_due = now if self.peers else None
         if self._next is None and (lease.key or lease.others):
             self._next = now + _TICK_S
         halts, lease.halts = lease.halts, False
@@ -143,14 +141,13 @@ class Control:
     @property
     def due(self) -> float | None:
         """Time at which :meth:`tick` must run next; None if nothing is due."""
-        times = (self._next, self._state.due, self._turn_due, self._turns.due)
-        return min((at for at in times if at is not None), default=None)
+        return earliest(self._next, self._state.due, self._turn_due, self._turns.due)
 
     def tick(self, now: float) -> None:
         """End control whose time is over. Call :meth:`note` and :meth:`show_turn` afterwards."""
         if self._next is not None and now >= self._next:
             self._next = None
-            self.lease.tick(_ms(now))
+            self.lease.tick(ms(now))
         self._state.tick(now)
         self._turns.tick(now)
 
@@ -164,5 +161,11 @@ class Control:
         self._state.changed(now)
 
 
-def _ms(seconds: float) -> int:
+def earliest(*times: float | None) -> float | None:
+    """Return the earliest of these times; None if all are None."""
+    return min((at for at in times if at is not None), default=None)
+
+
+def ms(seconds: float) -> int:
+    """Return a time in milliseconds, in which leases and the arbiter count."""
     return int(1000 * seconds)

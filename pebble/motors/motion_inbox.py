@@ -5,16 +5,8 @@ from itertools import chain
 
 from msgspec import Struct
 
+from pebble.contract import payloads as p
 from pebble.contract.groups import Member
-from pebble.contract.payloads import (
-    SCRIPT,
-    ControlRequest,
-    ControlTurn,
-    ControlVouched,
-    Drive,
-    EstopCommand,
-    EstopReset,
-)
 from pebble.motion.arbiter import PERSON, UNKNOWN_RUN
 from pebble.motors.control import Control
 from pebble.transports import State
@@ -32,7 +24,7 @@ class ReceivedDrive(Struct, frozen=True):
     ``company``: the members of its group that this motor owner takes, such as lights; all are carried out, or none.
     """
 
-    drive: Drive
+    drive: p.Drive
     at: float
     company: tuple[Member, ...] = ()
 
@@ -40,14 +32,14 @@ class ReceivedDrive(Struct, frozen=True):
 class ReceivedReset(Struct, frozen=True):
     """A reset, with the time at which it was received."""
 
-    reset: EstopReset
+    reset: p.EstopReset
     at: float
 
 
 class ReceivedRequest(Struct, frozen=True):
     """A request for control, with the time at which it was received, and whether it takes control over."""
 
-    request: ControlRequest
+    request: p.ControlRequest
     over: bool
     at: float
 
@@ -55,13 +47,13 @@ class ReceivedRequest(Struct, frozen=True):
 class Batch(Struct):
     """All messages that were waiting, to be judged in the order of the fields."""
 
-    stops: list[EstopCommand]
+    stops: list[p.EstopCommand]
     resets: list[ReceivedReset]
     requests: list[ReceivedRequest]
-    turns: list[tuple[str, ControlTurn]]
+    turns: list[tuple[str, p.ControlTurn]]
     lost: bool  # messages may have been lost
     drives: list[ReceivedDrive]
-    vouched: ControlVouched | None
+    vouched: p.ControlVouched | None
 
 
 class MotionInbox:
@@ -76,15 +68,15 @@ class MotionInbox:
         self.dropped = 0
         self._control = control
         self._lock = threading.Lock()
-        self._stops: list[EstopCommand] = []
+        self._stops: list[p.EstopCommand] = []
         self._resets: list[ReceivedReset] = []
         self._requests: dict[tuple[str, str], ReceivedRequest] = {}  # by sender, the newest sender last
-        self._turns: dict[str, ControlTurn] = {}  # by owner
+        self._turns: dict[str, p.ControlTurn] = {}  # by owner
         self._lost = False
-        self._vouched: ControlVouched | None = None
+        self._vouched: p.ControlVouched | None = None
         self._drives: dict[int, list[ReceivedDrive]] = {}  # by sender, the newest sender last
 
-    def put_stop(self, stop: EstopCommand) -> bool:
+    def put_stop(self, stop: p.EstopCommand) -> bool:
         with self._lock:
             was_empty = self._empty
             if stop not in self._stops:
@@ -93,7 +85,7 @@ class MotionInbox:
                 self._drop(self._stops)
             return was_empty
 
-    def put_reset(self, reset: EstopReset, now: float) -> bool:
+    def put_reset(self, reset: p.EstopReset, now: float) -> bool:
         with self._lock:
             was_empty = self._empty
             self._resets.append(ReceivedReset(reset, now))
@@ -101,26 +93,27 @@ class MotionInbox:
                 self._drop(self._resets)
             return was_empty
 
-    def put_request(self, request: ControlRequest, over: bool, now: float) -> bool:
+    def put_request(self, request: p.ControlRequest, over: bool, now: float) -> bool:
         with self._lock:
             was_empty = self._empty
             sender = self._control.sender(request)
             waiting = self._requests.pop(sender, None)
             if len(self._requests) >= _REQUESTS:
-                knows = self._control.knows
+                knows = self._control.knows  # who neither has control nor asks first gives way
                 del self._requests[next(key for key, received in self._requests.items() if not knows(received.request))]
                 self.dropped += 1
-            over = not request.ends() and (over or (waiting is not None and waiting.over))
+            waiting_takes_over = waiting is not None and waiting.over  # a renewal must not undo that
+            over = not request.ends() and (over or waiting_takes_over)
             self._requests[sender] = ReceivedRequest(request, over, now)
             return was_empty
 
-    def put_turn(self, owner: str, turn: ControlTurn) -> bool:
+    def put_turn(self, owner: str, turn: p.ControlTurn) -> bool:
         with self._lock:
             was_empty = self._empty
             self._turns[owner] = turn
             return was_empty
 
-    def put_vouched(self, vouched: ControlVouched) -> bool:
+    def put_vouched(self, vouched: p.ControlVouched) -> bool:
         with self._lock:
             was_empty = self._empty
             self._vouched = vouched
@@ -132,7 +125,7 @@ class MotionInbox:
             with self._lock:
                 self._lost = True
 
-    def put_drive(self, drive: Drive, now: float, company: tuple[Member, ...] = ()) -> bool:
+    def put_drive(self, drive: p.Drive, now: float, company: tuple[Member, ...] = ()) -> bool:
         with self._lock:
             was_empty = self._empty
             sender = run_of(drive)
@@ -162,14 +155,14 @@ class MotionInbox:
             self._drives or self._stops or self._resets or self._requests or self._turns or self._vouched is not None
         )
 
-    def _drop(self, waiting: list[EstopCommand] | list[ReceivedReset]) -> None:
+    def _drop(self, waiting: list[p.EstopCommand] | list[ReceivedReset]) -> None:
         del waiting[0]
         self.dropped += 1
 
 
-def run_of(drive: Drive) -> int:
+def run_of(drive: p.Drive) -> int:
     """Return the run of a script's drive command, or UNKNOWN_RUN; PERSON for a person's command."""
-    if drive.source != SCRIPT:
+    if drive.source != p.SCRIPT:
         return PERSON
     return drive.run if isinstance(drive.run, int) else UNKNOWN_RUN
 
@@ -183,4 +176,6 @@ def _replaced(waiting: list[ReceivedDrive], newest: ReceivedDrive) -> list[Recei
     if newest.drive.moves or not zeros:
         return [*zeros, newest]
     final = next((received for received in zeros if received.drive.valid_ms == 0), None)
-    return [newest if final is None else ReceivedDrive(final.drive, newest.at, newest.company)]
+    if final is None:
+        return [newest]
+    return [ReceivedDrive(final.drive, newest.at, newest.company)]

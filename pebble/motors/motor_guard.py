@@ -12,7 +12,7 @@ from msgspec import UNSET
 from pebble.contract.payloads import LAST_RUN, Drive, EstopCommand, EstopReset, EstopState
 from pebble.motion.arbiter import HOLD_MS, PERSON, REFUSED, Arbiter, newer
 from pebble.motion.latch import Latch, stop_of
-from pebble.motors.control import Control
+from pebble.motors.control import Control, earliest, ms
 from pebble.motors.motion_inbox import run_of
 from pebble.motors.paced import Paced
 from pebble.motors.state_file import StateFile
@@ -55,10 +55,10 @@ class MotorGuard:
         self._file, self._barred_file, self._counters, self._control = file, barred_file, counters, control
         self._state = Paced(lambda: publish(self.state()))
         self._latch = Latch(control.boot, NAMES, operator.sub)
-        self._arbiter = Arbiter(self._latch, control.lease, _ms(now), operator.sub, round(1000 * watchdog_s))
+        self._arbiter = Arbiter(self._latch, control.lease, ms(now), operator.sub, round(1000 * watchdog_s))
         self._saving = self._saved = 0  # numbers of writes: the newest one, and the newest one that succeeded
-        self._hold_until: float | None = None  # of the person who commanded last
-        self._barred = 0  # as noted last
+        self._hold_until: float | None = None  # the end of the hold of the person who commanded last
+        self._barred = 0  # the newest barred run, as saved and published last
         self._log = RateLimitedLog(log, burst=5)
         self._can_save = False
 
@@ -86,7 +86,9 @@ class MotorGuard:
     @property
     def persisted(self) -> bool | None:
         """True if the file holds the current state; None if this owner cannot save."""
-        return self._saving == self._saved if self._can_save else None
+        if not self._can_save:
+            return None
+        return self._saving == self._saved
 
     def stop(self, command: EstopCommand, now: float) -> None:
         """Latch an emergency stop. The caller must have stopped the motors before."""
@@ -103,7 +105,7 @@ class MotorGuard:
             self._state.changed(now)
 
     def reset(self, reset: EstopReset, age_s: float, now: float) -> None:
-        if self._latch.reset(reset.boot, reset.count, _ms(age_s), _ms(now)):
+        if self._latch.reset(reset.boot, reset.count, ms(age_s), ms(now)):
             self._log.log("reset", logging.WARNING, "emergency stop reset by %s", _described(_given(reset.by), ""))
             self._save()
         elif self._latch.reset_refused:
@@ -117,14 +119,12 @@ class MotorGuard:
         run = run_of(drive)
         key = drive.key if isinstance(drive.key, str) else ""
         account = self._control.account(drive)
-        limit: int = self._arbiter.judge(drive.moves, run, valid_ms, _ms(now), key, account)
-        if self._arbiter.barred != self._barred:
-            self._note_barred(now)
+        limit: int = self._arbiter.judge(drive.moves, run, valid_ms, ms(now), key, account)
+        self._note_barred(now)
         if limit == REFUSED:
             needs_no_key = run != PERSON or account is None
-            is_stranger = self._control.lease.refuses(drive.moves, needs_no_key, key, account or "", _ms(now))
-            waits = drive.moves and self._control.waits(now)
-            reason = "handover" if waits else "stranger" if is_stranger else "latched" if self.latched else "overruled"
+            is_stranger = self._control.lease.refuses(drive.moves, needs_no_key, key, account or "", ms(now))
+            reason = self._reason_of_refusal(drive.moves, is_stranger, now)
             self._counters.add(reason)
             if drive.moves or run == PERSON:  # a script's zero is only to bar older runs, which the arbiter has done
                 self._log.warning(reason, "refused a drive command: %s", self._why_refused(reason, run, key))
@@ -136,8 +136,7 @@ class MotorGuard:
     def bar(self, run: int, now: float) -> None:
         """Bar the script runs that another motor owner of the robot has barred."""
         self._arbiter.bar(run)
-        if self._arbiter.barred != self._barred:
-            self._note_barred(now)
+        self._note_barred(now)
 
     @property
     def barred(self) -> int:
@@ -146,15 +145,14 @@ class MotorGuard:
     @property
     def due(self) -> float | None:
         """Time at which :meth:`tick` must run next; None if nothing is due."""
-        return min((at for at in (self._state.due, self._hold_until) if at is not None), default=None)
+        return earliest(self._state.due, self._hold_until)
 
     def tick(self, now: float) -> None:
         """End a person's hold whose time is over, and publish a state that had to wait."""
         if self._hold_until is not None and now >= self._hold_until:
             self._hold_until = None
-            self._arbiter.tick(_ms(now))
-            if self._arbiter.barred != self._barred:
-                self._note_barred(now)
+            self._arbiter.tick(ms(now))
+            self._note_barred(now)
         self._state.tick(now)
 
     def on_saved(self, number: int, succeeded: bool, now: float) -> None:
@@ -199,6 +197,14 @@ class MotorGuard:
         fields: dict[str, Any] = self._latch.state(self.persisted)
         return EstopState(**fields, barred=self._barred or UNSET)
 
+    def _reason_of_refusal(self, moves: bool, is_stranger: bool, now: float) -> str:
+        """Return the counter of a refused drive command; ``is_stranger``: its sender does not have control."""
+        if moves and self._control.waits(now):
+            return "handover"
+        if is_stranger:
+            return "stranger"
+        return "latched" if self.latched else "overruled"
+
     def _why_refused(self, reason: str, run: int, key: str) -> str:
         if reason == "handover":
             return "the robot's motor owners do not follow the same holder yet"
@@ -213,9 +219,11 @@ class MotorGuard:
         return f"run {run} has to wait: a person drives, or this process has just started"
 
     def _note_barred(self, now: float) -> None:
-        self._barred = self._arbiter.barred
-        self._barred_file.save(self._barred)
-        self._state.changed(now)
+        """Save and publish the newest barred run, if the arbiter has barred another one."""
+        if self._arbiter.barred != self._barred:
+            self._barred = self._arbiter.barred
+            self._barred_file.save(self._barred)
+            self._state.changed(now)
 
     def _save(self) -> None:
         if self._can_save:
@@ -224,13 +232,10 @@ class MotorGuard:
 
 def _described(by: str, why: str) -> str:
     """Return the sender and the reason of a stop or a reset, for the log."""
-    _, by, why = stop_of({"by": by, "why": why})
-    return f"{by or 'an unnamed sender'}{f' ({why})' if why else ''}"
+    _, by, why = stop_of({"by": by, "why": why})  # in printable characters
+    sender = by or "an unnamed sender"
+    return f"{sender} ({why})" if why else sender
 
 
 def _given(text: object) -> str:
     return text if isinstance(text, str) else ""
-
-
-def _ms(seconds: float) -> int:
-    return int(1000 * seconds)

@@ -8,19 +8,9 @@ from typing import Any, ClassVar
 
 from pebble import contract as c
 from pebble.contract import groups
-from pebble.contract.payloads import (
-    ControlRequest,
-    ControlState,
-    ControlTurn,
-    ControlVouched,
-    Drive,
-    EstopCommand,
-    EstopReset,
-    EstopState,
-    LightsSolid,
-)
+from pebble.contract import payloads as p
 from pebble.errors import PayloadError, TransportError
-from pebble.motors.control import Control
+from pebble.motors.control import Control, earliest
 from pebble.motors.motion_inbox import MotionInbox, ReceivedDrive, ReceivedRequest
 from pebble.motors.motor_guard import MotorGuard
 from pebble.motors.state_file import StateFile
@@ -32,7 +22,7 @@ from pebble.transports import Message, QoS
 _SAVE_AGAIN_S = 1.0
 _REPEAT_S = 5.0  # as often as boards repeat their reports
 _CHECK_S = 1.0  # an answer to a subscription may come later than the connection
-_FINAL_ZERO = Drive(x=0.0, z=0.0, valid_ms=0)
+_FINAL_ZERO = p.Drive(x=0.0, z=0.0, valid_ms=0)
 
 
 class MotorOwner(Service, ABC):
@@ -53,7 +43,7 @@ class MotorOwner(Service, ABC):
         self.notifier = Notifier()
         self._control = Control(
             self.config.security,
-            self._publish_control,
+            lambda state: self.publish(c.CONTROL_STATE, state, owner=self.owner),
             self.clock(),
             self.owner,
             self.config.motor_owners,
@@ -76,7 +66,7 @@ class MotorOwner(Service, ABC):
         self.on_stop(self._barred_file.close)
         self._deadline: Timer | None = None  # stops the motors unless a command arrives; None: they are stopped
         self._guard_timer: Timer | None = None
-        self.announced_latching = True  # that it latches, to operators
+        self.announced_latching = True  # operators were told that a stop latches here
         self._estop_note = Reported(self.notifier.feature, "estop", True)
         self._control_note = Reported(self.notifier.feature, "control", True)
 
@@ -96,14 +86,14 @@ class MotorOwner(Service, ABC):
         return self._guard.latched
 
     @abstractmethod
-    def move(self, drive: Drive, valid_s: float) -> None:
+    def move(self, drive: p.Drive, valid_s: float) -> None:
         """Move the motors: ``drive.x`` steers and ``drive.z`` is the throttle, both -1..1; for ``valid_s`` seconds."""
 
     @abstractmethod
     def halt(self) -> None:
         """Stop the motors now. This is called again and again while the motors stand still."""
 
-    def move_with(self, drive: Drive, valid_s: float, company: tuple[groups.Member, ...]) -> None:  # noqa: ARG002
+    def move_with(self, drive: p.Drive, valid_s: float, company: tuple[groups.Member, ...]) -> None:  # noqa: ARG002
         """Carry out a drive command, or a zero, and at once the members of its group on channels in :attr:`company`.
 
         A subclass with such channels overrides this method.
@@ -125,20 +115,20 @@ class MotorOwner(Service, ABC):
     # -- on the transport's threads; the stop is subscribed to before the drive commands
 
     @on(c.ESTOP, direct=True)
-    def receive_stop(self, stop: EstopCommand, _arrived: float) -> None:
-        if stop.owner not in self._control.peers:  # the bridge repeats it for one that has not confirmed it
+    def receive_stop(self, stop: p.EstopCommand, _arrived: float) -> None:
+        if stop.owner not in self._control.peers:  # else the bridge repeats it only for another owner
             self._judge_soon(self._waiting.put_stop(stop))
 
     @on(c.ESTOP_RESET, direct=True)
-    def receive_reset(self, reset: EstopReset, arrived: float) -> None:
+    def receive_reset(self, reset: p.EstopReset, arrived: float) -> None:
         self._judge_soon(self._waiting.put_reset(reset, arrived))
 
     @on(c.CONTROL, direct=True)
-    def receive_request(self, request: ControlRequest, arrived: float) -> None:
+    def receive_request(self, request: p.ControlRequest, arrived: float) -> None:
         self._judge_soon(self._waiting.put_request(request, False, arrived))
 
     @on(c.CONTROL_TAKE, direct=True)
-    def receive_take(self, request: ControlRequest, arrived: float) -> None:
+    def receive_take(self, request: p.ControlRequest, arrived: float) -> None:
         self._judge_soon(self._waiting.put_request(request, True, arrived))
 
     def set_up(self) -> None:
@@ -153,16 +143,16 @@ class MotorOwner(Service, ABC):
             receive = self.refusals.reader(c.GROUP, self._receive_group)
             self.transport.subscribe(self.addresses[c.GROUP].topic, receive, qos=QoS.DELIVERED, direct=True)
 
-    def _receive_turn(self, message: Message, turn: ControlTurn, names: dict[str, str]) -> None:
+    def _receive_turn(self, message: Message, turn: p.ControlTurn, names: dict[str, str]) -> None:
         if not message.retain:
             self._judge_soon(self._waiting.put_turn(names["owner"], turn))
 
     @on(c.DRIVE, direct=True)
-    def receive_drive(self, drive: Drive, arrived: float) -> None:
+    def receive_drive(self, drive: p.Drive, arrived: float) -> None:
         if not (drive.moves and self.is_copy(drive)):
             self._judge_soon(self._waiting.put_drive(drive, arrived))
 
-    def is_copy(self, command: Drive | LightsSolid) -> bool:
+    def is_copy(self, command: p.Drive | p.LightsSolid) -> bool:
         """True if ``command`` is the copy of a group's member: this motor owner takes the group itself."""
         return self._takes_groups and command.group is True
 
@@ -181,7 +171,7 @@ class MotorOwner(Service, ABC):
             self.post_message(c.GROUP, partial(self.accompany, company), newest_of=c.GROUP.metric)
 
     @on(c.CONTROL_VOUCHED, direct=True)
-    def receive_vouched(self, vouched: ControlVouched, _arrived: float) -> None:
+    def receive_vouched(self, vouched: p.ControlVouched, _arrived: float) -> None:
         self._judge_soon(self._waiting.put_vouched(vouched))
 
     def _judge_soon(self, was_empty: bool) -> None:
@@ -193,7 +183,7 @@ class MotorOwner(Service, ABC):
     def judge(self) -> None:
         """Judge all waiting messages, stops first, because a stop voids the drive commands that wait with it."""
         batch = self._waiting.take()
-        latches = not batch.stops or self._latches  # without a stop nothing here depends on it
+        latches = not batch.stops or self._latches  # asked only if there are stops
         for stop in batch.stops:
             self._halt()
             if latches:
@@ -320,7 +310,7 @@ class MotorOwner(Service, ABC):
     # -- the guard
 
     def _arm_guard(self) -> None:
-        due = min((at for at in (self._guard.due, self._control.due) if at is not None), default=None)
+        due = earliest(self._guard.due, self._control.due)
         if due is None or (self._guard_timer is not None and self._guard_timer.due <= due):
             return
         if self._guard_timer is not None:
@@ -348,15 +338,12 @@ class MotorOwner(Service, ABC):
         self._control.repeat_state(self.clock())
         self._arm_guard()
 
-    def _publish_state(self, state: EstopState) -> None:
+    def _publish_state(self, state: p.EstopState) -> None:
         """Publish the state. While a stop does not latch, remove it, repeatedly: a bridge may have missed that."""
         if self._latches:
             self.publish(c.ESTOP_STATE, state, owner=self.owner)
         else:
             self.clear(c.ESTOP_STATE, owner=self.owner)
-
-    def _publish_control(self, state: ControlState) -> None:
-        self.publish(c.CONTROL_STATE, state, owner=self.owner)
 
     def _show_turn(self) -> None:
         turn = self._control.turn(self._guard.barred, self.clock())

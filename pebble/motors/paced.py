@@ -11,8 +11,8 @@ class Paced:
 
     def __init__(self, publish: Callable[[], object], per_s: int = STATES_PER_S) -> None:
         self._publish = publish
-        self._published = deque([float("-inf")] * per_s, maxlen=per_s)
-        self.due: float | None = None  # when a state is published that could not be before
+        self._published = deque([float("-inf")] * per_s, maxlen=per_s)  # the times of the newest ones
+        self.due: float | None = None  # when a state that has to wait is published
 
     @property
     def last(self) -> float:
@@ -20,6 +20,7 @@ class Paced:
         return self._published[-1]
 
     def changed(self, now: float) -> None:
+        """Publish the changed state now, or let it wait until :attr:`due`."""
         allowed_at = self._published[0] + 1.0
         if now < allowed_at:
             self.due = allowed_at

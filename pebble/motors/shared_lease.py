@@ -1,10 +1,9 @@
-"""The leases of a robot with several motor owners: the first owner by name grants, the others follow. Pure.
+"""The leases of a robot's motor owners. Of several, the first owner by name grants, and the others follow. Pure.
 
 A *turn* is a grant with its number, which the others repeat. Times are milliseconds of the machine's clock.
 """
 
 import sys
-from abc import abstractmethod
 from typing import Any
 
 from pebble.contract.payloads import ControlTurn
@@ -15,7 +14,7 @@ SETTLES_MS = FOLLOWS_MS + 100
 
 
 class SharedLease(VouchedLease):
-    """A lease that refuses motion while the motor owners may follow different holders."""
+    """The lease of an only owner, and the base of the others, which refuse motion while holders may differ."""
 
     until = sys.maxsize  # when everything stops, unless another turn is received before
 
@@ -28,17 +27,16 @@ class SharedLease(VouchedLease):
         refused = super().refuses(moves, script, key, by, now)
         return refused or (moves and self.waits(now))
 
-    @abstractmethod
-    def waits(self, now: int) -> bool:
+    def waits(self, _now: int) -> bool:
         """True if no client may move anything now."""
+        return False
 
-    @abstractmethod
     def receive(self, owner: str, turn: ControlTurn, now: int) -> None:
         """Note the turn that a peer has sent."""
 
-    @abstractmethod
-    def shown(self, barred: int, now: int) -> ControlTurn | None:
+    def shown(self, _barred: int, _now: int) -> ControlTurn | None:
         """Return the turn to send to the peers; None if there is none to send."""
+        return None
 
 
 class FirstLease(SharedLease):
@@ -46,8 +44,8 @@ class FirstLease(SharedLease):
 
     def __init__(self, boot: str, peers: frozenset[str], now: int, *lease: Any) -> None:
         super().__init__(peers, now, *lease)
-        self._boot, self._turn = boot, 0
-        self._missing, self._turned_at = set(peers), now
+        self._boot, self._turn = boot, 0  # the number of the present turn
+        self._missing, self._turned_at = set(peers), now  # peers that do not follow it yet, and when it began
 
     def take(self, client: tuple[str, ...], ms: int, now: int) -> None:
         super().take(client, ms, now)
@@ -109,9 +107,9 @@ class FollowingLease(SharedLease):
         """Do nothing: the first owner ends control that is over."""
 
 
-def lease_of(owner: str, owners: tuple[str, ...], boot: str, *lease: Any) -> VouchedLease:
+def lease_of(owner: str, owners: tuple[str, ...], boot: str, *lease: Any) -> SharedLease:
     """Return the lease of ``owner``, one of the robot's ``owners``; ``lease``: the arguments of VouchedLease."""
     others, first = frozenset(owners) - {owner}, min(owners, default=owner)
     if not others:
-        return VouchedLease(*lease)
+        return SharedLease(others, *lease)
     return FirstLease(boot, others, *lease) if owner == first else FollowingLease(frozenset({first}), *lease)

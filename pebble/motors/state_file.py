@@ -35,7 +35,7 @@ class StateFile:
         self.path = path
         self._on_saved = on_saved
         self._changed = threading.Condition()
-        self._newest: tuple[int, Any] | None = None
+        self._newest: tuple[int, Any] | None = None  # the number of the write and its value, until it begins
         self._number = 0
         self._writing = False
         self._closing = False
@@ -72,7 +72,7 @@ class StateFile:
             finally:
                 os.close(file)
             value = json.loads(raw) if len(raw) <= _LONGEST else None
-            return Unreadable() if value is None else value
+            return Unreadable() if value is None else value  # null is never saved
         except FileNotFoundError:
             return None
         except (OSError, ValueError, RecursionError) as error:
@@ -119,7 +119,8 @@ class StateFile:
                     self._changed.wait()
                 if self._newest is None:
                     return
-                (number, value), self._newest, self._writing = self._newest, None, True
+                number, value = self._newest
+                self._newest, self._writing = None, True
             succeeded = self._write(value)
             with self._changed:
                 self._writing = False

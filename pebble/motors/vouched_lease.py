@@ -13,8 +13,8 @@ class VouchedLease(Lease):
     ``ENDS_AFTER_MS`` it counts in any case.
     """
 
-    vouched: tuple[int, int] | None = None  # None: there is no bridge, and all time counts
-    _received_all_since = 0
+    vouched: tuple[int, int] | None = None  # begin and end; None: there is no bridge, and all time counts
+    _received_all_since = 0  # before it messages may have been lost in this process
 
     def vouch(self, begin: int, end: int, now: int) -> None:
         """Note the period for which the bridge vouches. Ignore one from the future: it is of another clock."""
@@ -22,7 +22,7 @@ class VouchedLease(Lease):
             self.vouched = max(begin, self._received_all_since), end
 
     def doubt(self, now: int) -> None:
-        """Note that messages may be lost here, from now back to any time, although the bridge has forwarded them."""
+        """Note that messages which the bridge has forwarded until now may be lost in this process."""
         self._received_all_since = now
 
     def tick(self, now: int) -> None:

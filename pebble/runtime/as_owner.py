@@ -26,7 +26,8 @@ def as_owner(folder: Path, *modules: str, make: bool = False) -> Iterator[None]:
                 folder.mkdir(mode=0o700, parents=True, exist_ok=True)  # another user may be faster
         except OSError as error:
             raise PebbleError(f"{folder}: {error.strerror}") from None
-    if not is_root() or (owner := owner_of(folder)).uid == 0:
+    owner = owner_of(folder) if is_root() else None
+    if owner is None or owner.uid == 0:
         yield
         return
     for name in modules:
@@ -38,7 +39,8 @@ def as_owner(folder: Path, *modules: str, make: bool = False) -> Iterator[None]:
 @contextmanager
 def as_before() -> Iterator[None]:
     """Be root again in the ``with`` block, inside of :func:`as_owner`."""
-    if hasattr(os, "getresuid") and os.getresuid()[2] == 0 != os.geteuid():
+    was_root = hasattr(os, "getresuid") and os.getresuid()[2] == 0  # by its saved user id
+    if was_root and os.geteuid() != 0:
         with as_user(Owner(0, os.getgid())):
             yield
     else:

@@ -29,11 +29,11 @@ class BoundedOutput:
         self.flooded = False  # by the newest chunk: the reader may take its time
         self._write, self._rate, self._most = write, rate, rate * _BURST_S
         self._lines = LineSplitter(longest, truncate=True)
-        self._tokens, self._filled_at = self._most, now
-        self._newest, self._newest_at, self._repeats = b"", now, 0
+        self._tokens, self._filled_at = self._most, now  # lines that may pass now, and when that was computed
+        self._newest, self._newest_at, self._repeats = b"", now, 0  # line, without its time, and its repetitions
         self._kept: deque[bytes] = deque(maxlen=KEPT)
         self._left_out = 0
-        self._suppressed_at, self._said_at = float("-inf"), now
+        self._suppressed_at, self._said_at = float("-inf"), now  # when a line was left out, and when that was written
 
     @property
     def waits(self) -> bool:
@@ -43,13 +43,19 @@ class BoundedOutput:
     def feed(self, data: bytes, now: float) -> None:
         """Handle a chunk of output."""
         self.tick(now)
-        if self.flooded and len(data) > 2 * _SKIM and (end := data.rfind(b"\n", 0, -_SKIM)) >= 0:
-            self._left_out, self._suppressed_at = self._left_out + data.count(b"\n", 0, end + 1), now
-            self._lines.reset()
-            data = data[end + 1 :]
+        if self.flooded and len(data) > 2 * _SKIM:
+            data = self._skim(data, now)
         for line in self._lines.feed(data):
             self._line(line.rstrip(), now)
         self.flooded = self._suppressed_at == now
+
+    def _skim(self, data: bytes, now: float) -> bytes:
+        """Return the last lines of a large chunk; count the others without reading them."""
+        begin = data.rfind(b"\n", 0, -_SKIM) + 1
+        if begin > 0:
+            self._left_out, self._suppressed_at = self._left_out + data.count(b"\n", 0, begin), now
+            self._lines.reset()
+        return data[begin:]
 
     def tick(self, now: float) -> None:
         """Write the number of dropped lines, if that is due."""
@@ -63,8 +69,9 @@ class BoundedOutput:
     def end(self) -> None:
         """Write the last count of dropped lines, and the unfinished line."""
         self._say()
-        if rest := self._lines.rest().rstrip():
-            self._write(rest)
+        unfinished = self._lines.rest().rstrip()
+        if unfinished:
+            self._write(unfinished)
 
     def _line(self, line: bytes, now: float) -> None:
         clock = _clock(line)

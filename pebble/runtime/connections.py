@@ -40,17 +40,17 @@ def local_transport(config: Config, name: str, *, will: Message | None = None, a
 def check_connections(config: Config) -> None:
     """Raise ConfigError for mistakes that only the robot's machine can know: missing transports, long paths."""
     remote = config.services.mqtt_bridge.remote
-    places = {"transport.kind": config.transport.kind}
+    kinds = {"transport.kind": config.transport.kind}  # by config key
     if remote is not None:
-        places["services.mqtt_bridge.remote.kind"] = remote.kind
+        kinds["services.mqtt_bridge.remote.kind"] = remote.kind
     problems = []
-    for place, kind in places.items():
+    for key, kind in kinds.items():
         try:
             check_kind(kind)
         except TransportError as error:
-            problems.append(f"{place}: {error}")
-    added = programs_of(config.installed, config)
-    has_sockets = config.transport.kind == "zenoh" or any(program.has_sockets for program in added)
+            problems.append(f"{key}: {error}")
+    programs = programs_of(config.installed, config)
+    has_sockets = config.transport.kind == "zenoh" or any(program.has_sockets for program in programs)
     if has_sockets and not fits_socket(config.run_dir() / LONGEST_SOCKET):
         problems.append(
             f"transport.run_dir: {config.run_dir()} is too long for the sockets in it, set it to a shorter path"
@@ -74,7 +74,8 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
     """Return a connection to operators, not yet opened: to ``remote`` if it is set, else to ``remote_mqtt``."""
     bridge = config.services.mqtt_bridge
     if bridge.remote is None:
-        remote, program = bridge.remote_mqtt, "" if name == _BRIDGE else name
+        remote = bridge.remote_mqtt
+        program = "" if name == _BRIDGE else name
         settings = mqtt_settings(remote, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S, program=program)
         settings = replace_settings(settings, vital=(*_VITAL_STATES, *_renamed_vital(config)))
         if bridge.link.profile != "wide":
@@ -171,7 +172,7 @@ def _renamed_vital(config: Config) -> tuple[str, ...]:
 
 def _renamed(config: Config) -> Iterator[tuple[c.Channel, str]]:
     """Yield the channels that this config renames, and their topics, for every serial line."""
-    section = config.services.serial_mcu_bridge  # in the process of a line: that line
+    section = config.services.serial_mcu_bridge  # of all lines; in the process of one line that line's
     for line in (section, *config.serial_instances().values()):
         addresses = Addresses(replace(config, services=replace(config.services, serial_mcu_bridge=line)))
         for channel in c.CHANNELS:

@@ -26,7 +26,7 @@ class Inbox:
         self._limit = limit
         self._lock = threading.RLock()
         self._wakeup = Wakeup()
-        self._jobs: OrderedDict[Hashable, Job] = OrderedDict()
+        self._jobs: OrderedDict[Hashable, Job] = OrderedDict()  # by name, or by a number if a job has none
         self._internal: deque[Job] = deque()
         self._numbers = count()
         self._woken = False
@@ -42,8 +42,9 @@ class Inbox:
                 self._jobs.pop(last_of, None)
             name = newest_of if last_of is None else last_of
             if len(self._jobs) >= self._limit and name not in self._jobs:
-                unnamed = (waiting for waiting in self._jobs if type(waiting) is int)
-                del self._jobs[next(unnamed, next(iter(self._jobs)))]
+                oldest = next(iter(self._jobs))
+                oldest_unnamed = next((key for key in self._jobs if type(key) is int), oldest)
+                del self._jobs[oldest_unnamed]
                 self.dropped += 1
             self._jobs[next(self._numbers) if name is None else name] = job
         self._wakeup.set()

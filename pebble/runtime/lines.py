@@ -13,7 +13,7 @@ class LineSplitter:
     def __init__(self, limit: int = LINE_LIMIT, end: bytes = b"\n", *, truncate: bool = False) -> None:
         self.discarded_lines = 0  # lines that were longer than the limit
         self._limit, self._separator, self._truncate = limit, end, truncate
-        self._tail = b""
+        self._tail = b""  # the unfinished line
         self._skipping = False  # inside the rest of a line that was too long
 
     def feed(self, chunk: bytes) -> list[bytes]:
@@ -44,13 +44,13 @@ class LineSplitter:
         self._skipping = False
 
     def _grow(self, part: bytes, lines: list[bytes]) -> None:
+        """Add to the unfinished line; if that is too long, skip its rest, and add its beginning to ``lines``."""
         if self._skipping:
             return
         self._tail += part
         if len(self._tail) > self._limit:
-            returned = self._limit if self._truncate else 0
-            if returned:
-                lines.append(self._tail[:returned])
+            if self._truncate:
+                lines.append(self._tail[: self._limit])
             self.discarded_lines += 1
             self._tail = b""
             self._skipping = True

@@ -120,7 +120,7 @@ class Notifier:
         return self._write(notes.Wanted(program, request.on, request.encoding))
 
     def hold(self, program: str, on: bool) -> bool:
-        """Let an on-demand program wait, or end its wait; the end of this process does so, too. See :meth:`request`."""
+        """Let an on-demand program wait, or end its wait, as the end of this process also does. See :meth:`request`."""
         return self._write(notes.Held(program, on))
 
     def feature(self, name: str, has: bool) -> bool:
@@ -159,9 +159,9 @@ def _one_line(text: str) -> str:
 class Reported:
     """A value that is sent to the launcher when it changes, until the launcher has taken it."""
 
-    def __init__(self, send: Callable[..., bool], *known: object) -> None:
-        """Make a reporter that calls ``send``. ``known``: the value that the launcher assumes at first."""
-        self._send, self._known = send, known
+    def __init__(self, send: Callable[..., bool], *assumed: object) -> None:
+        """Make a reporter that calls ``send``. ``assumed``: the value that the launcher assumes at first."""
+        self._send, self._known = send, assumed
 
     def report(self, *value: object) -> None:
         """Send ``value`` if the launcher does not know it yet. Call this regularly."""

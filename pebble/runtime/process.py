@@ -37,8 +37,7 @@ def run(service_class: type[Service], arguments: list[str] | None = None) -> int
         config = config_of_process(arguments[0])
         withhold(config.password_variables)
         set_log_level(config.log_level)
-        view = view_of(config, instance)
-        return _serve(service_class, view, instance)
+        return _serve(service_class, view_of(config, instance), instance)
     except PebbleError as error:
         for line in str(error).splitlines():
             log.error("%s", line)

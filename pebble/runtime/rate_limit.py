@@ -57,6 +57,7 @@ class RateLimitedLog:
 
     def _make_room(self, subject: str, now: float) -> str:
         """Forget subjects whose period is over; return the subject to count under, "" if there is no room."""
-        for old in [old for old, (began, _) in self._windows.items() if old and now - began >= self._period]:
-            del self._windows[old], self._totals[old]
+        expired = [name for name, (began, _) in self._windows.items() if name and now - began >= self._period]
+        for name in expired:
+            del self._windows[name], self._totals[name]
         return subject if len(self._windows) < (self._most or 0) else ""

@@ -107,7 +107,7 @@ class Service:
         self._remarks = RateLimitedLog(self.log, period_s=60.0, most=_SENDERS)
         self._inbox = Inbox()
         self._work = WorkLock()
-        self._states: dict[str, tuple[Channel, bytes]] = {}
+        self._states: dict[str, tuple[Channel, bytes]] = {}  # the newest ones, by topic, to be published again
         self._handled: dict[Channel, Subscription] = {}  # of methods marked with @on
         self._on_stop = ExitStack()
         self.running = True
@@ -226,7 +226,8 @@ class Service:
                 self.set_up()
             ready()
             while self.running:
-                self.turn(None if self._work.wakes_at == inf else max(0.0, self._work.wakes_at - self.clock()))
+                wakes_at = self._work.wakes_at
+                self.turn(None if wakes_at == inf else max(0.0, wakes_at - self.clock()))
         finally:
             self._tear_down()
 
@@ -271,14 +272,9 @@ class Service:
         for name in _marked(type(self), "period"):
             method = getattr(self, name)
             self.timers.add(now, method, period=method.period)
-        interval = self.republish_interval_s
+        interval = self.config.services.defaults.retained_publish_interval_seconds
         if interval > 0:
             self.timers.add(now + interval, self.republish, period=interval)
-
-    @property
-    def republish_interval_s(self) -> float:
-        """Seconds after which retained states are published again; 0: they are not repeated."""
-        return self.config.services.defaults.retained_publish_interval_seconds
 
     def _begin_connection(self) -> None:
         self.on_connected()

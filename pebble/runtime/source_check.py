@@ -22,9 +22,9 @@ class SourceCheck:
         self.wrong_hz: float | None = None  # the measured rate, if another was asked for
         self._asked_hz = asked_hz
         self._recent: deque[Hashable] = deque(maxlen=remembered)
-        self._at = 0.0
-        self._window: float | None = None  # the start of the measurement, perhaps to come
-        self._count = 0  # in the measurement; -1: it has not begun
+        self._at = 0.0  # when the newest came
+        self._window: float | None = None  # when the measurement of the rate began, or begins
+        self._count = 0  # contents in the measurement; -1: it has not begun
 
     @property
     def repeats(self) -> bool:
@@ -38,11 +38,13 @@ class SourceCheck:
     def take(self, content: Hashable, now: float, *, counts: bool = True) -> None:
         """Note a content. ``counts``: False while repetitions are normal, as for a sensor at rest."""
         if content not in self._recent:
-            self.changes += bool(self._recent)
+            if self._recent:
+                self.changes += 1
             self._recent.append(content)
             self.same_s = 0.0
         else:
-            self.same_s += (now - self._at) * counts
+            if counts:
+                self.same_s += now - self._at
             self.alternates = content != self.content
         self.content, self._at = content, now
 
@@ -59,6 +61,6 @@ class SourceCheck:
         seconds = now - self._window
         if seconds >= _RATE_S:
             rate, asked_hz = self._count / seconds, self._asked_hz
-            off = abs(rate - asked_hz) > max(_TOLERANCE * asked_hz, 1 / seconds)
-            self.wrong_hz = rate if asked_hz and off else None
+            is_wrong = asked_hz > 0 and abs(rate - asked_hz) > max(_TOLERANCE * asked_hz, 1 / seconds)
+            self.wrong_hz = rate if is_wrong else None
             self._window, self._count = now, 0

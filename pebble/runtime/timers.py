@@ -24,7 +24,7 @@ class Timers:
     """A heap of timers. Its owner asks how long to wait, and then runs the due ones. Times are passed in."""
 
     def __init__(self) -> None:
-        self._heap: list[tuple[float, int, Timer]] = []
+        self._heap: list[tuple[float, int, Timer]] = []  # when each is due, a number that grows, and the timer
         self._order = count()
 
     def add(self, due: float, job: Callable[[], None], *, period: float | None = None) -> Timer:
@@ -51,7 +51,9 @@ class Timers:
         while self._heap and self._heap[0][0] <= now:
             timer = heapq.heappop(self._heap)[2]
             if timer.period is not None:
-                timer.due = timer.due + timer.period if timer.due + timer.period > now else now + timer.period
+                timer.due += timer.period
+                if timer.due <= now:
+                    timer.due = now + timer.period
                 heapq.heappush(self._heap, (timer.due, next(self._order), timer))
             timer.job()
             self._discard_cancelled()

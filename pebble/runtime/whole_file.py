@@ -20,7 +20,7 @@ def is_root() -> bool:
 
 
 def _give(file: Path | int, owner: tuple[int, int]) -> None:
-    """Change the owner, unless the file has that owner already. Raises OSError."""
+    """Change the owner (user and group) of a file, unless it has that owner already. Raises OSError."""
     state = os.stat(file)  # noqa: PTH116
     if (state.st_uid, state.st_gid) != owner:
         os.chown(file, *owner)
@@ -29,7 +29,7 @@ def _give(file: Path | int, owner: tuple[int, int]) -> None:
 def set_mode(file: Path, mode: int, opened: Path | int | None = None) -> None:
     """Set the mode of ``file``; if its file system cannot hide it from others, log that. Raises OSError.
 
-    ``opened``: the file or descriptor to change, if that is not ``file``.
+    ``opened``: a path or descriptor through which to do it, if not by the name ``file``.
     """
     opened = file if opened is None else opened
     try:

@@ -12,9 +12,9 @@ class WorkLock:
     """
 
     def __init__(self) -> None:
-        self.wakes_at = -inf  # when the own thread runs timers, on the service's clock; guarded by this lock
+        self.wakes_at = -inf  # when the service's thread runs timers next, on its clock; guarded by this lock
         self._lock = threading.Lock()
-        self.awaited = False  # by the own thread
+        self.awaited = False  # by the service's thread
 
     def __enter__(self) -> None:
         self.awaited = True

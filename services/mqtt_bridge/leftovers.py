@@ -17,23 +17,21 @@ _EXCEPTED = (ONLINE, MCU_DESCRIBE)  # the bridge's own, and one that MCU_VALUE c
 class Leftovers:
     """The topics that robot and broker retain. Transports call :meth:`note_local` on their threads."""
 
-    def __init__(
-        self, base: str, subjects: Subjects, remote: Transport, *channels: Channel, sparing: bool = False
-    ) -> None:
+    def __init__(self, base: str, subjects: Subjects, remote: Transport, *channels: Channel, sparing: bool) -> None:
         """Store the arguments; ``channels`` are more channels that the bridge itself publishes on the remote side.
 
         ``sparing``: do not ask for topics that the robot has, because the answers would delay messages to it.
         """
         self._remote, self._sparing = remote, sparing
         self._on_robot: set[str] | None = set()  # topics that the robot retains; None: the search is over
-        self._at_remote: set[str] = set()
+        self._at_remote: set[str] = set()  # topics that the broker retains
         self._subscriptions: list[Subscription] = []
         states = [channel for channel in CHANNELS if channel.kind is Kind.STATE and channel.direction == OUTGOING]
         wanted = [state for state in states if state not in (*_EXCEPTED, *channels) and state.synonym_of is None]
         patterns = [state.filter(base) for state in wanted if state.is_pattern]
         named = subjects.topics(*(state for state in wanted if not state.is_pattern))
         self._filters = [MCU_VALUE.filter(base), *patterns, *named]
-        self._next = 0  # of the filters
+        self._next = 0  # the index of the filter to ask for next
 
     @property
     def done(self) -> bool:
@@ -42,7 +40,10 @@ class Leftovers:
     def note_local(self, message: Message) -> None:
         on_robot = self._on_robot
         if on_robot is not None and len(on_robot) <= _TOPICS:
-            (on_robot.add if message.payload else on_robot.discard)(message.topic)
+            if message.payload:
+                on_robot.add(message.topic)
+            else:
+                on_robot.discard(message.topic)
 
     def begin(self) -> None:
         """Start again, because a connection was lost."""
@@ -51,7 +52,7 @@ class Leftovers:
         self._at_remote.clear()
 
     def ask_next(self) -> bool:
-        """Ask the broker for the next few topics, and wait for the answer; False if all were asked for."""
+        """Ask the broker for the topics of the next filter, and wait for the answer; False if none is left."""
         on_robot = self._on_robot or set()
         while self._sparing and self._next < len(self._filters) and self._filters[self._next] in on_robot:
             self._next += 1
@@ -65,13 +66,13 @@ class Leftovers:
             self._next = len(self._filters)
         return True
 
-    def remove(self, remove: Callable[..., bool]) -> list[str]:
+    def remove(self, remove_topic: Callable[..., bool]) -> list[str]:
         """Remove messages that only the broker retains; return their topics. Nothing is noted afterwards.
 
-        ``remove(topic, unless=stays)`` removes one message unless ``stays(topic)``, and returns True if it did.
+        ``remove_topic(topic, unless=stays)`` removes a message unless ``stays(topic)``, and returns True if it did.
         """
         self._close()
-        removed = [topic for topic in sorted(self._at_remote) if remove(topic, unless=self._stays)]
+        removed = [topic for topic in sorted(self._at_remote) if remove_topic(topic, unless=self._stays)]
         self._on_robot = None
         return removed
 
@@ -80,9 +81,8 @@ class Leftovers:
         return topic in on_robot or max(len(on_robot), len(self._at_remote)) > _TOPICS
 
     def _close(self) -> None:
-        subscriptions, self._subscriptions = self._subscriptions, []
-        for subscription in subscriptions:
-            subscription.close()
+        while self._subscriptions:
+            self._subscriptions.pop().close()
 
     def _note_remote(self, message: Message) -> None:
         if message.retain and message.payload and len(self._at_remote) <= _TOPICS:

@@ -18,9 +18,10 @@ class MotorOwners:
     def __init__(self, base: str, owners: Iterable[str], notifier: Notifier) -> None:
         self.topics = {ESTOP_STATE.topic(base, owner=owner): owner for owner in owners}
         self._notifier = notifier
-        self._messages = dict.fromkeys(self.topics, 0)  # of this connection
-        self._checked = dict(self._messages)  # at the last check
-        self._received_at: dict[str, float | None] = dict.fromkeys(self.topics)  # None: since the first check
+        # By topic:
+        self._messages = dict.fromkeys(self.topics, 0)  # how many of this connection arrived,
+        self._checked = dict(self._messages)  # and how many until the last check
+        self._received_at: dict[str, float | None] = dict.fromkeys(self.topics)  # None: before the first check
         self._reported: dict[str, bool | None] = dict.fromkeys(self.topics)
 
     def connected(self) -> None:
@@ -38,8 +39,9 @@ class MotorOwners:
             received_at = self._received_at[topic]
             if received_at is None or (count > 1 and count != count_before):
                 received_at = self._received_at[topic] = now
-            reached = True if count > 1 else self._reported[topic]
-            if now - received_at >= _MISSED_S:
-                reached = False
-            if reached is not None and reached != self._reported[topic] and self._notifier.reaches(owner, reached):
+            is_silent = now - received_at >= _MISSED_S
+            if count <= 1 and not is_silent:
+                continue  # nothing new is known
+            reached = not is_silent
+            if reached != self._reported[topic] and self._notifier.reaches(owner, reached):
                 self._reported[topic] = reached

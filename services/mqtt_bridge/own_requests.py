@@ -42,21 +42,24 @@ class OwnRequests:
             for place in extension.requests:
                 with logged(extension.name):
                     self._requests.append(part(place)(service))
+        # Who carries out the requests on a channel, by the channel's suffix.
         self._takers = {channel.suffix: requests for requests in self._requests for channel in requests.channels}
 
     def message(self, channel: Channel, payload: bytes) -> None:
         """Handle a message that is not a flag."""
         if channel is DRIVE:
             self._note_drive(payload)
-        elif channel.kind is not Kind.FLAG and (value := self._decoded(channel, payload)) is not None:
-            self._take(channel, value)
+        elif channel.kind is not Kind.FLAG and channel.suffix in self._takers:
+            value = self._decode(channel, payload)
+            if value is not None:
+                self._take(channel, value)
 
     def flag(self, channel: Channel, payload: bytes) -> None:
         """Handle the value of a flag."""
         if channel is REMOTE_MIRROR:
             self._mirroring.switch(on=bool(payload and self._decode(channel, payload)))
-        else:
-            self._take(channel, bool(payload and self._decoded(channel, payload)))
+        elif channel.suffix in self._takers:
+            self._take(channel, bool(payload and self._decode(channel, payload)))
 
     def repeat(self) -> None:
         """Try again all requests that have failed."""
@@ -64,15 +67,11 @@ class OwnRequests:
             requests.repeat()
 
     def _take(self, channel: Channel, value: Any) -> None:
-        taker = self._takers.get(channel.suffix)
-        if taker is not None:
-            self._service.post_message(channel, partial(taker.take, channel, value), newest_of=channel.metric)
-
-    def _decoded(self, channel: Channel, payload: bytes) -> Any:
-        """Return the value of a message that an extension handles; None if it is malformed, or none does."""
-        return self._decode(channel, payload) if channel.suffix in self._takers else None
+        taker = self._takers[channel.suffix]
+        self._service.post_message(channel, partial(taker.take, channel, value), newest_of=channel.metric)
 
     def _decode(self, channel: Channel, payload: bytes) -> Any:
+        """Return the value of a message; None if it is malformed, which is counted."""
         try:
             return codec.decode(channel, payload)
         except PayloadError as error:

@@ -67,12 +67,16 @@ class Owner:
         """Note the owner's newest state; None: the owner has withdrawn it."""
         earlier, self.state = self.state, state
         if state is None:
-            self.withdrawn_at = now if self.withdrawn_at is None else self.withdrawn_at
+            if self.withdrawn_at is None:
+                self.withdrawn_at = now
             return
         self.withdrawn_at = None
         # A restart proves no reset: the file may be older than the stop.
-        if earlier is not None and earlier.boot == state.boot and not state.latched:
-            self.freed_at = now if earlier.latched or state.count > earlier.count else self.freed_at
+        was_stopped = (
+            earlier is not None and earlier.boot == state.boot and (earlier.latched or state.count > earlier.count)
+        )
+        if was_stopped and not state.latched:
+            self.freed_at = now
         if self.pending is not None and self.confirms(str(self.pending.stop.stop)):
             self.pending = None
 
@@ -84,7 +88,7 @@ class PassedStops:
         self._owners = {owner: Owner() for owner in owners}
         self._clock = clock
         self._lock = threading.Lock()
-        self._passed: dict[str, float] = {}  # by name, when it was passed first; the oldest first
+        self._passed: dict[str, float] = {}  # when a stop was forwarded first, by its name; the oldest stop first
 
     @property
     def pending(self) -> dict[str, Pending]:
@@ -104,7 +108,7 @@ class PassedStops:
             first = self._passed.setdefault(name, now)
             if len(self._passed) > NAMES:
                 del self._passed[next(iter(self._passed))]
-            waiting = {key for key, owner in self._owners.items() if _waits(owner, name)}
+            waiting = {key for key, owner in self._owners.items() if _waits(owner, name)}  # have not confirmed it yet
             reset_since = {key for key, owner in self._owners.items() if owner.freed_at > first} - waiting
             if reset_since:
                 return [_addressed(stop, key) for key in self._owners if key not in reset_since]
@@ -146,5 +150,6 @@ def _addressed(stop: EstopCommand, owner: str) -> bytes:
 
 
 def _encoded(command: EstopCommand, **fields: Any) -> bytes:
+    """Return a stop with these fields as JSON, in which empty texts are left out."""
     sender = {"by": command.by or UNSET, "why": command.why or UNSET}
     return codec.encode(ESTOP, msgspec.structs.replace(command, **(sender | fields)))

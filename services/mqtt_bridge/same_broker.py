@@ -28,7 +28,8 @@ class SameBrokerProbe:
     def __init__(self, config: Config, local: Transport, remote: Transport, clock: Callable[[], float]) -> None:
         section = config.services.mqtt_bridge.remote
         self.topic = BRIDGE_PROBE.topic(config.base)
-        self.possible = config.transport.kind == ("mqtt" if section is None else section.kind)
+        remote_kind = "mqtt" if section is None else section.kind
+        self.possible = config.transport.kind == remote_kind  # the two sides may be one broker
         self.announces = config.transport.mqtt_mirror is not None
         self._local, self._remote, self._clock = local, remote, clock
         self._sent: deque[bytes] = deque(maxlen=_REMEMBERED)
@@ -78,20 +79,18 @@ class SameBrokerProbe:
             self.report_none()
 
     def begin_round(self, remote_topic: str) -> int | None:
-        """Send a probe, wait (bounded) until it would have arrived, and return the round; None without a connection.
-
-        It waits first for the remote side to have the probe, then for the local side to have received what that sent.
-        """
+        """Send a probe, wait (bounded) until it would have arrived, and return the round; None without a connection."""
         self._round += 1
         if not self.send():
             return None
-        barrier(self._remote, remote_topic)
-        barrier(self._local, self.topic)
+        barrier(self._remote, remote_topic)  # until the remote side has the probe,
+        barrier(self._local, self.topic)  # then until the local side has received what that sent
         return self._round if self.both_connected else None
 
     def proves_two_brokers(self, round_: int) -> bool:
         """True if no probe came back in this round, and no newer round has begun."""
-        return round_ == self._round != self._same_in_round and self.both_connected
+        is_newest = round_ == self._round
+        return is_newest and self._same_in_round != round_ and self.both_connected
 
     # -- the transports' threads
 

@@ -7,16 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from pebble.contract import (
-    BRIDGE_PROBE,
-    CONTROL_STATE,
-    CONTROL_VOUCHED,
-    DRIVE,
-    ESTOP,
-    ESTOP_STATE,
-    ONLINE,
-    codec,
-)
+from pebble import contract as c
+from pebble.contract import codec
 from pebble.contract.levels import LEVELS
 from pebble.contract.names import with_name
 from pebble.contract.payloads import ControlState
@@ -27,7 +19,7 @@ from pebble.forwarding.names import Names
 from pebble.forwarding.observer import ROBOT, Observers, Step, steps_of
 from pebble.forwarding.private_topics import PrivateTopics
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
-from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
+from pebble.forwarding.routing import TABLE_A1, Drop, Side
 from pebble.forwarding.service import CHECK_SOON_S, ForwardingService
 from pebble.forwarding.side import Gate
 from pebble.forwarding.subjects import Subject
@@ -55,7 +47,8 @@ _RETRY_S = 1.0
 _IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a program requests of the bridge now
 LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later
 _LOGGED = 200  # characters of a topic
-_CHECK_STOPS_S, _NOTICED_S = 1.0, 1.0
+_CHECK_STOPS_S = 1.0
+_NOTICED_S = 1.0  # by so much later than its limit a silence is noticed
 _ARRIVAL_S = 0.25  # between two looks whether a probe has arrived, for which the mirror waits
 _THIN_GRACE_S = 30.0  # over a thin link, while a client floods it
 ASK_S = 0.2  # between two questions about what is left at the remote broker
@@ -65,7 +58,7 @@ class MqttBridge(ForwardingService):
     """The bridge: it forwards by Table A.1, once it knows that its two sides are not one broker."""
 
     name = "mqtt_bridge"
-    publishes = (ONLINE, BRIDGE_PROBE, CONTROL_VOUCHED)
+    publishes = (c.ONLINE, c.BRIDGE_PROBE, c.CONTROL_VOUCHED)
     client_name = "local-bridge"
     rules = TABLE_A1
     probed_sides = (Side.REMOTE,)
@@ -74,14 +67,14 @@ class MqttBridge(ForwardingService):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         section = self.config.services.mqtt_bridge
-        self._heartbeat = Heartbeat(self.addresses[ONLINE]) if section.heartbeat.enabled else None
+        self._heartbeat = Heartbeat(self.addresses[c.ONLINE]) if section.heartbeat.enabled else None
         self._same_broker = SameBrokerProbe(self.config, self.transport, self.remote, self.clock)
         notifier = Notifier()
         self._owners = MotorOwners(self.config.base, self.config.motor_owners, notifier)
         self._passed_stops = PassedStops(self.config.motor_owners, self.clock)
         self._observers = Observers(self.config, self.clock)
-        decides = min(self.config.motor_owners, default="")
-        self._control_topic = CONTROL_STATE.topic(self.config.base, owner=decides) if decides else ""
+        deciding_owner = min(self.config.motor_owners, default="")
+        self._control_topic = c.CONTROL_STATE.topic(self.config.base, owner=deciding_owner) if deciding_owner else ""
         private = next((extension.private for extension in self.config.installed if extension.private), "")
         self._private = (part(private) if private else PrivateTopics)(self.config.base)
         self.forwarder.stays = self._private.stays
@@ -92,10 +85,10 @@ class MqttBridge(ForwardingService):
             self.config.base, self.subjects, self.remote, *self._uplink.channels, sparing=self._is_thin
         )
         self._leftover_timer: Timer | None = None
-        asks = section.remote is None or section.remote.kind == "mqtt"
-        self._vouching = Vouching(self.remote, self.clock(), None if asks else self._silence_s)
-        self._local_changes = 0  # of the connection
-        self._stop_topic = ESTOP.topic(self.config.base)
+        sends_pings = section.remote is None or section.remote.kind == "mqtt"
+        self._vouching = Vouching(self.remote, self.clock(), None if sends_pings else self._silence_s)
+        self._local_changes = 0  # how often the local connection was made or lost
+        self._stop_topic = c.ESTOP.topic(self.config.base)
         self._stops = self._make_stops()
         self.transport.policy.is_invented = lambda topic: self.subjects.invented(topic.encode()) is not None
         self.remote.policy.skips_retained = partial(self.forwarder.skips_retained, Side.REMOTE)
@@ -105,10 +98,6 @@ class MqttBridge(ForwardingService):
     def winner(self) -> Side:
         """Side whose retained messages count: where names are checked the local one, as flags are the robot's own."""
         return Side.LOCAL if self.config.security.named else Side.REMOTE
-
-    @property
-    def _stop_filters(self) -> list[str]:
-        return [self._stop_topic, *([with_name(self._stop_topic, "+")] if self.config.security.named else [])]
 
     @property
     def _silence_s(self) -> float:
@@ -131,7 +120,7 @@ class MqttBridge(ForwardingService):
 
     def make_remote(self) -> Transport:
         enabled = self.config.services.mqtt_bridge.heartbeat.enabled
-        will = Heartbeat(self.addresses[ONLINE]).will(now_ms()) if enabled else None
+        will = Heartbeat(self.addresses[c.ONLINE]).will(now_ms()) if enabled else None
         return remote_transport(self.config, "remote-bridge", will=will)
 
     def _make_stops(self) -> "StopConnection | None":
@@ -140,7 +129,10 @@ class MqttBridge(ForwardingService):
             return None
         from pebble.services.mqtt_bridge.stop_connection import StopConnection  # only who needs it pays for it
 
-        make = partial(StopConnection, transport, self._stop_filters, self._pass_stop, self._forwards, self.clock)
+        filters = [self._stop_topic]
+        if self.config.security.named:
+            filters.append(with_name(self._stop_topic, "+"))
+        make = partial(StopConnection, transport, filters, self._pass_stop, self._forwards, self.clock)
         if not self._is_thin:
             return make(notices_s=self._silence_s + _NOTICED_S)
         transport.suit_link(thin=True)
@@ -196,10 +188,11 @@ class MqttBridge(ForwardingService):
         if self.forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
             self._look_later()
             return
-        is_waiting = self._leftovers.ask_next()
-        pause = self._uplink.pause(ASK_S)
-        wait, then = (pause, self._look_for_leftovers) if is_waiting else (INITIAL_SYNC_S, self._remove_leftovers)
-        self._leftover_timer = self.call_at(self.clock() + wait, then)
+        has_asked = self._leftovers.ask_next()
+        wait_s, then = INITIAL_SYNC_S, self._remove_leftovers
+        if has_asked:  # more may be left
+            wait_s, then = self._uplink.pause(ASK_S), self._look_for_leftovers
+        self._leftover_timer = self.call_at(self.clock() + wait_s, then)
 
     def _remove_leftovers(self) -> None:
         if self.forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
@@ -220,11 +213,10 @@ class MqttBridge(ForwardingService):
             self.synchronize_later(Side.LOCAL)
         if self.forwarder.gate is not Gate.OPEN:
             self._check_brokers()
-        elif side is Side.REMOTE and epoch == self.epoch:
-            self._same_broker.send()
+            return
+        self._same_broker.send()
+        if side is Side.REMOTE and epoch == self.epoch:
             self.subscribe_remote()
-        else:
-            self._same_broker.send()
 
     def subscribe_remote(self) -> None:
         super().subscribe_remote()
@@ -252,7 +244,7 @@ class MqttBridge(ForwardingService):
             self._open()
         if self.forwarder.gate is Gate.OPEN or not self._same_broker.both_connected:
             return
-        round_ = self._same_broker.begin_round(self.subjects.topics(DRIVE)[0])
+        round_ = self._same_broker.begin_round(self.subjects.topics(c.DRIVE)[0])
         if round_ is not None:
             wait_s = _PROBE_WAIT_S if self.forwarder.gate is Gate.WAITING else _AGAIN_WAIT_S
             self.call_at(self.clock() + wait_s, partial(self._end_round, round_))
@@ -282,9 +274,8 @@ class MqttBridge(ForwardingService):
             "the local and the remote side are one broker, or something else forwards outgoing/# to the local one: "
             "nothing is mirrored"
         )
-        self.forwarder.retained.synchronize(
-            Side.REMOTE
-        )  # retained local flags wait for remote ones, which will not come
+        # The robot's retained flags would wait for those of the remote side, which will not come.
+        self.forwarder.retained.synchronize(Side.REMOTE)
 
     def check_again(self, epoch: int) -> None:  # noqa: ARG002  (a round of probes notices a reconnect)
         self._check_brokers()
@@ -303,9 +294,10 @@ class MqttBridge(ForwardingService):
         passes = self._same_broker.both_connected and (
             gate is Gate.SHUT or (gate is Gate.OPEN and bool(self.subscriptions[Side.REMOTE]))
         )
-        dropped = counters[f"{Side.REMOTE.value}: {Drop.LATE.value}"], self.transport.counters["dropped"]
-        losses = gate, self.epoch, self._local_changes, counters[f"{Side.LOCAL.value}: refused"], *dropped
-        self.publish(CONTROL_VOUCHED, self._vouching.check(passes, losses, self.clock()))
+        late, refused = counters[f"{Side.REMOTE.value}: {Drop.LATE.value}"], counters[f"{Side.LOCAL.value}: refused"]
+        # Any change of these may mean that a message was lost.
+        losses = gate, self.epoch, self._local_changes, refused, late, self.transport.counters["dropped"]
+        self.publish(c.CONTROL_VOUCHED, self._vouching.check(passes, losses, self.clock()))
 
     @every(CHECK_S)
     def _check_owners(self) -> None:
@@ -334,7 +326,7 @@ class MqttBridge(ForwardingService):
         if self._heartbeat is not None and message.topic == self._heartbeat.topic:
             if self._heartbeat.is_ours(message) and self.forwarder.gate is Gate.OPEN:
                 # one broker after all, or another program's heartbeat of the same millisecond
-                self.post_message(BRIDGE_PROBE, self._same_broker.send_again, newest_of="suspect")
+                self.post_message(c.BRIDGE_PROBE, self._same_broker.send_again, newest_of="suspect")
             return
         if message.topic in self._owners.topics:
             self._owners.receive(message.topic)
@@ -349,7 +341,7 @@ class MqttBridge(ForwardingService):
         """Note who has control, and the present key, which decides whether a command has an age."""
         keys = None
         with suppress(PayloadError):
-            state: ControlState = codec.decode(CONTROL_STATE, payload)
+            state: ControlState = codec.decode(c.CONTROL_STATE, payload)
             keys = frozenset([state.key.encode()]) - {b""}
             self._observers.control(state)
         self.forwarder.ages.keys = keys
@@ -358,7 +350,7 @@ class MqttBridge(ForwardingService):
         if self._same_broker.proves_same_broker(message):
             self.shut()
         elif self._same_broker.is_request(message):
-            self.post_message(BRIDGE_PROBE, self._same_broker.answer_request, newest_of="request")
+            self.post_message(c.BRIDGE_PROBE, self._same_broker.answer_request, newest_of="request")
 
     def receive_remote(self, epoch: int, message: Message) -> None:
         topic = message.topic if self.names is None else self.names[message.topic].topic
@@ -380,7 +372,7 @@ class MqttBridge(ForwardingService):
 
     def _follow_owner(self, owner: str, payload: bytes) -> None:
         with suppress(PayloadError):
-            self._passed_stops.follow(owner, codec.decode(ESTOP_STATE, payload) if payload else None)
+            self._passed_stops.follow(owner, codec.decode(c.ESTOP_STATE, payload) if payload else None)
 
     def _has_passed(self, message: Message) -> bool:
         """True if the stops' own connection has passed this stop on already. Otherwise remembers it."""
@@ -395,23 +387,24 @@ class MqttBridge(ForwardingService):
             self._receive_stop(message)
 
     def _react(self, side: Side, message: Message, routed: Routed) -> None:
-        """Handle a message with a request to the bridge itself, whether or not a remote side is connected.
+        """Tell the observers of a message, and handle a request to the bridge itself.
 
-        The bridge does not receive messages that it forwards to the local side, so this is the only occasion.
+        Requests of the robot's programs count even while nothing is forwarded. The bridge does not receive what it
+        forwards to the local side, so requests from the remote side are handled here, too.
         """
         channel = routed.subject.channel if routed.subject is not None else None
-        local = side is Side.LOCAL
-        if not local and isinstance(routed.outcome, Drop):
+        is_local = side is Side.LOCAL
+        if not is_local and isinstance(routed.outcome, Drop):
             self._observers.refused(routed.outcome, channel, routed.by)
         if routed.outcome is Drop.STALE:
             self.refusals.stale("a command" if channel is None else channel.metric)
             return
-        if not isinstance(routed.outcome, Forward) and (routed.outcome in _IGNORED or not local):
+        if isinstance(routed.outcome, Drop) and (routed.outcome in _IGNORED or not is_local):
             return
         if channel is None or codec.is_blank(message.payload):
             return
         if not message.retain and routed.outcome is not Drop.KNOWN:
-            by_robot = local and self.forwarder.gate is Gate.OPEN
+            by_robot = is_local and self.forwarder.gate is Gate.OPEN
             self._observers.passed(channel, ROBOT if by_robot else routed.by, message.payload)
         self._requests.message(channel, message.payload)
 

@@ -11,6 +11,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable
 from enum import Enum
+from typing import NamedTuple
 
 from pebble.contract.codec import MAX_COMMAND_BYTES
 from pebble.services.mqtt_bridge.passed_stops import is_named
@@ -34,6 +35,13 @@ class Way(Enum):
     STOPS = "stops"
 
 
+class _Expected(NamedTuple):
+    """A stop whose copy may come, until a time."""
+
+    key: int  # a hash of its topic and payload
+    until: float
+
+
 class Copies:
     """A memory that recognises the second copy of a stop without a name, which comes both ways; thread-safe.
 
@@ -45,29 +53,28 @@ class Copies:
         """Store the arguments; ``notices_s``: seconds after which a lost connection is noticed."""
         self._clock, self._notices_s = clock, notices_s
         self._lock = threading.Lock()
-        #: By the way on which the copy is to come: hashes, and until when.
-        self._expected = {way: deque[tuple[int, float]](maxlen=_COPIES) for way in Way}
-        self._dropped = deque[tuple[float, Message]](maxlen=_DROPPED)
+        self._expected = {way: deque[_Expected](maxlen=_COPIES) for way in Way}  # by the way on which the copy comes
+        self._dropped = deque[tuple[float, Message]](maxlen=_DROPPED)  # copies on the main connection, and their times
 
-    def is_copy(self, way: Way, message: Message, *, other: bool) -> bool:
+    def is_copy(self, way: Way, message: Message, *, comes_both_ways: bool) -> bool:
         """True if this stop came the other way before; then forget it, else remember it.
 
-        ``other``: the stop can come the other way now.
+        ``comes_both_ways``: the other connection receives stops now.
         """
         key, now, expected = hash((message.topic, message.payload)), self._clock(), self._expected[way]
         with self._lock:
-            while expected and expected[0][1] < now:
+            while expected and expected[0].until < now:
                 expected.popleft()
-            copy = next((entry for entry in expected if entry[0] == key), None)
+            copy = next((entry for entry in expected if entry.key == key), None)
             if copy is not None:
                 expected.remove(copy)
                 if way is Way.MAIN:
                     short = message.payload[:MAX_COMMAND_BYTES]  # a stop as well: it cannot be read
                     self._dropped.append((now, Message(message.topic, short, message.qos)))
                 return True
-            if other and not message.retain:  # one with the retain flag may be an old one, of which there is no copy
+            if comes_both_ways and not message.retain:  # with the flag it may be an old one, of which there is no copy
                 other_way, wait_s = (Way.STOPS, _PROMPT_S) if way is Way.MAIN else (Way.MAIN, _BEHIND_S)
-                self._expected[other_way].append((key, now + wait_s))
+                self._expected[other_way].append(_Expected(key, now + wait_s))
             return False
 
     def forget(self) -> None:
@@ -113,9 +120,10 @@ class StopConnection:
         self._transport, self._filters, self._clock = transport, tuple(filters), clock
         self._pass_on, self._main = pass_on, main
         self._copies = Copies(clock, notices_s)
-        self._failing_since = self._off_until = float("-inf")
+        self._failing_since = float("-inf")  # when stops arrived on it last, or it was not needed
+        self._off_until = float("-inf")  # when it is tried again
         self._connected_at = float("inf")
-        self._kicks = 0
+        self._kicks = 0  # how often in a row the main connection was lost for it
         transport.policy.is_stop = lambda _topic: True  # it is subscribed to nothing else
         self._reported: bool | None = None  # the log says that it is there, or that it is not
         transport.on_state(self._on_state)
@@ -127,7 +135,7 @@ class StopConnection:
 
     def is_copy(self, message: Message) -> bool:
         """True if a stop without a name on the main connection has passed already. Remembers or forgets the stop."""
-        return not is_named(message.payload) and self._copies.is_copy(Way.MAIN, message, other=self.listens)
+        return not is_named(message.payload) and self._copies.is_copy(Way.MAIN, message, comes_both_ways=self.listens)
 
     def check(self) -> None:
         now = self._clock()
@@ -138,7 +146,8 @@ class StopConnection:
         elif self._transport.state is State.CLOSED:
             if now >= self._off_until:
                 self._failing_since = now
-                self._open()
+                self._transport.open(timeout=0.0)
+                self._transport.subscribe_all(dict.fromkeys(self._filters, self._receive), direct=True)
         elif self.listens:
             self._failing_since = now
             self._report(True)
@@ -157,10 +166,6 @@ class StopConnection:
 
     def close(self) -> None:
         self._transport.close()
-
-    def _open(self) -> None:
-        self._transport.open(timeout=0.0)
-        self._transport.subscribe_all(dict.fromkeys(self._filters, self._receive), direct=True)
 
     def _give_up(self, why: str, seconds: float) -> None:
         self._off_until = self._clock() + seconds
@@ -181,7 +186,7 @@ class StopConnection:
     def _receive(self, message: Message) -> None:
         if message.retain:  # an old one: live ones have no such mark on this connection
             return
-        if is_named(message.payload) or not self._copies.is_copy(Way.STOPS, message, other=self._main()):
+        if is_named(message.payload) or not self._copies.is_copy(Way.STOPS, message, comes_both_ways=self._main()):
             self._pass_on(message)
 
     def _on_state(self, state: State) -> None:

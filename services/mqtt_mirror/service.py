@@ -52,9 +52,9 @@ class MqttMirror(ForwardingService):
             self._watched |= {self.addresses[ONLINE].topic}
         self._fresh_s = _FRESH * silent_after(bridge.heartbeat.interval_seconds, bridge.link.slowest)
         self._probes = Probes()
-        self._announced = False  # the bridge has sent a probe since the newest check began
-        self._under_way = False  # the bridge has not announced yet that no probe is under way
-        self._slowest_s = bridge.remote_mqtt.silence_seconds if bridge.remote is None else 0.0
+        self._announced = False  # the bridge has announced a probe since the newest check began
+        self._under_way = False  # a probe of the bridge may be under way
+        self._slowest_s = bridge.remote_mqtt.silence_seconds if bridge.remote is None else 0.0  # a probe takes at most
         self._requested_at = float("-inf")
         self._is_operators = False  # by the newest check the broker is the operators', not one of the robot's
         self._refused = ""  # why nothing is mirrored, as logged
@@ -159,9 +159,10 @@ class MqttMirror(ForwardingService):
             self.forwarder.receive(Side.LOCAL, message)
         elif message.topic == self._probe_topic:
             self._under_way = message.payload != NO_PROBE
-            self._announced |= self._under_way
-            if self._under_way and self._probes.announce(message.payload):
-                self.shut()
+            if self._under_way:
+                self._announced = True
+                if self._probes.announce(message.payload):
+                    self.shut()
         # else a heartbeat: only the bridge publishes it; one from the broker is a reason to request a probe
 
     def receive_remote(self, epoch: int, message: Message) -> None:

@@ -28,7 +28,6 @@ class MemoryHub:
         self.era: int | None = 1  # counts its runs; None while it is stopped
         self._eras = itertools.count(2)
         self._clients: list[MemoryTransport] = []  # all that are open, connected or not
-        self._connected_clients: list[MemoryTransport] = []
 
     def __reduce__(self) -> tuple[type[MemoryHub], tuple[()]]:
         return MemoryHub, ()  # in another process it is another hub
@@ -59,17 +58,8 @@ class MemoryHub:
         with self.lock:
             self._clients.append(client)
 
-    def attach(self, client: MemoryTransport) -> None:
-        with self.lock:
-            self._connected_clients.append(client)
-
-    def detach(self, client: MemoryTransport) -> None:
-        with self.lock:
-            self._connected_clients = [other for other in self._connected_clients if other is not client]
-
     def leave(self, client: MemoryTransport) -> None:
         with self.lock:
-            self.detach(client)
             self._clients = [other for other in self._clients if other is not client]
 
     def distribute(self, message: Message, publisher: MemoryTransport) -> None:
@@ -80,8 +70,9 @@ class MemoryHub:
             elif message.retain:
                 self.retained.pop(message.topic, None)
             live = replace(message, retain=False, retain_requested=message.retain, waiting_since=self.now())
-            for client in self._connected_clients:
-                client.receive(_Delivery(live, publisher))
+            for client in self._clients:
+                if client._present:
+                    client.receive(_Delivery(live, publisher))
 
     def now(self) -> float | None:
         """Return the time at which messages are delivered; None in a simulated time."""
@@ -164,6 +155,7 @@ class MemoryTransport(Transport):
 
     @property
     def _present(self) -> bool:
+        """True if this client is connected to the hub, which has not stopped since."""
         return self._attached is not None and self._attached == self._hub.era
 
     def _send_retained(self, subscription: Subscription) -> None:
@@ -186,13 +178,13 @@ class MemoryTransport(Transport):
     def _work(self) -> None:
         """React to the hub's start or stop, or deliver the message that has waited longest."""
         with self._hub.lock:
-            changed = self._attached != self._hub.era
-            delivery = self._inbox.popleft() if self._inbox and not changed else None
+            hub_changed = self._attached != self._hub.era
+            delivery = self._inbox.popleft() if self._inbox and not hub_changed else None
         if delivery is not None:
             self._deliver(delivery)
-        elif changed and self._attached is not None:
+        elif hub_changed and self._attached is not None:
             self._on_hub_stopped()
-        elif changed:
+        elif hub_changed:
             self._connect()
 
     def _deliver(self, delivery: _Delivery) -> None:
@@ -206,7 +198,6 @@ class MemoryTransport(Transport):
     def _on_hub_stopped(self) -> None:
         with self._hub.lock:
             self._attached = None
-            self._hub.detach(self)
             self._inbox.clear()
         self.problem = "the hub is away"
         self._set_state(State.CONNECTING)
@@ -217,7 +208,6 @@ class MemoryTransport(Transport):
             if self._stopping or self._hub.era is None:
                 return
             self._attached = self._hub.era
-            self._hub.attach(self)
             retained_topics = set(self._hub.retained)
             for subscription in self._subscriptions:
                 self._send_retained(subscription)

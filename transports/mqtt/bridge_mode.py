@@ -31,7 +31,7 @@ class BridgeMode:
         self._lacking = False  # a broker at this address had no bridge mode: one hang-up is enough from then on
 
     def note(self, result: Result) -> None:
-        """Note that the next attempt has ended with ``result``."""
+        """Note that the attempt which ``next_attempt`` named has ended with ``result``, and choose the next one."""
         attempt, self.next_attempt = self.next_attempt, Attempt.BRIDGE
         if attempt is Attempt.PROBE:
             self._probed = result is Result.ACCEPTED

@@ -29,6 +29,7 @@ class Limits(Struct, frozen=True):
         return self.fit(will) if will is not None and self.will else None
 
     def both(self, other: Limits) -> Limits:
+        """Return the functions that both of these limits allow."""
         return Limits(self.retain and other.retain, min(self.qos, other.qos), self.will and other.will)
 
     @property
@@ -48,7 +49,7 @@ class Limits(Struct, frozen=True):
 
 
 EVERYTHING: Final = Limits()
-#: What a CONNECT is tried with on which the broker hangs up, in this order.
+#: With these a CONNECT is tried, one after the other, while the broker hangs up.
 _STEPS: Final = (EVERYTHING, Limits(qos=0), Limits(retain=False), Limits(retain=False, qos=0), Limits(will=False))
 
 
@@ -57,7 +58,7 @@ class Asking(Enum):
 
     NOTHING = "none"
     WITHOUT_WILL = "a CONNECT without a will"
-    AGAIN = "a CONNECT with a will, as the limits have it: it takes one without, or has said what it lacks"
+    AGAIN = "a CONNECT with a will, as the limits have it: the broker takes one without, or has said what it lacks"
 
 
 class BrokerLimits:
@@ -95,13 +96,13 @@ class BrokerLimits:
     def note_connect(self, result: Result, now: float) -> None:
         """Note how a CONNECT with a will, as `limits` have it, has ended. The first line that fits counts.
 
-        | result                               | it was asked | then                                           |
-        |--------------------------------------|--------------|------------------------------------------------|
-        | retained messages or QoS 1 refused   | any          | again, without                                 |
-        | hung up                              | not again    | without a will                                 |
-        | hung up                              | again        | again with less, as long as there is less      |
-        | accepted                             | any          | so it is used                                  |
-        | any other                            | again        | with everything: the will was not the reason   |
+        | result                             | tried | the next CONNECT is                                |
+        |------------------------------------|-------|----------------------------------------------------|
+        | retained messages or QoS 1 refused | any   | at once, without these                             |
+        | hung up                            | first | at once, without a will (a probe)                  |
+        | hung up                            | again | at once, with less, as long as there is less       |
+        | accepted                           | any   | the same                                           |
+        | any other                          | again | with everything: the limits were not the reason    |
         """
         again, self._asking = self._asking is Asking.AGAIN, Asking.NOTHING
         if result is Result.RETAIN_REFUSED and self.limits.retain:

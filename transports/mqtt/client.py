@@ -1,29 +1,27 @@
 """A client of an MQTT broker for one connection: its socket, the bytes that wait to be written, and message ids.
 
 It has neither a lock nor a thread: the connection has both. One `recv` takes everything that has come, and one `send`
-writes a message, or all acknowledgements of what was read. A general client library needs several calls for each, and
-makes objects that are not used here.
+writes a message, or all acknowledgements of what was read.
 """
 
 import socket
 import ssl
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import closing, suppress
 from typing import NamedTuple
 
 from pebble.transports.base import Message
 from pebble.transports.hosts import CONNECT_TIMEOUT_S, HANDSHAKE_S, Address, dial
 from pebble.transports.mqtt import packets
-from pebble.transports.mqtt.packets import Filter, Listener, Reader
+from pebble.transports.mqtt.packets import MOST_IDS, Filter, Listener, Reader, SendQuota
 from pebble.transports.mqtt.poll import SocketPoll
 from pebble.transports.settings import MqttSettings
 
 SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
 _PIECE = 64 * 1024  # bytes that are read at once
 _ENDING_S = 0.2  # after DISCONNECT
-_MOST_IDS = 65_535  # MQTT's packet identifiers have 16 bits
 _NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", None)
 _NOT_NOW = (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
 
@@ -51,7 +49,7 @@ class TlsLateError(TimeoutError):
 def begin_tls(plain: socket.socket, opening: Opening) -> ssl.SSLSocket:
     """Return a non-blocking socket with TLS, which closes ``plain``; so does a failed handshake. Raises OSError."""
     assert opening.context is not None  # noqa: S101 - else there is no TLS
-    name = opening.settings.host.partition("%")[0]  # certificates have addresses without a network card
+    name = opening.settings.host.partition("%")[0]  # without the network card of an address: fe80::1%eth0
     sock = opening.context.wrap_socket(plain, server_hostname=name, do_handshake_on_connect=False)
     try:
         sock.setblocking(False)
@@ -78,32 +76,6 @@ def _shake_hands(sock: ssl.SSLSocket, patience_s: float) -> None:
                 return
 
 
-class SendQuota:
-    """A limit on unacknowledged messages of QoS 1 (the broker's Receive Maximum). Messages beyond it wait here."""
-
-    def __init__(self, send: Callable[[bytes], None]) -> None:
-        self._send = send
-        self._left = self._most = _MOST_IDS
-        self._held: deque[bytes] = deque()
-
-    def begin(self, most: int) -> None:
-        self._left = self._most = most
-
-    def takes(self, packet: bytes) -> bool:
-        """Return True if ``packet`` may be sent now, and count it; else keep it, to send it later."""
-        if self._left <= 0:
-            self._held.append(packet)
-            return False
-        self._left -= 1
-        return True
-
-    def acknowledged(self) -> None:
-        if self._held:
-            self._send(self._held.popleft())
-        else:
-            self._left = min(self._left + 1, self._most)
-
-
 def keep_unsent(sock: socket.socket, size: int) -> None:
     """Let the kernel accept only about ``size`` bytes beyond those on their way, if supported; 0: its default."""
     if _NOTSENT_LOWAT is not None:
@@ -113,11 +85,11 @@ def keep_unsent(sock: socket.socket, size: int) -> None:
 
 def _mark(sock: socket.socket, dscp: int) -> None:
     """Mark our packets for routers that forward marked packets first, if the system permits it."""
-    v6 = sock.family == socket.AF_INET6
+    level, option = socket.IPPROTO_IP, socket.IP_TOS
+    if sock.family == socket.AF_INET6:
+        level, option = socket.IPPROTO_IPV6, socket.IPV6_TCLASS
     with suppress(OSError):
-        sock.setsockopt(
-            socket.IPPROTO_IPV6 if v6 else socket.IPPROTO_IP, socket.IPV6_TCLASS if v6 else socket.IP_TOS, dscp << 2
-        )
+        sock.setsockopt(level, option, dscp << 2)
 
 
 class Client:
@@ -223,7 +195,7 @@ class Client:
         """Send a PUBLISH; return its message id, 0 with QoS 0."""
         mid = 0
         if qos:
-            mid = self._mid = self._mid % _MOST_IDS + 1
+            mid = self._mid = self._mid % MOST_IDS + 1
         packet = packets.publish(topic, payload, qos, mid, retain=retain, modern=self._modern, expires_s=expires_s)
         if not qos or self._quota.takes(packet):
             self._send(packet)
@@ -256,13 +228,13 @@ class Client:
             with suppress(OSError, ValueError):  # it sends nothing more; it has ended
                 self.socket.shutdown(socket.SHUT_WR)
                 self.socket.settimeout(_ENDING_S)
-                end = time.monotonic() + _ENDING_S  # a broker that goes on sending is not waited for
+                end = time.monotonic() + _ENDING_S  # also for a broker that goes on sending
                 while self.socket.recv(_PIECE) and time.monotonic() < end:
                     pass
         self.close()
 
     def _next_id(self) -> int:
-        self._mid = self._mid % _MOST_IDS + 1
+        self._mid = self._mid % MOST_IDS + 1
         return self._mid
 
     def _send(self, data: bytes) -> None:

@@ -9,9 +9,9 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from pebble.transports import clock, hosts
 from pebble.transports.base import Answer, Message, Outgoing, QoS
@@ -20,7 +20,7 @@ from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, Limits
 from pebble.transports.mqtt.client import Client, Opening, TlsLateError, keep_unsent
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
-from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Sink
+from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Owner
 from pebble.transports.mqtt.outgoing import (
     Backlog,
     InFlightTable,
@@ -45,13 +45,6 @@ _BY_SYSTEM = 0  # as the system has it
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
 _ONCE = 2  # of TCP_QUICKACK: what is due now; the next one again waits a moment for MQTT's own, to go along with it
 _ABORT = struct.pack("ii", 1, 0)  # SO_LINGER that makes close() drop what was not sent
-
-
-class Owner(Sink, Protocol):
-    """The transport that owns a connection."""
-
-    def note_answers(self, refused: Mapping[str, bool]) -> None:
-        """Note for each filter whether the broker refuses it (T21). Called on the network thread."""
 
 
 def ignore(_messages: list[Message]) -> None:
@@ -82,9 +75,9 @@ class Connection:
         self._owner, self._settings, self._counters = owner, opening.settings, counters
         self._lock = threading.RLock()
         self._backlog = Backlog()
-        self._in_flight = InFlightTable()
+        self.in_flight = InFlightTable()
         self.incoming = Incoming(
-            opening.settings, owner, counters, self._in_flight, where=where, as_published=as_published
+            opening.settings, owner, counters, self.in_flight, where=where, as_published=as_published
         )
         self.pings = self.incoming.pings
         self._poll = SocketPoll()
@@ -118,7 +111,7 @@ class Connection:
         except Refused:
             raise
         except Lost as lost:
-            if self._client.socket is None:
+            if self._client.socket is None:  # the broker closed it
                 raise Refused(f"{self.where} hung up on our CONNECT", Result.HUNG_UP) from None
             raise lost from None
         self.max_packet = accepted.max_packet
@@ -136,7 +129,7 @@ class Connection:
                     sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _ABORT)
                 sock.close()
             self._poll.close()
-            self._in_flight.end()
+            self.in_flight.end()
 
     def disconnect(self) -> None:
         """Send DISCONNECT, which makes the broker discard our will."""
@@ -194,17 +187,19 @@ class Connection:
         incoming.age.delay.delivered()
         if incoming.age.has_retained:
             incoming.age.note_handled()
-        if self._in_flight.answered:
-            self._in_flight.complete()
+        if self.in_flight.answered:
+            self.in_flight.complete()
 
     def _wait(self, timeout: float) -> tuple[bool, float]:
         """Return whether the socket is readable, and the time when this was known.
 
         Bytes that are already in the socket have come at an unknown time, unless it was empty just before. So it is
-        first polled without a wait, unless that was done a moment ago.
+        first polled without a wait, unless it was found empty a moment ago. Each time when it is empty is noted.
         """
         if not self._poll.registered:
-            self._register()
+            with self._lock:
+                if self._client.socket is not None:
+                    self._poll.register(self._client.socket)
         if self._client.socket is None:
             raise self.incoming.lost
         blocked, waiting = bool(self._client.waiting), self.incoming.age.waiting
@@ -221,17 +216,11 @@ class Connection:
             ready = self._poll.wait(max(wait, 0.0), write=blocked)
             now = clock.since_boot()
             if now - began <= wait + OVERSLEPT_S:
-                waiting.empty(now)  # until just now
+                waiting.empty(now)  # what is there has come just now: this process did not sleep
         readable, writable, _woken = ready
         if writable:
             self.incoming.answered_at = now  # the other side's TCP accepted some bytes: slow, but alive
         return readable, now
-
-    def _register(self) -> None:
-        with self._lock:
-            if self._client.socket is None:
-                raise self.incoming.lost
-            self._poll.register(self._client.socket)
 
     def _write(self) -> None:
         self._client.write()
@@ -266,12 +255,12 @@ class Connection:
             client, limits = self._client, self.limits
             if client.socket is None:
                 return False
-            if message.qos is QoS.DELIVERED and self._in_flight.unacked >= UNACKED_LIMIT and self._is_full(message):
+            if message.qos is QoS.DELIVERED and self.in_flight.unacked >= UNACKED_LIMIT and self._is_full(message):
                 return False
             if not limits.qos and client.unwritten > _UNWRITTEN and not self._owner.policy.is_stop(message.topic):
                 return False
             if message.retain and limits.retain:
-                self._in_flight.accept(message)
+                self.in_flight.accept(message)
             if message.qos is QoS.LATEST and client.waiting:
                 self._counters.add("dropped", self._backlog.put(message))
             else:
@@ -290,7 +279,8 @@ class Connection:
         return _OVERHEAD + len(message.topic.encode()) + len(message.payload) <= self.max_packet
 
     def _is_full(self, message: Message) -> bool:
-        beyond = self._in_flight.unacked - UNACKED_LIMIT
+        """True if no message beyond the limit may be sent, or only stops may, and this is none."""
+        beyond = self.in_flight.unacked - UNACKED_LIMIT
         return beyond >= UNACKED_RESERVE or not self._owner.policy.is_stop(message.topic)
 
     def _write_publish(self, message: Message, expires_s: int | None) -> None:
@@ -299,7 +289,7 @@ class Connection:
         mid = self._client.publish(
             message.topic, message.payload, int(message.qos), retain=message.retain, expires_s=expires_s
         )
-        self._in_flight.sent(message, mid, clock.since_boot())
+        self.in_flight.sent(message, mid, clock.since_boot())
 
     def subscribe(self, filters: Iterable[tuple[str, bool]], qos: QoS = QoS.DELIVERED) -> PendingAck:
         """Subscribe to filters, each with its noLocal option (MQTT 5 only)."""
@@ -313,13 +303,13 @@ class Connection:
         return self._request(self._client.unsubscribe, filters, [])
 
     def _request(self, send: Callable[[Sequence[T]], int], filters: Sequence[T], asked: Sequence[str]) -> PendingAck:
-        """Send a few filters in each packet; return the pending answer to the last packet, which comes last."""
+        """Send a few filters in each packet; return the pending answer to the last. ``asked``: texts of a SUBSCRIBE."""
         ack = PendingAck()
         with self._lock:
             for at in range(0, len(filters), FILTERS):
                 if self._client.socket is not None:
                     ack = PendingAck()
-                    self._in_flight.ask(send(filters[at : at + FILTERS]), ack, asked[at : at + FILTERS])
+                    self.in_flight.ask(send(filters[at : at + FILTERS]), ack, asked[at : at + FILTERS])
             if not filters or self._client.socket is None:
                 ack.complete()
         self.wake()
@@ -339,17 +329,13 @@ class Connection:
 
     @property
     def has_room(self) -> bool:
-        return self._in_flight.unacked < UNACKED_LIMIT // 2
+        return self.in_flight.unacked < UNACKED_LIMIT // 2
 
     @property
     def drained(self) -> bool:
         """True if all accepted messages are written, and acknowledged if they have QoS 1."""
         with self._lock:
-            return not (self._in_flight.unacked or self._backlog.waiting or self._client.waiting)
-
-    @property
-    def unacked(self) -> int:
-        return self._in_flight.unacked
+            return not (self.in_flight.unacked or self._backlog.waiting or self._client.waiting)
 
     @property
     def outgoing(self) -> Outgoing:
@@ -358,9 +344,10 @@ class Connection:
             if sock is None:
                 return Outgoing()
             waiting = self._backlog.size + self._client.unwritten + unconfirmed_bytes(sock)
-            round_trip_s, since = shortest_round_trip_s(sock), self._in_flight.waiting_since
-            # TCP may end before the broker; and brokers without TCP_NODELAY send an answer after that to the one before
-            usual_s = 2 * max(round_trip_s, self._in_flight.round_trip_s)
+            round_trip_s, since = shortest_round_trip_s(sock), self.in_flight.waiting_since
+            # Of two round trips: TCP's may end at a proxy; and a broker without TCP_NODELAY holds an answer back until
+            # the one before it is acknowledged.
+            usual_s = 2 * max(round_trip_s, self.in_flight.round_trip_s)
             stalled_s = 0.0 if since is None else max(0.0, clock.since_boot() - since - usual_s)
             return Outgoing(waiting, round_trip_s, stalled_s)
 
@@ -370,7 +357,7 @@ class Connection:
             sock = self._client.socket
             if sock is None:
                 return None
-            number, seconds = self._in_flight.newest_answer(clock.since_boot())
+            number, seconds = self.in_flight.newest_answer(clock.since_boot())
             shortest, present = shortest_round_trip_s(sock), present_round_trip_s(sock)
             queue_s = max(0.0, present - shortest) if shortest else None
             delivered_s, late_s = self.incoming.age.delay.delivery(clock.since_boot())
@@ -379,12 +366,7 @@ class Connection:
     def unconfirmed_retained(self) -> list[Message]:
         """Return the retained messages that the broker may not have received, oldest first."""
         with self._lock:
-            return self._in_flight.unconfirmed_retained()
-
-    @property
-    def lost_bytes(self) -> int:
-        """Bytes of the largest message after which the broker was silent until the connection ended."""
-        return self._in_flight.lost_bytes
+            return self.in_flight.unconfirmed_retained()
 
     def written_before_loss(self) -> dict[str, int] | None:
         """Return the bytes by topic that may be why the broker closed the connection; None for another reason."""
@@ -392,4 +374,4 @@ class Connection:
             incoming = self.incoming
             if not (incoming.may_concern_message or (self._client.hung_up and not incoming.reason)):
                 return None
-            return self._in_flight.first_written(clock.since_boot())
+            return self.in_flight.first_written(clock.since_boot())

@@ -12,8 +12,9 @@ from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits
 from pebble.transports.mqtt.client import Client, Opening
-from pebble.transports.mqtt.connection import Connection, Owner
+from pebble.transports.mqtt.connection import Connection
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
+from pebble.transports.mqtt.incoming import Owner
 from pebble.transports.settings import MqttSettings
 
 _ENDING_S = 1.0  # so long a broker that ends may still accept connections, and hang up on them
@@ -27,7 +28,7 @@ class Dialler:
     """A maker of connections. It remembers how attempts at a broker have ended, and chooses the next way by that."""
 
     def __init__(
-        self, client_id: str, settings: MqttSettings, will: Message | None, client_class: type[Client] = Client
+        self, client_id: str, settings: MqttSettings, will: Message | None, client_class: type[Client]
     ) -> None:
         # The same at each reconnect: the broker then closes our own half-dead connection at once.
         self._client_id = client_ids.unique(client_id) if settings.client_id is None else settings.client_id
@@ -60,11 +61,6 @@ class Dialler:
         self._address = address
         self.limits.begin(time.monotonic())
 
-    @property
-    def where(self) -> str:
-        """The broker in words, with the address if its host has several."""
-        return self.addresses.where
-
     def connect(self, owner: Owner, counters: Counters, stopping: threading.Event) -> Connection:
         """Return a connection that the broker has accepted. Raises Lost."""
         if self.limits.wants_probe or (self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PROBE):
@@ -73,7 +69,8 @@ class Dialler:
         as_published = self._settings.as_published and not plain
         connection = self._make(self.limits.limits.fit_will(self._will), owner, counters, as_published=as_published)
         try:
-            self.stalled |= connection.connect(stopping) > _HESITATION_S
+            if connection.connect(stopping) > _HESITATION_S:
+                self.stalled = True
         except Lost as lost:
             self._note_result(lost.result if isinstance(lost, Refused) else Result.FAILED)
             raise
@@ -95,7 +92,7 @@ class Dialler:
             ),
             counters,
             owner,
-            where=self.where,
+            where=self.addresses.where,
             as_published=as_published,
             limits=self.limits.limits,
             client_class=self._client_class,
@@ -124,6 +121,7 @@ class Dialler:
 
     @property
     def _is_last_attempt(self) -> bool:
+        """True unless another attempt has to show whether the broker has bridge mode."""
         return not self._asks_for_bridge_mode or self._bridge_mode.next_attempt is Attempt.BRIDGE
 
     def _note_result(self, result: Result) -> None:
@@ -154,12 +152,13 @@ class Dialler:
         if attempt is None or not isinstance(lost, Silent):
             return isinstance(lost, TlsLate)
         answered_s = attempt.incoming.answered_s
-        return attempt.lost_bytes > _LARGE or (answered_s is not None and answered_s < _SOON_S)
+        return attempt.in_flight.lost_bytes > _LARGE or (answered_s is not None and answered_s < _SOON_S)
 
     def note_end(self, lost: Lost) -> bool:
         """Note how a connection, or an attempt, has ended; return True if segments are small from now on."""
         silent, late = isinstance(lost, Silent), isinstance(lost, TlsLate)
-        self.stalled |= silent
+        if silent:
+            self.stalled = True
         if late:
             self.addresses.was_slow()
         if self.loses_large or not (silent or late):
@@ -189,7 +188,7 @@ class Dialler:
         """
         addresses, asks_again = self.addresses, self.limits.asks_again
         if self._is_last_attempt and not asks_again:
-            failed = addresses.failed(problem.removeprefix(f"{self.where} "), held_s)
+            failed = addresses.failed(problem.removeprefix(f"{self.addresses.where} "), held_s)
             if addresses.several:
                 problem = f"broker {addresses.host_port}: {failed}"
         if asks_again and held_s <= 0:

@@ -6,7 +6,7 @@ them; the messages that it matches in excess are sorted out by exact matching on
 """
 
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from hashlib import blake2b
 
 from pebble.transports.base import Message
@@ -69,21 +69,17 @@ class BrokerFilters:
             if not overlapping:
                 break
             for existing in overlapping:
-                wanted = cover(wanted, existing)
+                wanted = cover(wanted, existing)  # wider: it may overlap more of them
                 merged.add(existing)
         self._subscribed = [*(existing for existing in self._subscribed if existing not in merged), wanted]
         return wanted, sorted(merged - {wanted})
 
-    def prune(self, unwanted: str, wanted: Iterable[str]) -> list[str]:
-        """Remove and return the subscribed filters that overlap ``unwanted`` but none of ``wanted``.
-
-        ``unwanted`` is a filter that is no longer needed.
-        """
-        needs = list(wanted)
+    def prune(self, unwanted: str, wanted: Sequence[str]) -> list[str]:
+        """Remove and return the subscribed filters that overlap ``unwanted`` and none that is still ``wanted``."""
         idle = [
             existing
             for existing in self._subscribed
-            if overlap(existing, unwanted) and not any(overlap(existing, need) for need in needs)
+            if overlap(existing, unwanted) and not any(overlap(existing, filter_) for filter_ in wanted)
         ]
         self._subscribed = [existing for existing in self._subscribed if existing not in idle]
         return idle
@@ -96,8 +92,8 @@ class OwnMessageFilter:
     """
 
     def __init__(self) -> None:
-        # Digests by topic: of our newest payload, until another client publishes another one,
-        self._own = BoundedTable[bytes](_LIMIT, _BYTES, len)
+        # Digests by topic:
+        self._own = BoundedTable[bytes](_LIMIT, _BYTES, len)  # of our newest payload, until another client publishes,
         self._seen = BoundedTable[bytes](_LIMIT, _BYTES, len)  # and of the newest payload received
         self._repeats: set[str] = set()  # topics whose retained message will come a second time
 
@@ -112,8 +108,10 @@ class OwnMessageFilter:
 
     def subscribe_again(self, filter_: str) -> None:
         """Expect the retained messages that ``filter_`` matches to be sent once more."""
-        topics = list(self._seen) if is_pattern(filter_) else [filter_] if self._seen.has(filter_) else []
-        self._repeats.update(topic for topic in topics if overlap(topic, filter_))
+        if is_pattern(filter_):
+            self._repeats.update(topic for topic in list(self._seen) if overlap(topic, filter_))
+        elif self._seen.has(filter_):
+            self._repeats.add(filter_)
 
     def is_echo(self, message: Message) -> bool:
         """True if this is our own retained message, sent back to us; else forget ours, which is outdated."""

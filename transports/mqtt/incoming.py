@@ -1,6 +1,7 @@
 """Reads packets from a broker on one MQTT connection, in batches, and makes messages with an age of them."""
 
 import logging
+from collections.abc import Mapping
 from typing import Protocol
 
 from pebble.transports import clock
@@ -26,13 +27,16 @@ _SHOWN = 3  # filters
 _LACKS = {reasons.NO_RETAIN: Result.RETAIN_REFUSED, reasons.NO_QOS: Result.QOS_REFUSED}
 
 
-class Sink(Protocol):
-    """The receiver of packets, called on the network thread with the connection's lock: it must not wait or publish."""
+class Owner(Protocol):
+    """The transport that owns a connection, called on the network thread."""
 
-    policy: TopicPolicy
+    policy: TopicPolicy  # asked with the connection's lock held
 
     def note_refusal(self, topic: str, why: str) -> None:
-        """Note that the broker does not accept messages of this topic (MQTT 5)."""
+        """Note that the broker does not accept messages of this topic (MQTT 5). Must neither wait nor publish."""
+
+    def note_answers(self, refused: Mapping[str, bool]) -> None:
+        """Note for each filter whether the broker refuses it (T21)."""
 
 
 class Incoming:
@@ -41,7 +45,7 @@ class Incoming:
     def __init__(
         self,
         settings: MqttSettings,
-        sink: Sink,
+        owner: Owner,
         counters: Counters,
         in_flight: InFlightTable,
         *,
@@ -55,9 +59,9 @@ class Incoming:
         self._accepted_at = 0.0
         self.where, self._settings = where, settings
         self._refusal: Refused | None = None
-        self.reason = ""  # of its DISCONNECT
-        self.may_concern_message = False  # the reason
-        self._taken_over = True  # possibly: MQTT 3.1.1 has no words for it
+        self.reason = ""  # why the broker closed the connection, as its DISCONNECT says
+        self.may_concern_message = False  # the reason may be a message of ours
+        self._taken_over = True  # another client may have taken our id: True also where MQTT 3.1.1 cannot tell
         self.messages: list[Message] = []  # read, and not delivered yet
         self.answers: dict[str, bool] = {}  # new answers: filters, each refused or not
         self.more = False  # a batch ended before the socket was empty
@@ -65,7 +69,7 @@ class Incoming:
         self.age = ReadAge(self.answered_at)
         self.pings = Pings(settings, in_flight, self.age)
         self._packets = 0  # received so far
-        self._sink, self._counters, self._in_flight = sink, counters, in_flight
+        self._owner, self._counters, self._in_flight = owner, counters, in_flight
 
     # -- called by the connection
 
@@ -85,15 +89,15 @@ class Incoming:
         """
         age, began_with, size = self.age, self._packets, 0
         while (packets_left := began_with + _BATCH - self._packets) > 0:
-            before = self._packets
+            packets_before = self._packets
             size += self._read_piece(client, now, packets_left)
-            if not self.more or self._packets == before:
+            if not self.more or self._packets == packets_before:
                 break
             now = clock.since_boot()
         if size and self.pings.is_thin:  # any sign of life counts: answers wait behind messages of others
             self.answered_at = clock.since_boot()
-        is_piece = size > 0 and self._packets == began_with  # of a long message
-        if age.has_retained or is_piece:
+        is_part = size > 0 and self._packets == began_with  # of a message that is longer than what was read
+        if age.has_retained or is_part:
             age.note_arriving()
         if not self.more:
             age.waiting.empty(age.received_at)
@@ -103,7 +107,9 @@ class Incoming:
 
         Afterwards `more` is True if there may be more packets. Raises Lost.
         """
-        unread = self._left or self._receive(client, now)
+        unread = self._left
+        if not unread:
+            unread = self._receive(client, now)
         self.age.update(now, client.socket)
         try:
             self._left = bytes_left = client.read(most)
@@ -136,9 +142,10 @@ class Incoming:
     @property
     def lost(self) -> Lost:
         """Error for a connection that the other side has closed, with the reason."""
-        why, id_ = self.reason or f"{self.where} closed the connection", self._settings.client_id
-        if id_ is not None and self.accepted is not None and self._taken_over:
-            why += f' (does another client use the client id "{id_}"? a broker lets in only the newest)'
+        why = self.reason or f"{self.where} closed the connection"
+        client_id = self._settings.client_id
+        if client_id is not None and self.accepted is not None and self._taken_over:
+            why += f' (does another client use the client id "{client_id}"? a broker lets in only the newest)'
         if filters := self._in_flight.asked:
             more = f" and {len(filters) - _SHOWN} more" if len(filters) > _SHOWN else ""
             why += f", asked to deliver {', '.join(filters[:_SHOWN])}{more}"
@@ -192,7 +199,7 @@ class Incoming:
         now = clock.since_boot()
         if code >= reasons.FAILURE and (topic := self._in_flight.topic_of(mid)) is not None:
             self._counters.add("publications_refused")
-            self._sink.note_refusal(topic, reasons.words(code))
+            self._owner.note_refusal(topic, reasons.words(code))
         sent_at = self._in_flight.acknowledge(mid, now)
         if sent_at is not None:
             self._packets += 1
@@ -213,7 +220,9 @@ class Incoming:
         except UnicodeDecodeError:
             self._counters.add("malformed")
             return
-        retain_requested = retain if self.as_published else (True if retain else None)
+        retain_requested: bool | None = retain
+        if not retain and not self.as_published:
+            retain_requested = None  # the broker hides it
         qos = QoS.DELIVERED if first & ANY_QOS else QoS.LATEST
         self.messages.append(Message(text, payload, qos, retain, retain_requested, age.since))
 
@@ -221,7 +230,7 @@ class Incoming:
         if self.messages:
             return False  # what came before may change the answer
         try:
-            skipped = self._sink.policy.skips_retained(topic)
+            skipped = self._owner.policy.skips_retained(topic)
         except Exception:  # foreign code on our thread
             log.exception("asking whether to skip a retained message of %r failed", topic)
             return False

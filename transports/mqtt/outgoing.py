@@ -11,6 +11,7 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
+from typing import NamedTuple
 
 from msgspec import Struct
 
@@ -120,8 +121,16 @@ class _Unconfirmed(Struct):
     """A retained message that the broker may not have, until a PUBACK or the answer to a later ping confirms it."""
 
     message: Message
-    mid: int | None = None
-    ping: int | None = None
+    mid: int | None = None  # of a DELIVERED message, once it is written
+    ping: int | None = None  # the number of the next ping after a LATEST message was written
+
+
+class _Ping(NamedTuple):
+    """A ping that is not answered yet."""
+
+    sent_at: float
+    ack: PendingAck | None  # waits for the answer
+    written: dict[str, tuple[float, int]]  # `InFlightTable._written` when it was sent
 
 
 class InFlightTable:
@@ -134,13 +143,12 @@ class InFlightTable:
         self._unconfirmed: dict[str, _Unconfirmed] = {}  # newest retained message of each topic, oldest first
         self._requests: dict[int, tuple[PendingAck, Sequence[str]]] = {}  # unanswered, with the filters of a SUBSCRIBE
         self.answered: list[PendingAck] = []  # and not completed yet
-        #: Unanswered: when sent, what waits for it, and what was written before it and after the ping before.
-        self._pings: deque[tuple[float, PendingAck | None, dict[str, tuple[float, int]]]] = deque()
-        # By topic, since when and of how many bytes: messages written after the newest ping, larger than those
-        self._written: dict[str, tuple[float, int]] = {}
-        self._accepted: dict[str, tuple[float, int]] = {}  # that an answered ping followed.
-        self._ping_number = self._pong_number = 0
-        self.lost_bytes = 0  # of the largest message for which the other side was silent to the end
+        self._pings: deque[_Ping] = deque()  # unanswered, oldest first
+        # When the largest message of each topic was written, and its bytes: of those that an answered ping followed,
+        self._accepted: dict[str, tuple[float, int]] = {}
+        self._written: dict[str, tuple[float, int]] = {}  # and of those since the newest ping, if it is larger
+        self._ping_number = self._pong_number = 0  # how many were sent, and answered
+        self.lost_bytes = 0  # of the largest message after which the other side was silent until the connection ended
         self._newest_s = 0.0  # how long the newest answer to a ping took
 
     # -- messages
@@ -153,7 +161,10 @@ class InFlightTable:
     @property
     def waiting_since(self) -> float | None:
         """Time since when DELIVERED messages wait and none was acknowledged; None if none waits."""
-        return max(next(iter(self._unacked.values()))[1], self._acked_at) if self._unacked else None
+        if not self._unacked:
+            return None
+        _, oldest_sent_at = next(iter(self._unacked.values()))
+        return max(oldest_sent_at, self._acked_at)
 
     def unconfirmed_retained(self) -> list[Message]:
         """Return the retained messages that the broker may not have, oldest first."""
@@ -199,7 +210,7 @@ class InFlightTable:
         A message is counted only if it is the first of its topic, or larger than all before it.
         """
         sizes: dict[str, int] = {}
-        for written in (*(written for _, _, written in self._pings), self._written):
+        for written in [*(ping.written for ping in self._pings), self._written]:
             for topic, (at, size) in written.items():
                 if at >= now - WINDOW_S - self.round_trip_s:
                     sizes[topic] = max(size, sizes.get(topic, 0))
@@ -232,7 +243,7 @@ class InFlightTable:
 
     def ping(self, now: float, ack: PendingAck | None) -> None:
         """Track a PINGREQ."""
-        self._pings.append((now, ack, self._written))
+        self._pings.append(_Ping(now, ack, self._written))
         self._written = {}
         self._ping_number += 1
 
@@ -240,16 +251,17 @@ class InFlightTable:
         """Process a PINGRESP."""
         if not self._pings:
             return
-        sent_at, ack, written = self._pings.popleft()
+        ping = self._pings.popleft()
         self._pong_number += 1
-        self._newest_s = now - sent_at
+        self._newest_s = now - ping.sent_at
         self.measured(self._newest_s)
-        for topic, (at, size) in written.items():
+        for topic, (at, size) in ping.written.items():
             _note(self._accepted, topic, at, max(size, SMALL))
-        for topic in [t for t, entry in self._unconfirmed.items() if entry.ping and entry.ping <= self._pong_number]:
-            del self._unconfirmed[topic]
-        if ack is not None:
-            self.answered.append(ack)
+        for topic, entry in list(self._unconfirmed.items()):
+            if entry.ping and entry.ping <= self._pong_number:
+                del self._unconfirmed[topic]
+        if ping.ack is not None:
+            self.answered.append(ping.ack)
 
     def measured(self, round_trip_s: float) -> None:
         self._round_trips.append(round_trip_s)
@@ -261,16 +273,19 @@ class InFlightTable:
 
     def newest_answer(self, now: float) -> tuple[int, float]:
         """Return the number of answered pings, and the seconds of the newest answer or of a longer wait."""
-        waits = now - self._pings[0][0] if self._pings else 0.0
+        waits = now - self._pings[0].sent_at if self._pings else 0.0
         return self._pong_number, max(self._newest_s, waits)
 
     def end(self) -> None:
         """Complete all pending answers, because none can come after the connection's end."""
-        unanswered = self._pings[0][2] if self._pings else self._written
+        unanswered = self._pings[0].written if self._pings else self._written
         self.lost_bytes = max((size for _, size in unanswered.values()), default=0)
         self.complete()
-        for ack in [*(ack for ack, _ in self._requests.values()), *(ack for _, ack, _ in self._pings if ack)]:
+        for ack, _ in self._requests.values():
             ack.complete()
+        for ping in self._pings:
+            if ping.ack is not None:
+                ping.ack.complete()
         self._requests.clear()
         self._pings.clear()
 

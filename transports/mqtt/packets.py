@@ -4,7 +4,8 @@ Sources are MQTT 3.1.1 and MQTT 5.0 (OASIS), chapters 2 and 3 of each. ``modern`
 """
 
 import struct
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable
 from typing import Final, Protocol
 
 from msgspec import Struct
@@ -13,8 +14,9 @@ from pebble.transports.base import Message
 
 MAX_PACKET: Final = 1024 * 1024  # bytes; a longer one is read and discarded
 HEAD: Final = 2 + 65_535 + 2  # bytes of a PUBLISH up to its message id, at most
+MOST_IDS: Final = 65_535  # message ids have 16 bits
 RETAIN: Final = 0b1  # in the first byte of a PUBLISH
-ANY_QOS: Final = 0b110
+ANY_QOS: Final = 0b110  # there, too: not 0 with QoS 1 or 2
 
 PINGREQ: Final = b"\xc0\x00"
 DISCONNECT: Final = b"\xe0\x00"
@@ -96,13 +98,8 @@ def publish(
 
 
 def subscribe(mid: int, filters: Iterable[Filter], *, modern: bool) -> bytes:
-    options = _options if modern else _qos
-    wanted = [_text(filter_.text) + bytes((options(filter_),)) for filter_ in filters]
+    wanted = [_text(filter_.text) + bytes((_options(filter_) if modern else filter_.qos,)) for filter_ in filters]
     return _packet(_SUBSCRIBE, mid.to_bytes(2, "big"), b"\0" if modern else b"", *wanted)
-
-
-def _qos(filter_: Filter) -> int:
-    return filter_.qos
 
 
 def _options(filter_: Filter) -> int:
@@ -179,19 +176,37 @@ class Listener(Protocol):
         """True if a retained message of this topic is not wanted."""
 
 
-class Quota(Protocol):
-    """A counter of the messages that the broker has not acknowledged; called before the listener."""
+class SendQuota:
+    """A limit on unacknowledged messages of QoS 1 (the broker's Receive Maximum). Messages beyond it wait here."""
+
+    def __init__(self, send: Callable[[bytes], None]) -> None:
+        self._send = send
+        self._left = self._most = MOST_IDS  # how many more may be sent now, and at most
+        self._held: deque[bytes] = deque()
 
     def begin(self, most: int) -> None:
         """Set how many unacknowledged messages the broker accepts."""
+        self._left = self._most = most
 
-    def acknowledged(self) -> None: ...
+    def takes(self, packet: bytes) -> bool:
+        """Return True if ``packet`` may be sent now, and count it; else keep it, to send it later."""
+        if self._left <= 0:
+            self._held.append(packet)
+            return False
+        self._left -= 1
+        return True
+
+    def acknowledged(self) -> None:
+        if self._held:
+            self._send(self._held.popleft())
+        else:
+            self._left = min(self._left + 1, self._most)
 
 
 class Reader:
     """A parser of packets from received bytes; ``acks`` collects the acknowledgements to be written."""
 
-    def __init__(self, listener: Listener, quota: Quota, *, modern: bool) -> None:
+    def __init__(self, listener: Listener, quota: SendQuota, *, modern: bool) -> None:
         self.acks = bytearray()
         self._listener, self._quota, self._modern = listener, quota, modern
         self._data, self._at = b"", 0  # received bytes, and where those begin that are not read yet
@@ -235,7 +250,7 @@ class Reader:
                 else:
                     self._data, self._at = b"", 0
                 break
-            size, start = data[at + 1], at + 2
+            size, start = data[at + 1], at + 2  # the packet's length, usually of one or two bytes, and its end
             if size > 127 and start < end and (more := data[start]) < 128:
                 size, start = size & 127 | more << 7, start + 1
             elif size > 127:
@@ -268,27 +283,27 @@ class Reader:
         self._data, self._at = b"", 0
 
     def _publish(self, data: bytes, first: int, start: int, stop: int) -> None:
-        """Give a PUBLISH to the listener. Hot."""
-        end = start + 2 + int.from_bytes(data[start : start + 2], "big")
-        body, topic = end, data[start + 2 : end]
+        """Give a PUBLISH, whose topic begins at ``start``, to the listener. Hot."""
+        topic_end = start + 2 + int.from_bytes(data[start : start + 2], "big")
+        payload_at, topic = topic_end, data[start + 2 : topic_end]
         qos = first & ANY_QOS
-        if qos:
-            body += 2
+        if qos:  # a message id follows the topic
+            payload_at += 2
             if qos == _QOS_1:
-                self.acks += b"\x40\x02" + data[end:body]
+                self.acks += b"\x40\x02" + data[topic_end:payload_at]
             elif qos == _QOS_2:  # nothing is subscribed to with it: PUBREC, so that the broker goes on
-                self.acks += b"\x50\x02" + data[end:body]
+                self.acks += b"\x50\x02" + data[topic_end:payload_at]
             else:
                 raise MalformedError("a message of QoS 3")
-        if self._modern and body < stop and data[body] < 128:
-            body += 1 + data[body]
-        elif self._modern and body <= stop:
-            size, length = _read_variable(data[body : min(body + 4, stop)], 0)
-            body = stop + 1 if size < 0 else body + length + size
-        if body > stop or not topic:
+        if self._modern and payload_at < stop and data[payload_at] < 128:  # then properties, whose length is one byte
+            payload_at += 1 + data[payload_at]
+        elif self._modern and payload_at <= stop:
+            size, length = _read_variable(data[payload_at : min(payload_at + 4, stop)], 0)
+            payload_at = stop + 1 if size < 0 else payload_at + length + size
+        if payload_at > stop or not topic:
             raise MalformedError("a message that ends in its head" if topic else "a message without a topic")
-        if not (first & RETAIN and body < stop and self._listener.skips(topic)):
-            self._listener.on_publication(topic, data[body:stop], first)
+        if not (first & RETAIN and payload_at < stop and self._listener.skips(topic)):
+            self._listener.on_publication(topic, data[payload_at:stop], first)
 
     def _other(self, first: int, body: bytes) -> None:
         if first not in _SHORTEST or len(body) < _SHORTEST[first]:
@@ -325,27 +340,28 @@ class Reader:
     # -- packets that are too long
 
     def _begin_discarding(self, start: int, stop: int) -> None:
+        """Begin to discard a PUBLISH, once its topic and message id are here."""
         data, at = self._data, self._at
         if data[at] & 0xF0 != _PUBLISH:
             raise MalformedError(f"a packet that begins with {data[at]:02x} and has {stop - start} bytes")
         if len(data) < start + HEAD:
             self._keep(start + HEAD - at)
             return
-        end = start + 2 + int.from_bytes(data[start : start + 2], "big")
-        ack = b"\x40\x02" + data[end : end + 2] if data[at] & ANY_QOS == _QOS_1 else b""
-        self._too_long = data[start + 2 : end], stop - start, ack
+        topic_end = start + 2 + int.from_bytes(data[start : start + 2], "big")
+        ack = b"\x40\x02" + data[topic_end : topic_end + 2] if data[at] & ANY_QOS == _QOS_1 else b""
+        self._too_long = data[start + 2 : topic_end], stop - start, ack
         self._discarded, self._data, self._at = stop - at, b"", 0
         self.feed(data[at:])
 
     def _discard(self, data: bytes) -> bytes:
         """Discard bytes of a long packet; return those after it."""
-        rest = data[self._discarded :]
-        self._discarded -= len(data) - len(rest)
+        after = data[self._discarded :]
+        self._discarded -= len(data) - len(after)
         if not self._discarded:
             topic, size, ack = self._too_long
             self.acks += ack
             self._listener.on_too_long(topic, size)
-        return rest
+        return after
 
 
 _CONNACK, _PUBACK, _PUBREL, _SUBACK, _UNSUBACK, _PINGRESP, _DISCONNECT = 0x20, 0x40, 0x62, 0x90, 0xB0, 0xD0, 0xE0

@@ -15,7 +15,8 @@ class SocketPoll:
     def __init__(self) -> None:
         self._wakeup = WakeupPipe()
         self.registered = False
-        self._sock, self._wake, self._write = -1, self._wakeup.fileno(), False
+        self._sock, self._wake = -1, self._wakeup.fileno()  # descriptors
+        self._write = False  # the poll waits also until the socket is writable
         self._poll = select.poll() if hasattr(select, "poll") else None  # Windows has none
 
     def register(self, sock: socket.socket) -> None:
@@ -37,7 +38,8 @@ class SocketPoll:
                 if descriptor == self._wake:
                     woken = True
                 else:
-                    readable, writable = bool(events & ~select.POLLOUT), bool(events & select.POLLOUT)
+                    readable = bool(events & ~select.POLLOUT)  # also with an error, as reading it says
+                    writable = bool(events & select.POLLOUT)
         if woken:
             self._wakeup.clear()
         return readable, writable, woken

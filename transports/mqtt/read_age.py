@@ -4,6 +4,7 @@ import socket
 from collections import deque
 from collections.abc import Callable
 from math import inf
+from typing import NamedTuple
 
 from pebble.transports import clock
 from pebble.transports.mqtt.outgoing import present_round_trip_s
@@ -42,6 +43,14 @@ class WaitingTime:
         self._counted -= size
 
 
+class _Ping(NamedTuple):
+    """An unanswered ping."""
+
+    since: float  # messages before its answer may have waited since then
+    sent_at: float
+    clear: bool  # no other data of ours was before it, so that the time of its answer tells something
+
+
 class BrokerDelay:
     """A measure of how long messages that arrive now have waited at the broker. The broker answers a ping after them.
 
@@ -57,14 +66,13 @@ class BrokerDelay:
     """
 
     def __init__(self) -> None:
-        #: Unanswered pings: since when messages before the answer may have waited, when sent, and if it tells anything.
-        self._asked: deque[tuple[float, float, bool]] = deque()
+        self._pings: deque[_Ping] = deque()  # oldest first
         self._read = self._delivered = 0.0, 0.0  # the newest answer: when its ping was sent, and how long it took
         self._shortest = _FAR_S
         self._newest = 0.0  # seconds until the newest answer
         self._came_at = 0.0  # when something was received last
-        self._stall = 0.0  # seconds for which the broker stood still,
-        self._until = 0.0  # which counts until then
+        self._stall = 0.0  # seconds for which the broker stood still; messages count as having waited so long
+        self._until = 0.0  # until this time
         self._prompt = 0  # answers in a row that came right after the newest of several pings
 
     def usual(self, seconds: float) -> None:
@@ -73,30 +81,33 @@ class BrokerDelay:
 
     def asked(self, now: float, *, clear: bool) -> None:
         """Note that a ping was sent; ``clear``: no other data of ours was on its way."""
-        self._asked.append((now, now, clear))
+        self._pings.append(_Ping(now, now, clear))
 
     def stalled(self, since: float, now: float) -> None:
         """Note that a ping was sent after a time without reading, in which messages may have waited at the broker."""
-        self._asked.append((since, now, True))
+        self._pings.append(_Ping(since, now, clear=True))
 
     def answered(self, now: float) -> None:
         """Note that the oldest ping was answered."""
-        if self._asked:
-            _, sent_at, clear = self._asked.popleft()
-            self._read = sent_at, now - sent_at
-            self._newest = now - sent_at if clear else 0.0
-            self.usual(now - sent_at)
-        near = self._shortest <= _NEAR_S
-        prompt = near and bool(self._asked) and now - self._asked[-1][1] <= self._shortest + _NEAR_S
-        self._prompt = self._prompt + 1 if prompt else 0
+        if self._pings:
+            ping = self._pings.popleft()
+            took_s = now - ping.sent_at
+            self._read = ping.sent_at, took_s
+            self._newest = took_s if ping.clear else 0.0
+            self.usual(took_s)
+        is_near = self._shortest <= _NEAR_S
+        if is_near and self._pings and now - self._pings[-1].sent_at <= self._shortest + _NEAR_S:
+            self._prompt += 1
+        else:
+            self._prompt = 0
         if self._prompt >= _LOST:
-            self._asked.clear()
+            self._pings.clear()
             self._newest = 0.0
 
     def acknowledged(self, sent_at: float, now: float) -> None:
         """Note a PUBACK for a message sent at ``sent_at``: earlier pings were answered, or their answers are lost."""
-        while self._asked and self._asked[0][1] < sent_at:
-            self._asked.popleft()
+        while self._pings and self._pings[0].sent_at < sent_at:
+            self._pings.popleft()
         self._newest = min(self._newest, now - sent_at)
 
     def delivered(self) -> None:
@@ -106,7 +117,7 @@ class BrokerDelay:
     def delivery(self, now: float) -> tuple[float, float]:
         """Return the age of the newest ping before which everything is delivered, and how late its answer was."""
         sent_at, took = self._delivered
-        waits = now - self._asked[0][1] if self._asked else 0.0
+        waits = now - self._pings[0].sent_at if self._pings else 0.0
         return now - sent_at, max(took, waits) - self._shortest
 
     def seconds(self, now: float, round_trip_s: Callable[[], float]) -> float:
@@ -122,8 +133,10 @@ class BrokerDelay:
         The longest counts, less the time of the way itself.
         """
         since = sent_at = now
-        if self._asked:  # the oldest that says something
-            since, sent_at = next(((since, sent_at) for since, sent_at, clear in self._asked if clear), (now, now))
+        for ping in self._pings:
+            if ping.clear:  # the oldest that tells anything
+                since, sent_at = ping.since, ping.sent_at
+                break
         if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:  # nothing came: it stood still
             self._stall, self._until = now - sent_at, now + _BACKLOG_S
         self._came_at = now

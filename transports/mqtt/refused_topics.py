@@ -1,4 +1,4 @@
-"""Topics on which a broker accepts no messages: it says so on MQTT 5; on 3.1.1 it can only hang up.
+"""Topics on which a broker accepts no messages: on MQTT 5 the broker says so, on 3.1.1 it can only hang up.
 
 A topic is withheld after three losses in a row, each soon after a message on it. If several topics are withheld, they
 are tried one at a time from then on, so that only the topic at fault stays withheld. Pure but for the log.
@@ -49,7 +49,7 @@ class RefusedTopics:
         self._losses: dict[str, int] = {}  # in a row, by topic
         self.withheld: dict[str, Withheld] = {}
         self._trial: Trial | None = None
-        self._quiet_at = -inf  # from then on other messages were accepted, so that a trial shows something
+        self._quiet_at = -inf  # no trial before it: only after a time without a loss it shows something
         #: Topics on which the broker takes no messages: why, and when that was last in the log.
         self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)
 
@@ -88,13 +88,14 @@ class RefusedTopics:
         """Note a lost connection. ``written``: bytes by topic before the loss; None if no message was the reason."""
         written, trial, self._trial = written or {}, self._trial, None
         self._quiet_at = now + QUIET_S
-        if trial is not None and {topic for topic in written if not self._is_vital(topic)} == {trial.topic}:
+        if trial is not None and [topic for topic in written if not self._is_vital(topic)] == [trial.topic]:
             self._blame(where, trial.topic, written[trial.topic], now)
             return
         self._losses = {topic: self._losses.get(topic, 0) + 1 for topic in written}
         often = {topic: written[topic] for topic, losses in self._losses.items() if losses >= LOSSES}
-        large = {topic: size for topic, size in often.items() if size >= LARGE}
-        suspects = large or {topic: size for topic, size in often.items() if not self._is_vital(topic)}
+        suspects = {topic: size for topic, size in often.items() if size >= LARGE}
+        if not suspects:  # no large message: it may be any topic but the vital ones
+            suspects = {topic: size for topic, size in often.items() if not self._is_vital(topic)}
         if len(suspects) == 1:
             self._blame(where, *suspects.popitem(), now)
         elif suspects:
@@ -114,7 +115,8 @@ class RefusedTopics:
 
     def report(self, where: str, topic: str, why: str, now: float, level: int = logging.WARNING) -> None:
         """Log a refused topic, at most once in a while for each topic, because many messages may follow."""
-        if now - self.not_taken.get(topic, ("", -inf))[1] >= _NOT_TAKEN_S:
+        _, logged_at = self.not_taken.get(topic, ("", -inf))
+        if now - logged_at >= _NOT_TAKEN_S:
             self.not_taken[topic] = why, now
             log.log(level, "%s: %s does not take a message on %s: %s", self._client_id, where, topic, why)
 

@@ -202,7 +202,7 @@ class MqttTransport(Transport):
                 self.was_ended = self._dialler.is_gone(lost, connected=connected, was_ended=self.was_ended)
                 if self._dialler.note_end(lost):
                     text = "the way there seems to lose large packets (a wrong MTU?): from now on they are small"
-                    log.warning("%s: %s: %s", self.client_id, self._dialler.where, text)
+                    log.warning("%s: %s: %s", self.client_id, self._dialler.addresses.where, text)
                 problem = str(lost)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 log.exception("%s: unexpected failure of the connection", self.client_id)
@@ -294,9 +294,9 @@ class MqttTransport(Transport):
         with self._filters.lock:
             self._connection = connection
             subscribed = connection.subscribe([(filter_, self._no_local(filter_)) for filter_ in self._filters])
-            copied = connection.ping()
+            after_retained = connection.ping()  # its answer follows the retained messages
         self._await(connection, subscribed, stopping, self._deliver_all)
-        self._await(connection, copied, stopping, self._deliver_all)
+        self._await(connection, after_retained, stopping, self._deliver_all)
         self._initial_sync(known_topics)
 
     def _let_catch_up(self, connection: Connection, stopping: threading.Event) -> None:
@@ -352,6 +352,7 @@ class MqttTransport(Transport):
         stopping: threading.Event,
         receive: Callable[[list[Message]], None],
     ) -> None:
+        """Run the connection until ``ack`` is done; ``receive`` gets the messages. Raises Lost, also when closing."""
         asked_at = clock.since_boot()
         while not ack.done:
             if stopping.is_set():
@@ -387,23 +388,21 @@ class MqttTransport(Transport):
                     subscription.refused = is_refused
 
     def note_refusal(self, topic: str, why: str) -> None:
-        self._refused.report(self._dialler.where, topic, why, time.monotonic())
+        self._refused.report(self._dialler.addresses.where, topic, why, time.monotonic())
 
-    def _finish(
-        self, connection: Connection, will: Message | None, receive: Callable[[list[Message]], None] = ignore
-    ) -> None:
+    def _finish(self, connection: Connection, will: Message | None) -> None:
         """Publish the will, wait (bounded) until everything is acknowledged, then send DISCONNECT."""
         if will is not None:
             connection.publish(will)
         last = connection.ping()
         deadline = time.monotonic() + _CLOSING_S
         while time.monotonic() < deadline and not (last.done and connection.drained):
-            connection.pump(deadline - time.monotonic(), receive)
+            connection.pump(deadline - time.monotonic(), ignore)
         connection.disconnect()
 
     def _keep_unconfirmed(self, connection: Connection) -> None:
         """Mark retained messages that the broker may not have received as pending."""
-        self.counters.add("unconfirmed", connection.unacked)
+        self.counters.add("unconfirmed", connection.in_flight.unacked)
         with self._publishing:
             for message in connection.unconfirmed_retained():
                 if message.topic not in self._own.pending:

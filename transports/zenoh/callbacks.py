@@ -2,18 +2,16 @@
 
 Two problems of these threads, which are Rust's, are solved here.
 
-1. Python's state. For each callback Python makes a state for such a thread, with memory from the kernel, and frees it
-afterwards: an mmap, an munmap and the faults of new pages for each message (Python 3.11), 5 % of its cost. If the state
-is requested once more than it is released (PyGILState_Ensure of Python's C API), it stays, also when its thread ends:
-some 17 KB. Zenoh has a few threads for all sessions of a process, and seldom a new one (forty sessions, one after the
-other: five). Even so, only the first threads keep their state.
+1. Python's state. For each callback Python makes a state for such a thread, and frees it afterwards, which takes 5 % of
+a message's cost (Python 3.11). A state that is requested once more than it is released (PyGILState_Ensure of Python's C
+API) stays, also when its thread ends: some 17 KB. Zenoh seldom makes a new thread (forty sessions, one after the other:
+five). Even so, only the first threads keep their state.
 
 2. Blocking. One of these threads at a time waits for all sockets. It runs the callbacks itself, and meanwhile no other
-thread waits for the sockets unless it is given something to do. A callback that has to wait, for room for its own
-message or for another thread that waits for room, would wait until Zenoh closes that connection, because no thread
-notices that there is room again. So where a callback takes long, a guard gives another of Zenoh's threads something to
-do. Measured with 1.10.2: of 2,000 messages of 1 KB that a callback publishes 1,000 are lost without the guard, and none
-with it.
+thread waits for the sockets unless it is given something to do. So a callback that waits for room would wait until
+Zenoh closes that connection, because no thread notices that there is room again. Where a callback takes long, a guard
+gives another of Zenoh's threads something to do. Measured with 1.10.2: of 2,000 messages of 1 KB that a callback
+publishes 1,000 are lost without the guard, and none with it.
 """
 
 from __future__ import annotations
@@ -42,22 +40,24 @@ ensure_state = ctypes.pythonapi.PyGILState_Ensure
 
 
 class Calls:
-    """Counters of one thread: callbacks begun, callbacks ended, and the number begun when the guard last looked."""
+    """Counters of one thread: callbacks begun and ended, and what the guard saw when it looked last."""
 
-    __slots__ = ("begun", "ended", "known", "ran")
+    __slots__ = ("begun", "begun_before", "ended", "ran")
 
     def __init__(self) -> None:
-        self.begun = self.ended = self.known = 0
-        self.ran = False  # when the guard looked last, a callback was running
+        self.begun = self.ended = 0
+        self.begun_before = 0  # `begun` when the guard looked last
+        self.ran = False  # a callback was running then
 
 
 class Guard:
     """A watch for callbacks that take long: it makes another of Zenoh's threads wait for the sockets instead."""
 
     def __init__(self) -> None:
-        self.rests = True
+        self.rests = True  # it sleeps until a callback wakes it
         self.helped = 0  # times
-        self._suspects = self._warned = False
+        self._suspects = False  # it found a running callback when it looked last
+        self._warned = False
         self._wakeup, self._lock = Wakeup(), threading.Lock()
         self._thread: threading.Thread | None = None
         self._calls: list[Calls] = []
@@ -104,20 +104,20 @@ class Guard:
             if quiet < _REST:
                 continue
             self.rests = True
-            if not self._look():  # else a callback began that did not know yet
+            if not self._look():  # else a callback has begun that did not see it
                 self._wakeup.wait(None)
             self.rests, quiet = False, 0
 
     def _look(self) -> bool:
-        """Help if a callback takes long; True if any has begun since the last check, or still runs."""
+        """Help if a callback takes long; return True if any has begun since the last look, or still runs."""
         active = self._suspects = False
         for calls in self._calls:
             begun, runs = calls.begun, calls.begun != calls.ended
-            active = active or runs or begun != calls.known
+            active = active or runs or begun != calls.begun_before
             if runs and calls.ran:  # the same one, or many without a pause
                 self._help()
             self._suspects = self._suspects or runs
-            calls.known, calls.ran = begun, runs
+            calls.begun_before, calls.ran = begun, runs
         return active
 
     def _help(self) -> None:
@@ -135,13 +135,13 @@ class Guard:
 
 guard = Guard()
 _nothing: zenoh.handlers.Callback[Any] = zenoh.handlers.Callback(lambda _reply: None, indirect=False)
-_own = threading.local()  # part of a thread's state: empty in a new one
+_local = threading.local()  # part of a thread's state: empty in a new thread
 use, forget = guard.use, guard.forget
 
 
 def _begin() -> Calls:
     """Note the first callback on this thread; return the thread's counters."""
-    calls = _own.calls = Calls()
+    calls = _local.calls = Calls()
     # A thread of Python's has its state, and waits for no sockets: it publishes to a handler of its own session.
     if isinstance(threading.current_thread(), threading._DummyThread) and guard.watch(calls):
         ensure_state()
@@ -155,7 +155,7 @@ def direct(function: Callable[[Any], None], at_end: Callable[[], None] | None = 
     """
 
     def run(received: Any) -> None:
-        calls = _own.calls if hasattr(_own, "calls") else _begin()
+        calls = _local.calls if hasattr(_local, "calls") else _begin()
         calls.begun += 1
         try:
             if guard.rests:

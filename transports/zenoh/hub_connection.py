@@ -25,7 +25,7 @@ class HubConnection:
     """The connection to a hub. Each hub that `watch` sees begins a new one. ``name``: this client's session."""
 
     def __init__(
-        self, client_id: str, will: Message | None, own: OwnRetained, count: Callable[[], object], account: str = ""
+        self, client_id: str, will: Message | None, own: OwnRetained, count: Callable[[], object], account: str
     ) -> None:
         self._account = account
         self._will = None if will is None else wire.Will.of(will, client_id)
@@ -36,7 +36,7 @@ class HubConnection:
         self.name = ""
         self.watch = HubWatch()
         self.lock = threading.Lock()  # no answer of a connection is offered after the next one began
-        self._connection = 0
+        self._connection = 0  # its number
 
     def open(self) -> None:
         """Begin a connection for a client that was opened, perhaps again."""
@@ -99,6 +99,7 @@ class HubConnection:
             answered.wait(max(0.0, end - time.monotonic()))
 
     def _query(self, session: zenoh.Session, subscription: Subscription, counts: dict[str, int]) -> threading.Event:
+        """Ask for the retained messages of one subscription; return an event that is set at the end of the answer."""
         connection, answered = self._connection, threading.Event()
 
         def take(reply: zenoh.Reply) -> None:

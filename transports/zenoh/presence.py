@@ -11,7 +11,7 @@ import msgspec
 import zenoh
 
 from pebble.transports.zenoh.callbacks import direct
-from pebble.transports.zenoh.wire import LIVE, SYNC, UP, pack_count, unpack_count
+from pebble.transports.zenoh.wire import LIVE, SYNC, UP
 
 log = logging.getLogger(__name__)
 
@@ -132,14 +132,16 @@ class Barrier:
     def _missing(self, expected: dict[str, str], answers: dict[str, int]) -> dict[str, str]:
         return {name: text for name, text in expected.items() if name not in self._silent and name not in answers}
 
-    def _ask(self, wanted: set[str], answers: dict[str, int], left: float) -> bool:
+    def _ask(self, wanted: set[str], answers: dict[str, int], remaining_s: float) -> bool:
+        """Ask for the answers of ``wanted`` siblings, and wait a moment; return True if all are in ``answers``."""
         done = threading.Event()
         names = wanted if self._by_name else ["*"]
-        ended: list[None] = []
+        ended: list[None] = []  # an entry for each query; appending is safe on any thread
 
         def take(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                answers[str(reply.ok.key_expr).removeprefix(SYNC)] = unpack_count(reply.ok.payload.to_bytes())
+                sibling = str(reply.ok.key_expr).removeprefix(SYNC)
+                answers[sibling] = int.from_bytes(reply.ok.payload.to_bytes(), "big")
                 if wanted <= set(answers):
                     done.set()
 
@@ -154,11 +156,11 @@ class Barrier:
                 zenoh.handlers.Callback(take, end, indirect=False),
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
-                timeout=left,
+                timeout=remaining_s,
             )
-        done.wait(min(left, _ASK_AGAIN_S))
+        done.wait(min(remaining_s, _ASK_AGAIN_S))
         return wanted <= set(answers)
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
-            query.reply(SYNC + self._name, pack_count(self._retained_count()))
+            query.reply(SYNC + self._name, self._retained_count().to_bytes(8, "big"))

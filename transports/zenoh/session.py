@@ -20,8 +20,7 @@ from pebble.transports.settings import TlsSettings, ZenohSettings
 from pebble.transports.zenoh import callbacks, wire
 
 # By default connections are accepted, opened and read on separate runtimes: a received message wakes a thread that only
-# wakes another one (11.3 wake-ups in a round trip instead of 7.1, 1.15 times the time one way at 20 Hz). Sending has
-# its own runtime, because a callback may send.
+# wakes another one (1.15 times the time one way at 20 Hz). Sending has its own runtime, because a callback may send.
 # There are more threads than connections, so that one is left to wait for the sockets when all others are in callbacks
 # that wait (.callbacks); each takes 15 KB.
 _RUNTIME = "(acc: (handover: rx), net: (handover: rx), rx: (worker_threads: 16))"
@@ -56,7 +55,7 @@ def unix_endpoint(path: Path) -> str:
 
 
 def _numbered(endpoint: str) -> str:
-    """Return an endpoint with a network card's number in place of its name, which Zenoh does not accept."""
+    """Return an endpoint, as tls/[fe80::1%eth0]:7447, with the number of the card, whose name Zenoh does not accept."""
     start, zone, rest = endpoint.partition("%")
     name, bracket, port = rest.partition("]")
     try:
@@ -112,9 +111,8 @@ def _config(settings: ZenohSettings, mode: str, listen: list[Path], connect: lis
         "listen": {"endpoints": [*map(unix_endpoint, listen), *map(_numbered, settings.listen)]},
         "connect": {"endpoints": [*map(unix_endpoint, connect), *map(_numbered, settings.connect)], "retry": _RETRY},
         # How long a router or peer waits for scouting before open() returns; 500 ms by default.
-        # Gossip would announce our unix sockets to programs connected by TLS: on one machine, one connection between
-        # two robots made all their processes connect to each other, without TLS. Every process connects to every
-        # sibling by itself, so gossip is not needed.
+        # Gossip would announce our unix sockets to programs connected by TLS: two connected robots of one machine had
+        # all their processes connect to each other, without TLS. Each process finds its siblings without it.
         "scouting": {"delay": 1, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": False},  # the order of arrival at the hub decides, never a clock
         "transport": {

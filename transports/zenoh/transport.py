@@ -23,6 +23,7 @@ from pebble.transports.base import Message, State, Subscription, Transport
 from pebble.transports.peers import PeerRegistry, PresenceLock, new_name, prepare_run_dir
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.topics import is_pattern
+from pebble.transports.zenoh import session as sessions
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub_connection import GOODBYE_S, HUB_ANSWER_S, HubConnection
@@ -30,14 +31,6 @@ from pebble.transports.zenoh.keymap import filter_to_key, key_to_topic
 from pebble.transports.zenoh.loopback_queue import LoopbackQueue
 from pebble.transports.zenoh.presence import Barrier, HubView
 from pebble.transports.zenoh.publishers import Publishers
-from pebble.transports.zenoh.session import (
-    HUB_SOCKET,
-    check_process,
-    close_at_exit,
-    close_session,
-    open_session,
-    session_config,
-)
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +45,7 @@ class ZenohTransport(Transport):
     def __init__(self, client_id: str, settings: ZenohSettings, *, will: Message | None = None) -> None:
         super().__init__(client_id, will=will)
         self.settings = settings
-        self._elsewhere = bool(settings.client and settings.connect)  # its hub is, with siblings that it does not know
+        self._elsewhere = bool(settings.client and settings.connect)  # its hub and siblings are on other machines
         self._connecting = threading.RLock()  # held while subscribing, and while a connection is made
         self._subscribers: dict[Subscription, zenoh.Subscriber[None]] = {}
         self._publishers = Publishers(lambda topic: self.policy.is_invented(topic))
@@ -86,24 +79,18 @@ class ZenohTransport(Transport):
             self._start_peer()
         self._thread = threading.Thread(target=self._run, name=f"pebble-zenoh {self.client_id}", daemon=True)
         self._thread.start()
-        close_at_exit(self)
+        sessions.close_at_exit(self)
         self._opened.wait(min(timeout, OPEN_SYNC_S))
 
     def _start_peer(self) -> None:
-        self._presence = self._siblings.register(self.client_id)
+        presence = self._presence = self._siblings.register(self.client_id)
         try:
-            self._listen(self._presence)
-        except TransportError:
-            self._presence.release()
-            raise
-
-    def _listen(self, presence: PresenceLock) -> None:
-        try:
-            hub = self.settings.run_dir / HUB_SOCKET
+            hub = self.settings.run_dir / sessions.HUB_SOCKET
             siblings = self._siblings.sockets(but=presence.name)
-            config = session_config(self.settings, "peer", listen=[presence.socket], connect=[hub, *siblings])
-            session = open_session(config)
+            config = sessions.session_config(self.settings, "peer", listen=[presence.socket], connect=[hub, *siblings])
+            session = sessions.open_session(config)
         except (zenoh.ZError, TransportError) as error:
+            presence.release()
             raise TransportError(f"zenoh session of {self.client_id}: {error}") from None
         if self._begin(session, presence.name):
             presence.ready()
@@ -111,14 +98,14 @@ class ZenohTransport(Transport):
     def _start_client(self) -> bool:
         """Try until a hub answers, without which a session in client mode cannot open; True if it has opened."""
         account = self.settings.account
-        hub = [] if self.settings.connect else [self.settings.run_dir / HUB_SOCKET]
-        config = session_config(self.settings, "client", listen=[], connect=hub)
+        hub = [] if self.settings.connect else [self.settings.run_dir / sessions.HUB_SOCKET]
+        config = sessions.session_config(self.settings, "client", listen=[], connect=hub)
         while not self._hub.watch.closed:
             try:
-                session = open_session(config)
+                session = sessions.open_session(config)
             except zenoh.ZError as error:
                 log.debug("%s: %s", self.client_id, error)
-                hubs = ", ".join(self.settings.connect) or self.settings.run_dir / HUB_SOCKET
+                hubs = ", ".join(self.settings.connect) or self.settings.run_dir / sessions.HUB_SOCKET
                 self.problem = f"no hub answers at {hubs}"
                 self._hub.watch.wait_closed(_RETRY_S)
                 continue
@@ -129,7 +116,7 @@ class ZenohTransport(Transport):
     def _begin(self, session: zenoh.Session, name: str) -> bool:
         with self._hub.lock:
             if self._hub.watch.closed:
-                close_session(session)
+                sessions.close_session(session)
                 return False
             self._hub.name, self._session = name, session
             self._publishers.declared.clear()
@@ -164,14 +151,15 @@ class ZenohTransport(Transport):
         except zenoh.ZError as error:
             log.warning("%s could not close in order: %s", self.client_id, error)
         finally:
-            close_session(session)
+            sessions.close_session(session)
 
     # -- the transport's thread: every time a hub appears a new connection begins
 
     def _run(self) -> None:
         if self.settings.client and not self._start_client():
             return
-        version, linked = 0, 0  # version of the newest view handled; its connection that works, 0: none
+        version = 0  # of the newest view that was handled
+        linked = 0  # the number of the hub connection that works; 0: none does
         self._wait_for_siblings_once()
         watch = self._hub.watch
         while (view := watch.wait(version, _RETRY_S if watch.hubs and not linked else None)) is not None:
@@ -268,7 +256,7 @@ class ZenohTransport(Transport):
 
     def _send(self, message: Message, urgent: bool) -> bool:
         if self._pid != os.getpid():
-            check_process(self._pid)
+            sessions.check_process(self._pid)
         session = self._session
         if session is None or (self.settings.client and not self._hub.watch.hubs):
             return False
@@ -290,7 +278,7 @@ class ZenohTransport(Transport):
         self._declare_all([subscription])
 
     def _declare_all(self, subscriptions: Sequence[Subscription]) -> None:
-        check_process(self._pid)
+        sessions.check_process(self._pid)
         with self._connecting:
             session = self._session
             if session is None:
@@ -312,7 +300,7 @@ class ZenohTransport(Transport):
         if subscription in self._subscribers:
             return
         origin = zenoh.Locality.ANY if subscription.echo else zenoh.Locality.REMOTE
-        only = None if is_pattern(subscription.filter) else subscription.filter
+        only_topic = None if is_pattern(subscription.filter) else subscription.filter
         may_be_ours = subscription.direct and subscription.echo
         late_s, publishers = self._ages.late_s, self._publishers
 
@@ -324,7 +312,7 @@ class ZenohTransport(Transport):
             since = stamp.sent_ns / 1e9 if stamp.boot == wire.BOOT else None
             if (since is None or read_at - since > late_s) and self._is_late(sample, stamp, read_at):
                 return
-            topic, payload = only or key_to_topic(str(sample.key_expr)), sample.payload.to_bytes()
+            topic, payload = only_topic or key_to_topic(str(sample.key_expr)), sample.payload.to_bytes()
             qos = min(stamp.qos, subscription.qos)
             message = Message(topic, payload, qos, False, stamp.retain_requested, read_at if since is None else since)
             if may_be_ours and publishers.thread == threading.get_ident():

@@ -24,7 +24,7 @@ from pebble.transports.base import Message, QoS
 from pebble.transports.zenoh.callbacks import direct
 
 RETAINED = "@retain/"  # + key: the newest retained message, put before the live one and queried by subscribers
-SYNC = "@sync/"  # + name: answers with how many retained messages this session has sent
+SYNC = "@sync/"  # + name: answers with how many retained messages this session has sent, in 8 bytes
 UP = "@up/"  # + name: liveliness token of a hub
 LIVE = "@live/"  # + name: liveliness token of a client
 HELLO = "@hub/hello"  # query: name, digests of retained messages, will; the answer lists the keys the hub lacks
@@ -56,7 +56,6 @@ _QUALITIES = (QoS.LATEST, QoS.DELIVERED)
 
 _LIVE = struct.Struct(">BIQ")  # quality and retain, boot, ns since it
 _RETAINED = struct.Struct(">BQ")
-_COUNT = struct.Struct(">Q")
 
 BOOT = crc32(Path("/proc/sys/kernel/random/boot_id").read_bytes())  # shared by all containers of a machine
 
@@ -155,10 +154,10 @@ def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> byt
 
     Where a hub has just died, the query ends for others long after the next hub has answered it.
     """
-    came: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
+    replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()  # None: the query has ended
     session.get(
         key,
-        direct(came.put, lambda: came.put(None)),
+        direct(replies.put, lambda: replies.put(None)),
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
         timeout=timeout,
@@ -167,7 +166,7 @@ def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> byt
     )
     end = time.monotonic() + timeout + _LATE_S
     with contextlib.suppress(queue.Empty):
-        while (reply := came.get(timeout=max(0.0, end - time.monotonic()))) is not None:
+        while (reply := replies.get(timeout=max(0.0, end - time.monotonic()))) is not None:
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
     return None
@@ -179,12 +178,3 @@ def account_of(key: str, what: str) -> str:
     if not key.startswith(what) or "*" in account or "/" in account or OF in account:
         raise ValueError(f"{key} is no query of an account")
     return account
-
-
-def pack_count(count: int) -> bytes:
-    return _COUNT.pack(count)
-
-
-def unpack_count(data: bytes) -> int:
-    (count,) = _COUNT.unpack(data)
-    return int(count)

@@ -26,12 +26,8 @@ class _Paho(paho.Client):
 
     listener: Listener
     opening: Opening
-    ahead = b""  # was taken out of the socket; `begin` of it was read
-    begin = 0
-
-    @property
-    def unwritten(self) -> int:
-        return sum(packet["to_process"] for packet in self._out_packet)
+    ahead = b""  # bytes that were taken out of the socket
+    begin = 0  # of these, how many paho has read
 
     def _create_socket_connection(self) -> socket.socket:
         return dial(self.opening.address)  # paho would try all of the host's in one attempt
@@ -54,19 +50,23 @@ class _Paho(paho.Client):
         return bool(self._in_packet["have_remaining"]) and self._in_packet["remaining_length"] > MAX_PACKET
 
     def _handle_publish(self) -> MQTTErrorCode:
+        """Let paho handle a PUBLISH; if it is too long or not wanted, only acknowledge it."""
         packet, first = self._in_packet["packet"], self._in_packet["command"]
-        end = 2 + int.from_bytes(packet[:2])
+        topic_end = 2 + int.from_bytes(packet[:2])
+        id_end = topic_end + 2 if first & ANY_QOS else topic_end  # with QoS 0 there is no message id
         if self._too_long:
-            self.listener.on_too_long(bytes(packet[2:end]), self._in_packet["remaining_length"])
-        elif not (first & RETAIN and self._skips_retained(packet, end, end + 2 if first & ANY_QOS else end)):
+            self.listener.on_too_long(bytes(packet[2:topic_end]), self._in_packet["remaining_length"])
+        elif not (first & RETAIN and self._skips_retained(packet, topic_end, id_end)):
             return super()._handle_publish()
-        return self._send_puback(int.from_bytes(packet[end : end + 2])) if first & ANY_QOS else MQTTErrorCode(0)
+        if id_end == topic_end:
+            return MQTTErrorCode.MQTT_ERR_SUCCESS
+        return self._send_puback(int.from_bytes(packet[topic_end:id_end]))
 
-    def _skips_retained(self, packet: bytearray, end: int, start: int) -> bool:
-        """True if the arrived retained PUBLISH, whose topic ends at ``end``, is not wanted. Removals are wanted."""
-        if self._protocol == MQTTProtocolVersion.MQTTv5 and start < len(packet):
-            start += 1 + packet[start]  # of properties, of which nobody needs 128 bytes
-        return len(packet) > start and self.listener.skips(bytes(packet[2:end]))
+    def _skips_retained(self, packet: bytearray, topic_end: int, payload_at: int) -> bool:
+        """True if this retained PUBLISH is not wanted. Removals are wanted."""
+        if self._protocol == MQTTProtocolVersion.MQTTv5 and payload_at < len(packet):
+            payload_at += 1 + packet[payload_at]  # properties are before it, of which nobody needs 128 bytes
+        return len(packet) > payload_at and self.listener.skips(bytes(packet[2:topic_end]))
 
     def _handle_on_message(self, message: paho.MQTTMessage) -> None:
         first = (ANY_QOS if message.qos else 0) | (RETAIN if message.retain else 0)
@@ -167,7 +167,7 @@ class PahoClient:
 
     @property
     def unwritten(self) -> int:
-        return self._paho.unwritten
+        return sum(packet["to_process"] for packet in self._paho._out_packet)
 
     @property
     def waiting(self) -> bool:
@@ -222,8 +222,12 @@ class PahoClient:
         if reason.is_failure:
             self._listener.on_refused(reason.value)
         else:
-            names = ("MaximumPacketSize", "", "MaximumQoS", "RetainAvailable")
-            self._listener.on_accepted(Accepted(*(getattr(properties, name, None) for name in names)))
+            accepted = Accepted(
+                max_packet=getattr(properties, "MaximumPacketSize", None),
+                max_qos=getattr(properties, "MaximumQoS", None),
+                retain=getattr(properties, "RetainAvailable", None),
+            )
+            self._listener.on_accepted(accepted)
 
     def _on_disconnect(self, _client: Any, _data: Any, flags: Any, reason: ReasonCode, _properties: Any) -> None:
         if flags.is_disconnect_packet_from_server:

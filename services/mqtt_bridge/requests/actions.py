@@ -49,9 +49,7 @@ class Action:
     Operators read the log, and a command's words or output may hold a token: these go to a file in ``folder``.
     """
 
-    def __init__(
-        self, row: Row, control: SystemControl, *, folder: Path, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, row: Row, control: SystemControl, *, folder: Path, clock: Callable[[], float]) -> None:
         self.name, self.control, self._cooldown_s = row.channel.metric, control, row.cooldown_s
         self._output = folder / f"{self.name.rpartition('/')[2]}.log"
         self._clock = clock

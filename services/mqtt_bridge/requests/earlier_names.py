@@ -106,22 +106,19 @@ class Renaming(Requests):
 
 
 class _Removal:
-    """The removal of one earlier name: watches for a living robot of that name; without one it cleans the brokers.
-
-    It removes the messages that brokers retain under the name, and checks that they are gone.
-    """
+    """The removal of what brokers retain under an earlier name, unless a living robot has that name now."""
 
     def __init__(self, name: str, sides: list[Transport], call_in: CallIn, done: Callable[[], None]) -> None:
         self._name, self._sides, self._call_in, self._done = name, sides, call_in, done
         self._subscriptions: list[Subscription] = []
-        self._found: list[set[str]] = []  # on each side: heartbeats, then topics
+        self._answers: list[set[str]] = []  # of each side: its heartbeats, and later the topics that it retains
         self._removed = 0
 
     def begin(self) -> None:
         self._ask(ONLINE.topic(self._name), _note_heartbeat, WATCH_S, self._look)
 
     def _look(self) -> None:
-        if any(len(heartbeats) > 1 for heartbeats in self._found):  # one may be retained
+        if any(len(heartbeats) > 1 for heartbeats in self._answers):  # one may be retained
             log.info("%s is another robot now: what is retained under this name is its own", self._name)
             self._end()
             self._done()
@@ -131,15 +128,15 @@ class _Removal:
             self._end()
 
     def _remove(self) -> None:
-        self._removed = sum(map(len, self._found))
-        for transport, topics in zip(self._sides, self._found, strict=True):
+        self._removed = sum(map(len, self._answers))
+        for transport, topics in zip(self._sides, self._answers, strict=True):
             for topic in sorted(topics):
                 transport.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
         again = partial(self._ask, f"{self._name}/#", _note_retained, _ARRIVE_S, self._check)
         self._call_in(_ARRIVE_S, again)
 
     def _check(self) -> None:
-        remaining = [topic for topics in self._found for topic in topics]
+        remaining = [topic for topics in self._answers for topic in topics]
         remaining += [subscription.filter for subscription in self._subscriptions if subscription.refused]
         self._end()
         if remaining:
@@ -153,13 +150,16 @@ class _Removal:
     def _ask(
         self, filter_: str, note: Callable[[set[str], Message], None], wait_s: float, then: Callable[[], None]
     ) -> None:
-        """Subscribe on all sides; call ``then`` after their retained messages. No exception ends the bridge."""
+        """Subscribe on all sides, and call ``then`` after ``wait_s``. No exception ends the bridge.
+
+        ``note(answers, message)`` adds what a message says to the answers of its side.
+        """
         self._end()
-        self._found = [set() for _ in self._sides]
+        self._answers = [set() for _ in self._sides]
         try:
-            for transport, topics in zip(self._sides, self._found, strict=True):
-                received = partial(note, topics)
-                self._subscriptions.append(transport.subscribe(filter_, received, echo=False, direct=True))
+            for transport, answers in zip(self._sides, self._answers, strict=True):
+                receive = partial(note, answers)
+                self._subscriptions.append(transport.subscribe(filter_, receive, echo=False, direct=True))
         except TransportError as error:
             log.warning("what is left of its earlier name %s stays: %s", self._name, error)
             self._end()
@@ -167,16 +167,15 @@ class _Removal:
         self._call_in(wait_s, then)
 
     def _end(self) -> None:
-        subscriptions, self._subscriptions = self._subscriptions, []
-        for subscription in subscriptions:
-            subscription.close()
+        while self._subscriptions:
+            self._subscriptions.pop().close()
 
 
-def _note_heartbeat(found: set[str], message: Message) -> None:
-    if len(found) < _TOPICS and _OFFLINE.search(message.payload) is None:
-        found.add(message.payload.hex())
+def _note_heartbeat(heartbeats: set[str], message: Message) -> None:
+    if len(heartbeats) < _TOPICS and _OFFLINE.search(message.payload) is None:
+        heartbeats.add(message.payload.hex())
 
 
-def _note_retained(found: set[str], message: Message) -> None:
-    if message.retain and message.payload and len(found) < _TOPICS:
-        found.add(message.topic)
+def _note_retained(topics: set[str], message: Message) -> None:
+    if message.retain and message.payload and len(topics) < _TOPICS:
+        topics.add(message.topic)

@@ -46,8 +46,8 @@ class Media:
         send_one: Callable[[str, ProgramRequest], bool] = lambda _program, _request: True,
     ) -> None:
         self._programs, self._send_one = programs, send_one
-        self._allowed: dict[Row, bool] = {}
-        self._requested = {row: _first(row, running or {}) for row in MEDIA}
+        self._allowed: dict[Row, bool] = {}  # the flag of each medium, once it is known
+        self._requested = {row: _earlier_request(row, running or {}) for row in MEDIA}
         self._sent: dict[str, ProgramRequest] = {}  # by program
 
     def allow(self, flag: Channel, allowed: bool) -> None:
@@ -65,9 +65,10 @@ class Media:
         """Return the requests by program, without those whose flag is still unknown."""
         requests: dict[str, ProgramRequest] = {}
         for row, request in self._requested.items():
-            if not request.on or row in self._allowed:
-                allowed = request.on and self._allowed[row]
-                requests |= dict.fromkeys(row.programs, request if allowed else _NO)
+            if request.on and row not in self._allowed:
+                continue
+            runs = request.on and self._allowed[row]
+            requests |= dict.fromkeys(row.programs, request if runs else _NO)
         return {name: request for name, request in requests.items() if name in self._programs}
 
     def send(self) -> None:
@@ -77,7 +78,7 @@ class Media:
                 self._sent[program] = request
 
 
-def _first(row: Row, running: Mapping[str, ProgramRequest]) -> ProgramRequest:
+def _earlier_request(row: Row, running: Mapping[str, ProgramRequest]) -> ProgramRequest:
     return next((running[name] for name in row.programs if name in running), _NO)
 
 

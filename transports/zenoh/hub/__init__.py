@@ -10,8 +10,7 @@ import errno
 import logging
 import socket
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import zenoh
 
@@ -19,16 +18,13 @@ from pebble.errors import TransportError
 from pebble.transports.counters import Counters
 from pebble.transports.peers import FileLock, PeerRegistry, new_name, prepare_run_dir
 from pebble.transports.renewed import Renewed
-from pebble.transports.settings import TlsSettings, ZenohSettings
+from pebble.transports.settings import ZenohSettings
 from pebble.transports.socket_holders import why_not
 from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.hub.worker import HubWorker
 from pebble.transports.zenoh.presence import Barrier
 from pebble.transports.zenoh.session import HUB_SOCKET, close_at_exit, close_session, open_session, session_config
-
-if TYPE_CHECKING:
-    from pebble.transports.zenoh.hub.journal import Journal
 
 log = logging.getLogger(__name__)
 
@@ -40,17 +36,18 @@ class ZenohHub:
         self.name = new_name()
         self.counters = Counters()
         self._settings = settings
+        self._socket = settings.run_dir / HUB_SOCKET
         self._lock: FileLock | None = None
         self._session: zenoh.Session | None = None
         self._worker: HubWorker | None = None
         self._store: HubStore | None = None
         self._admission = admission or Admission(settings.wills, settings.unretained)
-        self._certificates = None if settings.tls is None else _renewed(settings.tls)
-        self._used = self._newest
+        self._certificates: Renewed[Any] | None = None
+        if settings.tls is not None:
+            from pebble.transports.credentials import renewed_context  # ssl, which few hubs need
 
-    @property
-    def _socket(self) -> Path:
-        return self._settings.run_dir / HUB_SOCKET
+            self._certificates = renewed_context(settings.tls)
+        self._used = self._newest  # the certificates and rules of the session
 
     @property
     def retained(self) -> dict[str, bytes]:
@@ -124,7 +121,11 @@ class ZenohHub:
         return lock
 
     def _start(self) -> None:
-        journal = None if (file := self._settings.journal) is None else _journal(file)
+        journal = None
+        if self._settings.journal is not None:
+            from pebble.transports.zenoh.hub.journal import Journal  # sqlite3, 2.5 MB
+
+            journal = Journal(self._settings.journal)
         self._store = store = HubStore(self._settings.max_wills)
         self._worker = HubWorker(self.name, store, self._admission, journal, self.counters)
         self._listen(self._worker)
@@ -139,7 +140,7 @@ class ZenohHub:
             self._session = open_session(config)
         except zenoh.ZError as error:
             raise TransportError(f"the hub cannot open {self._socket}: {error}") from None
-        Barrier(self._session, self.name, lambda: 0)
+        Barrier(self._session, self.name, lambda: 0)  # answers the clients that wait for this hub
         worker.serve(self._session)
 
     def _is_free(self, endpoint: str) -> bool:
@@ -148,7 +149,8 @@ class ZenohHub:
         A robot's hub runs without such an endpoint, because any user can take a port; other hubs end.
         """
         kind = socket.SOCK_DGRAM if endpoint.startswith("quic/") else socket.SOCK_STREAM
-        host, _, port = endpoint.partition("/")[2].partition("#")[0].partition("?")[0].rpartition(":")
+        place = endpoint.partition("/")[2].partition("#")[0].partition("?")[0]  # without protocol and options
+        host, _, port = place.rpartition(":")
         try:
             family, *_, address = socket.getaddrinfo(host.strip("[]"), int(port), type=kind)[0]
             with socket.socket(family, kind) as tried:
@@ -163,15 +165,3 @@ class ZenohHub:
             log.error("%s; the robot runs without it: end that process and start the robot again", fact)
             return False
         return True
-
-
-def _journal(file: Path) -> Journal:
-    from pebble.transports.zenoh.hub.journal import Journal  # sqlite3, 2.5 MB
-
-    return Journal(file)
-
-
-def _renewed(tls: TlsSettings) -> Renewed[Any]:
-    from pebble.transports.credentials import renewed_context  # ssl, which few hubs need
-
-    return renewed_context(tls)

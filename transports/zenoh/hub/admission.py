@@ -50,7 +50,7 @@ class Admission:
     def admitted(self, record: Record) -> Record | None:
         """Return ``record`` to be stored, without a refused will, which is counted; None if it must not be stored."""
         if isinstance(record, Retained):
-            refused = bool(self._unretained) and _matches_any(self._unretained, key_to_topic(record.key))
+            refused = any(matches(filter_, key_to_topic(record.key)) for filter_ in self._unretained)
             return None if refused else record
         if record.will is None or self.takes(record.will.topic):
             return record
@@ -73,7 +73,3 @@ class Admission:
         self._logged.add(client)
         more = "; those of further clients are only counted" if len(self._logged) == _CLIENTS else ""
         log.warning("refused the %s of %r: %s%s", what, client, why, more)
-
-
-def _matches_any(filters: Sequence[str], topic: str) -> bool:
-    return any(matches(filter_, topic) for filter_ in filters)

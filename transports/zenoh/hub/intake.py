@@ -32,8 +32,10 @@ class Intake:
         self._lock = threading.Lock()
         self._changed, self._room = threading.Condition(self._lock), threading.Condition(self._lock)
         self._tasks, self._queries = deque[tuple[Task, int]](), deque[Task]()
-        self._bytes = self._outside = 0  # of the tasks; senders that wait for room
-        self._ended = self._was_task = False
+        self._bytes = 0  # of the tasks
+        self._outside = 0  # senders that wait for room
+        self._was_task = False  # a task was taken last, so it is the queries' turn
+        self._ended = False
 
     def put(self, task: Task) -> None:
         """Queue a task of the hub itself, or the arrival or departure of a client."""
@@ -66,10 +68,10 @@ class Intake:
 
     def ask(self, work: _OnQuery, query: zenoh.Query) -> None:
         """Queue a query. It gets no answer if too many wait, or once its client no longer waits."""
-        came = monotonic()
+        asked_at = monotonic()
 
         def answer() -> None:
-            if monotonic() - came < wire.RETAINED_ANSWER_S:
+            if monotonic() - asked_at < wire.RETAINED_ANSWER_S:
                 work(query)
             else:
                 query.drop()  # type: ignore[no-untyped-call]
@@ -93,7 +95,7 @@ class Intake:
         with self._lock:
             if not (self._tasks or self._queries or self._ended) and not self._changed.wait(timeout):
                 return _nothing
-            if self._queries and (self._was_task or not self._tasks):
+            if self._queries and (self._was_task or not self._tasks):  # it is their turn
                 self._was_task = False
                 return self._queries.popleft()
             if not self._tasks:

@@ -42,7 +42,9 @@ class Journal:
         A damaged file is set aside as ``<path>.bad``.
         """
         try:
-            return self._read()
+            records = [record for (record,) in self._opened().execute("SELECT record FROM records ORDER BY rowid")]
+            self._loaded = True
+            return records
         except (OSError, sqlite3.OperationalError) as error:
             self._fail(error)
         except sqlite3.DatabaseError as error:
@@ -94,11 +96,6 @@ class Journal:
         if self._syncer.is_alive():
             self._syncer.join()
         self._release()
-
-    def _read(self) -> list[bytes]:
-        records = [record for (record,) in self._opened().execute("SELECT record FROM records ORDER BY rowid")]
-        self._loaded = True
-        return records
 
     def _opened(self) -> sqlite3.Connection:
         """Return the open database, readable for this user alone. Raises OSError and sqlite3.Error."""

@@ -55,13 +55,14 @@ class HubStore:
 
         A later value, or removal, by another client stays.
         """
-        return [key for key, digest in hello.own.items() if self._differs(key, digest, hello.name)]
+        return [key for key, its_digest in hello.own.items() if self._differs(key, its_digest, hello.name)]
 
-    def _differs(self, key: str, own: int | None, name: str) -> bool:
+    def _differs(self, key: str, its_digest: int | None, client: str) -> bool:
+        """True if this client, whose own value has this digest, should send that value; None: it has removed it."""
         retained = self._retained.get(key)
         if retained is None:
-            return own is not None
-        return retained.stamp.origin == name and digest(retained.payload) != own
+            return its_digest is not None
+        return retained.stamp.origin == client and digest(retained.payload) != its_digest
 
     def _store_retained(self, record: Retained) -> bool:
         before = self._retained.get(record.key)

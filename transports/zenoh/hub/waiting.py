@@ -1,6 +1,7 @@
 """Subscribers' queries that wait in the hub for retained messages which are known to be on their way."""
 
 from collections import deque
+from typing import NamedTuple
 
 import zenoh
 
@@ -8,14 +9,22 @@ QUERIES = 1000  # that wait; further ones are answered at once
 PATIENCE_S = 0.5  # so long each waits
 
 
+class _Waiting(NamedTuple):
+    """A query that is answered once ``needs`` are here, or at ``until``."""
+
+    until: float
+    needs: dict[str, int]  # how many retained messages, by client
+    query: zenoh.Query
+
+
 class WaitingQueries:
     """Queries that wait, each until a given number of retained messages of each client is here. Not thread-safe."""
 
     def __init__(self) -> None:
         self._received: dict[str, int] = {}  # how many retained messages have arrived, by client
-        self._waiting: deque[tuple[float, dict[str, int], zenoh.Query]] = deque()
+        self._waiting: deque[_Waiting] = deque()  # oldest first
         self._awaited: set[str] = set()  # clients whose messages these wait for
-        self._looks = False  # True if some of them may have waited for long enough
+        self._looks = False  # True if such a message came, so that some query may have all that it needs
 
     def count_from(self, client: str, count: int) -> None:
         """Note that this client has sent ``count`` retained messages until now, and that all of them are here."""
@@ -37,7 +46,7 @@ class WaitingQueries:
         """Let a query wait; False if it must be answered now."""
         if len(self._waiting) >= QUERIES or self._has_arrived(needs):
             return False
-        self._waiting.append((now + PATIENCE_S, needs, query))
+        self._waiting.append(_Waiting(now + PATIENCE_S, needs, query))
         self._awaited.update(needs)
         return True
 
@@ -45,25 +54,25 @@ class WaitingQueries:
         """Return the time at which to call :meth:`take`; infinite if nothing waits."""
         if not self._waiting:
             return float("inf")
-        return float("-inf") if self._looks else self._waiting[0][0]
+        return float("-inf") if self._looks else self._waiting[0].until
 
     def take(self, now: float) -> list[zenoh.Query]:
         """Remove and return the queries to answer now: nothing is missing for them, or they have waited long enough."""
         due = []
-        while self._waiting and now >= self._waiting[0][0]:
+        while self._waiting and now >= self._waiting[0].until:
             due.append(self._waiting.popleft())
         if self._looks:
             self._looks = False
-            due += [entry for entry in self._waiting if self._has_arrived(entry[1])]
-            self._waiting = deque(entry for entry in self._waiting if not self._has_arrived(entry[1]))
+            due += [entry for entry in self._waiting if self._has_arrived(entry.needs)]
+            self._waiting = deque(entry for entry in self._waiting if not self._has_arrived(entry.needs))
         if not self._waiting:
             self._awaited.clear()
-        return [query for _, _, query in due]
+        return [entry.query for entry in due]
 
     def drop(self) -> None:
         """Drop all queries without an answer."""
-        for _, _, query in self._waiting:
-            query.drop()  # type: ignore[no-untyped-call]
+        for entry in self._waiting:
+            entry.query.drop()  # type: ignore[no-untyped-call]
         self._waiting.clear()
 
     def _has_arrived(self, needs: dict[str, int]) -> bool:

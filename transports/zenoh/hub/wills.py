@@ -13,7 +13,7 @@ class WillTimes:
         self._due: dict[str, float] = {}
 
     def on_hello(self, name: str, now: float, *, alive: bool, has_will: bool) -> None:
-        """Note a client's hello. If its token is not there yet (``alive``) and does not follow, its will is due."""
+        """Note a client's hello. ``alive``: its token is there; if not, and none follows, its will is due."""
         if alive:
             self._due.pop(name, None)
         elif has_will:
@@ -24,7 +24,7 @@ class WillTimes:
         self._due[name] = now + GONE_S
 
     def on_restart(self, names: Iterable[str], now: float) -> None:
-        """Set the times of the wills that were stored before a restart, so that their clients can come back before."""
+        """Give the clients of these stored wills time to come back after a restart, before the wills are published."""
         for name in names:
             self._due.setdefault(name, now + RETURN_S)
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 import zenoh
@@ -41,7 +40,7 @@ class HubWorker:
         self._store, self._journal, self._counters, self._admission = store, journal, counters, admission
         self.alive_clients: set[str] = set()
         self._name, self._wills = name, WillTimes()
-        self._has_met = False  # another hub
+        self._has_met = False  # another hub was there
         self._token: zenoh.LivelinessToken | None = None
         self._waiting, self._intake = WaitingQueries(), Intake()
         self._session: zenoh.Session | None = None
@@ -61,7 +60,8 @@ class HubWorker:
         for what, work in ((wire.HELLO, self._on_hello), (wire.BYE, self._on_bye)):
             for key in (what, f"{what}/*"):
                 session.declare_queryable(key, direct(partial(self._intake.greet, work)))
-        session.liveliness().declare_subscriber(wire.LIVE + "*", self._queued(self._on_client), history=True)
+        note_client = direct(lambda sample: self.post(partial(self._on_client, sample)))
+        session.liveliness().declare_subscriber(wire.LIVE + "*", note_client, history=True)
         session.liveliness().declare_subscriber(wire.UP + "*", direct(self._on_hub), history=True)
         self._token = session.liveliness().declare_token(wire.UP + self._name)
         if not self._thread.is_alive():
@@ -77,9 +77,6 @@ class HubWorker:
 
     # -- the thread
 
-    def _queued(self, work: Callable[[Any], None]) -> zenoh.handlers.Callback[Any]:
-        return direct(lambda event: self.post(lambda: work(event)))
-
     def post(self, task: Task) -> None:
         """Run ``task`` on the hub's thread."""
         self._intake.put(task)
@@ -89,7 +86,8 @@ class HubWorker:
             if (task := self._intake.take(self._pause())) is None:
                 return
             self._do(task)
-            self._answer_waiting()
+            for query in self._waiting.take(time.monotonic()):
+                self._intake.ask(self._answer, query)
             self._publish_due_wills()
             if self._journal is not None and time.monotonic() >= self._journal.rewrite_at:
                 self._write_journal(self._journal)
@@ -130,23 +128,20 @@ class HubWorker:
         if not self._waiting.add(needs, query, time.monotonic()):
             self._answer(query)
 
-    def _answer_waiting(self) -> None:
-        for query in self._waiting.take(time.monotonic()):
-            self._intake.ask(self._answer, query)
-
     def _answer(self, query: zenoh.Query) -> None:
         with query:
             for retained in self._selected(query.key_expr):
                 query.reply(wire.RETAINED + retained.key, retained.payload, attachment=retained.stamp.pack())
 
     def _selected(self, wanted: zenoh.KeyExpr) -> list[Retained]:
+        """Return the stored messages whose keys, under `wire.RETAINED`, a query asks for."""
         text = str(wanted)
         if "*" not in text:
             retained = self._store.get(text.removeprefix(wire.RETAINED))
             return [] if retained is None else [retained]
         begin = text.partition("*")[0].rstrip("$/")  # rules most keys of a fleet out, quickly
-        keys = ((wire.RETAINED + retained.key, retained) for retained in self._store.retained())
-        return [retained for key, retained in keys if key.startswith(begin) and wanted.intersects(key)]
+        keyed = ((wire.RETAINED + retained.key, retained) for retained in self._store.retained())
+        return [retained for key, retained in keyed if key.startswith(begin) and wanted.intersects(key)]
 
     # -- clients
 
