@@ -4,9 +4,9 @@ A change that no test notices survives: no test asserts what the line does, or t
 copy of the tree, collected once; for each change, a forked process replaces the code of its function and runs the rows
 that reach its line: programs that tests start do not have it. A line that runs while tests are imported (a constant, a
 class body, a default) is changed in the copy and tried by all rows in a new process, which takes seconds. Calls that
-log are counted apart. A hang counts as killed. A page module is changed in the copy and tried by all rows; those of
-tests/ext/page/modules, which run in Node, if no others are named. What is inside its strings and templates is not
-changed.
+log are counted apart. A hang counts as killed. A row is a test function with its parameters, an arc a step from one
+line to the next. A page module is changed in the copy and tried by all rows; those of tests/ext/page/modules, which run
+in Node, if no others are named. What is inside its strings and templates is not changed.
 """
 
 import argparse
@@ -26,7 +26,7 @@ import tempfile
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import CodeType, FrameType, FunctionType
@@ -184,6 +184,11 @@ def children() -> Iterator[int]:
                 yield int(path.parent.name)
 
 
+def lines_of(arcs: Iterable[Sequence[Any]]) -> set[tuple[str, int]]:
+    """Return the lines from and to which the arcs lead, each with its file."""
+    return {(file, line) for file, *ends in arcs for line in ends}
+
+
 class Trial:
     """A plugin for pytest that runs the collected rows without a mutant, and with each, in a copy of the tree."""
 
@@ -225,7 +230,7 @@ class Trial:
         if session.testsfailed:
             return None
         self.session, self.items = session, {item.nodeid: item for item in session.items}
-        self.imported = {(file, line) for file, *ends in self.arcs for line in ends}
+        self.imported = lines_of(self.arcs)
         self.passed.write_text("{}")
         forked(lambda: self.passed.write_text(json.dumps(self.run_rows(list(self.items), stop=False))))
         sys.settrace(None)
@@ -244,30 +249,42 @@ class Trial:
         return True
 
     def read_rows(self) -> None:
-        """Order the rows that pass without a mutant, modules with the fastest first; name the rows that do not pass."""
+        """Read which rows pass without a mutant, fast modules first; name the rows that do not pass."""
         passed = json.loads(self.passed.read_text())  # by the name of a row: its seconds, and its arcs
-        names = sorted(passed, key=lambda name: passed[name][0])
-        self.slowest = {self.items[name].path: passed[name][0] for name in names}  # by module: the last one counts
-        names.sort(key=lambda name: self.slowest[self.items[name].path])  # rows of a module share what they set up
+        module_of = {name: self.items[name].path for name in passed}
+        self.slowest: defaultdict[Path, float] = defaultdict(float)  # seconds of a module's slowest row
+        for name, (seconds, _) in passed.items():
+            self.slowest[module_of[name]] = max(self.slowest[module_of[name]], seconds)
+        # rows of a module stay together, as they share what they set up
+        names = sorted(passed, key=lambda name: (self.slowest[module_of[name]], passed[name][0]))
         self.rows = {name: passed[name] for name in names}
-        rows = list(self.rows.items())
-        self.lines = {name: {(file, line) for file, *ends in arcs for line in ends} for name, (_, arcs) in rows}
+        self.lines = {name: lines_of(arcs) for name, (_, arcs) in self.rows.items()}
         self.failing = FAILED.findall(self.failed.read_text())
-        print(f"{len(rows)} rows pass without a mutant; left out, as they fail: {', '.join(self.failing) or 'none'}")
-        if not rows:
+        print(f"{len(names)} rows pass without a mutant; left out, as they fail: {', '.join(self.failing) or 'none'}")
+        if not names:
             pytest.exit("no row passes without a mutant", 2)
-        arcs_of = {name: set(map(tuple, arcs)) for name, (_, arcs) in rows if self.options.matrix}
-        for arc in set().union(*arcs_of.values()):
-            functions = {name.partition("[")[0] for name, arcs in arcs_of.items() if arc in arcs}
+        if self.options.matrix:
+            self.write_arcs()
+
+    def write_arcs(self) -> None:
+        """Write which test functions cover each arc, for --spare."""
+        covering: defaultdict[tuple[str, int, int], set[str]] = defaultdict(set)
+        for name, (_, arcs) in self.rows.items():
+            for arc in arcs:
+                covering[tuple(arc)].add(name.partition("[")[0])
+        for arc, functions in covering.items():
             print(json.dumps({"name": str(arc), "result": "arc", "killers": sorted(functions)}), file=self.out)
 
     def run_rows(self, names: list[str], stop: bool) -> dict[str, Any]:
-        """Run rows and write which fail, or do not end; return the seconds and arcs of the others."""
+        """Run rows, or only up to the first that fails if ``stop``; return the seconds and arcs of those that pass.
+
+        The file ``failed`` then has the others.
+        """
         passed, failed = {}, ""
         for number, (name, following) in enumerate(itertools.zip_longest(names, names[1:]), 1):
             if number % 100 == 0:
                 print(f"{number} of {len(names)} rows", file=SCREEN)
-            self.failed.write_text(f"{failed}FAILED {name}\n")
+            self.failed.write_text(f"{failed}FAILED {name}\n")  # which stays there if this row hangs
             self.arcs.clear()
             failures, start = self.session.testsfailed, time.monotonic()
             self.session.config.hook.pytest_runtest_protocol(item=self.items[name], nextitem=self.items.get(following))

@@ -41,7 +41,7 @@ class EmergencyStop:
         self._barred = 0  # of the last state
         self._paused = False
         self._since = now
-        self._unsaved = False
+        self._unsaved = False  # there was a stop or a reset since the last `save`
         self._saves = True  # there is a file system that can be written to
         self._saved: bool | None = False  # `latched` by the file; None: unknown
         self._restore()
@@ -147,7 +147,7 @@ class EmergencyStop:
         latched = self.latch.latched
         if self._saved == latched:
             return
-        self._saved = None
+        self._saved = None  # until the file is complete
         try:
             with open(_NEW, "w") as file:
                 json.dump(self.latch.saved(), file)
@@ -155,7 +155,7 @@ class EmergencyStop:
             self._saved = latched
             self._saves = True
         except OSError as error:
-            self._saves = error.errno not in (_EROFS, _ENODEV)
+            self._saves = error.errno not in (_EROFS, _ENODEV)  # other errors may pass: the next stop tries again
 
     def _restore(self) -> None:
         """Restore the latch: free without a file, latched if it cannot be read."""

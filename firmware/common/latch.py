@@ -117,7 +117,10 @@ class Latch:
         return self._waits
 
     def tick(self, now: int) -> None:
-        """End a pause whose time is over. Call it at least every few minutes, as clocks of boards wrap."""
+        """Admit persons again if all have paused for half a second since a reset.
+
+        Call it at least every few minutes, as clocks of boards wrap.
+        """
         if self._waits and self._diff(now, self._waits_from) >= 500:
             self._waits = False
 

@@ -72,9 +72,9 @@ class Lease:
             if key:
                 return True
             if not script:
-                if self.strangers == 2 or (self.strangers and self.key):
+                if self.strangers == 2 or (self.strangers == 1 and self.key):
                     return True
-                self._received = now
+                self._received = now  # a stranger moves the motors: the state shows that for 2 s
                 self.changed = self.changed or not self.others
                 self.others = True
         return False
@@ -124,6 +124,6 @@ def request_of(fields: dict) -> tuple[str, str, str, int] | None:
 
 
 def shown(text: str, limit: int) -> str:
-    """Return ``text`` in the letters of names; "/" separates a server and its person."""
+    """Return ``text`` in lower case, with "_" for what names cannot have; the "/" in SERVER/PERSON stays."""
     letters = "abcdefghijklmnopqrstuvwxyz0123456789_-/"
     return "".join([char if char in letters else "_" for char in text.lower()[:limit]])

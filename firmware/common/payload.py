@@ -45,8 +45,8 @@ def parse(raw: memoryview | bytes, grouped: bool = False) -> tuple[float, float,
     """Return ``(x, z, y, run, valid_ms, key)`` from bare or wrapped JSON; None if the command is refused.
 
     Axes are limited to -1..1; missing ones, and those that are no number, are 0; NaN and infinity are refused. The
-    other values are as the arbiter needs them. Wrong ones, or a wrong ``source``, refuse a command that moves anything,
-    but never a stop; so do further members of a group, which no board takes. ``grouped``: it is in a group of commands.
+    other values are as the arbiter needs them. If one of these or ``source`` is wrong, only a stop is admitted.
+    ``grouped``: the command is a member of a group. If that has other members, too, only a stop is admitted.
     """
     try:
         body = load(raw)

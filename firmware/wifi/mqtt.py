@@ -139,17 +139,17 @@ class Client:
         return True
 
     def subscribe(self, count: int) -> None:
-        """Subscribe to the first ``count`` topics, those without an account first (packet 1, 3.8).
+        """Subscribe to the first ``count`` topics: the ``plain`` ones, then all with the sender's account (3.8).
 
-        Only stops and resets have QoS 1: a broker keeps some of those for a client that is slow to read, whatever else
-        it is sent; of messages with QoS 0 it drops the newest.
+        The second part only if names are checked. Stops and resets have QoS 1, all others QoS 0: for a client that
+        reads slowly a broker drops the newest messages of QoS 0, but stores some of QoS 1.
         """
         names = self.names
         both = self.topics[: min(count, self.plain)]
         both += tuple([names.ANY + topic for topic in self.topics[:count]] if names else ())
         self._asked = len(both)
         filters = [text(self.root + topic) + (b"\1" if b"estop" in topic else b"\0") for topic in both]
-        self.send(0x82, b"\x00\x01", *filters)
+        self.send(0x82, b"\x00\x01", *filters)  # with packet id 1
 
     def publish(self, retain: int, topic: bytes, payload: bytes) -> bool:
         """Publish with QoS 0; ``retain`` 1: as a retained message. False if there is no room for it now."""

@@ -128,12 +128,11 @@ class NetworkRobot:
         client = self.session.client
         raw = client.data[client.first : client.last]
         if kind == "subscribed":
-            granted = bytes(raw)
-            stop = granted[_ESTOP]
-            granted = granted[-len(client.topics) :]  # these are all topics, with names if those are checked
+            results = bytes(raw)  # in the order of Client.subscribe: topics without an account come first
+            granted = results[-len(client.topics) :]  # of all topics, with an account if names are checked
             if granted[_DRIVE] > 127:
                 raise ValueError("subscription refused")
-            self.stops.stoppable = stop <= 127 and granted[_RESET] <= 127
+            self.stops.stoppable = results[_ESTOP] <= 127 and granted[_RESET] <= 127
             self.stops.controllable = granted[_CONTROL] <= 127
             self.groups = getattr(self.body, "groups", b"") if granted[-1] <= 127 else b""
             self._heartbeats = 0

@@ -149,16 +149,16 @@ class Reader:
         tells_nothing = shown == "text" and (get_origin(kind) is Literal or kind in (str, Path))
         must_be = f"must be {expected(kind, metas)}" + ("" if tells_nothing else f", not {shown}")
         reading = reading_of(annotation, kind, metas, raw, default) if self._other_forms else None
+        if reading is not None and reading.differs:
+            is_set = bool(reading.value) or reading.value == 0
+            used = f"{msgspec.json.encode(reading.value).decode()} is used" if is_set else "it counts as not set"
+            self.notes.warning(path, f"{must_be}; {used}")
+            return reading.value
         is_raw = reading is not None and type(reading.value) is type(raw) and reading.value == raw
-        if reading is None or (is_raw and not reading.differs):  # raw itself was refused before this call
+        if reading is None or is_raw:  # raw itself was refused before this call
             self.notes.problem(path, must_be)
             return _WRONG
-        if not reading.differs:
-            return self._plain(annotation, reading.value, path, NODEFAULT)
-        is_set = bool(reading.value) or reading.value == 0
-        used = f"{msgspec.json.encode(reading.value).decode()} is used" if is_set else "it counts as not set"
-        self.notes.warning(path, f"{must_be}; {used}")
-        return reading.value
+        return self._plain(annotation, reading.value, path, NODEFAULT)
 
     def _parsed(self, metas: list[Meta], value: Any, path: problems.Path) -> Any:
         parse = _extra(metas, "parse")

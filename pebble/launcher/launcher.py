@@ -70,7 +70,8 @@ class Launcher:
         """
         config = self._config
         if config.path is not None:
-            require_own(config.path, "runs nothing of it", there=True)
+            # root must not run the commands that another user writes into a config
+            require_own(config.path, does="runs nothing of it", there=True)
         own_records = OwnRecords(self._logs, config.log_level)
         in_state_dir = config.state_file("launcher").with_suffix(".lock")
         with own_records, RunLock(config.run_dir(), config.base, in_state_dir) as lock:

@@ -103,10 +103,10 @@ class ProcessSupervisor:
         if self.state not in _ACTIVE:
             return
         log.info("%s is released", self.program.name)
-        if self.state is ProgramState.REPLACED:
+        if self.state is ProgramState.REPLACED:  # the child was asked to end before
             self.state = ProgramState.RELEASED
             return
-        self._end_child(ProgramState.RELEASED, ProgramState.IDLE)
+        self._end_child(ProgramState.RELEASED, without_child=ProgramState.IDLE)
         if self._child is not None:
             self._timer = self._reactor.after(self.program.stop_timeout_s, self._kill_overdue)
 
@@ -139,7 +139,7 @@ class ProcessSupervisor:
     def stop(self) -> None:
         """Ask the child to end, and start no other."""
         self.held = False
-        self._end_child(ProgramState.STOPPING, ProgramState.STOPPED)
+        self._end_child(ProgramState.STOPPING, without_child=ProgramState.STOPPED)
 
     def restart(self) -> None:
         """Ask the child to end; a program that should run is then started again."""
@@ -215,14 +215,14 @@ class ProcessSupervisor:
 
     # -- the end of a child
 
-    def _end_child(self, ending: ProgramState, ended: ProgramState) -> None:
-        """Ask the child to end, and set the state ``ending``; without a child, set ``ended``."""
+    def _end_child(self, ending: ProgramState, *, without_child: ProgramState) -> None:
+        """Ask the child to end, and set the state ``ending``; without a child, set the other one."""
         self._cancel_timer()
         if self._child is not None:
             self.state = ending
             self._child.terminate()
         else:
-            self.state = ended
+            self.state = without_child
             self.policy.stopped(None)
             self._on_change()
 

@@ -37,9 +37,10 @@ class Reactor:
         now = self._clock()
         if self._read_at is not None:
             before, self._read_at = self._read_at, now
-            if now - before > _TURN_S + _STALL_S:
-                self._stood_still_s += now - before - _TURN_S  # a starved launcher still ends a program that hangs
-                self._on_stall(now - before)
+            passed_s = now - before
+            if passed_s > _TURN_S + _STALL_S:
+                self._stood_still_s += passed_s - _TURN_S  # a turn counts: timers of a starved process run in the end
+                self._on_stall(passed_s)
         return now - self._stood_still_s
 
     def watch(self, descriptor: int, job: Job) -> None:

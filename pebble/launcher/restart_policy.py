@@ -47,15 +47,16 @@ class RestartPolicy:
         return max(0.0, self._started + START_INTERVAL_S - now)
 
     def started(self, now: float, *, plain: bool = False) -> None:
-        """Record a start. A ``plain`` program counts as ready; it is watched from its first sign of life on."""
+        """Record a start. A ``plain`` program need not report anything: it counts as ready, and not as stuck."""
         if self.state == "stopped":  # it was asked to end: this is no restart
             self.state = "init"
         elif self.last_exit is not None:
             self.restarts += 1
         self._started = now
+        self.stuck_at = now + START_LIMIT_S
         if plain:
             self.ready(now)
-        self.stuck_at = float("inf") if plain else now + START_LIMIT_S
+            self.stuck_at = float("inf")  # unless a sign of life comes after all: then more are expected
 
     def ready(self, now: float) -> None:
         self.state = "ready"

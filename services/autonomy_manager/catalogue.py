@@ -176,7 +176,7 @@ class Catalogue:
         described, problem = Description(), ""
         try:
             if folder.parent != _OWN_SCRIPTS:
-                require_own(entry, "runs nothing of it")
+                require_own(entry, does="runs nothing of it")
         except PebbleError as error:
             return _Answer(described, problem=str(error), broken=True)
         try:

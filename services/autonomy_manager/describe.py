@@ -62,11 +62,11 @@ def _texts(description: Description) -> Iterator[str]:
 
 
 class DescribeError(Exception):
-    """An error: the script has no form of settings. The text says why."""
+    """An error: a script has not described itself, so it is offered without settings. The text says why."""
 
 
 class BrokenScriptError(DescribeError):
-    """An error: the script cannot be started either. The text says why."""
+    """An error: a script cannot run at all, so it cannot be started. The text says why."""
 
 
 def is_ours(entry: Path) -> bool:

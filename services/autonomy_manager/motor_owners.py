@@ -79,15 +79,17 @@ class MotorOwners:
     def ending(self, run: int, baseline: Baseline, signs: bool = True) -> str:
         """Return why this run must end; empty if it may continue. New owners are added to ``baseline``.
 
-        ``signs`` False: its commands look like a person's, so owners bar it by its own commands, which does not end it.
+        ``signs`` False: its script does not sign its commands. Owners take them for a person's and so bar the run at
+        once, which says nothing about people.
         """
         for owner, state in self._states.items():
             boot, count, barred = baseline.setdefault(owner, (state.boot, state.count, 0))
             if state.latched or (state.boot == boot and state.count != count):
                 return _stopped(owner, state)
-            if signs and state.last_barred != barred and not newer(run, state.last_barred):
-                is_newest = state.last_barred == run and not newer(self.newest_run, run)
-                return OVERRIDDEN if is_newest else SUPERSEDED  # a newer run bars this one by beginning
+            is_barred = state.last_barred != barred and not newer(run, state.last_barred)
+            if signs and is_barred:
+                newer_began = state.last_barred != run or newer(self.newest_run, run)
+                return SUPERSEDED if newer_began else OVERRIDDEN  # a newer run bars this one by beginning
             if state.boot != boot:
                 return f"motor owner {owner} was restarted: start the script again"
         return ""

@@ -146,7 +146,7 @@ class Runner:
         try:
             number, baseline = self._service.begin_run(plan)
             self._run = run = Run(number, plan, baseline)
-            self._service.halt(number)  # the motor owner knows the run: who stops now, stops it before it drives
+            self._service.halt(number)  # now the motor owner knows the run, so a person can stop it before it drives
             for step in plan.dependencies:
                 run.dependencies.append(self._started(run, step))
             run.main = self._started(run, plan.main)

@@ -67,9 +67,9 @@ class AutonomyManager(Service):
         self._status: AutonomyStatus | None = None
         self._connected_before = False
         self._waiting: Callable[[], None] | None = None  # a start, until its script is listed
-        self._signs = True  # the newest run's script signs what it drives; else its commands look like a person's
-        self._moves = False  # what looks like a person's has moved the wheels: perhaps a script that does not sign
-        self._person_moves = False  # the newest command that is certainly a person's
+        self._signs = True  # the newest run's script signs its drive commands; else they look like a person's
+        self._unsigned_moves = False  # while it does not sign: the newest command without a signature moves the wheels
+        self._person_moves = False  # the newest command that is certainly a person's moves the wheels
 
     def start(self) -> None:
         if self._offer.begin():
@@ -180,7 +180,7 @@ class AutonomyManager(Service):
             if not drive.moves and drive.valid_ms == 0:
                 self.post(self._person_stops, newest_of="person stops")
         else:
-            self._moves = drive.moves
+            self._unsigned_moves = drive.moves
 
     def _person_drives(self) -> None:
         """Let scripts wait for a person who drives, or end them, as the config says."""
@@ -217,7 +217,10 @@ class AutonomyManager(Service):
         return self.config.path or self.config.folder
 
     def begin_run(self, plan: Plan) -> tuple[int, Baseline]:
-        """Return the number of a new run. Raises PebbleError if none may start now."""
+        """Begin a run; return its number, and the motor owners' states, with which later ones are compared.
+
+        Raises PebbleError if none may start now.
+        """
         if refusal := self._owners.refusal:
             raise StoppedError(refusal)
         self._local.hold()
@@ -226,7 +229,7 @@ class AutonomyManager(Service):
         except PebbleError:
             self._local.release()
             raise
-        self._signs, self._moves = plan.main.script.ours, False
+        self._signs, self._unsigned_moves = plan.main.script.ours, False
         for step in self._owners.steps_to(run):
             self.halt(step)
         return run, self._owners.baseline()
@@ -240,8 +243,8 @@ class AutonomyManager(Service):
     def halt(self, run: int) -> None:
         """Stop the wheels now."""
         self.publish(DRIVE, Drive(source=SCRIPT, run=run))
-        if self._moves and not self._owners.held:  # who has control moves the wheels, and no script that does not sign
-            self._moves = False
+        if self._unsigned_moves and not self._owners.held:  # a person with control drives: leave the wheels alone
+            self._unsigned_moves = False
             self.publish(DRIVE, Drive(source=self.name))
 
     def halt_repeatedly(self, run: int) -> None:

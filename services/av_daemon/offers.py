@@ -12,20 +12,20 @@ from pebble.services.av_daemon.config import AvDaemon
 
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
-    """Return ``value`` with pictures and sound. They obey only with the bridge, which starts their programs."""
-    devices, obeys = config.section(AvDaemon), config.services.mqtt_bridge.enabled
+    """Return ``value`` with pictures and sound. Operators control both only with the bridge, which starts programs."""
+    devices, controls = config.section(AvDaemon), config.services.mqtt_bridge.enabled
     video, audio = devices.enabled and devices.video.enabled, devices.enabled and devices.audio.enabled
     return replace(
         value,
-        video=_completed(value.video, devices.video, ("width", "height", "fps"), video, obeys),
-        audio=_completed(value.audio, devices.audio, ("rate", "channels"), audio, obeys),
+        video=_completed(value.video, devices.video, ("width", "height", "fps"), video, controls),
+        audio=_completed(value.audio, devices.audio, ("rate", "channels"), audio, controls),
     )
 
 
-def _completed(offer: Any, captured: Any, keys: tuple[str, ...], available: bool, obeys: bool) -> Any:
+def _completed(offer: Any, captured: Any, keys: tuple[str, ...], available: bool, controls: bool) -> Any:
     """Return ``offer``, with each of ``keys`` that is None there filled in from ``captured``."""
     missing = {key: getattr(captured, key) for key in keys if getattr(offer, key) is None}
-    return replace(offer, available=available, controls=available and obeys, **missing)
+    return replace(offer, available=available, controls=available and controls, **missing)
 
 
 def facts(config: Config) -> Facts:

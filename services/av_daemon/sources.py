@@ -74,7 +74,7 @@ def chunk_bytes(options: AvDaemon) -> int:
 
 
 def _camera(options: AvDaemon, start: float) -> Source:
-    if options.video.backend == "synthetic" and "#" in options.video.device:
+    if options.video.backend == "synthetic" and "#" in options.video.device:  # world.json#goob: a robot in a world
         return WorldCamera(options.video, start)
     if options.video.backend == "synthetic":
         return SyntheticCamera(options.video, start)

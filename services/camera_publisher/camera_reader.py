@@ -75,7 +75,7 @@ class CameraReader:
 
     def _read_while_enabled(self) -> None:
         while not self._stopping.is_set():
-            # not forever: a pause right after close() would leave this waiting
+            # with a limit: close() sets ``enabled``, but another thread may clear it before this waits
             if not self._enabled.wait(60.0) or self._stopping.is_set():
                 continue
             try:

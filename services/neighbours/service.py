@@ -155,7 +155,7 @@ class NeighboursService(Service):
 
     @on(DRIVE, direct=True)
     def drive(self, drive: Drive, _arrived: float) -> None:
-        """Handle a drive command to this robot, on the transport's thread; all commands of persons mean the same."""
+        """Handle a drive command to this robot, on the transport's thread; any command of a person ends a visit."""
         self.post(lambda: self._visit.received(drive, self.clock()), newest_of="script" if drive.signed else "person")
 
     # -- what a visit needs

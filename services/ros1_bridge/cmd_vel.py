@@ -56,8 +56,8 @@ class CmdVel:
         self._body, self._until = ZERO, 0.0  # the newest command, and when it ends
         self._zeros = ZEROS  # how many are to be sent once it has ended
         self._latched = False
-        self._opens = owed  # a new subscriber of the lock is told its state, which is this program's to say
-        self._owed = owed
+        self._owed = owed  # as stored
+        self._has_set_lock = owed  # then a new subscriber of the lock is told its state
         self._heard_at: float | None = None  # when the base last sent odometry
         self._cancelled_at = float("-inf")
         self._ends = False
@@ -126,7 +126,7 @@ class CmdVel:
             self._body, self._until, self._zeros = ZERO, 0.0, ZEROS
             if not self._ends:
                 self._out.send(ZERO)
-            if not self._latched:  # or the repeated lock would wait as well
+            if not self._latched:  # else each call would put off the lock, which the thread repeats
                 self._plan(time.monotonic())
 
     def latch(self, latched: bool) -> None:
@@ -137,7 +137,7 @@ class CmdVel:
             self._latched = latched
             self._body, self._until, self._zeros = ZERO, 0.0, ZEROS
             self._out.send(ZERO)
-            self._opens = True
+            self._has_set_lock = True
             self._send_lock()
             if latched:
                 self._owe(True)  # another thread writes it
@@ -164,7 +164,7 @@ class CmdVel:
 
     def _first_lock(self) -> bytes | None:
         """Return the first message for a new subscriber of the lock, if any; called on the thread of sockets."""
-        if not self._opens:
+        if not self._has_set_lock:
             return None
         if not self._latched:
             self._owe(False)

@@ -74,7 +74,10 @@ class SerialService(Service, ABC):
         return self.config.services.serial_mcu_bridge
 
     def follow_driving(self) -> Subscription:
-        """Receive drive commands to judge sensors, on a board that does not itself move the wheels."""
+        """Subscribe to drive commands: while they move the wheels, a sensor that never changes has failed.
+
+        For a board with sensors that does not itself move the wheels.
+        """
 
         def note(drive: Drive) -> None:
             self.sensors.drive(self.clock() + self.options.safety.drive_timeout_seconds if drive.moves else 0.0)

@@ -12,7 +12,7 @@ from pebble.extensions.media.config import HandlerTopics
 
 
 class Playback(Section, frozen=True, kw_only=True):
-    """Sounds and their player; decoded ones are played by the audio receiver's command."""
+    """Sounds and their player. Sounds that are no wav files are decoded, and played by the audio receiver's player."""
 
     retired: ClassVar = {
         **dict.fromkeys(("stop_timeout", "scan_interval"), ONE_VALUE),

@@ -81,10 +81,13 @@ class Device:
         )
 
     def alias_body(self, route: Route, sample: McuSample) -> Payload | None:
-        """Return a sample as the payload of its alias, and store motion. None: there is no motion to summarise."""
+        """Return ``sample`` as the payload of its interface's alias; None for a summary before the first motion sample.
+
+        A motion sample is stored as well, because summaries repeat the newest one.
+        """
         body = "" if route.alias is None else route.alias.body
         if route.interface.profile == imu.MOTION and imu.fits(imu.MOTION, sample.value):
-            motion = self._reports.motion(sample.t, sample.seq, sample.mcu_ms, sample.value)  # summaries repeat it
+            motion = self._reports.motion(sample.t, sample.seq, sample.mcu_ms, sample.value)
             return motion if body else sample
         if body:
             return self._reports.summary(sample.t, sample.seq, sample.mcu_ms, sample.value)

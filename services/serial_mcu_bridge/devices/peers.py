@@ -26,7 +26,7 @@ class PeerDevices:
             self._peers[uid] = _PeerDevice(claims, now + CONFIRM_S if retained else None)
 
     def forget(self, uid: str) -> None:
-        """Forget a device: it has withdrawn its manifest, or is this one."""
+        """Forget a device that has withdrawn its manifest, or is the caller's own."""
         self._peers.pop(uid, None)
 
     def claimants(self, claim: str) -> list[str]:
