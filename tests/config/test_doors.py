@@ -11,6 +11,7 @@ from pebble.config import load, parse
 from pebble.config.raw import deep_merge
 from pebble.config.rules.doors import warning_of_open
 from pebble.errors import ConfigError
+from tests.kit.configs import at
 from tests.support import ROOT
 
 REMOTE, UPLINK = "services.mqtt_bridge.remote_mqtt", "services.mqtt_bridge.remote"
@@ -23,12 +24,6 @@ GOOD: dict[str, Any] = {
     "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "broker.lab", **LOGIN}}},
 }
 MQTT: dict[str, Any] = {"transport": {"kind": "mqtt"}}
-
-
-def at(path: str, value: Any) -> dict[str, Any]:
-    for key in reversed(path.split(".")):
-        value = {key: value}
-    return value
 
 
 def problems(level: str, *changes: dict[str, Any]) -> list[str]:

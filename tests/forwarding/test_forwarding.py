@@ -102,16 +102,10 @@ class TestAdmission:
         assert self.refuse(admission, "incoming/flags/more") is None
         assert self.refuse(admission, "incoming/flags/f7") is Drop.TOO_MANY
 
-    def test_a_flag_that_the_robot_does_not_have_need_not_be_removed(self) -> None:
-        admission = Admission()
-        assert self.refuse(admission, "incoming/flags/one", b"") is Drop.KNOWN
-        assert self.refuse(admission, "incoming/flags/one") is None
-        assert self.refuse(admission, "incoming/flags/one", b"") is None
-        assert self.refuse(admission, "incoming/flags/mqtt-video", b"") is None  # of the contract
-        assert self.refuse(admission, "incoming/flags/one", b"", side=LOCAL) is None
-
     def test_flags_of_the_robot_itself_are_always_admitted_and_count(self) -> None:
         admission = Admission()
+        assert self.refuse(admission, "incoming/flags/f0", b"") is Drop.KNOWN, "it has none to be removed"
+        assert self.refuse(admission, "incoming/flags/mqtt-video", b"") is None
         for number in range(MAX_UNKNOWN_FLAGS + 5):
             assert self.refuse(admission, f"incoming/flags/f{number}", side=LOCAL) is None
         assert self.refuse(admission, "incoming/flags/f1") is None
@@ -146,14 +140,19 @@ class TestAdmission:
         assert self.SUBJECTS.invented(f"{BASE}/{topic}".encode()) is kind
         assert self.SUBJECTS.invented(f"pebble/robots/another/{topic}".encode()) is None
 
-    @pytest.mark.parametrize("topic", ["drive-values", "flags/reboot", "flags/mqtt-video", "flags/mine", "mine"])
-    def test_messages_to_a_robot_are_bounded_in_size(self, topic: str) -> None:
+    @pytest.mark.parametrize(
+        ("side", "topic", "refused"),
+        [
+            *((REMOTE, f"incoming/{metric}", Drop.TOO_LARGE) for metric in ("drive-values", "flags/reboot", "mine")),
+            *((REMOTE, f"incoming/flags/{flag}", Drop.TOO_LARGE) for flag in ("mqtt-video", "mine")),
+            (REMOTE, "incoming/estop", None),  # any payload is one
+            (LOCAL, "outgoing/map", None),
+        ],
+    )
+    def test_messages_to_a_robot_are_bounded_in_size(self, side: Side, topic: str, refused: Drop | None) -> None:
         admission = Admission()
-        assert self.refuse(admission, f"incoming/{topic}", bytes(MAX_COMMAND_BYTES)) is None
-        assert self.refuse(admission, f"incoming/{topic}", bytes(MAX_COMMAND_BYTES + 1)) is Drop.TOO_LARGE
-
-    def test_but_a_stop_is_not_since_any_payload_is_one(self) -> None:
-        assert self.refuse(Admission(), "incoming/estop", bytes(MAX_COMMAND_BYTES + 1)) is None
+        assert self.refuse(admission, topic, bytes(MAX_COMMAND_BYTES), side) is None
+        assert self.refuse(admission, topic, bytes(MAX_COMMAND_BYTES + 1), side) is refused
 
     @pytest.mark.parametrize(
         ("topics", "most"),
@@ -171,13 +170,6 @@ class TestAdmission:
             assert self.refuse(admission, f"incoming/{topics[0]}", b" \t" * 16) is None  # a probe
             assert self.refuse(admission, f"incoming/{topics[0]}", side=LOCAL) is None
             clock.now += 1
-
-    def test_commands_of_the_contract_are_not_since_one_may_be_a_stop(self) -> None:
-        admission = Admission(Clock())
-        assert {self.refuse(admission, "incoming/drive-values") for _ in range(5000)} == {None}
-
-    def test_what_a_robot_sends_is_not(self) -> None:
-        assert self.refuse(Admission(), "outgoing/map", bytes(MAX_COMMAND_BYTES + 1), side=LOCAL) is None
 
 
 class TestReconciliation:
@@ -267,30 +259,19 @@ class TestReconciliation:
                 reconciliation.receive(place, "t", payload.encode(), retained=who.isupper())
         assert reconciliation.synchronize(side) == [(side, "t", payload.encode()) for payload in sent]
 
-    def test_its_memory_is_bounded(self) -> None:
+    @pytest.mark.parametrize(("size", "number"), [(1, 2 * TOPICS), (1 << 19, 40)])
+    def test_its_memory_is_bounded_in_topics_and_in_bytes(self, size: int, number: int) -> None:
         reconciliation = Reconciliation(REMOTE)
 
         def fill(number: int) -> None:
-            reconciliation.receive(LOCAL, f"held/{number}", b"x", retained=True)
-            reconciliation.receive(REMOTE, f"said/{number}", b"x", retained=False)
-            reconciliation.note_published(LOCAL, f"said/{number}", b"x")
-
-        assert grows_no_more(fill, 2 * TOPICS)
-        assert len(reconciliation.synchronize(REMOTE)) <= 2 * TOPICS
-
-    def test_its_memory_is_bounded_in_bytes(self) -> None:
-        reconciliation = Reconciliation(REMOTE)
-
-        def fill(number: int) -> None:
-            value = bytes(1 << 19)
+            value = bytes(size)
             reconciliation.receive(LOCAL, f"held/{number}", value, retained=True)
-            reconciliation.receive(REMOTE, f"known/{number}", value, retained=False)
-            reconciliation.note_published(LOCAL, f"known/{number}", value)
+            reconciliation.receive(REMOTE, f"said/{number}", value, retained=False)
+            reconciliation.note_published(LOCAL, f"said/{number}", value)
 
-        assert grows_no_more(fill, 40)
-        assert reconciliation.value("known/0") is None
-        assert reconciliation.value("known/79") == bytes(1 << 19)
-        assert len(reconciliation.synchronize(REMOTE)) < 40
+        assert grows_no_more(fill, number)
+        assert (reconciliation.value("said/0"), reconciliation.value(f"said/{2 * number - 1}")) == (None, bytes(size))
+        assert len(reconciliation.synchronize(REMOTE)) <= min(number, 2 * TOPICS)
 
 
 class TestProbes:

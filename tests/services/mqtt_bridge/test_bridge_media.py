@@ -56,20 +56,13 @@ class TestDecision:
         media.request(VIDEO_CONTROL, MediaRequest(enabled=True, encoding=asked))
         assert media.requests()[CAMERA] == ProgramRequest(on=True, encoding=encoding)
 
-    def test_what_the_robot_does_not_have_is_not_wanted(self) -> None:
-        media = Media((CAMERA,))
-        media.allow(MQTT_AUDIO, True)
-        media.request(AUDIO_CONTROL, ASKED)
-        assert media.requests() == {CAMERA: NO}
-
-    def test_what_runs_already_was_asked_for(self) -> None:
+    def test_what_runs_already_was_asked_for_and_can_be_stopped_before_its_flag_is_known(self) -> None:
         opus = ProgramRequest(on=True, encoding="opus")
-        media = Media(ALL, running={MICROPHONE: opus, SPEAKER: opus})
+        media = Media((CAMERA, MICROPHONE), running={MICROPHONE: opus})
         assert media.requests() == {CAMERA: NO}, "and the flag of audio is not known yet"
+        media.request(AUDIO_CONTROL, ASKED)
         media.allow(MQTT_AUDIO, True)
-        assert media.requests() == {CAMERA: NO, MICROPHONE: opus, SPEAKER: opus}
-
-    def test_what_runs_already_can_be_stopped_before_its_flag_is_known(self) -> None:
+        assert media.requests() == {CAMERA: NO, MICROPHONE: YES}, "there is no loudspeaker"
         media = Media(ALL, running={CAMERA: YES})
         media.request(VIDEO_CONTROL, MediaRequest(enabled=False))
         assert media.requests()[CAMERA] == NO
