@@ -189,6 +189,15 @@ def examine(cycles: Cycles, side: Side, topic: str, payload: bytes) -> Finding:
     return cycles.examine(side, subject, Message(topic, payload))
 
 
+def test_a_probe_that_comes_back_where_it_was_sent_proves_nothing() -> None:
+    cycles = Cycles(Clock())
+    probe = cycles.probe(REMOTE, TOPIC)
+    assert examine(cycles, LOCAL, TOPIC, probe) is Finding.PROBE
+    assert cycles.closed_ways == set()
+    assert examine(cycles, REMOTE, TOPIC, probe) is Finding.PROBE
+    assert cycles.closed_ways == {(REMOTE, TOPIC)}
+
+
 def test_memory_is_bounded() -> None:
     cycles = Cycles(Clock())
 
