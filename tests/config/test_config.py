@@ -77,21 +77,17 @@ def file_problem(path: Path) -> str:
 
 
 class TestMeaning:
-    def test_an_id_is_enough(self) -> None:
+    def test_an_id_is_enough_and_services_run_only_when_asked_except_the_launcher(self) -> None:
         config = read({"robot": {"id": "goob"}})
         assert config.base == "pebble/robots/goob"
         assert (config.identity.system, config.identity.type, config.identity.id) == ("pebble", "robots", "goob")
-        assert config.transport.kind == "mqtt"
+        assert (config.transport.kind, config.robot.platform, config.warnings) == ("mqtt", "linux", ())
         assert (config.local_mqtt.host, config.local_mqtt.port) == ("127.0.0.1", 1883)
-        assert config.robot.platform == "linux"
-        assert config.warnings == ()
-        with pytest.raises(AttributeError):
-            config.log_level = "DEBUG"  # type: ignore[misc]
-
-    def test_services_run_only_when_asked_except_the_launcher(self) -> None:
-        services = read({"robot": {"id": "goob"}}).services
+        services = config.services
         enabled = {name for name in services.__struct_fields__ if getattr(getattr(services, name), "enabled", False)}
         assert enabled == {"launcher"}
+        with pytest.raises(AttributeError):
+            config.log_level = "DEBUG"  # type: ignore[misc]
 
     @pytest.mark.parametrize("name", OURS)
     def test_our_own_files_load_without_a_remark(self, name: str) -> None:
@@ -675,21 +671,22 @@ class TestPasswords:
 
 
 class TestWebInterface:
-    @pytest.mark.parametrize("host", ["127.1.2.3", "::1", "localhost"])
-    def test_it_is_for_this_machine_by_default(self, host: str) -> None:
-        config = read(at("web_interface.host", host))
-        assert (config.section(WebInterface).local, config.warnings) == (True, ())
+    @pytest.mark.parametrize(
+        ("host", "local"),
+        [
+            *((host, True) for host in ("127.1.2.3", "::1", "localhost")),
+            *((host, False) for host in ("0.0.0.0", "::", "192.168.1.7", "goob.local")),
+        ],
+    )
+    def test_it_is_for_this_machine_by_default(self, host: str, local: bool) -> None:
         web = read({"robot": {"id": "goob"}}).web_interface
         assert (web.host, web.port, web.local, web.mqtt.host) == ("127.0.0.1", 8080, True, "")
         assert (web.plain_http, web.plain_http_drive) == (False, False)
-
-    @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.7", "goob.local"])
-    def test_addresses_that_other_machines_reach(self, host: str) -> None:
         config = read(at("web_interface.host", host))
-        assert not config.section(WebInterface).local
-        (warning,) = config.warnings
-        assert warning.startswith(f"web_interface.host: other machines reach {host}, ")
-        assert read(at("web_interface", {"host": host, "plain_http": True})).warnings == ()
+        assert config.section(WebInterface).local is local
+        warned = [] if local else [f"web_interface.host: other machines reach {host}"]
+        assert [warning.partition(", ")[0] for warning in config.warnings] == warned
+        assert read(at("web_interface", {"host": host, "plain_http": not local})).warnings == ()
 
     def test_a_certificate_that_does_not_exist_yet_stops_the_page_and_not_the_robot(self) -> None:
         config = read(at("web_interface.tls", {"certificate": "server.pem", "key": "server.key"}))

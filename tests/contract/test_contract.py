@@ -135,14 +135,10 @@ def test_a_channel_is_well_formed(channel: Channel) -> None:
     assert re.fullmatch(r"([a-z0-9-]+|{[a-z]+})(/([a-z0-9-]+|{[a-z]+}))*", channel.metric)
     assert channel.doc.endswith(".")
     assert channel.default_qos in (0, 1)
+    assert channel.default_retain == (channel.kind in (Kind.STATE, Kind.FLAG))
     assert channel.rate_hz >= 0
     assert channel.payload in (bool, bytes) or issubclass(channel.payload, Payload)
     assert channel.synonym_of is None or channel_of(f"{channel.direction}/{channel.synonym_of}") is not None
-
-
-@each_channel
-def test_only_state_and_flags_are_retained(channel: Channel) -> None:
-    assert channel.default_retain == (channel.kind in (Kind.STATE, Kind.FLAG))
 
 
 @each_channel

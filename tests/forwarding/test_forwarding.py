@@ -282,9 +282,6 @@ class TestProbes:
         assert [probes.announce(first), probes.see(first)] == [False, True]
         assert [probes.see(second), probes.announce(second)] == [False, True]
 
-    def test_memory_is_bounded(self) -> None:
-        probes = Probes()
-
         def fill(number: int) -> None:
             probes.see(b"%d" % number)
             probes.see(b"x" * (100_000 + number))
@@ -310,69 +307,77 @@ class Wire(MemoryTransport):
         return self.up
 
 
+@pytest.fixture
+def local() -> Wire:
+    return Wire()
+
+
+@pytest.fixture
+def remote() -> Wire:
+    return Wire()
+
+
+@pytest.fixture(name="clock")
+def a_clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def waiting(local: Wire, remote: Wire, clock: Clock) -> Forwarder:
+    return Forwarder(Subjects(make_config()), TABLE_A1, {LOCAL: local, REMOTE: remote}, winner=REMOTE, clock=clock)
+
+
+@pytest.fixture
+def forwarder(waiting: Forwarder) -> Forwarder:
+    waiting.open()
+    return waiting
+
+
 class TestEventBuffer:
     @pytest.fixture
-    def wire(self) -> Wire:
-        return Wire()
-
-    @pytest.fixture
-    def clock(self) -> Clock:
-        return Clock()
-
-    @pytest.fixture
-    def counters(self) -> Counters:
-        return Counters()
-
-    @pytest.fixture
-    def events(self, wire: Wire, counters: Counters, clock: Clock) -> EventBuffer:
-        return EventBuffer(wire, counters, clock=clock, limit=4)
+    def events(self, remote: Wire, clock: Clock) -> EventBuffer:
+        self.counters = Counters()
+        return EventBuffer(remote, self.counters, clock=clock, limit=4)
 
     def publish(self, events: EventBuffer, *numbers: int) -> None:
         for number in numbers:
             events.send(Message("t", b"%d" % number, QoS.DELIVERED))
 
-    def test_keeps_the_newest_of_an_outage(self, events: EventBuffer, counters: Counters, wire: Wire) -> None:
-        wire.up = False
+    def test_keeps_the_newest_of_an_outage(self, events: EventBuffer, remote: Wire) -> None:
+        remote.up = False
         events.watch(State.CONNECTING)
         self.publish(events, 1, 2, 3, 4, 5, 6)
-        wire.up = True
+        remote.up = True
         events.flush()
-        assert wire.sent == [b"3", b"4", b"5", b"6"]
-        assert counters["events_dropped"] == 2
+        assert remote.sent == [b"3", b"4", b"5", b"6"]
+        assert self.counters["events_dropped"] == 2
 
-    def test_repeats_what_a_dying_link_may_have_swallowed(self, events: EventBuffer, wire: Wire, clock: Clock) -> None:
+    def test_repeats_what_a_dying_link_may_have_swallowed(
+        self, events: EventBuffer, remote: Wire, clock: Clock
+    ) -> None:
         self.publish(events, 1)
         clock.now += RESEND_S
         self.publish(events, 2)
         clock.now += RESEND_S - 0.1
-        wire.up = False
+        remote.up = False
         events.watch(State.CONNECTING)
         clock.now += 60
         self.publish(events, 3)
-        wire.up = True
+        remote.up = True
         self.publish(events, 4)  # before the flush: waits its turn
         events.flush()
-        assert wire.sent == [b"1", b"2", b"2", b"3", b"4"]
+        assert remote.sent == [b"1", b"2", b"2", b"3", b"4"]
 
-    def test_one_refused_in_between_is_sent_with_the_next(self, events: EventBuffer, wire: Wire) -> None:
-        wire.up = False
+    def test_one_refused_in_between_is_sent_with_the_next(self, events: EventBuffer, remote: Wire) -> None:
+        remote.up = False
         self.publish(events, 1)
-        wire.up = True
+        remote.up = True
         self.publish(events, 2)
-        assert wire.sent == [b"1", b"2"]
+        assert remote.sent == [b"1", b"2"]
 
 
 class TestGate:
     """An event that arrives while the gate opens or shuts: what was waiting may have been sent, or cleared, already."""
-
-    @pytest.fixture
-    def remote(self) -> Wire:
-        return Wire()
-
-    @pytest.fixture
-    def forwarder(self, remote: Wire) -> Forwarder:
-        transports = {LOCAL: Wire(), REMOTE: remote}
-        return Forwarder(Subjects(make_config()), TABLE_A1, transports, winner=REMOTE, clock=Clock())
 
     def receive(self, forwarder: Forwarder, monkeypatch: pytest.MonkeyPatch, change: Callable[[], None]) -> None:
         """Receive an event, and ``change`` the gate just before it waits."""
@@ -385,30 +390,19 @@ class TestGate:
         monkeypatch.setattr(EventBuffer, "hold", hold_late)
         forwarder.receive(LOCAL, Message(f"{BASE}/outgoing/weather", b"1", QoS.DELIVERED))
 
-    def test_it_is_sent(self, forwarder: Forwarder, remote: Wire, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.receive(forwarder, monkeypatch, forwarder.open)
+    def test_it_is_sent(self, waiting: Forwarder, remote: Wire, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.receive(waiting, monkeypatch, waiting.open)
         assert remote.sent == [b"1"]
 
-    def test_it_is_not_sent_later(self, forwarder: Forwarder, remote: Wire, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.receive(forwarder, monkeypatch, forwarder.shut)
-        forwarder.rearm()
-        forwarder.open()
+    def test_it_is_not_sent_later(self, waiting: Forwarder, remote: Wire, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.receive(waiting, monkeypatch, waiting.shut)
+        waiting.rearm()
+        waiting.open()
         assert remote.sent == []
 
 
 class TestLate:
     """What has waited in a process that stood still, before it was forwarded."""
-
-    @pytest.fixture
-    def local(self) -> Wire:
-        return Wire()
-
-    @pytest.fixture
-    def forwarder(self, local: Wire) -> Forwarder:
-        transports = {LOCAL: local, REMOTE: Wire()}
-        forwarder = Forwarder(Subjects(make_config()), TABLE_A1, transports, winner=REMOTE, clock=Clock())
-        forwarder.open()
-        return forwarder
 
     @pytest.mark.parametrize(
         ("metric", "payload", "limit_s"),
@@ -519,18 +513,10 @@ class TestStops:
     FLAG = Message(f"{BASE}/incoming/flags/mqtt-video", b"true", QoS.DELIVERED, True, True)
 
     @pytest.fixture
-    def clock(self) -> Clock:
-        return Clock()
-
-    @pytest.fixture
-    def forwarder(self, clock: Clock) -> Forwarder:
-        local, remote = Wire(), Wire()
-        remote.as_published = True
-        forwarder = Forwarder(
-            Subjects(make_config()), TABLE_A1, {LOCAL: local, REMOTE: remote}, winner=REMOTE, clock=clock
-        )
-        forwarder.open()
-        return forwarder
+    def remote(self) -> Wire:
+        wire = Wire()
+        wire.as_published = True
+        return wire
 
     def first_pass(self, forwarder: Forwarder, clock: Clock, *others: Message) -> float:
         """How long stops are old, if one comes every 0.125 s, after ``others``."""

@@ -72,13 +72,15 @@ def test_a_stop_signal_while_starting_starts_no_further_child(launch: Launch) ->
 # -- keeping alive
 
 
-def test_a_killed_child_is_started_again_at_once(launch: Launch) -> None:
-    robot = launch(("serial", "good", DEVICE), ("bridge", "good", CONNECTION), restart_delay_seconds=600)
+def test_a_killed_child_is_started_again_at_once_with_the_config_of_its_launcher(launch: Launch) -> None:
+    robot = launch(("serial", "configured", DEVICE), ("bridge", "good", CONNECTION), restart_delay_seconds=600)
     assert robot.ready("serial", "bridge")
+    robot.config.write_text('{"robot": {"id": "another"}, "transport": {"kin')
     os.kill(robot.events("serial", "start")[0], signal.SIGKILL)
     assert until(lambda: len(robot.events("serial", "ready")) == 2, 20), "only the second restart may wait"
     again = {"state": "ready", "restarts": 1, "last_exit": "signal 9", "restarts_per_minute": 1}
     assert until(lambda: robot.services()["serial"] == again)
+    assert len(robot.events("serial", f"config:{BASE}")) == 2
     assert len(robot.events("bridge", "start")) == 1
 
 
@@ -101,15 +103,6 @@ def test_a_robot_runs_where_a_system_call_is_denied(launch: Launch, call: str, e
     assert robot.stop() == 0
     assert robot.stderr().count("is denied") == len(named)
     assert all(text in robot.stderr() for text in named)
-
-
-def test_a_child_that_starts_again_gets_the_config_of_its_launcher(launch: Launch) -> None:
-    robot = launch(("serial", "configured", DEVICE))
-    assert robot.ready("serial")
-    robot.config.write_text('{"robot": {"id": "another"}, "transport": {"kin')
-    os.kill(robot.events("serial", "start")[0], signal.SIGKILL)
-    assert until(lambda: len(robot.events("serial", "ready")) == 2, 20)
-    assert len(robot.events("serial", f"config:{BASE}")) == 2
 
 
 def test_a_crash_loop_is_visible_and_not_hot(launch: Launch) -> None:

@@ -101,24 +101,16 @@ def test_numbers_go_on_where_the_last_writer_ended_and_a_removed_one_is_made_aga
     again.close()
 
 
-def other_size(path: Path) -> object:
-    return path.write_bytes(bytes(100))
-
-
 def second_writer(path: Path) -> object:
     other = HallMemory(path.name, SLOTS)
     other.write(1, (1, 1, 1), None)
     return other
 
 
-def link(path: Path) -> object:
-    return path.symlink_to("/etc/passwd")
-
-
 REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
-    "another size": (other_size, "has 100 bytes, and 64 slots need 2072"),
+    "another size": (lambda path: path.write_bytes(bytes(100)), "has 100 bytes, and 64 slots need 2072"),
     "another writer": (second_writer, "is written by another process"),
-    "a link": (link, "Too many levels of symbolic links"),
+    "a link": (lambda path: path.symlink_to("/etc/passwd"), "Too many levels of symbolic links"),
 }
 
 

@@ -320,20 +320,14 @@ class TestJpegSplitter:
         got = [found for at in range(0, len(stream), size) for found in splitter.feed(stream[at : at + size])]
         assert got == list(self.PICTURES)
 
-    def test_a_preview_inside_does_not_end_a_picture(self) -> None:
+    def test_a_preview_inside_ends_no_picture_and_what_is_none_is_skipped(self) -> None:
         preview = b"\xff\xe1" + (len(self.PICTURES[0]) + 2).to_bytes(2) + self.PICTURES[0]
         whole = self.PICTURES[1][:2] + preview + self.PICTURES[1][2:]
         assert JpegSplitter().feed(whole + self.PICTURES[2]) == [whole, self.PICTURES[2]]
-
-    def test_garbage_between_pictures_is_skipped(self) -> None:
-        splitter = JpegSplitter()
+        splitter = JpegSplitter(limit=10_000)
         stream = b"garbage" + self.PICTURES[0] + b"\xff\xd8 no picture \xff" + self.PICTURES[1]
         assert splitter.feed(stream) == [self.PICTURES[0], self.PICTURES[1]]
-
-    def test_a_picture_without_end_is_given_up(self) -> None:
-        splitter = JpegSplitter(limit=10_000)
-        endless = self.PICTURES[0][:-2]
-        assert splitter.feed(endless + bytes(20_000)) == []
+        assert splitter.feed(self.PICTURES[0][:-2] + bytes(20_000)) == [], "it has no end"
         assert splitter.feed(self.PICTURES[1]) == [self.PICTURES[1]]
 
     def test_noise_never_breaks_it(self) -> None:
