@@ -29,15 +29,17 @@ def test_everything_that_is_listed_is_found(tmp_path: Path) -> None:
 
 def test_what_leads_outside_is_neither_listed_nor_found(tmp_path: Path) -> None:
     inside, outside = tmp_path / "sounds", tmp_path / "sounds-other"
-    put(inside, "a.wav")
+    put(inside, "a.wav", "text.txt")
     put(outside, "b.wav")
     (inside / "b.wav").symlink_to(outside / "b.wav")
     (inside / "other").symlink_to(outside)
+    (inside / "circle.wav").symlink_to("circle.wav")
+    (inside / "folder.wav").mkdir()
     clips = Clips(inside)
     assert clips.scan() == ["a.wav"]
-    for name in ("b.wav", "other/b.wav", "../sounds-other/b.wav", "a.wav/../../sounds-other/b.wav"):
+    names = ["b.wav", "other/b.wav", "../sounds-other/b.wav", "a.wav/../../sounds-other/b.wav", str(outside / "b.wav")]
+    for name in (*names, "circle.wav", "folder.wav", "text.txt", "~nobody/a.wav"):
         assert clips.find(name) is None, name
-    assert clips.find(str(outside / "b.wav")) is None
 
 
 def test_the_folder_may_be_a_link_and_a_name_a_way_around(tmp_path: Path) -> None:
