@@ -59,6 +59,7 @@ def test_a_turn_is_used_up_by_what_is_sent_and_another_rate_counts_from_now_on()
     pacer.use(0.0)
     assert not pacer.due(0.4)
     pacer.fps = 10
+    assert pacer.fps == pytest.approx(10)
     assert [pacer.due(at) for at in (0.45, 0.5)] == [False, True]
 
 
