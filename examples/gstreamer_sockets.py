@@ -60,7 +60,7 @@ def offer(path: Path, parser: str, reader: FrameReader, data: Callable[[Frame], 
 def main(config_path: str) -> None:
     config = load(Path(config_path))
     video, audio = config.section(AvDaemon).video, config.section(AvDaemon).audio
-    size = (video.width, video.height)[:: -1 if video.rotate_degrees in (90, 270) else 1]
+    size = (video.height, video.width) if video.rotate_degrees in (90, 270) else (video.width, video.height)
     bgr = "rawvideoparse format=bgr width={} height={} framerate={}/1".format(*size, round(video.fps))
     pcm = f"rawaudioparse pcm-format=s16le sample-rate={audio.rate} num-channels={audio.channels}"
     form = ("s16le", audio.rate, audio.channels)

@@ -47,7 +47,7 @@ class Datagrams(Transport):
         """Do nothing: every datagram arrives here anyway."""
 
     def _undeclare(self, subscription: Subscription) -> None:
-        """Do nothing, as above."""
+        """Do nothing, as _declare."""
 
     def _receive(self) -> None:
         while data := self._socket.recv(65_535):

@@ -28,4 +28,4 @@ class CheckResult:
     what: str = ""
 
 
-ok, warn, failed, skipped = (partial(CheckResult, state) for state in State)
+ok, warn, failed, skipped = (partial(CheckResult, state) for state in State)  # in its order

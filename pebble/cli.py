@@ -14,7 +14,7 @@ from typing import TextIO
 
 from pebble.errors import PebbleError
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # the output's disk, or its terminal has gone
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # the output's disk is full, or its terminal has gone
 
 
 def main() -> int:
@@ -39,7 +39,10 @@ def main() -> int:
         if error.filename is not None or error.errno not in _FULL:
             raise
         code = _fail(f"the output cannot be written: {error.strerror}")
-    return code if all([_flushes(sys.stdout), _flushes(sys.stderr)]) else code or 1
+    flushed = [_flushes(sys.stdout), _flushes(sys.stderr)]
+    if code == 0 and not all(flushed):
+        return 1
+    return code
 
 
 def _use_utf8() -> None:

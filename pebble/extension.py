@@ -189,7 +189,8 @@ def _declared(module: str) -> Extension | None:
     try:
         extension: Extension = import_module(module).EXTENSION
     except ModuleNotFoundError as error:
-        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+        is_ours = error.name is not None and f"{module}.".startswith(f"{error.name}.")
+        if not is_ours:  # the module is there, and imports something that is not
             raise
         return None
     return extension
@@ -217,9 +218,8 @@ def named(
         if extension.motors and not drives:
             raise ConfigError(f'extensions.{name}: it owns motors, write {{"drives": true}}')
         if drives and not extension.motors:
-            raise ConfigError(
-                f"extensions.{name}: it declares no motors, so no stop would be confirmed: leave out drives"
-            )
+            why = "it declares no motors, so no stop would be confirmed: leave out drives"
+            raise ConfigError(f"extensions.{name}: {why}")
         loaded.append(extension)
     return tuple(loaded), tuple(missing)
 
@@ -314,8 +314,8 @@ def refuse_claims(core: Extension, extensions: Iterable[Extension]) -> None:
 
     ``core`` declares what the core has.
     """
-    owners: dict[tuple[str, str], int] = {}
-    listed = (core, *extensions)  # one may be listed twice
+    claimed_by: dict[tuple[str, str], int] = {}  # places in ``listed``, by kind and name
+    listed = (core, *extensions)  # told apart by their places, for an extension may be listed twice
     for number, extension in enumerate(listed):
         claims: dict[str, Iterable[str]] = {
             "section": extension.sections,
@@ -325,7 +325,7 @@ def refuse_claims(core: Extension, extensions: Iterable[Extension]) -> None:
         }
         for kind, names in claims.items():
             for name in names:
-                first = owners.setdefault((kind, name), number)
+                first = claimed_by.setdefault((kind, name), number)
                 if first != number:
                     other = listed[first]
                     pair = f"{other.package} ({other.name}) and {extension.package} ({extension.name})"
@@ -346,7 +346,7 @@ def packages() -> Iterator[Extension]:
 
 
 def motors_of(extensions: Iterable[Extension], config: Any) -> dict[str, str]:
-    """Return the programs that own motors among those that extensions add, by the owner's name."""
+    """Return those programs of extensions that own motors, by the name of the motor owner."""
     running = {program.name for program in programs_of(extensions, config)}
     owners = {owner: program for extension in extensions for owner, program in extension.motors.items()}
     return {owner: program for owner, program in owners.items() if program in running}
@@ -366,7 +366,9 @@ def programs_of(extensions: Iterable[Extension], config: Any, core: Iterable[str
             owners[program.name] = extension.package
             if program.name in extension.motors.values():
                 program = replace(program, stage=Stage.DEVICE, on_demand=False)
-            programs.append(program if program.arguments else replace(program, arguments=(str(config.path),)))
+            if not program.arguments:
+                program = replace(program, arguments=(str(config.path),))
+            programs.append(program)
     return programs
 
 
@@ -435,7 +437,8 @@ def _of_file(path: Path) -> Extension:
         raise PebbleError(f"there is no file {path}")
     if hasattr(os, "getuid") and os.getuid() == 0:
         folders = (path.parent, path.resolve().parent)
-        if uid := path.stat().st_uid or max(owner_of(folder, nameless=False).uid for folder in folders):
+        uid = path.stat().st_uid or max(owner_of(folder, nameless=False).uid for folder in folders)
+        if uid:
             why = "and root runs no code of other users: chown root it, in a folder of root's"
             raise PebbleError(f"{path} belongs to user {uid}, {why}")
     name = path.stem
@@ -463,6 +466,7 @@ def _of_file(path: Path) -> Extension:
 
 
 def _checked(extension: Any) -> Extension:
+    """Return ``extension`` if it is an Extension with values of the right types. Raises PebbleError."""
     if not isinstance(extension, Extension):
         raise PebbleError("its EXTENSION is no pebble.extension.Extension")
     try:

@@ -28,7 +28,7 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
     besides root can change, and for a missing one that should be ``there``: it may have been removed since.
     """
     place, owner = Path("/"), Owner(0, 0)
-    system = place.lstat().st_uid  # in a user namespace root's files may seem to be of another user
+    root = place.lstat().st_uid  # in a user namespace root's files may seem to be of another user
     names = list(folder.absolute().parts[1:])
     while names:
         place /= names.pop(0)
@@ -38,7 +38,9 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
             if there:
                 raise PebbleError(f"{place}: {error.strerror}") from None
             break
-        uid = 0 if status.st_uid == system or not (nameless or _has_name(status.st_uid)) else status.st_uid
+        uid = status.st_uid
+        if uid == root or not (nameless or _has_name(uid)):
+            uid = 0
         if stat.S_ISLNK(status.st_mode):
             if owner.uid or uid:
                 raise PebbleError(f"{place} is a link of user {uid or owner.uid}: name the folder itself")
@@ -75,10 +77,11 @@ def _has_name(uid: int) -> bool:
     return False
 
 
-def _is_shared(found: os.stat_result) -> bool:
+def _is_shared(folder: os.stat_result) -> bool:
     """True if users other than the owner can replace files in the folder. In a sticky folder they cannot."""
-    writers = stat.S_IWOTH | (stat.S_IWGRP if found.st_gid else 0)
-    return bool(found.st_mode & writers) and stat.S_ISDIR(found.st_mode) and not found.st_mode & stat.S_ISVTX
+    writers = stat.S_IWOTH | (stat.S_IWGRP if folder.st_gid else 0)
+    is_sticky = bool(folder.st_mode & stat.S_ISVTX)
+    return bool(folder.st_mode & writers) and stat.S_ISDIR(folder.st_mode) and not is_sticky
 
 
 def is_open(folder: Path) -> bool:
@@ -112,9 +115,11 @@ def read_for(place: Path, file: Path) -> bytes:
 
     Raises OSError, and PebbleError as :func:`owner_of`.
     """
-    if hasattr(os, "geteuid") and os.geteuid() == 0 and (owner := owner_of(place, nameless=False, there=True)).uid:
-        with as_user(owner):
-            return read_plain(file)
+    if hasattr(os, "geteuid") and os.geteuid() == 0:
+        owner = owner_of(place, nameless=False, there=True)
+        if owner.uid:
+            with as_user(owner):
+                return read_plain(file)
     return read_plain(file)
 
 

@@ -33,7 +33,7 @@ class PublicNames:
 
     @staticmethod
     def find_spec(fullname: str, *_: object) -> ModuleSpec | None:
-        public = ".".join(fullname.split(".", 2)[:2])
+        public = ".".join(fullname.split(".", 2)[:2])  # its first two levels
         if public not in PUBLIC:
             return None
         from importlib.util import find_spec  # of use to public names only
@@ -50,7 +50,7 @@ class _SameModule:
 
     def __init__(self, place: ModuleSpec) -> None:
         self._place = place
-        self._spec: ModuleSpec | None = None
+        self._spec: ModuleSpec | None = None  # of the module under its first name
 
     def create_module(self, _: ModuleSpec) -> ModuleType:
         module = import_module(self._place.name)

@@ -106,10 +106,12 @@ class TcpProxy:
 
     def _join_to_target(self, near: socket.socket) -> None:
         target = self._target
+        far = socket.socket()
         try:
-            far = socket.create_connection(("127.0.0.1", target), 2)
+            self.connect(far, target)
         except OSError:
             near.close()
+            far.close()
             return
         for end in (near, far):
             end.settimeout(None)
@@ -121,6 +123,14 @@ class TcpProxy:
                 return
         for end in (near, far):  # it leads elsewhere by now
             end.close()
+
+    def connect(self, far: socket.socket, target: int) -> None:
+        far.settimeout(2)
+        far.connect(("127.0.0.1", target))
+
+    def hold(self, _size: int, *, answers: bool) -> None:
+        """Hold up a piece of data; ``answers``: it is what the target sends."""
+        time.sleep(self.delay_s)
 
     def passes(self, _data: bytes) -> bool:
         """True if a client's data is passed on; otherwise its connection is reset."""
@@ -275,10 +285,11 @@ class _Pair:
                 if not self._proxy.wait_until_passing() or not select.select([source], [], [], _STEP_S)[0]:
                     continue
                 data = source.recv(self._proxy.piece)
-                judged = source is self._ends[0] or self._proxy.judges_answers
+                answers = source is self._ends[1]
+                judged = not answers or self._proxy.judges_answers
                 if not data or (judged and not self._proxy.passes(data)):
                     break
-                time.sleep(self._proxy.delay_s)
+                self._proxy.hold(len(data), answers=answers)
                 self._send(sink, data)
         self.reset()
 
@@ -288,65 +299,25 @@ class _Pair:
                 data = data[sink.send(data, socket.MSG_DONTWAIT) :]
 
 
-class SlowTcpProxy:
-    """A proxy that passes at most ``kbits`` per second to ``target``, and any number back.
+class SlowTcpProxy(TcpProxy):
+    """A proxy that passes at most ``kbits`` per second of what ``target`` sends, and any number to it."""
 
-    ``back``: the other way round.
-    """
-
-    def __init__(self, target: int, kbits: float, *, back: bool = False) -> None:
-        self.port, self.kbits, self._back = free_port(), kbits, back
+    def __init__(self, target: int, kbits: float) -> None:
+        self.kbits = kbits
         self.passed = 0  # bytes that were slow
-        self._target = target
         self._turn = threading.Lock()
         self._free_at = 0.0
-        self._sockets: list[socket.socket] = []
-        self._listener = socket.socket()
-        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        self._listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, _SEGMENT)
-        self._listener.bind(("127.0.0.1", self.port))
-        self._listener.listen(16)
-        threading.Thread(target=self._accept, daemon=True).start()
+        super().__init__(target, piece=_SLOW_PIECE)
 
-    def stop(self) -> None:
-        for end in (self._listener, *self._sockets):
-            with suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-            end.close()
+    def connect(self, far: socket.socket, target: int) -> None:
+        far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        far.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, _SEGMENT)
+        super().connect(far, target)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self.stop()
-
-    def _accept(self) -> None:
-        with suppress(OSError):
-            while True:
-                near, _ = self._listener.accept()
-                far = socket.socket()
-                if self._back:
-                    far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-                    far.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, _SEGMENT)
-                far.connect(("127.0.0.1", self._target))
-                self._sockets += [near, far]
-                for source, sink, slow in ((near, far, not self._back), (far, near, self._back)):
-                    sink.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    threading.Thread(target=self._carry, args=(source, sink, slow), daemon=True).start()
-
-    def _carry(self, source: socket.socket, sink: socket.socket, slow: bool) -> None:
-        with suppress(OSError):
-            while data := source.recv(_SLOW_PIECE if slow else 65536):
-                if slow:
-                    self._wait(len(data))
-                sink.sendall(data)
-        for end in (source, sink):
-            with suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-
-    def _wait(self, size: int) -> None:
-        """Wait until the line has sent ``size`` bytes; callers take turns in the order of their calls."""
+    def hold(self, size: int, *, answers: bool) -> None:
+        """Wait until the line has sent ``size`` bytes of the target; callers take turns in the order of their calls."""
+        if not answers:
+            return
         with self._turn:
             now = time.monotonic()
             self._free_at = max(self._free_at, now) + size * 8 / (self.kbits * 1000)

@@ -40,6 +40,7 @@ def bounds() -> Iterator[Bound]:
 
 
 def _bounds(file: str, text: str) -> Iterator[Bound]:
+    """Yield the bounds of one file; the reason is the comment in the lines above, and the one behind the value."""
     for match in _CONSTANT.finditer(text):
         above = re.search(r"((?:^#.*\n)*)\Z", text[: match.start()], re.MULTILINE)
         lines = re.sub(r"^#:? ?", "", above[1] if above else "", flags=re.MULTILINE).split("\n")

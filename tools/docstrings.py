@@ -47,8 +47,10 @@ def _product() -> list[Path]:
 
 def main(arguments: list[str]) -> int:
     """Print the findings; return 1 if there are any."""
-    files = [file for path in map(Path, arguments) for file in ([path] if path.is_file() else path.rglob("*.py"))]
-    lines = [line for path in files or _product() for line in findings(path)]
+    files = [] if arguments else _product()
+    for path in map(Path, arguments):
+        files += [path] if path.is_file() else path.rglob("*.py")
+    lines = [line for path in files for line in findings(path)]
     print(*lines, sep="\n", end="\n" if lines else "")
     return 1 if lines else 0
 

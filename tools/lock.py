@@ -40,6 +40,7 @@ def compiled(*words: str) -> str:
 
 
 def main() -> None:
+    """Choose the packages of everything, then note at each the kinds of installation that need it."""
     upgrade = ["--upgrade"] if "--upgrade" in sys.argv[1:] else []
     compiled("pyproject.toml", "-", *EVERYTHING, "--generate-hashes", "--output-file", str(LOCK), *upgrade)
     text = LOCK.read_text()

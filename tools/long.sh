@@ -39,7 +39,7 @@ esac
 
 case "$1" in
 stops) $python -m tests.kit.schedules robot --log build/stops ;;
-soak) both tests.robot.soak --minutes "${MINUTES:-5}" ;;
+soak) for transport in zenoh mqtt; do $python -m tests.robot.soak --minutes "${MINUTES:-5}" --transport $transport; done ;;
 schedules) # the shortest schedule that violates a rule is printed, or the seed of a sequence that does
     $python -m tests.kit.schedules motion --schedules 10000
     $python -m tests.kit.schedules services --schedules 20000 --jobs 2
@@ -102,8 +102,8 @@ lowest)
     ;;
 packages)
     sh tools/setup.sh tools
-    tool -m pip_audit --requirement requirements.txt --require-hashes --disable-pip --vulnerability-service osv
     tool tools/sbom.py
+    tool -m pip_audit --requirement requirements.txt --require-hashes --disable-pip --vulnerability-service osv
     ;;
 *)
     list

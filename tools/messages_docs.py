@@ -59,6 +59,7 @@ def _views() -> Iterator[type]:
 
 
 def _script(kind: Any) -> str:
+    """Return a type of msgspec's as TypeScript writes it."""
     match kind:
         case types.Metadata():
             return _script(kind.type)

@@ -152,7 +152,7 @@ def forked(work: Callable[[], object], seconds: float | None = None) -> bool:
     ctypes.CDLL(None).prctl(36, 1)  # PR_SET_CHILD_SUBREAPER: a process whose parent ends becomes a child of this one
     others = set(children())
     try:
-        pid = os.fork() or run_and_exit(work)
+        pid = os.fork() or run_and_exit(work)  # it is 0 in the child, which never returns from there
         descriptor = os.pidfd_open(pid)
         ended, _, _ = select.select([descriptor], [], [], seconds)
         os.close(descriptor)
@@ -245,10 +245,12 @@ class Trial:
 
     def read_rows(self) -> None:
         """Order the rows that pass without a mutant, modules with the fastest first; name the rows that do not pass."""
-        rows = sorted(json.loads(self.passed.read_text()).items(), key=lambda row: row[1][0])
-        self.slowest = {self.items[name].path: seconds for name, (seconds, _) in rows}
-        rows.sort(key=lambda row: self.slowest[self.items[row[0]].path])  # those of a module share what they set up
-        self.rows = dict(rows)
+        passed = json.loads(self.passed.read_text())  # by the name of a row: its seconds, and its arcs
+        names = sorted(passed, key=lambda name: passed[name][0])
+        self.slowest = {self.items[name].path: passed[name][0] for name in names}  # by module: the last one counts
+        names.sort(key=lambda name: self.slowest[self.items[name].path])  # rows of a module share what they set up
+        self.rows = {name: passed[name] for name in names}
+        rows = list(self.rows.items())
         self.lines = {name: {(file, line) for file, *ends in arcs for line in ends} for name, (_, arcs) in rows}
         self.failing = FAILED.findall(self.failed.read_text())
         print(f"{len(rows)} rows pass without a mutant; left out, as they fail: {', '.join(self.failing) or 'none'}")
@@ -291,10 +293,11 @@ class Trial:
             (self.tree / file).write_bytes(text)
         in_fork = swaps or script
         work = (lambda: self.run_swapped(swaps, names)) if in_fork else (lambda: self.run_new(file, text))
-        survived = not names or forked(work, 5 * seconds + (5 if in_fork else 60))
+        result = "not reached"
+        if names:
+            result = "survived" if forked(work, 5 * seconds + (5 if in_fork else 60)) else "killed"
         (self.tree / file).write_bytes(self.texts[file])
-        record |= {"rows": len(names), "killers": FAILED.findall(self.failed.read_text())}
-        record["result"] = "killed" if not survived else "survived" if names else "not reached"
+        record |= {"rows": len(names), "killers": FAILED.findall(self.failed.read_text()), "result": result}
         record["seconds"] = round(time.monotonic() - start, 2)
         print("{seconds:6.2f} s  {name} {result}".format(**record), file=SCREEN)
         print(json.dumps(record), file=self.out)
@@ -327,8 +330,9 @@ class Trial:
 
 
 def report(file: str, possible: int, records: list[dict[str, Any]]) -> None:
-    """Print how many mutants were killed, those in calls that log separately, and all that were not killed."""
-    counts = Counter("log " * (":log:" in record["name"]) + record["result"] for record in records)
+    """Print how many mutants were killed, with a count of their own for calls that log, and list the others."""
+    results = [f"log {record['result']}" if ":log:" in record["name"] else record["result"] for record in records]
+    counts = Counter(results)
     seconds = sum(record["seconds"] for record in records) / max(1, len(records))
     print(f"{file}: {len(records)} of {possible} mutants: {dict(counts)}; {seconds:.2f} s each")
     for record in sorted(records, key=lambda record: record["line"]):

@@ -130,9 +130,8 @@ def build(source: Path, into: Path, sbom: Path | None = None) -> str:
     (sdist,), (wheel,) = into.glob("*.tar.gz"), into.glob("*.whl")
     normal(sdist, int(os.environ["SOURCE_DATE_EPOCH"]))
     lock = into / "robot.txt"
-    lock.write_bytes(
-        subprocess.run(["sh", source / "tools/locked.sh", "robot"], stdout=subprocess.PIPE, check=True).stdout
-    )
+    locked = subprocess.run(["sh", source / "tools/locked.sh", "robot"], stdout=subprocess.PIPE, check=True)
+    lock.write_bytes(locked.stdout)
     release = into / "RELEASE.json"
     release.write_text(json.dumps(manifest(source, version, [wheel, lock]), indent=1) + "\n")
     package(source, version, [release, lock, wheel], into)

@@ -40,6 +40,7 @@ def vendored(entries: list[dict[str, str]]) -> list[dict[str, Any]]:
 
 
 def main() -> None:
+    """Write the SBOM; ends the program if cyclonedx-py fails."""
     command = [sys.executable, "-W", "ignore::UserWarning", "-m", "cyclonedx_py", "requirements"]
     command += ["--pyproject", "pyproject.toml", "--output-reproducible", "--spec-version", "1.6"]
     packages = subprocess.run(["sh", "tools/locked.sh", "robot"], cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout

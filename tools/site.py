@@ -80,7 +80,7 @@ def main() -> int:
 def _link(origin: Path, page: Path, pages: dict[Path, Path], link: re.Match[str]) -> str:
     """Return a link in the site's form; a link to another file becomes its text, a broken one is unchanged."""
     folder = origin if origin.is_dir() else origin.parent
-    file = (folder / link[3]).resolve()
+    file = (folder / link[3]).resolve()  # of a link: [1] "!" of a picture, [2] text, [3] file, [4] heading
     if file not in pages:
         return link[2] if file.exists() else link[0]
     to = pages[file]
@@ -95,6 +95,7 @@ def _title(page: Path) -> str:
 
 
 def _relative(to: Path, folder: Path) -> str:
+    """Return the way from ``folder`` to a file, such as ``../page.md``."""
     up = 0
     while not to.is_relative_to(folder):
         folder, up = folder.parent, up + 1

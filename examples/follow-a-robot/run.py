@@ -41,12 +41,15 @@ class Companion:
     """
 
     def __init__(self, ahead_m: float, left_m: float) -> None:
-        self._seen, self._turned_rad = complex(ahead_m, left_m), 0.0
-        self._poses: tuple[Pose, Pose] | None = None
+        self._seen = complex(ahead_m, left_m)  # where it is, seen from this robot
+        self._turned_rad = 0.0  # how far it has turned to the left of this robot's heading
+        self._poses: tuple[Pose, Pose] | None = None  # of this robot and the other, at the last call
 
     def place(self, mine: Pose, its: Pose) -> Place:
-        before, self._poses = self._poses or (mine, its), (mine, its)
-        (step, turn_rad), (its_step, its_turn_rad) = _motion(before[0], mine), _motion(before[1], its)
+        my_last, its_last = self._poses or (mine, its)
+        self._poses = (mine, its)
+        step, turn_rad = _motion(my_last, mine)
+        its_step, its_turn_rad = _motion(its_last, its)
         self._seen += its_step * cmath.rect(1, self._turned_rad)
         self._seen = (self._seen - step) * cmath.rect(1, -turn_rad)
         self._turned_rad += its_turn_rad - turn_rad

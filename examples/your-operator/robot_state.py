@@ -75,10 +75,9 @@ class RobotState:
 
     def key(self, own_id):
         """Return the keys of all owners that gave control to this id; "" if the first by name, who decides, did not."""
-        keys = [
-            str(control.get("key") or "") if control.get("id") == own_id else ""
-            for _, control in sorted(self.known(self.controls).items())
-        ]
+        keys = []
+        for _, control in sorted(self.known(self.controls).items()):
+            keys.append(str(control.get("key") or "") if control.get("id") == own_id else "")
         return " ".join(filter(None, keys)) if keys and keys[0] else ""
 
     def show_holder(self, own_id):

@@ -78,16 +78,16 @@ class Reader:
 
         Return True if it is skipped. No topic of ours is so long: what is left is a message with an empty topic.
         """
-        topic = struct.unpack_from("!H", self.data, start)[0]
-        if 2 + topic + 2 <= LONGEST:
+        topic_size = struct.unpack_from("!H", self.data, start)[0]
+        if 2 + topic_size + 2 <= LONGEST:
             return False
-        self.head = header(self.data[0], size - topic) + text("")
+        self.head = header(self.data[0], size - topic_size) + text("")
         self.data = self.data[start + 2 :]
-        self.skipped = topic
+        self.skipped = topic_size
         return True
 
     def length(self):
-        """Return the size of the next packet's content, and its beginning: 0 if that has not arrived yet."""
+        """Return the size of the next packet's content, and where it begins: 0 if that is not known yet."""
         size = 0
         for index in range(1, len(self.data)):
             size |= (self.data[index] & 127) << 7 * (index - 1)

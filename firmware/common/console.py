@@ -38,7 +38,7 @@ class Port:
         while True:
             sys.stdin.readinto(byte)  # type: ignore[misc]  # here text streams have it too
             after = (self._put + 1) % _RING
-            while after == self._got:
+            while after == self._got:  # the ring is full until a turn reads
                 time.sleep_ms(1)
             self._ring[self._put] = byte[0]
             self._put = after
@@ -75,7 +75,7 @@ class Port:
                 count += 1
             if count:
                 sys.stdout.write(out.ring, out.first, count)  # type: ignore[call-overload]  # (buffer, offset, length)
-            count += count < most
+            count += count < most  # the CR itself, if there is one, is left out
             out.first = (out.first + count) % size
             out.used -= count
             now = time.ticks_ms()

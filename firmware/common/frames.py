@@ -43,13 +43,16 @@ class Sender:
         self._header = bytearray(_HEADER_SIZE)
 
     def send(self, kind: int, interface: int, sequence: int, now: int, data: bytes | bytearray) -> bool:
-        """Queue a frame with the time ``now`` in milliseconds. False: no room, and the frame is dropped."""
+        """Queue a frame with the time ``now`` in milliseconds. False: no room, and the frame is dropped.
+
+        COBS writes each run of bytes up to a zero, or of 254 at most, behind its length plus one, without the zero.
+        """
         ring, header, table = self.ring, self._header, _CRC
         size, end = len(ring), _HEADER_SIZE + len(data)
         if len(data) + _AROUND > size - self.used:
             return False
         struct.pack_into(_HEADER, header, 0, _VERSION, kind, 0, interface, sequence, now)
-        start = at = (self.first + self.used) % size  # start: where the length of the open run will be
+        start = at = (self.first + self.used) % size  # start: where the length of the open run will be; at: its end
         crc, run = 0xFFFF, 1
         for index in range(end + 2):
             if index < end:
@@ -67,7 +70,7 @@ class Sender:
                 run += 1
                 if run < _LONGEST_RUN:
                     continue
-                at += 1
+                at += 1  # the run is full: the next length takes a place of its own, not that of a zero
                 if at == size:
                     at = 0
             ring[start] = run
@@ -103,7 +106,7 @@ class Decoder:
         data = self.data
         source = target = 0
         while source < size:
-            code = data[source]
+            code = data[source]  # the length of a run plus one
             after = source + code
             if after > size:
                 return 0

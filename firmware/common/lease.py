@@ -23,6 +23,7 @@ class Lease:
         self.strangers = strangers
         self._diff = diff
         self._random = random
+        # times of the last renewal, of the holder's last motion, of the request, and of a command without a key
         self._since = self._held_from = self._asked = self._received = now
         self._limit_ms = self._wait = 0  # of the holder, and of the asker
         self._held = False  # in the last 5 s the holder moved something: others have to ask
@@ -52,7 +53,7 @@ class Lease:
             self.changed = True
 
     def holds(self, key: str, by: str) -> bool:
-        """True if a command of this account is from the holder; ``key`` may list those of several motor owners."""
+        """True if a command of this account is from the holder; ``key`` may list the keys of several motor owners."""
         if not self.key or self.holder[:1] != (by,):
             return False
         return key == self.key or (len(key) < 80 and self.key in key.split(" "))  # nobody can try many keys at once

@@ -32,7 +32,7 @@ class Lines:
         self._act = act
         self._line = bytearray(_LIMIT)
         self.length = 0
-        self._skipping = False
+        self._skipping = False  # the end of a line that is too long
         self._silent_at: int | None = None  # since when no byte was received
 
     def put(self, line: bytes) -> None:
@@ -76,7 +76,7 @@ class Lines:
         if at == length:
             return
         letter = line[at]
-        if 97 <= letter <= 122:
+        if 97 <= letter <= 122:  # a..z, made A..Z
             letter -= 32
         wanted = 2 if letter == 77 else 3 if letter == 76 else 4 if letter == 70 else 0  # M, L, F
         if not wanted:
@@ -105,16 +105,16 @@ def _after(line: bytearray, at: int, end: int, blanks: bool) -> int:
 
 def number(line: bytes | bytearray, at: int, end: int) -> float:
     """Return the decimal number at ``at``, without what follows it; 0 for anything else, also nan and inf."""
-    negative = line[at] == 45
-    if negative or line[at] == 43:
+    negative = line[at] == 45  # "-"
+    if negative or line[at] == 43:  # "+"
         at += 1
     digits = 0
     scale = 0  # 0: left of the point; else 10 ** digits right of it
     while at < end:
         byte = line[at]
-        if byte == 46 and not scale:
+        if byte == 46 and not scale:  # "."
             scale = 1
-        elif not 48 <= byte <= 57:
+        elif not 48 <= byte <= 57:  # no digit
             break
         elif digits < _MANY and scale < _MANY:
             digits = digits * 10 + byte - 48

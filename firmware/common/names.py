@@ -14,10 +14,10 @@ def sender(data: memoryview, at: int, stop: int) -> tuple[str, int]:
 
     An account is up to 32 of a-z, 0-9, _ and -, and does not begin with a hyphen.
     """
-    first = at
+    first = at  # then the end of the account: a-z, 0-9, - and _
     while first < stop and (96 < data[first] < 123 or 47 < data[first] < 58 or data[first] in (45, 95)):
         first += 1
-    if first < stop and data[first] == 47 and at < first <= at + 32 and data[at] != 45:
+    if first < stop and data[first] == 47 and at < first <= at + 32 and data[at] != 45:  # a "/" follows; no "-" first
         return bytes(data[at:first]).decode(), first + 1
     while first < stop and data[first] != 47:
         first += 1
@@ -25,10 +25,10 @@ def sender(data: memoryview, at: int, stop: int) -> tuple[str, int]:
 
 
 def sign(body: object, by: str) -> None:
-    """Write the account ``by`` into a command, in place of its ``by`` or in front of it; "-": a stranger."""
-    found = fields(body)
-    person = found.get("by")
-    found["by"] = shown(by + "/" + person, 40) if isinstance(person, str) and person and by != "-" else by
+    """Write the account ``by`` into a command, in place of the command's ``by`` or in front of it; "-": a stranger."""
+    command = fields(body)
+    person = command.get("by")
+    command["by"] = shown(by + "/" + person, 40) if isinstance(person, str) and person and by != "-" else by
 
 
 def claimed(by: str) -> str:

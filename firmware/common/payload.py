@@ -50,7 +50,7 @@ def parse(raw: memoryview | bytes, grouped: bool = False) -> tuple[float, float,
     """
     try:
         body = load(raw)
-        alone = True
+        alone = True  # the group has no other member
         if grouped and isinstance(body, dict):
             alone = len(body) == 1 and bytes(raw).count(b'"drive-values"') == 1
             body = body.get("drive-values")

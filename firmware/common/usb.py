@@ -41,7 +41,7 @@ class Port:
         while out.used:
             for _ in self._writable.ipoll(0):
                 break
-            else:
+            else:  # the host takes nothing now
                 return
             sent = sys.stdout.buffer.write(out.ring, out.first, min(self.chunk, out.used, size - out.first)) or 0
             out.first = (out.first + sent) % size

@@ -43,12 +43,12 @@ class Motor:
         duty = int(speed * 65535)
         if duty == self._duty:
             return
-        if not duty or duty ^ self._duty < 0:
+        if not duty or duty ^ self._duty < 0:  # it stops, or turns the other way
             self.stop()
         self._duty = duty
         if self._pwm:
             self._pwm.duty_u16(abs(duty))
-        elif duty:
+        elif duty:  # ahead by in1, backwards by in2
             self._pwm = PWM(self._pins[duty < 0], freq=self._freq, duty_u16=abs(duty))
 
     def stop(self) -> None:

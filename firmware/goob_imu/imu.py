@@ -42,10 +42,10 @@ class Imu:
         self.good = self.failed = self.calibrated = 0
         self._device, self._log = device, log
         self._data = bytearray(14)
-        self._skip = 0
+        self._skip = 0  # samples after power on that were skipped
         self._first = self._sums = self.bias  # lists of their own when a calibration starts; two more cost 100 bytes
         self._working = False
-        self._in_a_row = 0
+        self._in_a_row = 0  # failures
         self._retry_at: int | None = None
         self._read_at: int | None = None
         self._roll = self._pitch = 0.0

@@ -37,6 +37,7 @@ class Clock:
             self._close(add(now, _RETRY_MS))
 
     def _ask(self, now: int, age: int, server: str) -> None:
+        """Look up the server's name, then request the time from it. ``age``: since the present query was due."""
         if not self._open:
             if age >= 0:
                 self._due = now

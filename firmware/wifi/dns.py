@@ -24,7 +24,7 @@ def answer(data: bytes, asked: bytes, skip: int = 0) -> str | None:
     if data[2] & 0xF8 != 0x80 or data[4:6] != b"\0\1":  # not a response to a standard query of one question
         return None
     # Aliases (CNAME) come before their addresses. There is none if there is no such name, or if the server has trouble
-    found: list[bytes] = []
+    addresses: list[bytes] = []
     for _ in range(data[6] << 8 | data[7]):
         while at < len(data) and 0 < data[at] < 64:  # a name: labels, then 0 or, above 63, where the rest is
             at += data[at] + 1
@@ -35,12 +35,12 @@ def answer(data: bytes, asked: bytes, skip: int = 0) -> str | None:
         # type address, class internet but for mDNS's own bit in it
         if data[at : at + 2] == b"\0\1" and data[at + 2] & 127 == 0 and data[at + 3] == 1 and length == 4:
             address = data[at + 10 : at + 14]
-            if len(address) == 4 and address not in found:
-                found.append(address)
+            if len(address) == 4 and address not in addresses:
+                addresses.append(address)
             if not skip:
                 break
         at += 10 + length
-    if not found:
+    if not addresses:
         return ""
-    found.sort()
-    return "%d.%d.%d.%d" % tuple(found[skip % len(found)])
+    addresses.sort()
+    return "%d.%d.%d.%d" % tuple(addresses[skip % len(addresses)])

@@ -53,9 +53,9 @@ class Client:
         data = self.data
         self._end += count
         while not self._more and len(self.out) - self.waiting > 6:  # room for an answer, and for a ping
-            some = min(self._skip, self._end - self._at)
-            self._skip -= some
-            start = at = self._at = self._at + some
+            skipped = min(self._skip, self._end - self._at)
+            self._skip -= skipped
+            start = at = self._at = self._at + skipped
             length = shift = 0
             byte = 128
             while byte > 127:  # 2.2.3: seven bits a byte, least significant first, at most four bytes
@@ -68,7 +68,7 @@ class Client:
                 length |= (byte & 127) << shift
                 shift += 7
             stop = at + 1 + length
-            if stop > self._end and self._end - start < len(data):
+            if stop > self._end and self._end - start < len(data):  # incomplete, and there is room for more of it
                 return ""
             self._at = min(stop, self._end)
             self._skip = stop - self._at  # of one that is too long

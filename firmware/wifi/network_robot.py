@@ -124,6 +124,7 @@ class NetworkRobot:
                 self.deadman.rest()
 
     def _take(self, kind: str, now: int) -> None:
+        """Handle the answer to a subscription, or a publication."""
         client = self.session.client
         raw = client.data[client.first : client.last]
         if kind == "subscribed":

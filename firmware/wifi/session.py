@@ -137,7 +137,7 @@ class Session:
                 elif kind != "subscribed":
                     self._take(kind, now)
                 else:
-                    if not self._paused:
+                    if not self._paused:  # else it is for stops alone, and lists no other topic
                         self._take(kind, now)
                     if self.connection.state != "online":
                         self._in_flight = 0

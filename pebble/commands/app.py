@@ -32,7 +32,9 @@ def commands(words: Sequence[str] = ()) -> dict[str, Offered]:
 
     Packages of others are looked at only if none of our commands begins with the first of ``words``.
     """
-    offered = {**_CORE, **{name: row for extension in ours() for name, row in extension.commands.items()}}
+    offered = dict(_CORE)
+    for extension in ours():
+        offered |= extension.commands
     if not words or words[0] not in offered:
         foreign = list(packages())
         try:
@@ -42,23 +44,25 @@ def commands(words: Sequence[str] = ()) -> dict[str, Offered]:
                 raise
             log.error("%s", error)  # the help still has ours
             foreign = []
-        offered |= {name: row for extension in foreign for name, row in extension.commands.items()}
+        for extension in foreign:
+            offered |= extension.commands
     return dict(sorted(offered.items(), key=lambda item: (_GROUPS.index(item[1].group), item[1].rank)))
 
 
 def run(arguments: list[str]) -> int:
     """Run a command line; return the exit code, 2 if it is wrong. Raises PebbleError."""
-    for former, now in ((former, now) for extension in ours() for former, now in extension.former.items()):
-        if arguments[: len(former.split())] == former.split():
-            command = now.partition(" --")[0]
-            sys.stderr.write(f'pebble: "{former}" is now "{now}": pebble {command} --help\n')
-            return 2
+    for extension in ours():
+        for former, now in extension.former.items():
+            if arguments[: len(former.split())] == former.split():
+                command = now.partition(" --")[0]
+                sys.stderr.write(f'pebble: "{former}" is now "{now}": pebble {command} --help\n')
+                return 2
     with _thread_errors_on_stderr():
         return _run(arguments)
 
 
 def application(words: Sequence[str] = ()) -> Any:
-    """Return the command ``pebble``, which parses a command line; ``words``: those typed, to look for their command."""
+    """Return the command ``pebble``, which parses a command line; ``words``: as for :func:`commands`."""
     app = typer.Typer(cls=_Pebble, rich_markup_mode=None)
     app.callback()(_options)
     command = typer.main.get_command(app)
@@ -78,9 +82,8 @@ class _Pebble(TyperGroup):
         self.commands = {words: _Listed(words, offered) for words in offered if " " not in words}
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        formatter.write(
-            f"Usage: {ctx.command_path} COMMAND …  (also: --version, COMMAND --help, --install-completion)\n"
-        )
+        usage = f"Usage: {ctx.command_path} COMMAND …  (also: --version, COMMAND --help, --install-completion)\n"
+        formatter.write(usage)
         before = ""
         for name, row in self._offered.items():
             if " " not in name:
@@ -89,7 +92,7 @@ class _Pebble(TyperGroup):
 
 
 class _Listed(TyperCommand):
-    """A command of the table. Its module is imported only to run, explain or complete it."""
+    """A command of the table of :func:`commands`. Its module is imported only to run, explain or complete it."""
 
     def __init__(self, words: str, offered: Mapping[str, Offered]) -> None:
         super().__init__(words.split()[-1], help=offered[words].help)
@@ -102,6 +105,7 @@ class _Listed(TyperCommand):
         return command.make_context(info_name, args, parent, **extra)
 
     def _command(self, arguments: list[str]) -> Any:
+        """Return the command that ``arguments`` follow; with a subcommand of the table, the group that has it."""
         below: dict[str, Any] = {
             words.split()[1]: _Listed(words, self._offered)
             for words in self._offered
@@ -130,7 +134,7 @@ class _Completion(NamedTuple):
 
 
 def _complete_values(command: Any) -> None:
-    """Let a command and its subcommands complete the arguments whose values extensions know, by their names."""
+    """Let Tab complete the arguments of a command and its subcommands that have a name in Extension.completions."""
     places = {name: place for extension in ours() for name, place in extension.completions.items()}
     for parameter in command.params:
         if place := places.get(parameter.metavar or ""):
@@ -179,7 +183,7 @@ class _ErrorHandler(logging.StreamHandler):  # type: ignore[type-arg]  # of the 
 
 @contextmanager
 def _thread_errors_on_stderr() -> Iterator[None]:
-    """Log exceptions of threads to stderr. The command itself raises its own."""
+    """Log exceptions of threads to stderr. Those of the command itself are raised."""
     handler = _ErrorHandler()
     handler.setLevel(logging.ERROR)
     logging.getLogger("pebble").addHandler(handler)

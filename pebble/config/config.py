@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from msgspec import defstruct
 from msgspec.structs import asdict, fields, replace
 
-from pebble import extension
+from pebble import extension as extensions
 from pebble.config import problems
 from pebble.config.home import in_home
 from pebble.config.masking import holds_secret, masked, values_of
@@ -81,7 +81,7 @@ class Config(Root, frozen=True, kw_only=True):
         """Return the enabled serial lines, one process each, by instance name; ``""`` is the section itself."""
         section = self.services.serial_mcu_bridge
         lines: dict[str, SerialBridge] = {"": section, **section.instances}
-        protocols = {*OF_CORE, *(protocol for extension in self.installed for protocol in extension.protocols)}
+        protocols = {*OF_CORE}.union(*(extension.protocols for extension in self.installed))
         return {
             name: line
             for name, line in lines.items()
@@ -102,7 +102,7 @@ class Config(Root, frozen=True, kw_only=True):
 
     def on_demand_programs(self) -> tuple[str, ...]:
         """Return the programs that the bridge may request: they run while operators want their pictures or sound."""
-        return tuple(program.name for program in extension.programs_of(self.installed, self) if program.on_demand)
+        return tuple(program.name for program in extensions.programs_of(self.installed, self) if program.on_demand)
 
 
 def load(
@@ -123,7 +123,7 @@ _handed_over: Config | None = None
 
 
 def hand_over(config: Config) -> None:
-    """Set the config of this process, as the launcher does before it forks its children, which then have it."""
+    """Set the config of this process. The launcher does so before it forks its children: they have it, too."""
     global _handed_over
     _handed_over = config
 
@@ -149,19 +149,20 @@ def _config(
     lenient: bool = False,
     core_only: bool = False,
 ) -> Config:
+    """Read, check and complete a config; the arguments are those of :func:`load` and :func:`parse`."""
     notes = Notes()
     written = plain(raw, notes)
     available, lacking = _extensions(written, folder)
     installed, missing = ((), ()) if core_only else (available, lacking)
-    about_missing = [Note(tuple(lost.key.split(".", 1)), lost.reason) for lost in missing]
+    about_missing = [Note(tuple(extension.key.split(".", 1)), extension.reason) for extension in missing]
     (notes.warnings if lenient else notes.problems).extend(about_missing)
-    tree, kind, rules = _tree(installed)
+    file_class, config_class, rules = _classes(installed)
     reader = Reader(folder, env, rules, notes, file=path, other_forms=True)
     merged = with_instances(written)
-    unread = extension.keys_of_missing(installed)
+    unread = extensions.keys_of_missing(installed)  # no class has them: they would be unknown keys
     if core_only:
-        unread += [key for unused in available for key in unused.sections]
-    root = reader.section(tree, without(merged, unread))
+        unread += [key for extension in available for key in extension.sections]
+    root = reader.section(file_class, without(merged, unread))
     notes.forget_inherited(written, merged)
     if path is not None and holds_secret(written):
         warn_if_readable(notes, (), path, "it, and there is a password in it")
@@ -169,7 +170,7 @@ def _config(
         # Missing extensions come first: unknown sections may be theirs.
         raise ConfigError(list(dict.fromkeys(map(str, (*about_missing, *notes.problems)))))
     identity = Identity(root.robot.system, root.robot.type, root.robot.id)
-    config: Config = kind(
+    config: Config = config_class(
         **asdict(root),
         installed=installed,
         missing=missing,
@@ -183,11 +184,10 @@ def _config(
     )
     if lenient:
         config = _without_broken(config)
-        installed = config.installed
     if not is_text(str(config.run_dir())):
         why = "is no UTF-8, and sockets below it have to be: set it to another folder"
         raise ConfigError(f"transport.run_dir: {shown(str(config.run_dir()))}: {why}")
-    owners = (*map(config.motor_owner, config.motor_lines()), *extension.motors_of(installed, config))
+    owners = (*map(config.motor_owner, config.motor_lines()), *extensions.motors_of(config.installed, config))
     if len(owners) > len(set(owners)):
         raise ConfigError("extensions: two motor owners have one name; serial lines are called as their instances")
     return replace(config, motor_owners=owners)
@@ -195,62 +195,65 @@ def _config(
 
 def _extensions(written: Any, folder: Path) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:
     """Return the extensions of this config, ours and those that the file lists, and the ones that are missing here."""
-    listed = extension.value_at(written, "extensions")
+    listed = extensions.value_at(written, "extensions")
     entries = listed if isinstance(listed, dict) else {}
-    drives = {name: extension.value_at(entry, "drives") is True for name, entry in entries.items()}
-    named, missing = extension.named(drives, folder, Section)
-    installed = (*extension.ours(), *named)
-    sections = [*dir(Config), *(f"services.{name}" for name in dir(Services))]  # with the names of methods
+    drives = {name: extensions.value_at(entry, "drives") is True for name, entry in entries.items()}
+    named, missing = extensions.named(drives, folder, Section)
+    installed = (*extensions.ours(), *named)
+    taken = [*dir(Config), *(f"services.{name}" for name in dir(Services))]  # keys, and names of methods
     protocols = {name: SERIAL_PROTOCOLS[name] for name in OF_CORE}
-    core = Extension(name="core", package="Pebble", sections=dict.fromkeys(sections, ""), protocols=protocols)
-    extension.refuse_claims(core, installed)
-    for added in named:
-        SERIAL_PROTOCOLS.update(added.protocols)
-    return installed, (*missing, *extension.lacking(written))
+    core = Extension(name="core", package="Pebble", sections=dict.fromkeys(taken, ""), protocols=protocols)
+    extensions.refuse_claims(core, installed)
+    for extension in named:
+        SERIAL_PROTOCOLS.update(extension.protocols)
+    return installed, (*missing, *extensions.lacking(written))
 
 
 def _without_broken(config: Config) -> Config:
     """Return the config without extensions whose list of programs cannot be made, so that the robot starts."""
-    for tried in config.installed:
+    for extension in config.installed:
         try:
-            extension.programs_of([tried], config)
+            extensions.programs_of([extension], config)
         except ConfigError as error:
-            lost = Missing(tried.name, f"extensions.{tried.name}", str(error), drives=bool(tried.motors))
-            installed = tuple(other for other in config.installed if other is not tried)
-            warnings = (*config.warnings, str(error))
-            config = replace(config, installed=installed, missing=(*config.missing, lost), warnings=warnings)
+            key, drives = f"extensions.{extension.name}", bool(extension.motors)
+            missing = (*config.missing, Missing(extension.name, key, str(error), drives))
+            installed = tuple(other for other in config.installed if other is not extension)
+            config = replace(config, installed=installed, missing=missing, warnings=(*config.warnings, str(error)))
     return config
 
 
 @cache
-def _tree(installed: tuple[Extension, ...]) -> tuple[type[Root], Any, tuple[Rule, ...]]:
-    """Return the classes of a config file and of a read config, with these extensions' sections, and the rules."""
-    part = extension.part
-    file_class = tree_of({key: part(place) for added in installed for key, place in added.sections.items()})
-    ours = Root.__struct_fields__
-    more = [(field.name, field.type, field.default) for field in fields(file_class) if field.name not in ours]
-    names = {"__doc__": Config.__doc__, "__module__": __name__}
-    config_class = defstruct("Config", more, bases=(Config,), namespace=names, frozen=True, kw_only=True)
+def _classes(installed: tuple[Extension, ...]) -> tuple[type[Root], Any, tuple[Rule, ...]]:
+    """Return the class of a config file, the one of a Config, both with the sections of extensions, and the rules."""
+    sections: dict[str, type[Section]] = {}
     rules: list[Rule] = []
-    for added in installed:
-        if added.rules:
-            rules += [(section, _guarded(added, rule)) for section, rule in part(added.rules)]
+    for extension in installed:
+        sections |= {key: extensions.part(place) for key, place in extension.sections.items()}
+        if extension.rules:
+            rules += [(section, _guarded(extension, rule)) for section, rule in extensions.part(extension.rules)]
+    file_class = tree_of(sections)
+    keys = [field for field in fields(file_class) if field.name not in Root.__struct_fields__]
+    added = [(field.name, field.type, field.default) for field in keys]
+    namespace = {"__doc__": Config.__doc__, "__module__": __name__}
+    config_class = defstruct("Config", added, bases=(Config,), namespace=namespace, frozen=True, kw_only=True)
     return file_class, config_class, (*CHECKS, *rules)
 
 
 def _guarded(owner: Extension, rule: Check) -> Check:
     """Return a rule of an extension, with its exceptions turned into problems of the config; ours are not wrapped."""
-    if owner in extension.ours():
+    if owner in extensions.ours():
         return rule
 
     def check(reader: Reader, section: Any, path: problems.Path) -> Any:
         try:
-            checked, why = rule(reader, section, path), f"returned no {type(section).__name__}"
+            checked = rule(reader, section, path)
         except Exception as error:  # noqa: BLE001 - a stranger's
-            checked, why = None, f"failed: {type(error).__name__}: {error}"
-        if isinstance(checked, type(section)):
-            return checked
-        reader.notes.problem(path, f"a rule of {owner.package} {why}")
+            problem = f"failed: {type(error).__name__}: {error}"
+        else:
+            if isinstance(checked, type(section)):
+                return checked
+            problem = f"returned no {type(section).__name__}"
+        reader.notes.problem(path, f"a rule of {owner.package} {problem}")
         return section
 
     return check
@@ -258,7 +261,8 @@ def _guarded(owner: Extension, rule: Check) -> Check:
 
 def full_tree() -> type[Root]:
     """Return the class of a file with our extensions only, for the schema and the table of keys."""
-    return _tree(extension.ours())[0]
+    file_class, _, _ = _classes(extensions.ours())
+    return file_class
 
 
 def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
@@ -274,19 +278,17 @@ def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
     if (by_login := env.get("XDG_RUNTIME_DIR")) and is_text(by_login):
         return Path(by_login, "pebble", robot)
     temporary = next(name for name in (env.get("TMPDIR"), "/tmp") if name and is_text(name))  # noqa: S108
-    return Path(temporary, f"pebble-{_user_id()}", robot)  # 0700, and checked when made
+    user = os.getuid() if hasattr(os, "getuid") else 0  # Windows has none, and a temporary folder for each user
+    return Path(temporary, f"pebble-{user}", robot)  # 0700, and checked when made
 
 
 def _is_run_from(folder: Path, base: str) -> bool:
     """True if this run directory can be read, and its newest launcher was that of the robot with this base topic."""
     try:
-        return read_plain(folder / LAUNCHER_LOCK).decode(errors="replace").splitlines()[1:2] == [base]
+        lines = read_plain(folder / LAUNCHER_LOCK).decode(errors="replace").splitlines()
     except OSError:
         return False
-
-
-def _user_id() -> int:
-    return os.getuid() if hasattr(os, "getuid") else 0  # Windows has none, and a temporary folder for each user
+    return len(lines) > 1 and lines[1] == base
 
 
 def default_state_folder(base: str, env: Mapping[str, str]) -> Path:
@@ -299,7 +301,7 @@ def default_state_folder(base: str, env: Mapping[str, str]) -> Path:
 
 def file_name(base: str) -> str:
     """Return a file name for one robot: its base topic, or a digest if that is too long for a file system."""
-    name = base.replace("/", "+")  # which no level of a topic contains
+    name = base.replace("/", "+")  # no level of a topic contains a +
     return name if len(os.fsencode(name)) <= _LONGEST_NAME else hashlib.sha256(os.fsencode(base)).hexdigest()
 
 

@@ -13,6 +13,5 @@ def in_home(path: str | Path) -> Path:
     try:
         return Path(path).expanduser()
     except RuntimeError:
-        raise ConfigError(
-            f"{path}: the home folder is not known; set HOME, or write a whole path for it in the config"
-        ) from None
+        why = "the home folder is not known; set HOME, or write a whole path for it in the config"
+        raise ConfigError(f"{path}: {why}") from None

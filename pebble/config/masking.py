@@ -1,4 +1,4 @@
-"""Finds the secrets in a config, by their keys and as secret_text does, and hides them."""
+"""Finds the secrets in a config, by their keys and in its texts as secret_text does, and hides them."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,8 +34,9 @@ def holds_secret(value: Any, key: str = "") -> bool:
         return any(holds_secret(item, key) for item in value)
     if value in ("", None) or isinstance(value, bool):
         return False
-    named = is_secret(key) and key not in _HARMLESS
-    return named or (isinstance(value, str) and without_secrets(value) != value)
+    if is_secret(key) and key not in _HARMLESS:
+        return True
+    return isinstance(value, str) and without_secrets(value) != value
 
 
 def masked(value: Any, key: str = "") -> Any:
@@ -48,10 +49,11 @@ def masked(value: Any, key: str = "") -> Any:
         is_environment = key == "env" or key.endswith("_env")
         return dict.fromkeys(value, HIDDEN) if is_environment else _object(value)
     if isinstance(value, tuple | list) and (key == "command" or key.endswith("_command")):
-        return [masked(word) if number == 0 else HIDDEN for number, word in enumerate(value)]  # any may be a secret
+        return [masked(word) for word in value[:1]] + [HIDDEN] * len(value[1:])  # an argument may be a secret
     if isinstance(value, tuple | list):
-        follows_option = [False, *(isinstance(item, str) and is_secret_option(item) for item in value)]
-        return [HIDDEN if follows_option[place] else masked(item, key) for place, item in enumerate(value)]
+        is_option = [isinstance(item, str) and is_secret_option(item) for item in value]
+        pairs = zip(value, [False, *is_option], strict=False)  # each with: does it follow an option such as --token?
+        return [HIDDEN if follows_option else masked(item, key) for item, follows_option in pairs]
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, str):

@@ -49,8 +49,10 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
     for meta in metas:
         if meta.gt is not None and number <= meta.gt:
             return None if default is NODEFAULT else Reading(default)
-        number = number if meta.ge is None else max(meta.ge, number)
-        number = number if meta.le is None else min(meta.le, number)
+        if meta.ge is not None:
+            number = max(meta.ge, number)
+        if meta.le is not None:
+            number = min(meta.le, number)
     return Reading(int(number) if kind is int else number)
 
 
@@ -63,7 +65,8 @@ def _forms(kind: Any, extra: dict[str, Any], raw: Any, number: float | None) -> 
         forms.append(str(raw))
     if number is not None and "circle" in extra and number.is_integer():
         forms.append(int(number % extra["circle"]))
-    return forms + [value for key, value in extra.get("synonyms", {}).items() if key == str(raw).upper()]
+    synonym = extra.get("synonyms", {}).get(str(raw).upper())
+    return forms if synonym is None else [*forms, synonym]
 
 
 def _number(raw: Any) -> float | None:

@@ -40,7 +40,10 @@ class Notes:
         self.warnings.append(Note(path, text))
 
     def forget_inherited(self, written: Any, merged: Any) -> None:
-        """Remove notes about values in ``merged`` that are not ``written``: the section they are from has them."""
+        """Remove notes about values that a serial line inherits: they are noted at the section that has them.
+
+        ``merged`` is ``written`` with the inherited values (raw.with_instances). A missing key is in neither.
+        """
         for notes in (self.problems, self.warnings, self.retired):
             notes[:] = [note for note in notes if holds(written, note.path) or not holds(merged, note.path)]
 
@@ -57,16 +60,16 @@ def _unused(retired: list[Note]) -> Iterator[str]:
         names = ", ".join(dict.fromkeys(show_path(path[-2:]) for path in paths))
         yield without_secrets(f"no longer used, delete them: {names}; `pebble check --keys` says what replaces each")
         return
-    for text in reasons:
-        groups: dict[Path, list[str]] = {}
+    for reason in reasons:
+        keys_of: dict[Path, list[str]] = {}  # by the path of their section
         for note in retired:
-            if note.text == text:
-                groups.setdefault(note.path[:-1], []).append(str(note.path[-1]))
-        places = (
-            show_path((*parent, keys[0] if len(keys) == 1 else f"{{{', '.join(keys)}}}"))
-            for parent, keys in groups.items()
-        )
-        yield without_secrets(f"{', '.join(places)}: no longer used, {text}")
+            if note.text == reason:
+                keys_of.setdefault(note.path[:-1], []).append(str(note.path[-1]))
+        places = []
+        for section, keys in keys_of.items():
+            listed = keys[0] if len(keys) == 1 else f"{{{', '.join(keys)}}}"
+            places.append(show_path((*section, listed)))
+        yield without_secrets(f"{', '.join(places)}: no longer used, {reason}")
 
 
 def show_path(path: Path) -> str:
@@ -78,8 +81,10 @@ def show_path(path: Path) -> str:
 def holds(raw: Any, path: Path) -> bool:
     """True if there is a value at ``path``."""
     for step in path:
-        steps = range(len(raw)) if isinstance(raw, list) else raw if isinstance(raw, Mapping) else ()
-        if step not in steps:
+        keys: Any = raw if isinstance(raw, Mapping) else ()
+        if isinstance(raw, list):
+            keys = range(len(raw))
+        if step not in keys:
             return False
         raw = raw[step]
     return True

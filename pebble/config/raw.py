@@ -11,6 +11,7 @@ from pebble.config.visible import hidden, shown
 from pebble.errors import ConfigError
 from pebble.extension import value_at
 
+#: Keys below which texts may begin or end with blanks: commands, values of variables, and words for people.
 _WORDS = ("command", "player_command", "env", "robots", "robot_discovery")
 #: Objects whose keys are names that the owner chose, which may begin with _.
 _OF_NAMES = ("env", "instances", "scripts", "extensions", "aliases", "settings", "camera_controls")
@@ -83,7 +84,7 @@ def _object(pairs: Pairs, notes: problems.Notes, path: problems.Path) -> dict[st
 
 
 def _is_words(path: problems.Path) -> bool:
-    """True if the text at ``path`` may begin or end with blanks: a command, a variable's value, or words for people."""
+    """True if the text at ``path`` may begin or end with blanks."""
     return "topics" not in path and any(key in _WORDS for key in path)
 
 
@@ -111,10 +112,10 @@ def with_instances(raw: Any) -> Any:
 def without(raw: Any, keys: Iterable[str]) -> Any:
     """Return ``raw`` without the values at these dotted keys."""
     for key in keys:
-        first, _, rest = key.partition(".")
-        inner = raw.get(first) if isinstance(raw, dict) else None
-        if rest and isinstance(inner, dict):
-            raw = raw | {first: without(inner, [rest])}
-        elif not rest and inner is not None:
-            raw = {name: value for name, value in raw.items() if name != first}
+        first, _, key_below = key.partition(".")
+        value = raw.get(first) if isinstance(raw, dict) else None
+        if key_below and isinstance(value, dict):
+            raw = raw | {first: without(value, [key_below])}
+        elif not key_below and value is not None:
+            raw = {name: other for name, other in raw.items() if name != first}
     return raw

@@ -58,31 +58,34 @@ class Reader:
         """Return a section of ``kind``. A refused value becomes the default, a missing required one None."""
         keys = _known(kind)
         if not isinstance(raw, dict):
-            is_switch = self._other_forms and "enabled" in keys and switch(raw) is not None
-            raw = {"enabled": raw} if is_switch else self._otherwise(kind, raw, path, {} if path else NODEFAULT)
+            if self._other_forms and "enabled" in keys and switch(raw) is not None:
+                raw = {"enabled": raw}
+            else:
+                raw = self._otherwise(kind, raw, path, {} if path else NODEFAULT)  # the whole file has no default
         values: dict[str, Any] = {}
         pairs = () if raw is _WRONG else raw.items()
         for written, value in pairs:
             key = self._key(kind, keys, written, (*path, written))
             field = keys.get(key)
-            if field is None or value in ("", None) or (self._other_forms and value == [] and field.default):
+            if field is None or value in ("", None):
                 continue
-            result = self._value(field.type, value, (*path, written), _default(field))
+            if self._other_forms and value == [] and field.default:  # the original means the default by it
+                continue
+            default = field.default if field.default_factory is NODEFAULT else field.default_factory()
+            result = self._value(field.type, value, (*path, written), default)
             if result is not _WRONG:
                 values[field.name] = result
         for field in keys.values():
             if field.required and field.name not in values:
                 values[field.name] = self._missing(field, (*path, field.encode_name))
-        return self._checked(kind(**values), path)
-
-    def _checked(self, section: S, path: problems.Path) -> S:
-        for kind, check in self._rules:
-            if isinstance(section, kind):
+        section = kind(**values)
+        for checked_kind, check in self._rules:
+            if isinstance(section, checked_kind):
                 section = check(self, section, path)
         return section
 
     def _key(self, kind: type[Section], known: Mapping[str, Any], key: str, path: problems.Path) -> str:
-        """Return the key under its own name, if it was written under another. Note an unknown key."""
+        """Return the present name of a key that may be written under another one. Note an unknown key."""
         name = kind.other_names.get(key, key)
         for retired, replacement in kind.all_retired().items():
             if key == retired or (retired.endswith("*") and key.startswith(retired[:-1])):
@@ -104,19 +107,25 @@ class Reader:
         return None
 
     def _value(self, annotation: Any, raw: Any, path: problems.Path, default: Any = NODEFAULT) -> Any:
+        """Return the value of a key, or _WRONG. What cannot be read as the key's kind is a matter of _otherwise."""
         kind, metas = unwrap(annotation)
+        container = get_origin(kind)
         if _is_section(kind):
             return self.section(kind, raw, path)
-        if get_origin(kind) is tuple:
-            listed = self._words(raw, path) if isinstance(raw, str) and unwrap(get_args(kind)[0])[0] is str else raw
+        if container is tuple:
+            item = get_args(kind)[0]
+            is_line = isinstance(raw, str) and unwrap(item)[0] is str
+            listed = self._words(raw, path) if is_line else raw
             if isinstance(listed, list):
-                return self._list(get_args(kind)[0], listed, path)
-        elif get_origin(kind) is dict and isinstance(raw, dict):
-            name, item = get_args(kind)
-            return self._map(name, item, raw, path)
-        elif kind is Path and isinstance(raw, str):
-            return self._path(raw, metas, path)
-        elif get_origin(kind) is not dict and kind is not Path:
+                return self._list(item, listed, path)
+        elif container is dict:
+            if isinstance(raw, dict):
+                name, item = get_args(kind)
+                return self._map(name, item, raw, path)
+        elif kind is Path:
+            if isinstance(raw, str):
+                return self._path(raw, metas, path)
+        else:
             return self._plain(annotation, raw, path, default)
         return self._otherwise(annotation, raw, path, default)
 
@@ -140,13 +149,15 @@ class Reader:
         tells_nothing = shown == "text" and (get_origin(kind) is Literal or kind in (str, Path))
         must_be = f"must be {expected(kind, metas)}" + ("" if tells_nothing else f", not {shown}")
         reading = reading_of(annotation, kind, metas, raw, default) if self._other_forms else None
-        if reading is None or (not reading.differs and (type(reading.value), reading.value) == (type(raw), raw)):
+        is_raw = reading is not None and type(reading.value) is type(raw) and reading.value == raw
+        if reading is None or (is_raw and not reading.differs):  # raw itself was refused before this call
             self.notes.problem(path, must_be)
             return _WRONG
         if not reading.differs:
             return self._plain(annotation, reading.value, path, NODEFAULT)
-        used = f"{msgspec.json.encode(reading.value).decode()} is used" if reading.value or reading.value == 0 else ""
-        self.notes.warning(path, f"{must_be}; {used or 'it counts as not set'}")
+        is_set = bool(reading.value) or reading.value == 0
+        used = f"{msgspec.json.encode(reading.value).decode()} is used" if is_set else "it counts as not set"
+        self.notes.warning(path, f"{must_be}; {used}")
         return reading.value
 
     def _parsed(self, metas: list[Meta], value: Any, path: problems.Path) -> Any:
@@ -185,18 +196,13 @@ class Reader:
         return {key: value for key, value in items.items() if _WRONG not in (value, named[key])}
 
 
-def _default(field: FieldInfo) -> Any:
-    """Return the default of a key, or NODEFAULT."""
-    return field.default if field.default_factory is NODEFAULT else field.default_factory()
-
-
 def unwrap(annotation: Any) -> tuple[Any, list[Meta]]:
     """Return the bare type behind ``Annotated`` and ``| None``, and the annotations around it."""
     metas: list[Meta] = []
     while True:
         if get_origin(annotation) is Annotated:
-            annotation, *more = get_args(annotation)
-            metas += more
+            annotation, *outer = get_args(annotation)
+            metas += outer
         elif get_origin(annotation) in (Union, types.UnionType) and types.NoneType in get_args(annotation):
             others = tuple(kind for kind in get_args(annotation) if kind is not types.NoneType)
             annotation = Union[others]  # noqa: UP007 - of a tuple made at run time

@@ -20,7 +20,7 @@ _WITH_BLANKS = re.compile(r"(://)[^\s/@:]{0,100}:(?!\d{1,5}(?:[\s/?#\"',;]|$))[^
 
 
 def is_secret(key: str) -> bool:
-    """True if the key's name says that its value, or the file or variable that it names, is a secret."""
+    """True if a key's name says that the value is a secret, or names a file or a variable with a secret in it."""
     return bool(_KEY(key))
 
 
@@ -32,21 +32,25 @@ def without_secrets(text: str) -> str:
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
     text = _WORD.sub(rf"\1{HIDDEN}", text) if "=" in text else text
-    return _MEMBER.sub(lambda found: f"{found[1] or found[2]}{HIDDEN}", text) if '":' in text else text
+    return _MEMBER.sub(lambda match: f"{match[1] or match[2]}{HIDDEN}", text) if '":' in text else text
 
 
 def _without_login(match: re.Match[str]) -> str:
+    """Return a word with stars for a login: from ``://`` or from the user name before the first colon to the last @."""
     word = match[0]
-    ends = [end.start() for end in _AT.finditer(word)]
-    if not ends:
+    ats = [at.start() for at in _AT.finditer(word)]
+    if not ats:
         return word
-    if (slashes := _SLASHES.search(word)) and slashes.end() <= ends[-1]:
+    end = ats[-1]
+    slashes = _SLASHES.search(word)
+    colon = next((colon for colon in _COLON.finditer(word, 0, end) if colon.end() < end), None)
+    if slashes and slashes.end() <= end:
         start = slashes.end()
-    elif colon := next((colon for colon in _COLON.finditer(word, 0, ends[-1]) if colon.end() < ends[-1]), None):
-        start = max((before.end() for before in _BEFORE_USER.finditer(word, 0, colon.start())), default=0)
+    elif colon:
+        start = max((sign.end() for sign in _BEFORE_USER.finditer(word, 0, colon.start())), default=0)
     else:
         return word
-    return f"{word[:start]}{HIDDEN}{word[ends[-1] :]}"
+    return f"{word[:start]}{HIDDEN}{word[end:]}"
 
 
 def shown_user(name: str) -> str:

@@ -27,7 +27,8 @@ def read_text(path: Path) -> str:
 def read_password(file: Path, option: str, place: Path | None = None) -> str:
     """Return the text of the file that ``option`` names, without its final newline. Raises PebbleError.
 
-    The error does not repeat the file's name, which may be the password itself. ``place``: a file that names it.
+    The error does not repeat the file's name, which may be the password itself. ``place``: the config that names it, if
+    one does: root then reads only what the config's owner may read.
     """
     try:
         return (read_text(file) if place is None else text_of(read_for(place, file))).rstrip("\n")
@@ -47,10 +48,10 @@ def text_of(data: bytes) -> str:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        wrong = error.start
+        wrong_byte = error.start
     else:
         if "\0" not in text:
             return text.replace("\r\n", "\n").replace("\r", "\n")
-        wrong = data.index(b"\0")
-    line = data.count(b"\n", 0, wrong) + 1
-    raise NotTextError(f"is not UTF-8 at its byte {wrong}, in line {line}: save it as UTF-8")
+        wrong_byte = data.index(b"\0")
+    line = data.count(b"\n", 0, wrong_byte) + 1
+    raise NotTextError(f"is not UTF-8 at its byte {wrong_byte}, in line {line}: save it as UTF-8")

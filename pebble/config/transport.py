@@ -2,9 +2,10 @@
 
 from typing import Annotated, Any, ClassVar, Literal
 
-from msgspec import Meta, field
+from msgspec import Meta
 
 from pebble.config.types import (
+    EMPTY,
     EXACT,
     ONE_VALUE,
     Account,
@@ -90,7 +91,7 @@ class ZenohSection(ZenohClient, frozen=True, kw_only=True):
         # Messages that a silent connection delays for less are delivered: at most 5 s, as types.Silence.
         int, Meta(ge=100, le=5000, description="A Zenoh peer that is silent for this many milliseconds is gone.")
     ] = 2000
-    settings: Annotated[dict[str, Any], doc("Settings of a third party's transport.")] = field(default_factory=dict)
+    settings: Annotated[dict[str, Any], doc("Settings of a third party's transport.")] = EMPTY
 
 
 class TransportSection(ZenohSection, frozen=True, kw_only=True):

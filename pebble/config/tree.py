@@ -306,13 +306,16 @@ def tree_of(sections: Mapping[str, type[Section]]) -> type[Root]:
 
 def _with(kind: type[Section], sections: Mapping[str, type[Section]]) -> Any:
     """Return a subclass of ``kind`` with more sections; a dotted key belongs to one of its sections."""
-    added = [(key, Annotated[section, doc(section.meaning())]) for key, section in sections.items() if "." not in key]
+    added: list[tuple[str, Any]] = []  # keys with their annotations
+    for key, section in sections.items():
+        if "." not in key:
+            added.append((key, Annotated[section, doc(section.meaning())]))
     for key_field in fields(kind):
         start = f"{key_field.name}."
         inner = {key.removeprefix(start): section for key, section in sections.items() if key.startswith(start)}
         if inner:
             section, *metas = get_args(key_field.type)
             added.append((key_field.name, Annotated[_with(section, inner), *metas]))
-    names = {"__doc__": kind.__doc__, "__module__": kind.__module__}
-    rows = [(name, annotation, get_args(annotation)[0]()) for name, annotation in added]
-    return defstruct(kind.__name__, rows, bases=(kind,), namespace=names, frozen=True, kw_only=True)
+    with_defaults = [(key, annotation, get_args(annotation)[0]()) for key, annotation in added]
+    namespace = {"__doc__": kind.__doc__, "__module__": kind.__module__}
+    return defstruct(kind.__name__, with_defaults, bases=(kind,), namespace=namespace, frozen=True, kw_only=True)

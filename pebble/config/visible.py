@@ -15,8 +15,10 @@ def hidden(text: str, *, words: bool = False) -> str:
 
     ``words``: a blank, a tab and a new line may stand anywhere.
     """
-    for place, char in enumerate("" if text.isprintable() and text.isascii() else text):
-        if _is_hidden(char) and not _joins(text, place) and not (words and char in "\t\n\r"):
+    may_hide = not (text.isprintable() and text.isascii())
+    for place, char in enumerate(text if may_hide else ""):
+        is_allowed = words and char in "\t\n\r"
+        if not is_allowed and _is_hidden(char) and not _joins(text, place):
             return f"holds U+{ord(char):04X}, which is not shown: remove it"
     return "" if words or text == text.strip() else "starts or ends with a blank: remove it"
 
@@ -37,6 +39,7 @@ def shown(text: str) -> str:
 
 
 def _steers(text: str, place: int) -> bool:
+    """True if the character at ``place`` is neither seen nor a blank: it may reorder text, or control a terminal."""
     import unicodedata
 
     char = text[place]

@@ -115,8 +115,8 @@ def run(make_transport: Callable[[Message], Transport], hub: AbstractContextMana
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
     try:
-        with hub as opened:
-            announcer.run(Notifier(), opened)
+        with hub as open_hub:
+            announcer.run(Notifier(), open_hub)
     except PebbleError as error:
         log.error("%s", error)
         return 1

@@ -40,12 +40,12 @@ class AnnouncerPipe:
     def connect(self, will: Message) -> int:
         """Send the will and all states to a new announcer; return its end of the socket, which the caller closes."""
         self.close()
-        self._socket, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket, announcers_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.setblocking(False)
         self._send("will", will)
         self._unsent = dict(self._states)
         self._send_states()
-        return other.detach()
+        return announcers_end.detach()
 
     def state(self, message: Message) -> None:
         """Send a state, which replaces the former one of its topic."""

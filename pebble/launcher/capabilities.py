@@ -77,7 +77,8 @@ def _motor(
     """Return the offers of the motor MCU's serial line: drive, stop, lights and telemetry, with their topics in use."""
     lines, owned = config.motor_lines(), bool(config.motor_owners)
     present = bool(lines)
-    name, line = next(iter(lines.items())) if lines else ("", config.services.serial_mcu_bridge)
+    name = next(iter(lines), "")  # the first of several; "" is the section itself
+    line = lines.get(name, config.services.serial_mcu_bridge)
     if name:
         addresses = Addresses(view_of(config, name))
     drive = offers.DriveOffer(
@@ -107,7 +108,8 @@ def _motor(
         imu=imu,
         imu_topic=imu_topic,
     )
-    return drive, _estop(config, [] if "estop" in lacking else [*config.motor_owners]), lights, telemetry
+    stoppable = [] if "estop" in lacking else [*config.motor_owners]
+    return drive, _estop(config, stoppable), lights, telemetry
 
 
 def _estop(config: Config, owners: list[str]) -> offers.EstopOffer:
@@ -130,13 +132,14 @@ def _imu(config: Config) -> tuple[bool, str]:
 
 def _outlets(config: Config, found: Collection[str]) -> offers.OutletsOffer:
     """Return the outlets of the self-describing MCUs that are connected now, with their topics in use."""
-    topics: dict[str, dict[str, str]] = {}
+    topics_of: dict[str, dict[str, str]] = {}  # by the outlet's name
     for key, channel in (("status_topic", c.OUTLET_STATUS), ("command_topic", c.OUTLET_COMMAND)):
         for feature in sorted(found):
             if name := channel.names(f"{config.base}/{channel.direction}/{feature}").get("outlet"):
-                topics.setdefault(name, {})[key] = channel.topic(config.base, outlet=name)
+                topics_of.setdefault(name, {})[key] = channel.topic(config.base, outlet=name)
     outlets = [
-        offers.OutletOffer(name=name, controls="command_topic" in used, **used) for name, used in sorted(topics.items())
+        offers.OutletOffer(name=name, controls="command_topic" in topics, **topics)
+        for name, topics in sorted(topics_of.items())
     ]
     controls = any(outlet.controls for outlet in outlets)
     return offers.OutletsOffer(available=bool(outlets), controls=controls, outlets=outlets)

@@ -1,4 +1,7 @@
-"""Judges, by the notes of the robot's processes, whether drive commands and stops reach the motors. Pure."""
+"""Judges, by the notes of the robot's processes, whether drive commands and stops reach the motors. Pure.
+
+A judgement is a state, "no", "unknown" or "yes", with the reason unless it is "yes".
+"""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -14,10 +17,9 @@ _WORDS = {"init": "starting"}  # of a process's state
 
 def _shown(mcu: Mcu) -> dict[str, Any]:
     """Return the state of a serial line, in the form of the robot's status."""
-    age = {} if mcu.silent_ms is None else {"heard_ms": mcu.silent_ms}
-    starts = {"starts_per_minute": mcu.starts} if mcu.starts else {}
-    why = mcu.why or _starts(mcu)
-    return {"state": mcu.state, **age, **starts, **({"why": why} if why else {})}
+    starts, why = mcu.starts or None, mcu.why or _starts(mcu) or None
+    fields = {"state": mcu.state, "heard_ms": mcu.silent_ms, "starts_per_minute": starts, "why": why}
+    return {name: value for name, value in fields.items() if value is not None}
 
 
 def _starts(mcu: Mcu) -> str:
@@ -26,7 +28,7 @@ def _starts(mcu: Mcu) -> str:
 
 
 def _drives(mcu: Mcu) -> tuple[str, str]:
-    """Return ("yes", "no" or "unknown", the reason) for a board. One that is silent at rest looks like a dead one."""
+    """Return the judgement of a board. A board that is silent by design looks like a dead one."""
     match mcu.state:
         case "absent":
             return _NO, mcu.why or "there is no such device"
@@ -53,9 +55,9 @@ class Driveable:
     ) -> None:
         self._lines, self._owners, self._ways = dict(lines), tuple(owners), tuple(ways)
         self._on_change = on_change
-        self._mcus: dict[str, Mcu] = {}  # by program, as all of these
-        self._connected: dict[str, Local] = {}
-        self._reached: dict[str, dict[str, bool]] = {}  # then by the line's name
+        self._mcus: dict[str, Mcu] = {}  # by program
+        self._connected: dict[str, Local] = {}  # by program
+        self._reached: dict[str, dict[str, bool]] = {}  # by program, and by the name of the line
 
     @property
     def mcus(self) -> dict[str, dict[str, Any]]:
@@ -66,10 +68,13 @@ class Driveable:
         """Handle a note about a serial line of ``program``."""
         if program not in self._lines:
             return
-        before, self._mcus[program] = self._mcus.get(program), note
-        same = before is not None and replace(before, silent_ms=None) == replace(note, silent_ms=None)
-        if before is None or not same or _drives(before) != _drives(note):
-            self._on_change()
+        before = self._mcus.get(program)
+        self._mcus[program] = note
+        if before is not None:
+            is_same = replace(before, silent_ms=None) == replace(note, silent_ms=None)
+            if is_same and _drives(before) == _drives(note):
+                return
+        self._on_change()
 
     def local(self, program: str, note: Local) -> None:
         """Handle a note about the connection of ``program`` to the robot's other processes."""

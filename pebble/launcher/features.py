@@ -23,17 +23,18 @@ class Features:
     @property
     def lacking(self) -> frozenset[str]:
         """Expected features that at least one process lacks."""
-        return self._present & _EXPECTED
+        return self._reported & _EXPECTED
 
     @property
     def found(self) -> frozenset[str]:
         """Further features that at least one process has."""
-        return self._present - _EXPECTED
+        return self._reported - _EXPECTED
 
     def receive(self, program: str, note: Feature) -> None:
         """Handle a note of ``program``."""
         report = {(program, note.name)}
-        if note.has is (note.name in _EXPECTED):
+        is_as_expected = note.has == (note.name in _EXPECTED)
+        if is_as_expected:
             self._set(self._reports - report)
         elif len(self._reports) < _MOST_REPORTS:
             self._set(self._reports | report)
@@ -43,10 +44,10 @@ class Features:
         self._set({report for report in self._reports if report[0] != program})
 
     @property
-    def _present(self) -> frozenset[str]:
+    def _reported(self) -> frozenset[str]:
         return frozenset(feature for _, feature in self._reports)
 
     def _set(self, reports: set[tuple[str, str]]) -> None:
-        before, self._reports = self._present, reports
-        if self._present != before:
+        before, self._reports = self._reported, reports
+        if self._reported != before:
             self._on_change()

@@ -87,8 +87,6 @@ class Launcher:
                 segments.sweep()  # Zenoh leaves files in /dev/shm even if its processes end in order
         return 0 if self._signals.received <= 1 and not self._lost else 1
 
-    # -- starting
-
     def _start(self) -> None:
         """Start all programs, without waiting for any to be ready."""
         self._reactor.watch(self._signals.descriptor, self._signals.drain)
@@ -117,13 +115,14 @@ class Launcher:
         )
 
     def _driveable_by(self, running: Collection[str]) -> Driveable:
+        """Return the judge of the motors that the programs ``running`` own."""
         lines = {program_of(name): self._config.motor_owner(name) for name in self._config.serial_instances()}
-        added = {program: name for name, program in motors_of(self._config.installed, self._config).items()}
-        owners = [*map(program_of, self._config.motor_lines()), *added]
+        by_extensions = {program: name for name, program in motors_of(self._config.installed, self._config).items()}
+        owners = [*map(program_of, self._config.motor_lines()), *by_extensions]
         return Driveable(
-            {program: name for program, name in (lines | added).items() if program in running},
+            {program: name for program, name in (lines | by_extensions).items() if program in running},
             [program for program in owners if program in running],
-            [name for name in ("mqtt_bridge",) if name in running],
+            ["mqtt_bridge"] if "mqtt_bridge" in running else [],
             lambda: self._status.changed(),
         )
 
@@ -151,12 +150,11 @@ class Launcher:
         self._status.stood_still()
         log.warning("stood still for %.1f s (suspended, or too busy a machine): this time counts for no limit", seconds)
 
-    # -- stopping
-
     def _stop_requested(self) -> bool:
         return self._signals.received > 0 or self._lost
 
     def _keep(self, lock: RunLock) -> None:
+        """Restart all programs if the run directory had to be made again; end the robot if another launcher has it."""
         if self._lost:
             return
         try:
@@ -210,8 +208,9 @@ def _check_runs_here(config: Config) -> None:
         )
     if config.path is None:
         raise ConfigError("the robot's processes know its config by its file, and this one has none")
-    if lost := [f"{extension.key}: {extension.reason}" for extension in config.missing if extension.drives]:
-        raise ConfigError(lost)
+    without_motors = [f"{extension.key}: {extension.reason}" for extension in config.missing if extension.drives]
+    if without_motors:
+        raise ConfigError(without_motors)
     check_connections(config)
 
 

@@ -18,7 +18,7 @@ LINE_LIMIT = 16_384  # bytes of a child's line; the rest of a longer line is dro
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 
 _OWN_NAME = "launcher"
-_LEAST = LEVELS.index("INFO")  # that is published
+_LEAST = LEVELS.index("INFO")  # of the levels that are published
 _LONGEST = 2048  # characters; longer lines are cut and end in three dots
 _FORM = re.compile(r"\d\d:\d\d:\d\d(?:[.,]\d+)? \[([A-Z]+)\] (.*)", re.DOTALL).fullmatch
 _TRACEBACK = re.compile(r"[\s|+]*(Exception Group )?Traceback \(most recent call last\):").match
@@ -51,7 +51,8 @@ class LogForwarder:
 
     def own_record(self, record: logging.LogRecord, text: str) -> None:
         """Forward a log record of the launcher."""
-        level = LEVELS[min(max(record.levelno // 10 - 1, 0), len(LEVELS) - 1)]  # others may lie in between
+        place = record.levelno // 10 - 1  # DEBUG is 10, INFO 20; a level between two counts as the lower
+        level = LEVELS[min(max(place, 0), len(LEVELS) - 1)]
         self._forward(level, _OWN_NAME, os.getpid(), text, logger=record.name)
 
     def _forward(self, level: str, service: str, pid: int, text: str, *, logger: str, published: bool = True) -> None:
@@ -136,7 +137,7 @@ class LevelReader:
 
 
 def text_of(line: bytes) -> str:
-    """Return a line of any bytes as text, without logins: foreign programs may print them."""
+    """Return a line of any bytes as text, without the logins that foreign programs may print."""
     return shown(without_secrets(line.decode(errors="replace").rstrip()))
 
 

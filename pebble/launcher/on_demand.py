@@ -17,20 +17,20 @@ log = logging.getLogger(__name__)
 
 
 class OnDemand:
-    """The requests in notes Wanted and Held: a program runs if one wants it and none holds it. For one thread."""
+    """The requests in notes Wanted and Held: a program runs while it is wanted and not held. For one thread."""
 
     def __init__(self, reactor: Reactor, supervisors: Iterable[ProcessSupervisor]) -> None:
         self._reactor = reactor
         self._supervisors = {s.program.name: s for s in supervisors if s.program.on_demand}
-        self._wanted: set[str] = set()
-        self._held: set[str] = set()
+        self._wanted: dict[str, bool] = {}  # by program, as the rest
+        self._held: dict[str, bool] = {}
         self._encodings: dict[str, str] = {}  # with which a program begins, whenever it is started
         self._until: dict[str, float] = {}  # when requests of an ended program expire
         self._refused: set[str] = set()  # programs whose first refused note was logged
 
     @property
     def requested(self) -> tuple[str, ...]:
-        return tuple(name for name in self._supervisors if name in self._wanted)
+        return tuple(name for name in self._supervisors if self._wanted.get(name))
 
     def environment(self, program: Program) -> dict[str, str]:
         """Return the variables through which a new process of ``program`` learns of its requests."""
@@ -43,25 +43,26 @@ class OnDemand:
         if not self._may(sender, note):
             return
         name, supervisor = note.program, self._supervisors[note.program]
-        (self._wanted.add if note.on else self._wanted.discard)(name)
-        changed = note.encoding != self._encodings.get(name, "")
+        self._wanted[name] = note.on
+        is_other_encoding = note.encoding != self._encodings.get(name, "")
         self._encodings[name] = note.encoding
         self._until.pop(name, None)
-        if changed and supervisor.requested and supervisor.policy.state != "ready":
+        if is_other_encoding and supervisor.requested and supervisor.policy.state != "ready":
             supervisor.release()  # a starting process would not receive the new encoding
         self._follow(name)
 
     def hold(self, sender: Program, note: Held) -> None:
         """Let a program wait, or end the wait, as ``note`` says."""
         if self._may(sender, note):
-            (self._held.add if note.on else self._held.discard)(note.program)
+            self._held[note.program] = note.on
             self._follow(note.program)
 
     def _follow(self, name: str) -> None:
+        """Run the program, let it wait or end it, as the requests now say."""
         supervisor = self._supervisors[name]
-        if name not in self._wanted:
+        if not self._wanted.get(name):
             supervisor.release()
-        elif name in self._held:
+        elif self._held.get(name):
             supervisor.hold()
         else:
             supervisor.request()
@@ -70,8 +71,8 @@ class OnDemand:
         """Note the end of a program. What it has requested runs for OUTLIVE_S longer, and what it holds runs again."""
         if not program.may_request:
             return
-        held, self._held = self._held, set()
-        for name in held:
+        no_longer_held, self._held = self._held, {}
+        for name in no_longer_held:
             self._follow(name)
         if not self.requested:
             return
@@ -85,7 +86,7 @@ class OnDemand:
         for name in [name for name, due in self._until.items() if due <= now]:
             del self._until[name]
             log.warning("%s: the program that requested it has ended, and the request was not repeated", name)
-            self._wanted.discard(name)
+            self._wanted[name] = False
             self._follow(name)
 
     def _may(self, sender: Program, note: Wanted | Held) -> bool:

@@ -27,7 +27,7 @@ class Pipes:
         self._child, self._reactor, self._on_note = child, reactor, on_note
         self._output = BoundedOutput(on_line, LINE_LIMIT, reactor.now(), rate=rate)
         self._notes = LineSplitter(LINE_LIMIT, truncate=True)
-        self._pause: Timer | None = None  # until its output is read again
+        self._pause: Timer | None = None  # until the output of a child that floods is read again
         self._tick: Timer | None = None
         self._watch_output()
         reactor.watch(child.notes, self._read_notes)

@@ -18,7 +18,7 @@ from pebble.runtime.bounded_output import LINES_PER_S
 from pebble.runtime.exits import ASKS_S, has_ended
 from pebble.runtime.timers import Timer
 
-_SCRIPTS_LINES_PER_S = 10 * LINES_PER_S  # it bounds each of them
+_SCRIPTS_LINES_PER_S = 10 * LINES_PER_S  # of a program that runs scripts: it bounds each script itself
 
 log = logging.getLogger(__name__)
 
@@ -77,11 +77,6 @@ class ProcessSupervisor:
     def running(self) -> bool:
         """True from the start of a child until its exit."""
         return self._child is not None
-
-    @property
-    def pid(self) -> int | None:
-        """The process id of the present child, if there is one."""
-        return None if self._child is None else self._child.pid
 
     @property
     def requested(self) -> bool:

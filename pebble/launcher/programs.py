@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Iterator
 from importlib import import_module
 
-from pebble.config import Config, SerialBridge
+from pebble.config import Config
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.extension import Program, Stage, programs_of
 from pebble.transports import module_of
@@ -20,26 +20,29 @@ def programs(config: Config) -> tuple[Program, ...]:
     Devices start before connections: motors have received a stop before any command can arrive.
     """
     core = [program for enabled, program in _core(config) if enabled]
-    added = programs_of(config.installed, config, core=(program.name for program in core))
-    return tuple(sorted([*core, *added], key=lambda program: (program.on_demand, program.stage)))
+    of_extensions = programs_of(config.installed, config, core=(program.name for program in core))
+    return tuple(sorted([*core, *of_extensions], key=lambda program: (program.on_demand, program.stage)))
 
 
 def _core(config: Config) -> Iterator[tuple[bool, Program]]:
+    """Yield Pebble's own processes, each with True if this robot runs it."""
     bridge, mirror = config.services.mqtt_bridge, config.transport.mqtt_mirror
     yield True, _announcer(config)
-    yield from ((True, _serial_line(config, *line)) for line in config.serial_instances().items())
-    seams = (
-        (extension.observer, extension.step, extension.private, *extension.requests) for extension in config.installed
-    )
-    shares = tuple(place.partition(":")[0] for places in seams for place in places if place)
     arguments = (str(config.path),)
+    for instance, line in config.serial_instances().items():
+        words = (*arguments, instance) if instance else arguments
+        yield True, Program(program_of(instance), SERIAL_PROTOCOLS[line.protocol].service, words, Stage.DEVICE)
+    shares: list[str] = []  # modules of extensions that the bridge loads
+    for extension in config.installed:
+        places = (extension.observer, extension.step, extension.private, *extension.requests)
+        shares += [place.partition(":")[0] for place in places if place]
     service = "pebble.services.mqtt_bridge.service:MqttBridge"
-    yield bridge.enabled, Program("mqtt_bridge", service, arguments, may_request=True, shares=shares)
+    yield bridge.enabled, Program("mqtt_bridge", service, arguments, may_request=True, shares=tuple(shares))
     yield mirror is not None, Program("mqtt_mirror", "pebble.services.mqtt_mirror.service:MqttMirror", arguments)
 
 
 def shared_modules(config: Config, table: Iterable[Program]) -> list[str]:
-    """Return the modules to import before the first fork: modules of the programs, and shared ones."""
+    """Return the modules to import before the first fork: those of the programs, and those that programs share."""
     programs = list(table)
     shared = dict.fromkeys(module for program in programs for module in program.shares)
     entries = (program.module.partition(":")[0] for program in programs if program.preloaded)
@@ -69,18 +72,13 @@ def _transport_modules(config: Config) -> tuple[str, ...]:
         kinds.add("mqtt")
     if bridge.enabled:
         kinds.add("mqtt" if bridge.remote is None else bridge.remote.kind)
-    return tuple(module for kind in sorted(kinds) if (module := module_of(kind)) is not None)
+    modules = map(module_of, sorted(kinds))
+    return tuple(module for module in modules if module is not None)
 
 
 def program_of(instance: str) -> str:
     """Return the name of the program of a serial line."""
     return f"serial_mcu_bridge:{instance}" if instance else "serial_mcu_bridge"
-
-
-def _serial_line(config: Config, instance: str, line: SerialBridge) -> Program:
-    """Return the program of a serial line: the bridge of its protocol."""
-    arguments = (str(config.path), instance) if instance else (str(config.path),)
-    return Program(program_of(instance), SERIAL_PROTOCOLS[line.protocol].service, arguments, Stage.DEVICE)
 
 
 def _announcer(config: Config) -> Program:

@@ -30,13 +30,13 @@ class Reactor:
         self._timers = Timers()
         self._clock, self._on_stall = clock, on_stall
         self._stood_still_s = 0.0
-        self._read: float | None = None  # when the clock was last read; None while nothing runs
+        self._read_at: float | None = None  # when the clock was last read; None while nothing runs
 
     def now(self) -> float:
         """Return the time by this reactor's clock, in seconds; notes a stall since the last call."""
         now = self._clock()
-        if self._read is not None:
-            before, self._read = self._read, now
+        if self._read_at is not None:
+            before, self._read_at = self._read_at, now
             if now - before > _TURN_S + _STALL_S:
                 self._stood_still_s += now - before - _TURN_S  # a starved launcher still ends a program that hangs
                 self._on_stall(now - before)
@@ -62,7 +62,7 @@ class Reactor:
     def run_until(self, condition: Callable[[], bool], timeout: float | None = None) -> bool:
         """Run jobs until ``condition()`` is true; return False if ``timeout`` seconds pass first."""
         end = None if timeout is None else self.now() + timeout
-        self._read = self._clock()
+        self._read_at = self._clock()
         try:
             while not condition():
                 now = self.now()
@@ -71,7 +71,7 @@ class Reactor:
                 self._turn(self._timers.wait(now), None if end is None else end - now)
             return True
         finally:
-            self._read = None
+            self._read_at = None
 
     def close(self) -> None:
         self._selector.close()

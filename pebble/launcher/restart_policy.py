@@ -40,7 +40,7 @@ class RestartPolicy:
 
     def exits_within_a_minute(self, now: float) -> int:
         """Return the number of unexpected exits in the last minute, LOOP_EXITS at most."""
-        return sum(now - at <= LOOP_WINDOW_S for at in self._exits)
+        return len([exited_at for exited_at in self._exits if now - exited_at <= LOOP_WINDOW_S])
 
     def request_delay_s(self, now: float) -> float:
         """Return the seconds to wait before an on-demand program is started again by a new request."""

@@ -26,7 +26,7 @@ class RunLock:
         self.path = run_dir / LAUNCHER_LOCK
         self._lock: FileLock | None = None
         self._state_lock: FileLock | None = None
-        self._problem = ""
+        self._problem = ""  # as last logged
 
     def take(self) -> Self:
         """Create the directory, and take both locks."""
@@ -61,29 +61,27 @@ class RunLock:
         True if they were created: programs that start now cannot reach those that were already running. Raises
         PebbleError if another launcher has taken the lock.
         """
-        lock, problem = self._lock, ""
+        lock = self._lock
         try:
             if lock is None or lock.in_place:
                 return False
             make_private(self._run_dir, close=True)
             fresh = FileLock.take(self.path)
         except (OSError, PebbleError) as error:
-            problem = str(error)
-        else:
-            if fresh is None:
-                raise PebbleError(f"{self.path} was removed, and another launcher holds it now: this robot stops")
-            lock.release()
-            self._lock = fresh
-            self._write()
-        if problem and problem != self._problem:
-            log.error(
-                "%s was removed: what starts again reaches none of the robot's other processes until it can be made "
-                "again: %s",
-                self._run_dir,
-                problem,
-            )
+            self._log_once(str(error))
+            return False
+        if fresh is None:
+            raise PebbleError(f"{self.path} was removed, and another launcher holds it now: this robot stops")
+        lock.release()
+        self._lock, self._problem = fresh, ""
+        self._write()
+        return True
+
+    def _log_once(self, problem: str) -> None:
+        if problem != self._problem:
+            text = "what starts again reaches none of the robot's other processes until it can be made again"
+            log.error("%s was removed: %s: %s", self._run_dir, text, problem)
         self._problem = problem
-        return not problem
 
     def release(self) -> None:
         """Release the locks. The files stay, with the process id of the last launcher and its robot."""

@@ -62,8 +62,8 @@ class StatusPublisher:
 
     def changed(self) -> None:
         """Publish the status soon, because the state of a supervisor may have changed."""
-        always = (supervisor for supervisor in self._supervisors if not supervisor.program.on_demand)
-        if not self._ready_reported and all(supervisor.policy.first_attempt_done for supervisor in always):
+        permanent = (supervisor for supervisor in self._supervisors if not supervisor.program.on_demand)
+        if not self._ready_reported and all(supervisor.policy.first_attempt_done for supervisor in permanent):
             self._ready_reported = True
             self._systemd.ready()
         if not self._status_due:
@@ -92,9 +92,8 @@ class StatusPublisher:
     def publish_last(self) -> None:
         """Publish the status, which says how all other programs ended, before the announcer stops."""
         if self._pipe.dropped:
-            log.info(
-                "log records that were not published, because the announcer was away or busy: %d", self._pipe.dropped
-            )
+            text = "log records that were not published, because the announcer was away or busy: %d"
+            log.info(text, self._pipe.dropped)
         self._publish_status()
 
     def close(self) -> None:
@@ -105,11 +104,12 @@ class StatusPublisher:
         shown = [supervisor for supervisor in self._supervisors if supervisor.shown]
         in_use = {supervisor.program.name: self._state(supervisor) for supervisor in shown if not _rests(supervisor)}
         self._systemd.status(_summary(in_use))
-        missing = ServiceState(state="failed", last_exit="not installed")
-        states = {extension.name: missing for extension in self._config.missing}
+        not_installed = ServiceState(state="failed", last_exit="not installed")
+        states = {extension.name: not_installed for extension in self._config.missing}
         states |= {supervisor.program.name: self._state(supervisor) for supervisor in shown}
-        urls = (supervisor.program.webrtc_url for supervisor in self._supervisors)
-        self._publish_state(STATUS, self._status(states, self._driveable.mcus, next(filter(None, urls), None)))
+        urls = [supervisor.program.webrtc_url for supervisor in self._supervisors if supervisor.program.webrtc_url]
+        status = self._status(states, self._driveable.mcus, urls[0] if urls else None)
+        self._pipe.state(self._message(STATUS, status))
 
     def _status(
         self, states: dict[str, ServiceState], mcus: dict[str, Any] | None = None, webrtc_url: str | None = None
@@ -131,10 +131,7 @@ class StatusPublisher:
     def _publish_capabilities(self) -> None:
         self._capabilities_due = False
         value = capabilities(self._config, self._addresses, self._features.lacking, self._features.found)
-        self._publish_state(CAPABILITIES, Capabilities(t=_now_ms(), value=value))
-
-    def _publish_state(self, channel: Channel, value: Any) -> None:
-        self._pipe.state(self._message(channel, value))
+        self._pipe.state(self._message(CAPABILITIES, Capabilities(t=_now_ms(), value=value)))
 
     def _will(self) -> Message:
         """Return the will: the status with every service stopped. The broker publishes it when the launcher dies."""

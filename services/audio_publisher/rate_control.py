@@ -117,10 +117,11 @@ class LevelControl:
         if now - self._polled_at > _GAP_S:
             self._slow_since = self._fast_since = None
         self._polled_at = now
-        self._slow_since = (self._slow_since or now) if age_s > _SLOW_S else None
-        self._empty_at = now if age_s < _EMPTY_S else self._empty_at
+        self._slow_since = _since(self._slow_since, age_s > _SLOW_S, now)
+        if age_s < _EMPTY_S:
+            self._empty_at = now
         is_fast = age_s < _FAST_S or now - self._empty_at < _BEACON_S
-        self._fast_since = (self._fast_since or now) if is_fast else None
+        self._fast_since = _since(self._fast_since, is_fast, now)
         if now - self._changed_at < _PAUSE_S:
             return False
         if self._slow_since is not None and now - self._slow_since >= _PATIENCE_S and self.level < self._last:
@@ -136,3 +137,10 @@ class LevelControl:
     def _change(self, by: int, now: float) -> bool:
         self.level, self._changed_at = self.level + by, now
         return True
+
+
+def _since(before: float | None, is_so: bool, now: float) -> float | None:
+    """Return since when something is so, if it was so since ``before``; None if it is not so now."""
+    if not is_so:
+        return None
+    return now if before is None else before

@@ -45,7 +45,8 @@ class AudioPublisher(Service):
         self._meter, self._numbers = RateMeter(), sequence_numbers()
         self._requested = self._known(requested_encoding())
         self._encoder: SoundEncoder | None = None
-        self._made_for: tuple[object, ...] = ()  # encoding, rate, channels and step
+        self._made_for: tuple[object, ...] = ()  # encoding, rate and channels
+        self._made_step: Step | None = None
         self._problem = ""  # why sound is not sent as requested
         self.reduced = ""  # because of a slow connection
         self._reader = FrameReader(self.config.run_dir(), "microphone", sharing=False, depth=_DEPTH)
@@ -123,11 +124,11 @@ class AudioPublisher(Service):
         A change of the step waits for the end of a packet.
         """
         step = self._rate.step if self._requested == "opus" else self._rate.configured
-        needed = (self._requested, rate, channels, step)
-        same_sound = needed[:-1] == self._made_for[:-1]
-        if self._encoder is None or (needed != self._made_for and not (same_sound and self._encoder.part_way)):
-            self._made_for = needed
-            self._encoder = self._make(*needed)
+        needed = (self._requested, rate, channels)
+        may_change_step = self._encoder is None or not self._encoder.part_way
+        if self._encoder is None or needed != self._made_for or (step != self._made_step and may_change_step):
+            self._made_for, self._made_step = needed, step
+            self._encoder = self._make(*needed, step)
             self.reduced = step.reduced if self._encoder.name == "opus" else ""
             reduced = f", with {self.reduced}" if self.reduced else ""
             self.log.info("sound is sent as %s%s", _format(self._encoder), reduced)
@@ -158,11 +159,9 @@ class AudioPublisher(Service):
                 self.log.warning("sound cannot be sent as %s: %s", attempt, error)
         raise PebbleError(self._problem)
 
-    # -- the report
-
     @every(1.0)
     def _report(self) -> None:
-        now, lost = self.clock(), self._reader.counters
+        now, unread = self.clock(), self._reader.counters
         bitrate = self._meter.bitrate(now)
         report = MediaReport(
             running=True,
@@ -171,7 +170,7 @@ class AudioPublisher(Service):
             rate=round(self._meter.rate(now), 2),
             bitrate=round(bitrate),
             # Chunks that this process was too slow for, and packets that the connection was too slow for.
-            dropped=self.counters["dropped"] + lost["skipped"] + lost["missed"] + lost["torn"],
+            dropped=self.counters["dropped"] + unread["skipped"] + unread["missed"] + unread["torn"],
             reduced=self.reduced or None,
             last_error=self._trouble(now) or None,
         )

@@ -98,8 +98,6 @@ class AudioReceiver(Service):
         self._packets.append((message.payload, time.monotonic()))
         self._wake.set()
 
-    # -- the report
-
     @every(1.0)
     def _report(self) -> None:
         now = self.clock()

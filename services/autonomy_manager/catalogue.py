@@ -83,39 +83,41 @@ class Catalogue:
         self._answers: dict[str, tuple[object, _Answer, float]] = {}
         self._complained: set[str] = set()  # names with a warning in the log
 
-    def scan(self, found: Callable[[dict[str, Script]], object]) -> None:
-        """Call ``found`` with all scripts: at once, and again when scripts that had to be run have answered."""
+    def scan(self, tell: Callable[[dict[str, Script]], object]) -> None:
+        """Call ``tell`` with all scripts: at once, and again when scripts that had to be run have answered."""
         folders = dict(self._folders())
         scripts = self._scripts(folders, asks=False)
         if self._asks:
-            found(dict(scripts))
+            tell(dict(scripts))
             told_at = self._clock()
             for name, places in folders.items():
                 scripts.update(self._scripts({name: places}, asks=True))
                 if self._clock() - told_at >= _TELL_S:
-                    found(dict(scripts))
+                    tell(dict(scripts))
                     told_at = self._clock()
         self._answers = {name: answer for name, answer in self._answers.items() if name in folders}
-        found(scripts)
+        tell(scripts)
 
     def _scripts(self, folders: Mapping[str, list[Path]], *, asks: bool) -> dict[str, Script]:
         scripts = {}
         for name, places in folders.items():
             candidates = (self._script(name, folder, asks=asks) for folder in places)
-            if (script := next(filter(None, candidates), None)) is not None:
+            script = next(filter(None, candidates), None)  # of the first folder that has one
+            if script is not None:
                 scripts[name] = script
         return scripts
 
     def _folders(self) -> Iterator[tuple[str, list[Path]]]:
-        names: dict[str, list[Path]] = {}
+        """Yield each name of a script, with the folders of this name in the order in which they count."""
+        folders: dict[str, list[Path]] = {}
         for root in self._roots:
             for folder in _inside(root):
-                names.setdefault(folder.name, []).append(folder)
-        usable = sorted(filter(self._usable, names), key=lambda name: (name.lower(), name))
+                folders.setdefault(folder.name, []).append(folder)
+        usable = sorted(filter(self._usable, folders), key=lambda name: (name.lower(), name))
         if len(usable) > MAX_SCRIPTS:
             self._complain("", "%d scripts are too many: only the first %d are offered", len(usable), MAX_SCRIPTS)
         for name in usable[:MAX_SCRIPTS]:
-            yield name, names[name]
+            yield name, folders[name]
 
     def _usable(self, name: str) -> bool:
         if name.startswith((".", "_")):
@@ -156,8 +158,9 @@ class Catalogue:
     def _answer(self, name: str, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
         """Return a script's description. It is kept until the script's files change; a failure is kept for a minute."""
         version = entry, stamp(entry), stamp(folder / MANIFEST)
-        command, before, until = self._answers.get(name, (None, _Answer(Description()), 0.0))
-        if (command == version and self._clock() < until) or (command is not None and not asks):
+        version_before, before, until = self._answers.get(name, (None, _Answer(Description()), 0.0))
+        is_current = version_before == version and self._clock() < until
+        if is_current or (version_before is not None and not asks):
             return before
         answer = self._asked(folder, entry, section, asks=asks)
         if not answer.asked:
@@ -207,10 +210,10 @@ class Catalogue:
         if python is not None and "/" in python:
             python = str(self._config.folder / in_home(python))
         if described.command:
-            program, *more = described.command
+            program, *arguments = described.command
             if program in ("python", "python3"):
                 program = interpreter(python, ours=ours)
-            return (str(folder / program) if "/" in program else program, *more)
+            return (str(folder / program) if "/" in program else program, *arguments)
         if python is None and entry.suffix != ".py" and os.access(entry, os.X_OK):
             return (str(entry),)
         return (interpreter(python, ours=ours), str(entry))
@@ -228,13 +231,13 @@ class Catalogue:
             unknown = [setting.key for setting in configured if setting.key not in options]
             if unknown:
                 self._complain(name, "%s has no setting %s: ignored", name, ", ".join(unknown))
+            with_options = [(setting, options[setting.key]) for setting in configured if setting.key in options]
             configured = [
-                _with_option(setting, options[setting.key]) for setting in configured if setting.key in options
+                replace(setting, arg=option.arg, arg_false=option.arg_false, mode=option.mode)
+                for setting, option in with_options
             ]
         merged = {setting.key: setting for setting in configured}
-        for setting in options.values():
-            merged.setdefault(setting.key, setting)
-        settings = tuple(merged.values())
+        settings = (*merged.values(), *(option for key, option in options.items() if key not in merged))
         if len(settings) > MAX_SETTINGS:
             self._complain(name, "%s is offered without settings: %d are too many", name, len(settings))
             return ()
@@ -286,16 +289,11 @@ def _merged(first: Description, second: Description) -> Description:
     )
 
 
-def _with_option(configured: Setting, option: Setting) -> Setting:
-    return replace(configured, arg=option.arg, arg_false=option.arg_false, mode=option.mode)
-
-
 def _dependencies(name: str, section: ScriptSection, described: Description) -> tuple[Dependency, ...]:
     """Return the dependencies in the config, or else the script's; each script once, and never itself."""
-    chosen: Iterable[tuple[str, Mapping[str, object]]]
+    declared = described.dependencies
     if section.dependencies:
-        chosen = ((dependency.file, dependency.config) for dependency in section.dependencies if dependency.enabled)
-    else:
-        chosen = ((dependency.file, dependency.config) for dependency in described.dependencies)
-    by_file = {file: Dependency(file, dict(config)) for file, config in chosen if file != name}
+        enabled = [dependency for dependency in section.dependencies if dependency.enabled]
+        declared = [Dependency(dependency.file, dict(dependency.config)) for dependency in enabled]
+    by_file = {dependency.file: dependency for dependency in declared if dependency.file != name}
     return tuple(by_file.values())

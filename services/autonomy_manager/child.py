@@ -88,10 +88,6 @@ class Process:
         self._thread = threading.Thread(target=self._watch, args=(ended,), name=f"script {self._file}", daemon=True)
         self._thread.start()
 
-    @property
-    def running(self) -> bool:
-        return self._child.code is None
-
     def signal(self, number: signal.Signals) -> None:
         self._child.signal(number)
 

@@ -131,7 +131,8 @@ def answer_of(command: Sequence[str], folder: Path, environment: Mapping[str, st
         answer, reason = _content(output), _content(errors)[-_REASON_BYTES:].decode(errors="replace")
     if code != 0:
         last = reason.strip().rpartition("\n")[2]
-        raise BrokenScriptError(f"{name} ended with code {code}{f': {_shown(last[:300])}' if last else ''}")
+        why = f": {_shown(last[:300])}" if last else ""
+        raise BrokenScriptError(f"{name} ended with code {code}{why}")
     return answer
 
 

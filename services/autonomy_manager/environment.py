@@ -22,7 +22,7 @@ def environment(*more: Mapping[str, str], ours: bool = True) -> dict[str, str]:
     if not ours and sys.prefix != sys.base_prefix and SYSTEM.is_file():
         pebbles = str(Path(sys.prefix, "bin"))
         places = merged.get("PATH", "").split(os.pathsep)
-        merged["PATH"] = os.pathsep.join(sorted(places, key=lambda place: place == pebbles))  # last: pebble is there
+        merged["PATH"] = os.pathsep.join(sorted(places, key=lambda place: place == pebbles))  # last, as True is 1
         merged.pop("VIRTUAL_ENV", None)
     for variables in more:
         merged |= variables

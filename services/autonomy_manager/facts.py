@@ -47,8 +47,10 @@ def facts(config: Config) -> Facts:
 
 
 def _fitness(config: Config, script: Script) -> str:
-    if script.broken or script.ours:
-        return f"does not run: {script.broken}" if script.broken else "runs, Pebble's own"
+    if script.broken:
+        return f"does not run: {script.broken}"
+    if script.ours:
+        return "runs, Pebble's own"
     from pebble.services.autonomy_manager.environment import environment
     from pebble.services.autonomy_manager.interpreter import lacking
 

@@ -59,11 +59,12 @@ def lacking(command: Sequence[str], folder: Path, variables: Mapping[str, str]) 
     for text in _sources(entry):
         try:
             tree = ast.parse(text)
-            imported = dict.fromkeys(name.partition(".")[0] for node in tree.body for name in _imported(node))
-            needs |= dict.fromkeys(_needs(tree, text)) if not imported.keys().isdisjoint(_ARRAYS) else {}
+            imported = [name.partition(".")[0] for node in tree.body for name in _imported(node)]
+            if not set(imported).isdisjoint(_ARRAYS):
+                needs |= dict.fromkeys(_needs(tree, text))
         except (SyntaxError, ValueError, RecursionError, MemoryError):
             continue
-        names |= imported
+        names |= dict.fromkeys(imported)
     places = (entry.parent, *entry.parent.parents[:_PARENTS])
     wanted = [name for name in names if name not in sys.stdlib_module_names and not _is_in(places, name)]
     wanted += needs
@@ -75,7 +76,7 @@ def lacking(command: Sequence[str], folder: Path, variables: Mapping[str, str]) 
 
 
 def _sources(entry: Path) -> Iterator[bytes]:
-    """Yield the text of a script, and of the files beside it that it imports."""
+    """Yield the text of a script, and of the files beside it that it names."""
     try:
         text = _read(entry)
         yield text
@@ -97,16 +98,17 @@ def _needs(tree: ast.Module, text: bytes) -> Iterator[str]:
         yield _OLD_NUMPY
     if re.search(rb"\bhasattr\(|\bAttributeError\b", text):
         return  # it looks for itself
-    modules: dict[str, str] = {}
+    modules: dict[str, str] = {}  # and their parts, by the names that the script gives them
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             modules |= {alias.asname or alias.name.partition(".")[0]: alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             modules |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
     for node in ast.walk(tree):
-        first, _, rest = ast.unparse(node).partition(".") if isinstance(node, ast.Attribute) else ("", "", "")
-        if modules.get(first, "").partition(".")[0] in _ARRAYS:
-            yield f"{modules[first]}.{rest}"
+        if isinstance(node, ast.Attribute):
+            module, _, attribute = ast.unparse(node).partition(".")
+            if modules.get(module, "").partition(".")[0] in _ARRAYS:
+                yield f"{modules[module]}.{attribute}"
 
 
 def _imported(node: ast.stmt) -> list[str]:

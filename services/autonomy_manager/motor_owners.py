@@ -86,8 +86,8 @@ class MotorOwners:
             if state.latched or (state.boot == boot and state.count != count):
                 return _stopped(owner, state)
             if signs and state.last_barred != barred and not newer(run, state.last_barred):
-                alone = state.last_barred == run and not newer(self.newest_run, run)
-                return OVERRIDDEN if alone else SUPERSEDED
+                is_newest = state.last_barred == run and not newer(self.newest_run, run)
+                return OVERRIDDEN if is_newest else SUPERSEDED  # a newer run bars this one by beginning
             if state.boot != boot:
                 return f"motor owner {owner} was restarted: start the script again"
         return ""

@@ -26,7 +26,8 @@ class Offer:
     ) -> None:
         """Store the arguments. ``fixed`` replaces the folders in tests."""
         self.scripts = dict(fixed or {})
-        self.complete = self._fixed = fixed is not None  # whether every folder was looked at once
+        self._fixed = fixed is not None
+        self.complete = self._fixed  # every folder was looked at once
         self._config, self._post, self._on_change = config, post, on_change
         self._files: list[dict[str, object]] | None = None
         self._wanted, self._ended = threading.Event(), False

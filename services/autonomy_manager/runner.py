@@ -47,7 +47,12 @@ class Run:
 
     @property
     def parts(self) -> list[Part]:
-        return [*([] if self.main is None else [self.main]), *self.dependencies]
+        return self.dependencies if self.main is None else [self.main, *self.dependencies]
+
+    @property
+    def running(self) -> Part | None:
+        """The script's own process; None before its start and after its end."""
+        return None if self.main is None or self.main.ended else self.main
 
 
 class Runner:
@@ -58,7 +63,7 @@ class Runner:
         self.stopped = False  # the error is an emergency stop: no failure, and it ends with the reset
         self._service, self._spawn, self._stop_timeout_s = service, spawn, stop_timeout_s
         self._run: Run | None = None
-        self._next: Plan | None = None
+        self._next: Plan | None = None  # waits for the end of the present run
 
     @property
     def run(self) -> Run | None:
@@ -84,7 +89,8 @@ class Runner:
 
     @property
     def config(self) -> Mapping[str, Value] | None:
-        return None if self._run is None or self._run.main is None or self._run.main.ended else self._run.plan.config
+        """The settings of the script that runs; None while none does."""
+        return None if self._run is None or self._run.running is None else self._run.plan.config
 
     @property
     def drives(self) -> bool:
@@ -129,16 +135,14 @@ class Runner:
         self._service.end_run(run.number)
         self._service.changed()
 
-    # -- starting
-
     def _go_on(self) -> None:
         if self._run is None and self._next is not None:
-            wanted, self._next = self._next, None
-            self._begin(wanted)
+            plan, self._next = self._next, None
+            self._begin(plan)
         self._service.changed()
 
     def _begin(self, plan: Plan) -> None:
-        file = plan.main.script.file
+        script = plan.main.script
         try:
             number, baseline = self._service.begin_run(plan)
             self._run = run = Run(number, plan, baseline)
@@ -147,17 +151,18 @@ class Runner:
                 run.dependencies.append(self._started(run, step))
             run.main = self._started(run, plan.main)
         except (OSError, ValueError, PebbleError) as error:
-            label = plan.main.script.label
-            self.error, self.stopped = f"Failed to start {label}: {error}", isinstance(error, StoppedError)
+            self.error, self.stopped = f"Failed to start {script.label}: {error}", isinstance(error, StoppedError)
             log.warning("%s", self.error)
             self._end()
             return
-        log.info("started %s, run %d, pid %d", file, number, run.main.child.pid)
+        log.info("started %s, run %d, pid %d", script.file, number, run.main.child.pid)
 
     def _started(self, run: Run, step: Step) -> Part:
         script = step.script
         path = str(self._service.config_path)
-        variables = {CONFIG: path, **({RUN: str(run.number)} if script.ours else {})}
+        variables = {CONFIG: path}
+        if script.ours:
+            variables[RUN] = str(run.number)
         launch = Launch(
             file=script.file,
             command=(*script.command, "--config", path, *step.options),
@@ -173,8 +178,6 @@ class Runner:
         part = Part(script.file, script.label, self._spawn(launch, on_end))
         return part
 
-    # -- ending
-
     def _end(self) -> None:
         """Begin to end the present run: first the wheels, then the script, then the scripts that it needed."""
         run = self._run
@@ -182,8 +185,8 @@ class Runner:
             return
         run.ending = True
         self._service.halt(run.number)
-        if run.main is not None and not run.main.ended:
-            self._terminate(run.main)
+        if run.running is not None:
+            self._terminate(run.running)
         else:
             self._end_dependencies(run)
 

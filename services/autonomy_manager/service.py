@@ -94,7 +94,8 @@ class AutonomyManager(Service):
     @on(AUTONOMY_COMMAND)
     def command(self, command: AutonomyCommand) -> None:
         word = (command.action or "").strip().lower()
-        begin = word in _START if word in (*_START, *STOP_WORDS) else command.enabled
+        is_known = word in (*_START, *STOP_WORDS)
+        begin = word in _START if is_known else command.enabled
         self._waiting = None
         if begin is None:
             self.log_limited.warning("command", "ignored a command that neither starts nor stops a script")
@@ -182,11 +183,12 @@ class AutonomyManager(Service):
             self._moves = drive.moves
 
     def _person_drives(self) -> None:
+        """Let scripts wait for a person who drives, or end them, as the config says."""
         now, self._waiting = self.clock(), None
         if self._runner.active is not None and self._runner.drives and self._section.on_override == "stop":
             self._runner.stop(OVERRIDDEN)
         if now >= self._overridden_until:
-            self.call_at(now + _HOLD_S, self._check_override)
+            self.call_at(now + _HOLD_S, self._check_override)  # it is called once, however many commands come
         self._overridden_until = now + _HOLD_S
         self.changed()
 
@@ -261,7 +263,7 @@ class AutonomyManager(Service):
 
     def _present_status(self) -> AutonomyStatus:
         run = self._runner.run
-        main = None if run is None or run.main is None or run.main.ended else run.main
+        main = None if run is None else run.running
         parts = [] if run is None else run.dependencies
         status = AutonomyStatus(
             running=main is not None,

@@ -14,7 +14,7 @@ _BUFFER_S = 0.5  # what ALSA holds while this process is busy
 _BEHIND = 10  # chunks; further behind, it skips to the newest
 
 
-class AlsaMicrophone:
+class AlsaMicrophone(CaptureProgram):
     """A microphone by ``arecord``: s16le, 20 ms a piece; none is lost unless this process is late by 200 ms."""
 
     def __init__(self, options: AvDaemon) -> None:
@@ -30,11 +30,11 @@ class AlsaMicrophone:
             f"--period-time={CHUNK_S * 1e6:.0f}", f"--buffer-time={_BUFFER_S * 1e6:.0f}",
             *([f"--device={audio.device}"] if audio.device is not None else []),
         ]  # fmt: skip
-        self._program = CaptureProgram(command)
+        super().__init__(command)
 
     def grab(self) -> Capture:
         while len(self._buffer) < self._size:
-            self._buffer += self._program.read()
+            self._buffer += self.read()
         behind = len(self._buffer) // self._size - 1
         skipped = behind if behind > _BEHIND else 0
         del self._buffer[: skipped * self._size]
@@ -43,9 +43,3 @@ class AlsaMicrophone:
         late_s = len(self._buffer) // self._size * CHUNK_S  # what waits behind it was recorded after it
         at_ns = time.monotonic_ns() - int(late_s * 1e9)
         return Capture(self._info, self._size, chunk, at_ns=at_ns, skipped=skipped)
-
-    def close(self) -> None:
-        self._program.close()
-
-    def interrupt(self) -> None:
-        self._program.interrupt()

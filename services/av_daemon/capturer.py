@@ -90,12 +90,12 @@ class Capturer:
             source.close()
 
     def _pump(self, source: Source) -> None:
-        read_at = time.monotonic()
+        had_reader_at = time.monotonic()
         while not self._ended.is_set():
             now = time.monotonic()
             if self._writer.wanted:
-                read_at = now
-            elif now - read_at >= self._rest_s:
+                had_reader_at = now
+            elif now - had_reader_at >= self._rest_s:
                 return
             self._deliver(source.grab())
 

@@ -3,11 +3,9 @@
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from msgspec import field
-
 from pebble.config import problems
 from pebble.config.reader import Reader, Rule
-from pebble.config.types import ONE_VALUE, UNIT, File, Section, ServiceSection, doc
+from pebble.config.types import EMPTY, ONE_VALUE, UNIT, File, Section, ServiceSection, doc
 from pebble.extensions.media.config import AudioChannels, FramesPerSecond, Pixels, Rotation, SampleRate
 from pebble.ownership import others_in
 from pebble.transports.socket_paths import fits_socket
@@ -32,9 +30,7 @@ class CameraCapture(Section, frozen=True, kw_only=True):
     ] = "/dev/video0"
     capture_format: Annotated[str, doc("Of v4l2: `auto`, `raw`, `mjpeg`, or a pixel format such as `yuyv`.")] = "auto"
     camera_name: Annotated[str | None, doc("Which libcamera camera; unset: the first.")] = None
-    camera_controls: Annotated[dict[str, Any], doc("Settings passed to the camera unchanged.")] = field(
-        default_factory=dict
-    )
+    camera_controls: Annotated[dict[str, Any], doc("Settings passed to the camera unchanged.")] = EMPTY
     width: Annotated[Pixels, doc("Pixels.")] = 640
     height: Annotated[Pixels, doc("Pixels.")] = 480
     fps: Annotated[FramesPerSecond, doc("Frames per second.")] = 15

@@ -100,7 +100,7 @@ class Health:
             if check.content == NOTHING:
                 what = "gives only zeros, as one that is muted or unplugged,"
             elif check.alternates:
-                what += "s again and again"
+                what = f"{what}s again and again"
             yield "repeats", f"{what} since {check.same_s:.0f} s"
         if wrong_hz is not None and sound:
             yield "rate", f"gives {wrong_hz / asked.rate * info.rate:.0f} samples a second where {info.rate} were asked"

@@ -17,32 +17,26 @@ _PROGRAMS = ("rpicam-vid", "libcamera-vid")
 _PIPE_BYTES = 1 << 20  # what an unprivileged process may have
 
 
-class LibcameraCamera:
-    """A camera whose pictures stay as it has compressed them."""
+class LibcameraCamera(CaptureProgram):
+    """A camera that compresses its pictures; they are shared unchanged."""
 
     def __init__(self, options: AvDaemon) -> None:
         video = options.video
         if video.capture_format not in ("auto", "mjpeg"):
             log.warning("libcamera sends mjpeg: capture_format %s does nothing", video.capture_format)
-        self._program = _start(options)
+        super().__init__(_command(options), pipe_bytes=_PIPE_BYTES)
         self._splitter = JpegSplitter()
         self._info = FrameInfo(format="mjpeg", width=video.width, height=video.height)
 
     def grab(self) -> Capture:
         pictures: list[bytes] = []
         while not pictures:
-            pictures = self._splitter.feed(self._program.read())
+            pictures = self._splitter.feed(self.read())
         newest = pictures[-1]
         return Capture(self._info, len(newest), newest, at_ns=time.monotonic_ns(), skipped=len(pictures) - 1)
 
-    def close(self) -> None:
-        self._program.close()
 
-    def interrupt(self) -> None:
-        self._program.interrupt()
-
-
-def _start(options: AvDaemon) -> CaptureProgram:
+def _command(options: AvDaemon) -> list[str]:
     video = options.video
     program = next((name for name in _PROGRAMS if shutil.which(name)), None)
     if program is None:
@@ -55,4 +49,4 @@ def _start(options: AvDaemon) -> CaptureProgram:
         command += ["--camera", video.camera_name]
     for name, value in video.camera_controls.items():
         command += [f"--{name}"] if value is True else [f"--{name}", str(value)]
-    return CaptureProgram(command, pipe_bytes=_PIPE_BYTES)
+    return command

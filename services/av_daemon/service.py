@@ -82,7 +82,7 @@ class AvDaemon(Service):
 
     @every(1.0)
     def look(self) -> None:
-        """End this process, to be restarted, if its shared memory was removed, or /dev/shm has room for it at last."""
+        """End this process, to be restarted, if its shared memory was removed, or if /dev/shm has room at last."""
         if not all(writer.in_place for writer in self._writers):
             raise DeviceError("the shared memory of the frames was removed: starting again with a new one")
         if any(writer.may_share for writer in self._writers):

@@ -94,11 +94,13 @@ class Rotated:
         self._scratch: Bytes = np.empty(0, np.uint8)
 
     def grab(self) -> Capture:
-        capture, upright, skipped = self._next()
-        height, width = upright.shape[:2] if self._degrees == 180 else upright.shape[1::-1]
+        capture, original, skipped = self._next()
+        height, width = original.shape[:2]
+        if self._degrees != 180:
+            height, width = width, height
 
         def draw(target: Bytes) -> None:
-            self._cv2.rotate(upright, self._turns[self._degrees], dst=target.reshape(height, width, 3))
+            self._cv2.rotate(original, self._turns[self._degrees], dst=target.reshape(height, width, 3))
 
         info = replace(capture.info, format="bgr24", width=width, height=height, stride=3 * width)
         return Capture(info, 3 * width * height, draw=draw, at_ns=capture.at_ns, skipped=skipped)
@@ -118,8 +120,8 @@ class Rotated:
             if len(self._scratch) < capture.size and capture.draw is not None:
                 self._scratch = np.empty(capture.size, np.uint8)
             try:
-                upright = picture(capture.pixels(self._scratch[: capture.size]), capture.info)
-                return capture, upright, skipped + broken
+                original = picture(capture.pixels(self._scratch[: capture.size]), capture.info)
+                return capture, original, skipped + broken
             except PayloadError:
                 continue
         raise DeviceError(f"{_BROKEN_LIMIT} pictures one after the other cannot be decoded")

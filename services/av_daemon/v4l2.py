@@ -21,7 +21,7 @@ _PASSED_ON = {"MJPG": "mjpeg", "YUYV": "yuyv"}  # frames that may travel as the 
 
 
 class V4l2Camera:
-    """A camera by its device. Its MJPEG is shared unchanged, unless ``capture_format`` is ``raw``.
+    """A camera by the name of its device. Its MJPEG is shared unchanged, unless ``capture_format`` is ``raw``.
 
     A read that hangs cannot be interrupted; OpenCV's timeout ends it after 3 s.
     """
@@ -73,11 +73,12 @@ class V4l2Camera:
 
     def _choose_format(self, video: CameraCapture) -> str:
         """Return the frames' format: the camera's own if readers can decode it and OpenCV passes it unchanged."""
+        if self._capture.getBackendName() != "V4L2":  # others decode regardless
+            return "bgr24"
         code = int(self._capture.get(self._cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
-        has = code.to_bytes(4, "little").decode("latin-1")
-        wanted = video.capture_format
-        encoding = _PASSED_ON.get(has) if self._capture.getBackendName() == "V4L2" else None  # others decode regardless
-        if encoding is None or wanted not in (encoding, "auto") or (wanted == "auto" and encoding != "mjpeg"):
+        encoding = _PASSED_ON.get(code.to_bytes(4, "little").decode("latin-1"))
+        wanted = "mjpeg" if video.capture_format == "auto" else video.capture_format
+        if encoding is None or encoding != wanted:
             return "bgr24"
         return encoding if self._capture.set(self._cv2.CAP_PROP_CONVERT_RGB, 0) else "bgr24"
 
@@ -92,7 +93,8 @@ class V4l2Camera:
         width, height = (
             int(self._capture.get(prop)) for prop in (self._cv2.CAP_PROP_FRAME_WIDTH, self._cv2.CAP_PROP_FRAME_HEIGHT)
         )
-        return FrameInfo(format=self._format, width=width, height=height, stride=2 * width * (self._format == "yuyv"))
+        stride = 2 * width if self._format == "yuyv" else 0  # a JPEG has no rows
+        return FrameInfo(format=self._format, width=width, height=height, stride=stride)
 
     def _wait(self) -> None:
         if not self._capture.grab():
@@ -120,8 +122,8 @@ def is_device(name: str) -> bool:
 
 def _without_secrets(device: str) -> str:
     """Return a network camera's URL without its password: the name of a camera is logged and published."""
-    scheme, separator, rest = device.partition("://")
+    scheme, separator, address = device.partition("://")
     if not separator:
         return device
-    place = rest.partition("?")[0]
-    return f"{scheme}://{place.rpartition('@')[2]}"
+    address = address.partition("?")[0]
+    return f"{scheme}://{address.rpartition('@')[2]}"

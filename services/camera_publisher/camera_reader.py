@@ -75,6 +75,7 @@ class CameraReader:
 
     def _read_while_enabled(self) -> None:
         while not self._stopping.is_set():
+            # not forever: a pause right after close() would leave this waiting
             if not self._enabled.wait(60.0) or self._stopping.is_set():
                 continue
             try:

@@ -1,4 +1,4 @@
-"""Chooses which of a camera's frames are sent, and which of those as full pictures. Pure: times are passed in."""
+"""Chooses which frames of a camera are sent, and which of these are full pictures. Pure: times are passed in."""
 
 _EARLY = 0.25  # of a period: how far ahead of its turn a frame may be, because cameras have jitter
 _LATE = 1.0  # periods that may be made up for; a longer pause is not

@@ -51,8 +51,8 @@ class RateController:
         self._fps, self._outgoing, self._counters = fps, outgoing, counters
         self._selector, self._window, self._rests = FrameSelector(fps), SendWindow(), Rests(thin)
         self._levels = LevelControl(fps, now, SMALL if thin else 0)
-        self._blocked = False  # was a frame held back since the last one that was encoded, because of a late one?
-        self._changed = False  # has ``step`` changed since the last poll?
+        self._blocked = False  # since the last encoded frame another was held back, because of a late one in flight
+        self._changed = False  # ``step`` has changed since the last poll
 
     @property
     def step(self) -> Step:
@@ -206,8 +206,8 @@ class LevelControl:
             return 0.0
         frames = len(self._seen)
         busy = sum(took for _, took in self._seen) / frames / self._frame_s
-        lost = sum(turns for _, turns in self._lost) / frames
-        return max(busy, 1.0 + lost) if lost > _LOST else busy
+        lost_share = sum(turns for _, turns in self._lost) / frames
+        return max(busy, 1.0 + lost_share) if lost_share > _LOST else busy
 
     def _go_down(self, load: float, now: float) -> bool:
         """Reduce as far as necessary. A step up that was just tried is undone, and tried later next time."""

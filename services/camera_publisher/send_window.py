@@ -61,7 +61,8 @@ class SendWindow:
 
         ``waiting`` bytes are still unacknowledged.
         """
-        self._round_trip_s, since_s, self._polled_at = round_trip_s, now - self._polled_at, now
+        since_s = now - self._polled_at
+        self._round_trip_s, self._polled_at = round_trip_s, now
         frames, slack_s = self._frames.acknowledge(waiting), self._slack_s(now)
         acknowledged = []
         for frame in frames:
@@ -75,7 +76,7 @@ class SendWindow:
         return acknowledged
 
     def _note_beacon(self, frames: list[Sent], since_s: float, now: float) -> None:
-        """Note that an access point delays acknowledgements, if these came together, later than the first needed."""
+        """Note that an access point delays acknowledgements, if those of ``frames`` came together and late."""
         sizes = [frame.size for frame in frames]
         needed_s = since_s * sizes[0] / sum(sizes[1:])  # by the first frame, at the pace of those that came with it
         if now - frames[0].at - self._round_trip_s > max(SLACK_S, 2 * needed_s):

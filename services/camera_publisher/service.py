@@ -56,21 +56,18 @@ class CameraPublisher(Service):
         self._encoding = self._known(requested_encoding())
         self._encoder = self._make_encoder(self._encoding)
         self._reader = CameraReader(
-            self._make_reader, partial(self.post, self._on_frame, newest_of="frame"), partial(self.post, self._on_end)
+            lambda: FrameReader(self.config.run_dir(), "camera", views=True),
+            partial(self.post, self._on_frame, newest_of="frame"),
+            partial(self.post, self._on_end),
         )
 
     def start(self) -> None:
-        self.on_stop(self._log_counters)
+        self.on_stop(lambda: self.log.info("pictures: %s", self.counters.snapshot()))
         self._remote.on_state(lambda _state: self.post(self._on_remote))
         self._remote.open(timeout=0.0)
         self.on_stop(self._remote.close)
         self._reader.open()
         self.on_stop(self._reader.close)
-
-    def _log_counters(self) -> None:
-        self.log.info("pictures: %s", self.counters.snapshot())
-
-    # -- what operators request
 
     @on(VIDEO_CONTROL)
     def control(self, request: MediaRequest) -> None:
@@ -113,8 +110,6 @@ class CameraPublisher(Service):
             quality=options.jpeg_quality,
         )
 
-    # -- the connection
-
     def _on_remote(self) -> None:
         """Adapt to the connection's present state. Frames in flight are lost, even if it is connected again."""
         self._rate.connection_lost()
@@ -134,11 +129,6 @@ class CameraPublisher(Service):
         if self._polling:
             self.call_at(self.clock() + _POLL_S, self._poll)
 
-    # -- frames
-
-    def _make_reader(self) -> FrameReader:
-        return FrameReader(self.config.run_dir(), "camera", views=True)
-
     def _on_end(self) -> None:
         raise DeviceError("the thread that reads the camera's frames has ended")  # the launcher restarts this process
 
@@ -152,7 +142,9 @@ class CameraPublisher(Service):
             if self._rate.may_encode(captured_s, now):
                 self._send_frame(frame)
         except PebbleError as error:
-            self._fail(error)
+            self._throw_away("failed")
+            self._problem = str(error)
+            self.log_limited.warning("a frame", "a frame of the camera cannot be sent: %s", error)
         finally:
             frame.release()
 
@@ -188,13 +180,6 @@ class CameraPublisher(Service):
         if not self._polling:
             self._polling = True
             self.call_at(now + _POLL_S, self._poll)
-
-    def _fail(self, error: PebbleError) -> None:
-        self._throw_away("failed")
-        self._problem = str(error)
-        self.log_limited.warning("a frame", "a frame of the camera cannot be sent: %s", error)
-
-    # -- the report
 
     @every(1.0)
     def _report(self) -> None:

@@ -37,7 +37,7 @@ def object_id(base: str) -> str:
     """Return a unique name of the robot that has only letters, digits and underscores or hyphens."""
     plain = base.replace("/", "_")
     allowed = re.sub(r"[^A-Za-z0-9_-]", "_", plain)
-    exact = allowed == plain and base.count("_") == 0
+    exact = allowed == plain and base.count("_") == 0  # else two robots might have one name
     return f"pebble_{allowed}" if exact else f"pebble_{allowed}_{crc32(base.encode()):08x}"
 
 
@@ -75,26 +75,27 @@ def _components(
     def topic(channel: c.Channel) -> str:
         return topic_of(base, capabilities, channel)
 
+    named = capabilities.get("named") is True
+
     def command(where: str) -> Component:
         return {"cmd_t": with_name(where, ACCOUNT) if named else where, "qos": 1}
 
-    named = capabilities.get("named") is True
     estop, video = section_of(capabilities, "estop"), section_of(capabilities, "video")
     if estop.get("available") is True:  # it needs no name
         yield "stop", {"p": "button", "name": "STOP", "cmd_t": c.ESTOP.topic(base), "cmd_tpl": _STOP, "qos": 1}
     if unit in _UNITS:
-        kind, shown = _UNITS[unit]
-        level = {"p": "sensor", "name": "Battery", "dev_cla": kind, "unit_of_meas": shown, "exp_aft": _STALE_S}
+        kind, sign = _UNITS[unit]
+        level = {"p": "sensor", "name": "Battery", "dev_cla": kind, "unit_of_meas": sign, "exp_aft": _STALE_S}
         yield "battery", level | {"stat_t": topic(c.CHARGING_LEVEL), "val_tpl": "{{ value_json.value }}"}
     if section_of(capabilities, "telemetry").get("charging_status") is True:
         yield "charging", _binary("Charging", "battery_charging", topic(c.CHARGING_STATUS), "value")
-    if video.get("encoding") == "jpeg":  # it shows no other
+    if video.get("encoding") == "jpeg":  # Home Assistant shows no other
         yield "camera", {"p": "camera", "name": "Camera", "t": topic(c.CAMERA)}
     if video.get("controls") is True:
         flag = {"p": "switch", "name": "Video", "stat_t": topic(c.MQTT_VIDEO), "val_tpl": _FLAG}
         yield "video", flag | {"pl_on": "true", "pl_off": "false"} | command(topic(c.MQTT_VIDEO)) | {"ret": not named}
     if section_of(capabilities, "lights").get("solid") is True:
-        unread = dict.fromkeys(("r_tpl", "g_tpl", "b_tpl"), "{{ 0 }}")  # without them it offers no colours
+        unread = dict.fromkeys(("r_tpl", "g_tpl", "b_tpl"), "{{ 0 }}")  # without them Home Assistant offers no colours
         light = {"p": "light", "name": "Light", "schema": "template", "cmd_on_tpl": _COLOUR, "cmd_off_tpl": _DARK}
         yield "light", light | unread | command(topic(c.LIGHTS_SOLID))
     for key, (section, channel) in _BUTTONS.items():

@@ -30,12 +30,12 @@ class HomeAssistantService(Service):
         self._place = f"{self._section.prefix}/device/{object_id(self.config.base)}/config"
         self._capabilities: dict[str, Any] = {}
         self._unit = ""
-        self._wanted = self._sent = b""  # messages
-        self._due = False  # again, although it has not changed
+        self._wanted = self._sent = b""  # the discovery message: as it should be, and as it was sent last
+        self._due = False  # it must be sent again, although it has not changed
         self._sent_at = float("-inf")
         self._file = saved(self.config)
         self._retained = self._load()  # topics that the broker may retain
-        self._emptied: set[str] = set()  # on this connection, perhaps not confirmed
+        self._emptied: set[str] = set()  # topics, on this connection, perhaps not confirmed
 
     def start(self) -> None:
         self._remote.on_state(lambda state: self.post(self._on_connection) if state is State.CONNECTED else None)
@@ -74,12 +74,14 @@ class HomeAssistantService(Service):
         if self._remote.state is not State.CONNECTED:
             return
         now = self.clock()
-        if self._wanted and (self._due or self._wanted != self._sent) and now - self._sent_at >= APART_S:
+        is_due = self._due or self._wanted != self._sent
+        if self._wanted and is_due and now - self._sent_at >= APART_S:
             self._save({*self._retained, self._place})  # first: it has to be emptied even if this process dies now
             if self._publish(self._place, self._wanted):
                 self._sent, self._sent_at, self._due = self._wanted, now, False
-        old = self._retained - ({self._place} if self._section.enabled else set())
-        if old and old <= self._emptied and not self._remote.outgoing.waiting:
+        in_use = {self._place} if self._section.enabled else set()
+        old = self._retained - in_use
+        if old and old <= self._emptied and not self._remote.outgoing.waiting:  # the broker has confirmed it
             self._save(self._retained - old)
         for topic in old - self._emptied:
             if self._publish(topic, b""):

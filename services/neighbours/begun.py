@@ -1,4 +1,4 @@
-"""A file with the newest run of each other robot that has begun here: each begins only once, even over restarts."""
+"""A file with the newest run of each other robot that has begun here: no run begins twice, even over restarts."""
 
 from collections.abc import Collection
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The neighbours of a robot that runs no program of ours, such as a board: this one runs beside its broker."""
+"""The neighbours of a robot that runs no program of ours, such as a board; this program runs beside its broker."""
 
 import os
 import zlib

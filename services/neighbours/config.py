@@ -81,12 +81,12 @@ def _check(reader: Reader, section: Neighbours, path: Path) -> Neighbours:
 def _check_hub(reader: Reader, root: Root, _: Path) -> Root:
     """Note a problem if the hub of the LAN is also the operators' hub, or the robot's."""
     endpoints = list(zenoh_endpoints(root))
-    meets = {_place_of(endpoint): endpoint for path, endpoint in endpoints if path[:3] == _LAN}
+    hubs = {_place_of(endpoint): endpoint for path, endpoint in endpoints if path[:3] == _LAN}
     for path, endpoint in endpoints:
-        mine = meets.get(_place_of(endpoint))
-        if mine is not None and path[:3] != _LAN:
+        hub = hubs.get(_place_of(endpoint))
+        if hub is not None and path[:3] != _LAN:
             why = f"is also {'.'.join(map(str, path))}: what is shared would come twice, or without end"
-            reader.notes.problem((*_LAN, "connect"), f"{mine} {why}; take another hub")
+            reader.notes.problem((*_LAN, "connect"), f"{hub} {why}; take another hub")
     return root
 
 
@@ -107,6 +107,6 @@ def facts(config: Config) -> Facts:
         return Facts()
     ways = [f"connects to {endpoint}" for endpoint in section.lan.connect]
     drivers = [name for name, granted in section.commanded.items() if granted]
-    names = {"receives": section.listens, "driven by scripts of": drivers, "shares": section.shares}
-    named = (f"{what} {' and '.join(robots)}" for what, robots in names.items() if robots)
-    return Facts((("lan", ", ".join([*ways, *named])),))
+    names_of = {"receives": section.listens, "driven by scripts of": drivers, "shares": section.shares}
+    lists = (f"{what} {' and '.join(names)}" for what, names in names_of.items() if names)
+    return Facts((("lan", ", ".join([*ways, *lists])),))

@@ -57,8 +57,6 @@ class NeighboursService(Service):
         self._received_at: dict[str, float] = {}
         self._state: Neighbours | None = None
 
-    # -- its life
-
     def start(self) -> None:
         self._lan.open(timeout=0.0)
         self.on_stop(self._lan.close)
@@ -157,7 +155,7 @@ class NeighboursService(Service):
 
     @on(DRIVE, direct=True)
     def drive(self, drive: Drive, _arrived: float) -> None:
-        """Handle a drive command to this robot, on the transport's thread; a person's all mean the same."""
+        """Handle a drive command to this robot, on the transport's thread; all commands of persons mean the same."""
         self.post(lambda: self._visit.received(drive, self.clock()), newest_of="script" if drive.signed else "person")
 
     # -- what a visit needs

@@ -16,7 +16,7 @@ LOCAL, PERSON = "a script of its own runs", "a person drives it"
 
 
 class Visit:
-    """The run of another robot here. ``publish`` drives. One thread; times are of one clock.
+    """The run of another robot here. ``publish`` drives this robot. For one thread; times are of one clock.
 
     ``begin`` returns why a run cannot begin, ``number`` a number for it; ``local_runs``: a script of this robot runs.
     """
@@ -40,7 +40,8 @@ class Visit:
         """Handle a command of a robot that may drive this one; return False if it has no effect."""
         if not drive.signed or not isinstance(drive.run, int):
             return False  # no script's: it could neither be ended nor told from the next one
-        if self._who != (name, drive.run) and not (drive.moves and self._starts(name, drive.run, now)):
+        is_new = self._who != (name, drive.run)
+        if is_new and not (drive.moves and self._starts(name, drive.run, now)):  # a zero begins no run
             return False
         if drive.moves and not self._sender.ended(now) and self._local_runs():
             self._sender.end(LOCAL, now)
@@ -77,7 +78,8 @@ class Visit:
 
     def driver(self, now: float) -> str:
         """Return the robot whose run drives this one; empty if none does."""
-        return "" if self._sender.ended(now) else self._who[0]
+        robot, _ = self._who
+        return "" if self._sender.ended(now) else robot
 
     def refused(self, now: float) -> dict[str, NeighbourRefusal]:
         """Return why the newest run of each robot has no effect here, by robot."""

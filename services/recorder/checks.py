@@ -41,6 +41,7 @@ def checks(config: Config) -> Iterator[CheckResult]:
 
 
 def _running(folder: Path, entries: list[Entry]) -> CheckResult:
+    """Check whether the recorder runs, and writes all that it receives."""
     if not Folder.is_in_use(folder):
         unfinished = sum(entry.is_active for entry in entries)
         if unfinished:

@@ -53,9 +53,12 @@ class CmdVel:
         )
         self._period_s, self._save = period_s or _PERIOD_S, save
         self._changed = threading.Condition()
-        self._body, self._until, self._zeros = ZERO, 0.0, ZEROS
-        self._latched, self._opens, self._owed = False, owed, owed
-        self._heard_at: float | None = None
+        self._body, self._until = ZERO, 0.0  # the newest command, and when it ends
+        self._zeros = ZEROS  # how many are to be sent once it has ended
+        self._latched = False
+        self._opens = owed  # a new subscriber of the lock is told its state, which is this program's to say
+        self._owed = owed
+        self._heard_at: float | None = None  # when the base last sent odometry
         self._cancelled_at = float("-inf")
         self._ends = False
         self._due = 0.0  # when the thread sends next; infinite: not before something changes
@@ -154,6 +157,7 @@ class CmdVel:
             self._goals.send(messages.CANCEL_ALL)
 
     def _owe(self, owed: bool) -> None:
+        """Store whether the base is locked by this program, which then has to unlock it."""
         if self._lock is not None and owed is not self._owed:
             self._owed = owed
             self._save(owed)
@@ -171,6 +175,7 @@ class CmdVel:
             self._owe(False)
 
     def _send(self) -> None:
+        """Send the command; a base that hangs gets zeros, so that it does not move when it goes on."""
         if self._body != ZERO and self.hangs:
             self.held_back += 1
             self._log.warning("hangs", "the base sends no odometry: it gets zeros instead of commands")

@@ -218,17 +218,17 @@ def _check(reader: Reader, root: Root, _: Path) -> Root:
     robot = root.robot
     if robot.id:
         base = Identity(robot.system, robot.type, robot.id).base
-        known = {"drive_values": c.DRIVE, **CHANNELS}
+        topics = {name: channel.topic(base) for name, channel in {"drive_values": c.DRIVE, **CHANNELS}.items()}
         for name, topic in section.topics.items():
-            if name not in known:
-                notes.problem((*_PATH, "topics", name), f"unknown key, the known ones are {', '.join(known)}")
-            elif topic != (own := known[name].topic(base)):
-                notes.problem((*_PATH, "topics", name), f"must be {own}, as the contract has it; leave it out")
+            if name not in topics:
+                notes.problem((*_PATH, "topics", name), f"unknown key, the known ones are {', '.join(topics)}")
+            elif topic != topics[name]:
+                why = f"must be {topics[name]}, as the contract has it; leave it out"
+                notes.problem((*_PATH, "topics", name), why)
     _warn(notes, section)
     if section.drives and section.ros.estop_topic == section.ros.cmd_vel_topic:
-        notes.problem(
-            (*_PATH, "ros", "estop_topic"), "is cmd_vel_topic, too: write the lock of the multiplexer, or none"
-        )
+        why = "is cmd_vel_topic, too: write the lock of the multiplexer, or none"
+        notes.problem((*_PATH, "ros", "estop_topic"), why)
     return root
 
 
@@ -274,11 +274,11 @@ def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
     section = config.section(Ros1)
     if not section.enabled:
         return value
-    known = TelemetryOffer() if value.telemetry is UNSET else value.telemetry
+    offer = TelemetryOffer() if value.telemetry is UNSET else value.telemetry
     metrics = section.telemetry
-    charges = known.charging_status or metrics.charging_status.enabled
-    odometry = known.wheel_odometry or metrics.wheel_odometry.enabled
-    return replace(value, telemetry=replace(known, charging_status=charges, wheel_odometry=odometry))
+    charges = offer.charging_status or metrics.charging_status.enabled
+    odometry = offer.wheel_odometry or metrics.wheel_odometry.enabled
+    return replace(value, telemetry=replace(offer, charging_status=charges, wheel_odometry=odometry))
 
 
 def facts(config: Config) -> Facts:

@@ -147,23 +147,23 @@ def route(body: bytes) -> Route:
 
 def goals(body: bytes) -> tuple[Header, list[Goal]]:
     reader = _Reader(body)
-    header, found = reader.header(), []
+    header, goals = reader.header(), []
     for _ in range(reader.count()):
         reader.skip(8)
         name, (code,), text = reader.text(), reader.get("B"), reader.text()
-        found.append(Goal(name, code, text))
-    return header, found
+        goals.append(Goal(name, code, text))
+    return header, goals
 
 
 def diagnostics(body: bytes) -> tuple[Header, list[Health]]:
     reader = _Reader(body)
-    header, found = reader.header(), []
+    header, parts = reader.header(), []
     for _ in range(reader.count()):
         (level,) = reader.get("b")
         name, message, _hardware = reader.text(), reader.text(), reader.text()
         pairs = [(reader.text(), reader.text()) for _ in range(reader.count())]
-        found.append(Health(level, name, message, dict(pairs)))
-    return header, found
+        parts.append(Health(level, name, message, dict(pairs)))
+    return header, parts
 
 
 def yaw(quaternion: Sequence[float]) -> float:

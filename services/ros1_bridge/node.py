@@ -66,10 +66,11 @@ class Node:
         self._evicted = False
         self._publications: dict[str, Publication] = {}
         self._subscriptions: dict[str, Subscription] = {}
-        self._missing: dict[tuple[str, str], float] = {}  # since when, by topic and node
-        self._lost: dict[tuple[str, str], list[str]] = {}  # whom to tell, and the publishers
+        #: By topic and node: since when a subscriber that the master lists is not connected, or was last told.
+        self._missing: dict[tuple[str, str], float] = {}
+        self._lost: dict[tuple[str, str], list[str]] = {}  # such subscribers to tell now, with the publishers to name
         self._is_lost = threading.Event()
-        self._revived = 0
+        self._revived = 0  # how often one was told
         self._ends = threading.Event()
         self._threads: list[threading.Thread] = []
         self._calls: queue.Queue[Callable[[], None]] = queue.Queue(_MOST_CALLS_WAITING)
@@ -84,8 +85,6 @@ class Node:
         self._api = serve(self, host, lambda: self._refuse("calls", "calls of its API by other nodes"))
         self.uri = f"http://{host}:{self._api.server_address[1]}/"
         self._address = host, self._listener.getsockname()[1]
-
-    # -- to use
 
     def advertise(self, topic: str, form: Form, definition: str) -> Publication:
         topic = "/" + topic.strip("/")
@@ -132,7 +131,7 @@ class Node:
     # -- what its API asks, on threads of its own
 
     def publishers_are(self, topic: str, uris: list[str]) -> None:
-        """Note the publishers of a topic. Connected ones stay: a master that has restarted lists none of them."""
+        """Note the publishers of a topic. Connected ones stay: a restarted master lists no publishers at first."""
         subscription = self._subscriptions.get(topic)
         if subscription is not None:
             self._in_sockets(lambda: self._update(subscription, uris))
@@ -193,16 +192,18 @@ class Node:
                     self._connect_soon(subscription, source)
 
     def _look(self) -> None:
+        """Register what the master does not know of this node, and tell lost subscribers about it. Raises RosError."""
         publishers, subscribers, _ = call(self.master, "getSystemState", self.name)
         uri = self._uri_of(self.name)
         if uri not in ("", self.uri) and lives(uri):
             if not self._evicted:
                 self._rest()
             raise RosError(f"another node is called {self.name}: {uri}")  # to register would end it
-        known = {topic for topic, nodes in publishers if self.name in nodes}
-        read = {topic for topic, nodes in subscribers if self.name in nodes}
+        published = {topic for topic, nodes in publishers if self.name in nodes}
+        subscribed = {topic for topic, nodes in subscribers if self.name in nodes}
+        is_complete = self._publications.keys() <= published and self._subscriptions.keys() <= subscribed
         # The name alone may be that of an earlier life of this node, which was killed.
-        if self._evicted or uri != self.uri or {*self._publications} - known or {*self._subscriptions} - read:
+        if self._evicted or uri != self.uri or not is_complete:
             self._register()
         self.others = {topic: sorted({*nodes} - {self.name}) for topic, nodes in publishers}
         self._revive(dict(publishers), dict(subscribers))
@@ -227,7 +228,7 @@ class Node:
             return ""
 
     def _revive(self, publishers: Mapping[str, list[str]], subscribers: Mapping[str, list[str]]) -> None:
-        """Tell subscribers that are not connected about this node. Otherwise one that was cut off waits for minutes."""
+        """Tell subscribers that are not connected about this node. They would wait for minutes after a cut."""
         now = time.monotonic()
         missing: dict[tuple[str, str], float] = {}
         for topic, publication in self._publications.items():
@@ -247,28 +248,24 @@ class Node:
             self._is_lost.wait()
             self._is_lost.clear()
             while self._lost and not self._ends.is_set():
-                topic, node = first = next(iter(tuple(self._lost)))  # each in turn: who hangs comes last
-                self._attempt_call(partial(self._tell, topic, node, self._lost.pop(first)))
+                topic, node = next(iter(tuple(self._lost)))  # the oldest; a copy, as another thread adds to it
+                publishers = self._lost.pop((topic, node))
+                self._attempt_call(partial(self._tell, topic, node, publishers))
 
     def _tell(self, topic: str, node: str, publishers: list[str]) -> None:
         uri = self._uri_of(node)
-        others = [other for name in publishers if name != self.name and (other := self._uri_of(name))]
+        others = filter(None, [self._uri_of(name) for name in publishers if name != self.name])
         self._revived += 1  # rospy ignores an address that it believes to be connected to, and any path is ours
         call(uri, "publisherUpdate", "/master", topic, [*others, f"{self.uri}{self._revived}/"])
         log.info("%s: told %s again that this node publishes it", topic, node)
 
     def _connect_soon(self, subscription: Subscription, source: Source) -> None:
         source.asked = True
-        if not self._call_soon(lambda: self._connect(subscription, source)):
-            source.asked = False
-
-    def _call_soon(self, job: Callable[[], None]) -> bool:
         try:
-            self._calls.put_nowait(job)
+            self._calls.put_nowait(lambda: self._connect(subscription, source))
         except queue.Full:
+            source.asked = False
             self._refuse("waiting calls", "calls of other nodes that waited")
-            return False
-        return True
 
     def _attempt_call(self, job: Callable[[], None]) -> None:
         try:
@@ -282,11 +279,10 @@ class Node:
         try:
             _, host, port = call(source.uri, "requestTopic", self.name, subscription.topic, [["TCPROS"]])
             sock = socket.create_connection((host, int(port)), timeout=CALL_S)
-            for option, value in (
-                *((socket.TCP_NODELAY, 1), (socket.TCP_KEEPIDLE, _QUIET_S)),
-                *((socket.TCP_KEEPINTVL, _PROBE_S), (socket.TCP_KEEPCNT, _PROBES)),
-            ):
-                sock.setsockopt(socket.IPPROTO_TCP, option, value)
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, _QUIET_S)
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, _PROBE_S)
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, _PROBES)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
             form, topic = subscription.form, subscription.topic
             sock.sendall(pack_header(callerid=self.name, topic=topic, md5sum=form.md5, type=form.kind, tcp_nodelay="1"))
@@ -325,7 +321,8 @@ class Node:
             while not self._jobs.empty():
                 self._attempt(self._jobs.get())
             now = time.monotonic()
-            for subscriber in [one for one, began in self._greetings.items() if now - began > GREETING_S]:
+            silent = [subscriber for subscriber, began in self._greetings.items() if now - began > GREETING_S]
+            for subscriber in silent:
                 self._end_greeting(subscriber)
                 self._refuse("greetings", "connections that said nothing")
         for key in list(self._select.get_map().values()):
@@ -364,7 +361,7 @@ class Node:
             chunk = subscriber.sock.recv(4096)
             if not chunk or publication is not None:
                 raise RosError("it sends what is not expected" if chunk else "it has closed the connection")
-            for header in subscriber.blocks.feed(chunk)[:1]:
+            for header in subscriber.blocks.feed(chunk)[:1]:  # none while it is incomplete
                 self._greet(subscriber, parse_header(header))
         except BlockingIOError:
             return
@@ -375,6 +372,7 @@ class Node:
                 self._end_greeting(subscriber)
 
     def _greet(self, subscriber: Subscriber, fields: Mapping[str, str]) -> None:
+        """Answer the request of a subscriber, and add it to its publication. Raises RosError if it is refused."""
         topic, md5 = fields.get("topic", ""), fields.get("md5sum", "")
         subscriber.name = fields.get("callerid", "?")[:100]
         publication = None if self._evicted else self._publications.get(topic)
@@ -398,6 +396,7 @@ class Node:
             publication.remove(subscriber, "this node was ended")
 
     def _update(self, subscription: Subscription, uris: list[str]) -> None:
+        """Connect to new publishers of a topic; forget those that are neither listed nor connected."""
         sources = subscription.sources
         for uri in [uri for uri, source in sources.items() if uri not in uris and source.sock is None]:
             del sources[uri]

@@ -1,4 +1,4 @@
-"""A topic that the node publishes, and its subscribers. A message that one cannot take now is dropped, never late."""
+"""A topic that the node publishes, and its subscribers. What a subscriber cannot take now is dropped, never late."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ class Subscriber:
         self.sock, self.name = sock, "?"
         self.publication: Publication | None = None  # None: it has not said yet what it wants
         self.blocks = Blocks(MOST_HEADER)
-        self._rest = b""  # of a block that was sent in part, and has to be completed
+        self._unsent = b""  # the end of a block that was sent in part, and has to be completed
         self._blocked_from: float | None = None
 
     def send(self, data: bytes) -> bool:
         """Send a block at once, or drop it and return False. Raises OSError if the connection is broken."""
         now = time.monotonic()
         try:
-            if self._rest:
-                self._rest = self._rest[self.sock.send(self._rest) :]
-            if not self._rest:
-                self._rest = data[self.sock.send(data) :]
+            if self._unsent:
+                self._unsent = self._unsent[self.sock.send(self._unsent) :]
+            if not self._unsent:
+                self._unsent = data[self.sock.send(data) :]
                 self._blocked_from = None
                 return True
         except BlockingIOError:
@@ -109,12 +109,12 @@ class Publication:
 
     def _send(self, subscriber: Subscriber, data: bytes) -> bool:
         try:
-            taken = subscriber.send(data)
+            was_sent = subscriber.send(data)
         except OSError as error:
             self._remove(subscriber, str(error))
             return False
-        self.dropped += not taken
-        return taken
+        self.dropped += not was_sent
+        return was_sent
 
     def _remove(self, subscriber: Subscriber, why: str) -> None:
         if subscriber in self._subscribers:

@@ -137,7 +137,8 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
         if report != self._shown:
             self._shown = report
             state, _, why = report
-            self.log.info("the base: %s%s", "ready" if state == "ready" else "cannot be driven", why and f", {why}")
+            verdict = "ready" if state == "ready" else "cannot be driven"
+            self.log.info("the base: %s", f"{verdict}, {why}" if why else verdict)
 
     def assess(self) -> tuple[str, int | None, str]:
         """Return the fields of a note Mcu: state, age of the last report (None: unknown), and reason."""

@@ -7,23 +7,21 @@ import math
 import struct
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from pebble import contract as c
 from pebble.contract import Channel
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.services.ros1_bridge import messages
-from pebble.services.ros1_bridge.config import LocalPlan, Metric, Ros1, Sampled
+from pebble.services.ros1_bridge.config import CHANNELS, LocalPlan, Metric, Ros1, Sampled
 from pebble.services.ros1_bridge.messages import Form, Goal, Header, Health, Pose
 from pebble.services.ros1_bridge.node import Node
 from pebble.transports.counters import Counters
 
 log = logging.getLogger(__name__)
 
-PUBLISHES = (
-    *(c.WHEEL_ODOMETRY, c.LOCALIZATION_POSE, c.NAVIGATION_STATUS, c.NAVIGATION_GOAL, c.NAVIGATION_LOCAL_PLAN),
-    *(c.NAVIGATION_GLOBAL_PLAN, c.DIAGNOSTICS, c.CHARGING_LEVEL, c.CHARGING_STATUS),
-)
+PUBLISHES = tuple(CHANNELS.values())
 LEVEL_S = 1.0  # between two levels of the battery, at least
 NAVIGATES_S = 5.0  # a planner that is silent for so long does nothing
 _ACTIVE = (0, 1, 6, 7)  # codes of goals that are pursued or about to be
@@ -60,17 +58,16 @@ class Telemetry:
             (battery or metrics.diagnostics.enabled, names.diagnostics_topic, messages.DIAGNOSTICS, self._diagnostics),
             (tells or section.drives, names.navigation_status_topic, messages.GOAL_STATUS, self._status),
             (tells or metrics.navigation_goal.enabled, names.navigation_goal_topic, messages.POSE, self._take_goal),
-            (metrics.navigation_local_plan.enabled, names.navigation_local_plan_topic, messages.PATH, self._local_plan),
-            (
-                metrics.navigation_global_plan.enabled,
-                names.navigation_global_plan_topic,
-                messages.PATH,
-                self._global_plan,
-            ),
         )
         for wanted, topic, form, read in topics:
             if wanted:
                 node.subscribe(topic, form, self._reader(topic, read))
+        for channel, topic, metric in (
+            (c.NAVIGATION_LOCAL_PLAN, names.navigation_local_plan_topic, metrics.navigation_local_plan),
+            (c.NAVIGATION_GLOBAL_PLAN, names.navigation_global_plan_topic, metrics.navigation_global_plan),
+        ):
+            if metric.enabled:
+                node.subscribe(topic, messages.PATH, self._reader(topic, partial(self._plan, channel, topic, metric)))
 
     @property
     def navigates(self) -> bool:
@@ -140,7 +137,8 @@ class Telemetry:
 
     def _status(self, body: bytes) -> None:
         header, goals = messages.goals(body)
-        goal = next((goal for goal in goals if goal.code in _ACTIVE), goals[-1] if goals else Goal("", -1, ""))
+        newest = goals[-1] if goals else Goal("", -1, "")
+        goal = next((goal for goal in goals if goal.code in _ACTIVE), newest)
         active = goal.code in _ACTIVE
         self._navigates_at = time.monotonic() if active else float("-inf")
         if not self._sampled(c.NAVIGATION_STATUS, self._metrics.navigation_status):
@@ -151,24 +149,16 @@ class Telemetry:
         }  # fmt: skip
         self._tell(c.NAVIGATION_STATUS, value, self._names.navigation_status_topic, header)
 
-    def _local_plan(self, body: bytes) -> None:
-        topic, metric = self._names.navigation_local_plan_topic, self._metrics.navigation_local_plan
-        self._plan(c.NAVIGATION_LOCAL_PLAN, topic, metric, body)
-
-    def _global_plan(self, body: bytes) -> None:
-        topic, metric = self._names.navigation_global_plan_topic, self._metrics.navigation_global_plan
-        self._plan(c.NAVIGATION_GLOBAL_PLAN, topic, metric, body)
-
     def _plan(self, channel: Channel, topic: str, metric: LocalPlan, body: bytes) -> None:
         if not self._sampled(channel, metric):
             return
         header, points = messages.route(body)
         most = min(metric.max_points, len(points))
         step = (len(points) - 1) / (most - 1) if most > 1 else 0.0
-        sample = [points[round(number * step)] for number in range(most)]
+        sample = [points[round(number * step)] for number in range(most)]  # with the first and the last
         for point in sample:
             _refuse_odd(*point)
-        shown = [dict(zip(("x_m", "y_m", "z_m"), (round(part, 6) for part in point), strict=True)) for point in sample]
+        shown = [{"x_m": round(x, 6), "y_m": round(y, 6), "z_m": round(z, 6)} for x, y, z in sample]
         value = {
             "frame_id": header.frame, "point_count": len(points), "sampled_point_count": most, "points": shown,
         }  # fmt: skip
@@ -193,14 +183,16 @@ class Telemetry:
             number = float(part.values[level.key])
             _refuse_odd(number)
             if self._is_due(c.CHARGING_LEVEL, level, LEVEL_S):
-                unit = next((unit for mark, unit in _UNITS.items() if mark in level.key), None)
-                payload = {"value": number, "timestamp": stamp} | ({"unit": unit} if unit else {})
+                payload: dict[str, Any] = {"value": number, "timestamp": stamp}
+                units = [unit for mark, unit in _UNITS.items() if mark in level.key]
+                if units:
+                    payload["unit"] = units[0]
                 self._publish(c.CHARGING_LEVEL, payload)
         if part.name == status.status_name and status.key in part.values:
             word = part.values[status.key].strip().lower()
             charges = word in status.truthy_values
-            known = charges or word in status.falsey_values
-            if known and self._is_due(c.CHARGING_STATUS, status, LEVEL_S):
+            is_understood = charges or word in status.falsey_values
+            if is_understood and self._is_due(c.CHARGING_STATUS, status, LEVEL_S):
                 self._publish(c.CHARGING_STATUS, {"value": charges, "timestamp": stamp})
 
     def _tell(self, channel: Channel, value: dict[str, Any], source: str, header: Header, **more: str) -> None:
@@ -222,13 +214,13 @@ def _place(position: messages.Numbers, yaw: float) -> dict[str, float]:
 
 def _items(parts: list[Health], most: int) -> list[dict[str, Any]]:
     """Return the diagnostics to publish: healthy parts only while there is room."""
-    found: list[Health] = []
+    chosen: list[Health] = []
     for part in parts:
-        if part.level > 0 or len(found) < most:
-            found.append(part)
+        if part.level > 0 or len(chosen) < most:
+            chosen.append(part)
     return [
         {"name": part.name, "level": part.level, "label": _label(_LEVELS, part.level), "message": part.message}
-        for part in found[:most]
+        for part in chosen[:most]
     ]
 
 

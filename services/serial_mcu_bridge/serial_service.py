@@ -49,8 +49,8 @@ class SerialService(Service, ABC):
         self._still = ""  # the logged problem of sensors
         self._warned_at = float("-inf")  # of a board that starts again and again
         self._holders: list[str] = []  # other programs at the device
-        self._misread = False
-        self._understood = (0, 0)  # which opening of the line, and how often its board was heard since
+        self._misread = False  # at the last check
+        self._heard = self._heard_opened = 0  # how many reports were understood, and in which opening of the line
         self._reported = Reported(Notifier().mcu)
         self.line = SerialLine(
             section.serial.port,
@@ -90,8 +90,6 @@ class SerialService(Service, ABC):
     def on_line_state(self, state: LineState) -> None:
         """React to a serial line that was opened, is ready, or is gone."""
 
-    # -- the line
-
     def _close_line(self) -> None:
         self.line.close()
         logged, dropped = self.device_log.totals(), self.counters["input_dropped"]
@@ -107,13 +105,15 @@ class SerialService(Service, ABC):
     def note_report(self, understood: bool) -> None:
         """Note a report; ``understood``: it belongs to the board's protocol, and is neither noise nor other text."""
         if understood:
-            opened, times = self._understood
-            self._understood = self.line.opened, times + 1 if opened == self.line.opened else 1
+            self._heard = self._heard_since_opening() + 1
+            self._heard_opened = self.line.opened
+
+    def _heard_since_opening(self) -> int:
+        return self._heard if self._heard_opened == self.line.opened else 0
 
     def note_start(self) -> None:
         """Note that the board has started: a restart, if it was heard since the line was opened."""
-        opened, times = self._understood
-        if opened == self.line.opened and times > 1:
+        if self._heard_since_opening() > 1:  # the report of this start is one of them
             self._starts.began(time.monotonic())
 
     def note_clock(self, mcu_ms: int) -> None:
@@ -126,22 +126,22 @@ class SerialService(Service, ABC):
         line, now = self.line, time.monotonic()  # the line's clock
         if line.state is LineState.CLOSED:
             return
-        idle, (opened, number) = now - line.output.sent_until >= CHECK_S, self._understood
-        number = number if opened == line.opened else 0
-        state, silent_ms = self._silence.check(line.state, line.opened, number, now, idle=idle)
+        idle, heard = now - line.output.sent_until >= CHECK_S, self._heard_since_opening()
+        state, silent_ms = self._silence.check(line.state, line.opened, heard, now, idle=idle)
         misread = silent_ms is None and line.state is LineState.READY and line.received > 0
         still = self.sensors.problem
         if still and not self._still:
             self.log.warning("%s", still)
         self._still = still
         starts = self._starts.within_a_minute(line.opened, now)
-        problem = _MISREAD if misread and self._misread else line.problem or still
+        misread_twice = misread and self._misread  # the first time a line may be under way
+        problem = _MISREAD if misread_twice else line.problem or still
+        self._misread = misread
         self._reported.report(state, silent_ms, problem, starts)
         if starts >= OFTEN and now - self._warned_at >= _WARN_S:
             self._warned_at = now
             text = "the board has started again %d times within a minute: its supply breaks down, or its cable is loose"
             self.log.warning(text, starts)
-        self._misread = misread  # a line may be under way
 
     @every(HOLDERS_S)
     def name_holders(self) -> None:
@@ -179,7 +179,7 @@ class SerialService(Service, ABC):
 
     def count_discarded(self, discarded: int) -> None:
         """Count and log discarded text lines; ``discarded``: their number so far."""
-        too_long = discarded and discarded - self.counters["lines_discarded"]
+        too_long = discarded - self.counters["lines_discarded"] if discarded else 0
         if too_long:
             self.counters.add("lines_discarded", too_long)
             self.device_log.warning("too long", "a line of the MCU was too long", times=too_long)

@@ -46,10 +46,11 @@ class Clips:
         """
         self.problem = ""
         root = self._folder.resolve()
-        names = (path[len(str(root)) :].lstrip("/") for path in islice(self._files(root), _MOST) if self._is_clip(path))
+        paths = filter(self._is_clip, islice(self._files(root), _MOST))
+        names = (path[len(str(root)) :].lstrip("/") for path in paths)
         clips = sorted(filter(self._can_be_named, names), key=lambda name: (name.lower(), name))
-        sizes = accumulate(len(name.encode()) for name in clips)
-        listed = sum(size <= _LONGEST_LIST for size in sizes)
+        sizes = accumulate(len(name.encode()) for name in clips)  # of the list up to each clip
+        listed = len([size for size in sizes if size <= _LONGEST_LIST])
         if listed < len(clips):
             self.problem = self.problem or f"only the first {listed} of {len(clips)} are listed"
         return clips[:listed]

@@ -66,7 +66,8 @@ class SoundboardHandler(Service):
     def command(self, command: SoundboardCommand) -> None:
         """Play or stop a clip; ``action`` wins over ``enabled``."""
         action = (command.action or "").strip().lower()
-        play = action in _PLAY if action in (*_PLAY, *STOP_WORDS) else command.enabled
+        is_known = action in (*_PLAY, *STOP_WORDS)
+        play = action in _PLAY if is_known else command.enabled
         if play is None:
             self.log.warning("ignored a command that neither plays nor stops: %.100r", command.action)
             return
@@ -84,8 +85,6 @@ class SoundboardHandler(Service):
         if program == "audio_receiver" and report.running and (report.doing or "").startswith("plays"):
             self._talk_back_at = self.clock()
 
-    # -- which clip
-
     def _requested(self, command: SoundboardCommand) -> _Request | None:
         """Return the clip to play; None, with an error in the status, if there is none."""
         name = command.file or ""
@@ -98,7 +97,7 @@ class SoundboardHandler(Service):
         if clip is None:
             self._error = f"Sound file not found: {name[:_LONGEST_NAME]}"
             return None
-        repeat = command.repeat
+        repeat = command.repeat  # True: until it is stopped, a number: so often, else once
         return _Request(clip, math.inf if repeat is True else max(1, repeat or 1))
 
     def scan(self) -> None:
@@ -110,8 +109,6 @@ class SoundboardHandler(Service):
         if files != self._listed:
             self._listed = files
             self.publish(SOUNDBOARD_FILES, SoundboardFiles(files=files, timestamp=time.time()))
-
-    # -- playing
 
     def _replace(self, request: _Request | None) -> None:
         """Stop the player, and play ``request`` when it has ended."""

@@ -40,11 +40,10 @@ def _check(reader: Reader, stream: VideoStream, path: Path) -> VideoStream:
 def _without_login(url: str) -> str:
     """Return ``url`` without user and password, if they can be told from its path."""
     before, slashes, after = url.partition("://")
-    authority = re.match(r"[^/?#\s]*", after)
-    place = authority[0] if authority else ""
-    if "@" in place:
-        return f"{before}{slashes}{place.rpartition('@')[2]}{after[len(place) :]}"
-    if "@" not in after or not re.search(r":(?!\d*$)", place):
+    authority = re.split(r"[/?#\s]", after, maxsplit=1)[0]
+    if "@" in authority:
+        return f"{before}{slashes}{authority.rpartition('@')[2]}{after[len(authority) :]}"
+    if "@" not in after or not re.search(r":(?!\d*$)", authority):
         return url  # an @ behind the port is part of a path
     return f"{before}{slashes}{after.rpartition('@')[2]}"  # the password has a slash
 

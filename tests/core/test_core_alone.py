@@ -77,6 +77,9 @@ class Line:
         self.lines += [line for line in lines if line.startswith("M ")]
         return self.lines
 
+    def send(self, data: bytes) -> None:
+        os.write(self._board, data)
+
     def end(self) -> None:
         os.close(self._board)
         os.close(self._pebble_end)
@@ -112,9 +115,14 @@ def test_a_robot_is_started_driven_and_stopped_and_its_line_ends(core: Path, kin
     broker, line = Broker(tmp_path), Line()
     operator = Operator(broker.port, BASE)
 
-    def driveable() -> str | None:
+    def driveable() -> dict[str, str]:
         value: dict[str, Any] = operator.newest("status").get("value", {})
-        return value.get("driveable", {}).get("state")
+        found: dict[str, str] = value.get("driveable", {})
+        return found
+
+    def shows(data: bytes, state: str, why: str = "") -> bool:
+        line.send(data)
+        return driveable().get("state") == state and why in driveable().get("why", "")
 
     def driven(wanted: str) -> bool:
         operator.send("incoming/drive-values", {"x": 0, "z": 0.5})
@@ -123,7 +131,10 @@ def test_a_robot_is_started_driven_and_stopped_and_its_line_ends(core: Path, kin
 
     try:
         with robot(core, kind, line, broker, tmp_path):
-            assert until(lambda: driveable() in ("yes", "unknown"), 20)
+            assert until(lambda: driveable().get("state") == "unknown", 20)
+            noise = b"\xff\x00\x80\n>>> \nM 0.000 0.000\nT a0=\n"
+            assert until(lambda: shows(noise, "unknown", "what its board sends is not understood"), 10, step=0.1)
+            assert until(lambda: shows(b"OK M\n", "yes"), 10, step=0.1)
             assert until(lambda: driven("M 0.500 0.500"), 10)
             begun = time.monotonic()
             assert until(lambda: line.read()[-1] == "M 0.000 0.000", 5)
@@ -136,7 +147,7 @@ def test_a_robot_is_started_driven_and_stopped_and_its_line_ends(core: Path, kin
             assert not any(driven("M 0.500 0.500") for _ in range(10))
             assert {*line.read()[count:]} <= {"M 0.000 0.000"}
             line.end()
-            assert until(lambda: driveable() == "no", 10)
+            assert until(lambda: driveable().get("state") == "no", 10)
     finally:
         operator.close()
         broker.stop()

@@ -324,37 +324,11 @@ def test_the_core_alone_reads_a_config_with_sections_of_extensions() -> None:
     assert names == ["zenoh_hub", "serial_mcu_bridge", "mqtt_bridge"]
 
 
-def test_a_robot_starts_though_a_section_of_what_is_missing_is_there(tmp_path: Path) -> None:
-    path = write(tmp_path, {"lamp": {}}, {"enabled": True})
-    assert load(path, lenient=True).warnings[0].startswith("extensions.lamp: no installed package offers it")
-
-
-def test_an_owner_of_motors_is_listed_as_such(tmp_path: Path) -> None:
-    lamp_file(tmp_path, "legs", drives=True)
-    done = pebble("check", str(write(tmp_path, {"legs.py": {}})))
-    assert (done.returncode, 'it owns motors, write {"drives": true}' in done.stderr) == (1, True)
-    lamp_file(tmp_path, "lamp")
-    done = pebble("check", str(write(tmp_path, {"lamp.py": {"drives": True}})))
-    assert (done.returncode, "it declares no motors" in done.stderr) == (1, True)
-
-
 def test_an_owner_of_motors_is_a_device(tmp_path: Path) -> None:
     lamp_file(tmp_path, "wheels", drives=True)
     config = load(write(tmp_path, {"wheels.py": {"drives": True}}, {"enabled": True}))
     assert [(one.name, one.stage) for one in programs_of(config.installed, config)] == [("lamp", Stage.DEVICE)]
     assert config.motor_owners == ("lamp",)
-
-
-def test_two_entries_of_one_file_are_refused(tmp_path: Path) -> None:
-    lamp_file(tmp_path, "lamp")
-    done = pebble("check", str(write(tmp_path, {"lamp.py": {}, "./lamp.py": {}})))
-    assert (done.returncode, "is added by two, lamp.py (lamp) and lamp.py (lamp)" in done.stderr) == (1, True)
-
-
-def test_a_file_that_would_hide_a_module_is_refused(tmp_path: Path) -> None:
-    lamp_file(tmp_path, "calendar")
-    done = pebble("check", str(write(tmp_path, {"calendar.py": {}})))
-    assert (done.returncode, "a module is called calendar already" in done.stderr) == (1, True)
 
 
 PROTOCOL = """
@@ -378,18 +352,36 @@ def test_a_row_is_all_that_a_serial_protocol_needs_besides_its_service(tmp_path:
     assert '"pebble_serial_v1" or "gyro_v1"' in pebble("check", str(path)).stderr
 
 
-def test_two_that_want_the_same_are_refused_with_both_names(tmp_path: Path) -> None:
-    lamp_file(tmp_path, "lamp")
-    lamp_file(tmp_path, "lamp2")
-    done = pebble("check", str(write(tmp_path, {"lamp.py": {}, "lamp2.py": {}})))
-    text = 'section "services.lamp" is added by two, lamp.py (lamp) and lamp2.py (lamp2): remove one of them'
-    assert (done.returncode, text in done.stderr) == (1, True)
+LAMP_FILE, LEGS_FILE = LAMP % {"name": "lamp", "drives": False}, LAMP % {"name": "legs", "drives": True}
+TWICE = 'section "services.%s" is added by two, %s and %s: remove one of them'
+#: Files and entries that a check refuses, and what it says.
+REFUSED: dict[str, tuple[dict[str, str], dict[str, Any], str]] = {
+    "motors that are not listed": ({"legs": LEGS_FILE}, {"legs.py": {}}, 'it owns motors, write {"drives": true}'),
+    "no motors": ({"lamp": LAMP_FILE}, {"lamp.py": {"drives": True}}, "it declares no motors"),
+    "one file, two entries": (
+        *({"lamp": LAMP_FILE}, {"lamp.py": {}, "./lamp.py": {}}),
+        "is added by two, lamp.py (lamp) and lamp.py (lamp)",
+    ),
+    "a file that would hide a module": (
+        *({"calendar": LAMP_FILE}, {"calendar.py": {}}),
+        "a module is called calendar already",
+    ),
+    "two with one section": (
+        *({"lamp": LAMP_FILE, "lamp2": LAMP % {"name": "lamp2", "drives": False}}, {"lamp.py": {}, "lamp2.py": {}}),
+        TWICE % ("lamp", "lamp.py (lamp)", "lamp2.py (lamp2)"),
+    ),
+    "a section of the core": (
+        *({"lamp": LAMP_FILE.replace(".lamp", ".mqtt_bridge")}, {"lamp.py": {}}),
+        TWICE % ("mqtt_bridge", "Pebble (core)", "lamp.py (lamp)"),
+    ),
+}
 
 
-def test_an_extension_adds_no_section_of_the_core(tmp_path: Path) -> None:
-    (tmp_path / "lamp.py").write_text((LAMP % {"name": "lamp", "drives": False}).replace(".lamp", ".mqtt_bridge"))
-    done = pebble("check", str(write(tmp_path, {"lamp.py": {}})))
-    text = 'section "services.mqtt_bridge" is added by two, Pebble (core) and lamp.py (lamp): remove one of them'
+@pytest.mark.parametrize(("files", "extensions", "text"), REFUSED.values(), ids=REFUSED)
+def test_a_check_refuses(files: dict[str, str], extensions: dict[str, Any], text: str, tmp_path: Path) -> None:
+    for name, source in files.items():
+        (tmp_path / f"{name}.py").write_text(source)
+    done = pebble("check", str(write(tmp_path, extensions)))
     assert (done.returncode, text in done.stderr) == (1, True)
 
 

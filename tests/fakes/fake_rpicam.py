@@ -1,7 +1,7 @@
 """A fake rpicam-vid: the synthetic scene on stdout, as JPEG pictures or raw planes.
 
-``FAKE`` in the environment: ``quiet`` (sends nothing), ``hangs`` (stops after 5 pictures), ``ends`` (after 5),
-``refuses`` (ends at once, with a complaint).
+``FAKE`` in the environment: ``quiet`` (sends nothing), ``hangs`` (stops after 5 pictures), ``refuses`` (ends at once,
+with a complaint).
 """
 
 from __future__ import annotations
@@ -34,8 +34,6 @@ def main() -> None:
     for number in count():
         if kind == "quiet" or (kind == "hangs" and number == 5):
             time.sleep(1000)
-        if kind == "ends" and number == 5:
-            return
         scene.render(number, picture)
         sys.stdout.buffer.write(cv2.imencode(".jpg", picture)[1].tobytes())
         sys.stdout.buffer.flush()

@@ -176,6 +176,9 @@ class Drill:
         while self.seconds < until:
             self.turn(self.random.uniform(0.005, 0.04))
 
+    def wait(self, seconds: float = 0.2) -> None:
+        self.run(self.seconds + seconds)
+
     def turn(self, seconds: float) -> None:
         """Time passes, the world does what is due, then the firmware's loop turns once.
 

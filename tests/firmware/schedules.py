@@ -19,6 +19,9 @@ ACT_S: Final = 8.0  # so long an operator drives and things go wrong
 STABLE_S: Final = 4.5
 BACK_S: Final = 30.0  # the longest waits are a back-off of 10 s, and 15 s until the Wi-Fi is rejoined
 
+Change = Callable[[Drill], object]
+Event = Callable[[Drill, float, float], None]
+
 HOSTILE: Final = (
     b'{"x": 0, "z": NaN}',
     b'{"x": 0, "z": Infinity}',
@@ -106,10 +109,10 @@ def _obey_again(drill: Drill) -> None:
     since = drill.seconds
     while drill.robot.stops.latch.latched or drill.state()["latched"]:
         drill.reset()
-        drill.run(drill.seconds + 1.0)
+        drill.wait(1.0)
         if drill.seconds > since + BACK_S:
             raise ViolatedError(f"it cannot be reset: {drill.state()}")
-    drill.run(drill.seconds + LIMIT_S)
+    drill.wait(LIMIT_S)
     start, moves = drill.seconds, drill.seen.moves
     for number in range(5):
         drill.at(start + 0.1 * number, _command(drill, (0.0, 0.5 if number % 2 else -0.5, 0.0), 1))
@@ -124,45 +127,38 @@ def _obey_again(drill: Drill) -> None:
 # -- faults: what happens to the drill, when, for how long
 
 
-def _wifi(drill: Drill, start: float, length: float) -> None:
-    drill.at(start, drill.network.radio.lose)
-    drill.at(start + length, drill.network.radio.restore)
+def _between(begin: Change, end: Change) -> Event:
+    def fault(drill: Drill, start: float, length: float) -> None:
+        drill.at(start, lambda: begin(drill))
+        drill.at(start + length, lambda: end(drill))
+
+    return fault
 
 
-def _broker(drill: Drill, start: float, length: float) -> None:
-    drill.at(start, drill.broker.kill)
-    drill.at(start + length, drill.broker.start)
+def _condition(name: str, value: object, after: object = False) -> Event:
+    """Set a condition of the network for a while."""
+    return _between(
+        lambda drill: setattr(drill.network.conditions, name, value),
+        lambda drill: setattr(drill.network.conditions, name, after),
+    )
 
 
-def _hole(drill: Drill, start: float, length: float) -> None:
-    drill.at(start, lambda: setattr(drill.network.conditions, "hole", True))
-    drill.at(start + length, lambda: setattr(drill.network.conditions, "hole", False))
+_hole = _condition("hole", True)
+_frozen = _between(lambda drill: drill.broker.freeze(), lambda drill: drill.broker.thaw())
+_quiet = _between(lambda drill: setattr(drill, "quiet", True), lambda drill: setattr(drill, "quiet", False))
 
 
 def _dns(drill: Drill, start: float, length: float) -> None:
     """A broken name server matters to who has to connect again."""
     how = drill.random.choice(("silent", "nonsense", "no such name"))
-    drill.at(start, lambda: setattr(drill.network.conditions, "dns", how))
+    _condition("dns", how, "answers")(drill, start, length)
     drill.at(start + 0.1, drill.broker.kill)
     drill.at(start + 0.3, drill.broker.start)
-    drill.at(start + length, lambda: setattr(drill.network.conditions, "dns", "answers"))
 
 
 def _ntp(drill: Drill, start: float, _length: float) -> None:
     how: Answers = drill.random.choice(("silent", "nonsense"))
-    drill.at(0.0, lambda: setattr(drill.network.conditions, "ntp", how))
-    drill.at(start + 5.0, lambda: setattr(drill.network.conditions, "ntp", "answers"))
-
-
-def _frozen(drill: Drill, start: float, length: float) -> None:
-    drill.at(start, drill.broker.freeze)
-    drill.at(start + length, drill.broker.thaw)
-
-
-def _quiet(drill: Drill, start: float, length: float) -> None:
-    """Nothing comes from the broker but answers to pings."""
-    drill.at(start, lambda: setattr(drill, "quiet", True))
-    drill.at(start + length, lambda: setattr(drill, "quiet", False))
+    _condition("ntp", how, "answers")(drill, 0.0, start + 5.0)
 
 
 def _flood(drill: Drill, start: float, length: float) -> None:
@@ -194,12 +190,6 @@ def _stale(drill: Drill, start: float, length: float) -> None:
     (_hole if drill.random.random() < 0.7 else _frozen)(drill, start, max(length, drill.random.uniform(1.5, 4.0)))
 
 
-def _mute(drill: Drill, start: float, length: float) -> None:
-    """Packets of the robot are lost, packets to it are not."""
-    drill.at(start, lambda: setattr(drill.network.conditions, "mute", True))
-    drill.at(start + length, lambda: setattr(drill.network.conditions, "mute", False))
-
-
 def _stops(drill: Drill, start: float, length: float) -> None:
     """Presses, each repeated; then resets, of which some are made from an older state."""
     random = drill.random
@@ -227,20 +217,20 @@ def _disk(drill: Drill, start: float, length: float) -> None:
     drill.at(start + length, lambda: setattr(drill.board.files, "before", lambda *_: None))
 
 
-_EVENTS: Final = {
+_EVENTS: Final[dict[str, Event]] = {
     "stops": _stops,
     "power": _power,
     "disk": _disk,
-    "wifi": _wifi,
-    "broker": _broker,
+    "wifi": _between(lambda drill: drill.network.radio.lose(), lambda drill: drill.network.radio.restore()),
+    "broker": _between(lambda drill: drill.broker.kill(), lambda drill: drill.broker.start()),
     "hole": _hole,
     "dns": _dns,
     "ntp": _ntp,
     "frozen": _frozen,
-    "quiet": _quiet,
+    "quiet": _quiet,  # nothing comes from the broker but answers to pings
     "flood": _flood,
     "i2c": _i2c,
     "retained": _retained,
     "stale": _stale,
-    "mute": _mute,
+    "mute": _condition("mute", True),  # packets of the robot are lost, packets to it are not
 }

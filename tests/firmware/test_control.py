@@ -19,10 +19,6 @@ from tests.firmware.test_network_robot import online
 KINDS = ("minilamp", "benjr")
 
 
-def run(drill: Drill, seconds: float) -> None:
-    drill.run(drill.seconds + seconds)
-
-
 @pytest.mark.parametrize(("kind", "security", "others"), [
     *((kind, {}, False) for kind in KINDS), ("benjr", {"level": "login", "strangers": "drive"}, True),
 ])  # fmt: skip
@@ -33,33 +29,33 @@ def test_two_drivers_and_only_who_has_control_moves_by_a_key(kind: str, security
         "boot": drill.state()["boot"],
     }  # fmt: skip
     drill.request("aaaaaaaa", by="Ann", device="phone")
-    run(drill, 0.5)
+    drill.wait(0.5)
     ann = drill.control()
     assert (ann["by"], ann["id"], ann["device"], len(ann["key"])) == ("ann", "aaaaaaaa", "phone", 8)
     drill.command(0, 0.5, key=ann["key"])
-    run(drill, 0.2)
+    drill.wait(0.2)
     assert any(drill.outputs())
     drill.request("bbbbbbbb", by="otto")
-    run(drill, 0.5)
+    drill.wait(0.5)
     assert (drill.control()["key"], drill.control()["asks"]) == (ann["key"], "otto")
     drill.command(0, 0.5, key=ann["key"])
-    run(drill, 0.2)
+    drill.wait(0.2)
     drill.request("bbbbbbbb", by="otto", take=True)
-    run(drill, 0.1)
+    drill.wait(0.1)
     assert not any(drill.outputs())  # each new driver begins with wheels at rest
     drill.nonsense(json.dumps({"z": 1, "key": ann["key"]}).encode())
-    run(drill, 0.5)
+    drill.wait(0.5)
     otto = drill.control()
     assert not any(drill.outputs())
     drill.command(0, 0.5, key=otto["key"])
-    run(drill, 0.2)
+    drill.wait(0.2)
     assert any(drill.outputs())
-    run(drill, 1.0)
+    drill.wait(1.0)
     assert moves(drill, "drive-values", z=0.7) is others
-    run(drill, 0.5)
+    drill.wait(0.5)
     assert drill.control()["others"] is others
     drill.request("bbbbbbbb", want="release")
-    run(drill, 0.5)
+    drill.wait(0.5)
     assert drill.control()["key"] == ""
     assert moves(drill, "drive-values", z=0.7)
 
@@ -68,13 +64,13 @@ def test_two_drivers_and_only_who_has_control_moves_by_a_key(kind: str, security
 def test_control_ends_without_its_holder_and_outlives_a_connection(kind: str) -> None:
     drill = online(kind)
     drill.request(for_ms=10_000)
-    run(drill, 0.5)
+    drill.wait(0.5)
     drill.drop_robot()
     states = len(drill.received(HOLDER))
-    run(drill, 6.0)
+    drill.wait(6.0)
     assert len(drill.received(HOLDER)) > states
     assert drill.control()["id"] == "aaaaaaaa"
-    run(drill, 6.0)
+    drill.wait(6.0)
     assert drill.control()["key"] == ""
 
 
@@ -96,7 +92,7 @@ def test_without_its_topic_a_board_has_no_control() -> None:
     assert capabilities["value"]["drive"]["control"] is False
     assert drill.control() == {}
     drill.command(0, 0.5)
-    run(drill, 0.2)
+    drill.wait(0.2)
     assert any(drill.outputs())
 
 
@@ -105,7 +101,7 @@ def at_named(kind: str) -> Drill:
     drill = online(kind, security={"level": "named", "strangers": "refuse"})
     drill.clock.watch = drill.check = lambda: None  # type: ignore[method-assign]  # the rule of drills knows no names
     send(drill, "by/page-1/control", id="aaaaaaaa", by="Ann", device="phone", for_ms=10_000)
-    run(drill, 0.5)
+    drill.wait(0.5)
     return drill
 
 
@@ -117,10 +113,10 @@ def moves(drill: Drill, metric: str, **body: Any) -> bool:
     """Whether this drive command moves a board that stands; the rule of drills knows no strangers."""
     drill.clock.watch = drill.check = lambda: None  # type: ignore[method-assign]
     send(drill, metric, **body)
-    run(drill, 0.3)
+    drill.wait(0.3)
     moving = any(drill.outputs())
     send(drill, "drive-values", z=0)
-    run(drill, 0.2)
+    drill.wait(0.2)
     assert not any(drill.outputs())  # a zero needs no name
     return moving
 
@@ -132,39 +128,39 @@ def test_of_what_has_no_name_or_is_retained_only_stops_and_zeros_count(kind: str
     for metric in ("control", "control/take", "by/otto/by/otto/control"):
         send(drill, metric, id="bbbbbbbb", by="otto")
     send(drill, "by/otto/control/take", id="bbbbbbbb", retain=True)  # live: it counts, and again as a retained one not
-    run(drill, 0.5)
+    drill.wait(0.5)
     assert (drill.control()["by"], drill.control()["id"]) == ("otto", "bbbbbbbb")
     send(drill, "by/page-1/control/take", id="aaaaaaaa", by="ann")
-    run(drill, 0.5)
+    drill.wait(0.5)
     drill.drop_robot()
-    run(drill, 5.0)
+    drill.wait(5.0)
     assert drill.control()["by"] in ("page-1/ann", "")
     assert drill.control()["key"] != key
     send(drill, "estop", stop="00000000000000aa", by="anybody")
-    run(drill, 0.3)
+    drill.wait(0.3)
     assert drill.state()["latched"]
     state = drill.state()
     for metric in ("estop-reset", "by/otto/by/otto/estop-reset"):
         send(drill, metric, boot=state["boot"], count=state["count"])
-    run(drill, 0.5)
+    drill.wait(0.5)
     assert drill.state()["latched"]
     send(drill, "by/sam/estop-reset", boot=state["boot"], count=state["count"])
-    run(drill, 0.5)
+    drill.wait(0.5)
     assert not drill.state()["latched"]
     send(drill, "by/otto/estop", stop="00000000000000bb", by="Eve")
-    run(drill, 0.3)
+    drill.wait(0.3)
     assert (drill.state()["latched"], drill.state()["by"]) == (True, "otto/eve")
 
 
 def test_a_topic_that_fits_nowhere_ends_the_connection_and_moves_nothing() -> None:
     drill = at_named("benjr")
     send(drill, "by/page-1/drive-values", z=0.5, key=drill.control()["key"])
-    run(drill, 0.1)
+    drill.wait(0.1)
     assert any(drill.outputs())
     send(drill, f"by/{'a' * 5000}/drive-values", z=1)
-    run(drill, 0.5)
+    drill.wait(0.5)
     assert not any(drill.outputs())
-    run(drill, 5.0)
+    drill.wait(5.0)
     assert drill.robot.session.connection.state == "online"
 
 

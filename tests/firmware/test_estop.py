@@ -16,7 +16,6 @@ from tests.firmware.test_network_robot import AHEAD, KINDS, online, published
 
 FILE = "/estop.json"
 A, B, C = NAME, "00000000000000bb", "00000000000000cc"
-TURN_S = 0.2
 
 
 def signed(drill: Drill, run: int, z: float = 0.5, **more: Any) -> None:
@@ -27,14 +26,10 @@ def states(drill: Drill) -> list[Any]:
     return published(drill, "estop/mcu")
 
 
-def wait(drill: Drill, seconds: float = TURN_S) -> None:
-    drill.run(drill.seconds + seconds)
-
-
 def stopped(kind: str = "benjr", name: str = A) -> Drill:
     drill = online(kind)
     drill.stop(name)
-    wait(drill, 0.5)
+    drill.wait(0.5)
     assert drill.state()["latched"]
     return drill
 
@@ -52,10 +47,10 @@ def reconnect(drill: Drill) -> None:
 def test_a_stop_halts_latches_and_is_confirmed(kind: str) -> None:
     drill = online(kind)
     drill.command(0.0, 0.5)
-    wait(drill)
+    drill.wait()
     assert drill.outputs() == AHEAD[kind]
     drill.stop(by="ann", why="test")
-    wait(drill)
+    drill.wait()
     assert not any(drill.outputs())
     message = [one.message for one in drill.broker.received if one.message.topic == STATE][-1]
     assert message.retain
@@ -63,7 +58,7 @@ def test_a_stop_halts_latches_and_is_confirmed(kind: str) -> None:
     assert (state.latched, state.count, state.recent, state.by, state.why) == (True, 1, [A], "ann", "test")
     assert (state.persisted, len(state.boot)) == (True, 8)
     drill.nonsense(b'{"x": 0, "z": 0.5}')
-    wait(drill)
+    drill.wait()
     assert not any(drill.outputs())
 
 
@@ -75,11 +70,11 @@ def test_a_stop_halts_latches_and_is_confirmed(kind: str) -> None:
 def test_what_cannot_be_read_is_a_stop_without_a_name(payload: bytes) -> None:
     drill = online("benjr")
     drill.broker.publish(ESTOP, payload, qos=1)
-    wait(drill, 0.6)
+    drill.wait(0.6)
     first = drill.state()
     assert (first["latched"], first["count"], len(first["recent"][0])) == (True, 1, 16)
     drill.broker.publish(ESTOP, payload, qos=0)
-    wait(drill, 0.6)
+    drill.wait(0.6)
     assert drill.state()["count"] == 2
     assert drill.state()["recent"][1:] == first["recent"]
 
@@ -89,7 +84,7 @@ def test_an_empty_payload_does_nothing(topic: str) -> None:
     drill = online("benjr")
     count = len(states(drill))
     drill.broker.publish(topic, b"", qos=1)
-    wait(drill, 0.5)
+    drill.wait(0.5)
     assert len(states(drill)) == count
 
 
@@ -99,7 +94,7 @@ def test_retained_copies_do_nothing() -> None:
     drill.broker.publish(RESET, b"{}", retain=True)
     while not states(drill):
         drill.turn(0.02)
-    wait(drill, 1.0)
+    drill.wait(1.0)
     assert [(state["latched"], state["count"]) for state in states(drill)] == [(False, 0)]
     assert drill.robot.refused == 2
 
@@ -107,13 +102,13 @@ def test_retained_copies_do_nothing() -> None:
 def test_a_zero_counts_though_a_newer_command_replaces_it() -> None:
     """A person's zero ends the script that moves, in whatever order they are read."""
     drill = online("benjr")
-    wait(drill, 3.0)
+    drill.wait(3.0)
     signed(drill, 17)
-    wait(drill)
+    drill.wait()
     assert any(drill.outputs())
     drill.command(0.0, 0.0)
     signed(drill, 17)
-    wait(drill)
+    drill.wait()
     assert not any(drill.outputs())
     assert drill.state()["barred"] == 17
 
@@ -127,10 +122,10 @@ def test_latched_survives_a_power_cut_and_so_does_free(kind: str) -> None:
     assert (state["latched"], state["count"], state["recent"], state["persisted"]) == (True, 0, [A], True)
     assert state["boot"] != boot
     drill.nonsense(b'{"z": 0.5}')
-    wait(drill)
+    drill.wait()
     assert not any(drill.outputs())
     drill.reset()
-    wait(drill, 0.5)
+    drill.wait(0.5)
     reconnect(drill)
     assert (drill.state()["latched"], drill.state()["recent"]) == (False, [A])
 
@@ -138,15 +133,15 @@ def test_latched_survives_a_power_cut_and_so_does_free(kind: str) -> None:
 def test_the_file_is_written_when_latched_changes_and_not_per_stop_with_motors_off() -> None:
     drill = online("benjr")
     drill.command(0.0, 0.5)
-    wait(drill)
+    drill.wait()
     written: list[tuple[str, str, Any]] = []
     drill.board.files.before = lambda what, path, _data: written.append((what, path, drill.outputs()))
     for name in (A, B, A, C, A):
         drill.stop(name)
-        wait(drill, 0.3)
+        drill.wait(0.3)
     assert written == [("write", "/estop.new", (0.0, 0.0)), ("rename", FILE, (0.0, 0.0))]
     drill.reset()
-    wait(drill, 0.3)
+    drill.wait(0.3)
     assert len(written) == 4
     assert json.loads(drill.board.files[FILE])["recent"] == [C, B, A]
 
@@ -161,11 +156,11 @@ def test_a_file_that_cannot_be_written_is_no_confirmation_and_is_tried_again_at_
     drill = online("benjr")
     drill.board.files.before = fail
     drill.stop()
-    wait(drill, 0.5)
+    drill.wait(0.5)
     assert (drill.state()["latched"], drill.state()["persisted"]) == (True, persisted)
     drill.board.files.before = lambda *_: None
     drill.stop()
-    wait(drill, 0.5)
+    drill.wait(0.5)
     assert drill.state()["persisted"] is True
 
 
@@ -187,7 +182,7 @@ def test_a_power_cut_in_the_middle_leaves_the_old_file_or_the_new_one(at: str, t
     drill.board.files.before = before
     drill.reset()
     with pytest.raises(PowerLostError):
-        wait(drill, 1.0)
+        drill.wait(1.0)
     drill.board.files.before = lambda *_: None
     reconnect(drill)
     assert drill.state()["latched"]
@@ -199,8 +194,8 @@ def test_at_most_four_states_a_second_and_the_newest_gets_out() -> None:
     start = drill.clock.now()
     for number in range(100):
         drill.stop(f"{number:016x}", by="b" * 99, why="w" * 99)
-        wait(drill, 0.03)
-    wait(drill, 0.5)
+        drill.wait(0.03)
+    drill.wait(0.5)
     times = [one.at for one in drill.broker.received if one.message.topic == STATE and one.at > start]
     assert min(later - earlier for earlier, later in pairwise(times)) > 0.2
     assert drill.state()["count"] == 100
@@ -209,14 +204,14 @@ def test_at_most_four_states_a_second_and_the_newest_gets_out() -> None:
 
 def test_a_state_has_at_most_300_bytes() -> None:
     drill = online("benjr")
-    wait(drill, 3.0)
+    drill.wait(3.0)
     signed(drill, (1 << 30) - 1)
     drill.robot.stops.latch.count = (1 << 30) - 10
     for name in (A, B, C, "00000000000000dd"):
         drill.stop(name, by="b" * 99, why="w" * 99)
-    wait(drill, 0.5)
+    drill.wait(0.5)
     drill.reset(count=1)
-    wait(drill, 0.5)
+    drill.wait(0.5)
     payload = drill.received(STATE)[-1]
     state = json.loads(payload)
     assert len(payload) == 300
@@ -229,9 +224,9 @@ def test_without_both_topics_a_stop_is_only_a_zero(refused: str) -> None:
     drill = online("benjr", refused={refused})
     assert published(drill, "capabilities")[-1]["value"]["estop"]["available"] is False
     drill.command(0.0, 0.5)
-    wait(drill)
+    drill.wait()
     drill.stop()
-    wait(drill)
+    drill.wait()
     assert any(drill.outputs()) == (refused == ESTOP)  # it is not delivered
     assert states(drill) == []
     assert not drill.robot.stops.latch.latched

@@ -17,12 +17,6 @@ def bench() -> Bench:
     return Bench("goob_imu", turn_ms=2)
 
 
-def test_it_sends_hello_when_it_boots(bench: Bench) -> None:
-    (hello,) = of(bench.frames(0.1), Type.HELLO)
-    assert parse_hello(hello.payload).device_uid == "goob-imu"
-    assert hello.sequence == 1
-
-
 def test_half_a_frame_from_before_a_reset_does_not_swallow_its_hello(bench: Bench) -> None:
     """On a serial port without USB, the host has no other sign that the firmware has changed."""
     bench.turn(0.002)

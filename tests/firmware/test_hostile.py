@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from pebble.extensions.lab.simulation.wireless import KINDS
 from tests.firmware.schedules import HOSTILE
-from tests.firmware.wireless_rig import Operator, Robots
+from tests.firmware.wireless_rig import Robots
+from tests.robot.operator import Operator
 from tests.support import Broker, until
 from tests.tcp_proxy import TcpProxy
 
@@ -37,10 +39,8 @@ class Hall:
         self.broker = Broker(folder)
         stack.callback(self.broker.kill)
         self.link = stack.enter_context(TcpProxy(self.broker.port))
-        self.operator = stack.enter_context(Operator(self.broker.port))
-        for info in [self.operator.send(kind, b'{"x": 0, "z": 1}', retain=True) for kind in KINDS]:
-            assert info is not None
-            info.wait_for_publish(5)
+        self.operator = stack.enter_context(closing(Operator(self.broker.port, "pebble/robots", "+/outgoing/online")))
+        self.send(b'{"x": 0, "z": 1}', retain=True)
         self.robots = stack.enter_context(Robots("127.0.0.1", self.link.port))
         self.robots.wait_online()
         assert self.beating(time.monotonic())
@@ -54,13 +54,20 @@ class Hall:
 
     def drive(self, z: float = 0.8) -> float:
         """Return when the broker had it."""
-        for info in [self.operator.drive(kind, 0.0, z) for kind in KINDS]:
-            assert info is not None
-            info.wait_for_publish(5)
+        self.send({"x": 0.0, "z": z})
         return time.monotonic()
 
+    def send(self, body: Any, **options: Any) -> None:
+        """Publish a drive command to each robot, and wait until the broker has it."""
+        for info in [self.operator.send(f"{kind}/incoming/drive-values", body, **options) for kind in KINDS]:
+            info.wait_for_publish(5)
+
+    def heartbeats(self, kind: str, since: float) -> list[dict[str, Any]]:
+        beats = [one.json for one in self.operator.on(f"{kind}/outgoing/online", since) if not one.retain]
+        return [beat for beat in beats if beat["online"]]
+
     def beating(self, since: float, count: float = 2.0) -> bool:
-        return until(lambda: all(self.operator.beating(kind, since) > count for kind in KINDS))
+        return until(lambda: all(len(self.heartbeats(kind, since)) > count for kind in KINDS))
 
     def have_not_moved(self) -> None:
         assert [self.robots.moves[kind] for kind in KINDS] == [[], []]
@@ -85,13 +92,12 @@ def hall(running: Hall) -> Hall:
 def test_nothing_hostile_moves_a_robot_or_stops_its_heartbeat(hall: Hall) -> None:
     began = time.monotonic()
     for number, payload in enumerate((*HOSTILE, *HUGE)):
-        for kind in KINDS:
-            hall.operator.send(kind, payload, qos=number % 2)
+        hall.send(payload, qos=number % 2)
         time.sleep(EVERY_S)
     assert hall.beating(began, 2.5 * RATE_HZ)
     hall.have_not_moved()
     for kind in KINDS:
-        stamps = [body["t"] for at, body in hall.operator.heartbeats[kind] if at > began]
+        stamps = [beat["t"] for beat in hall.heartbeats(kind, began)]
         assert (len(stamps) - 1) / (stamps[-1] - stamps[0]) * 1000 == pytest.approx(RATE_HZ, rel=0.1)
         assert hall.robots.robots[kind].online
     hall.drive()
@@ -119,5 +125,5 @@ def test_motors_are_off_within_a_second_and_no_retained_command_moves_them_after
     hall.robots.wait_online(20.0)
     assert hall.beating(time.monotonic())
     assert {kind: len(moves) for kind, moves in hall.robots.moves.items()} == moves
-    assert until(lambda: [hall.operator.drive(kind, 0.0, 0.8) for kind in KINDS] and hall.moving(), step=EVERY_S)
+    assert until(lambda: hall.drive() and hall.moving(), step=EVERY_S)
     assert hall.robots.alive

@@ -37,7 +37,7 @@ def online(
     while drill.robot.session.connection.state != "online":
         drill.turn(0.01)
         assert drill.seconds < 30, drill.robot.session.connection.reason
-    drill.run(drill.seconds + 0.5)
+    drill.wait(0.5)
     return drill
 
 
@@ -64,12 +64,12 @@ def test_a_group_moves_a_board_that_lists_it_as_its_drive_command_would(kind: st
     drill.clock.watch = drill.check = lambda: None  # type: ignore[method-assign]
     for moves in (lists and GROUPS[group], False):  # the second time it is stopped
         drill.broker.publish(f"{BASE}/incoming/group", group, qos=1)
-        drill.run(drill.seconds + 0.2)
+        drill.wait(0.2)
         assert any(drill.outputs()) is moves
-        drill.run(drill.seconds + 0.4)
+        drill.wait(0.4)
         assert not any(drill.outputs()), "for as long as it is valid"
         drill.stop()
-        drill.run(drill.seconds + 0.3)
+        drill.wait(0.3)
 
 
 def published(drill: Drill, metric: str) -> list[Any]:
@@ -119,7 +119,7 @@ def test_its_client_id_is_its_own_and_as_long_as_any_broker_takes(kind: str, mon
     monkeypatch.setattr(VirtualBroker, "taken_over", taken_over)
     drill = online(kind)
     drill.drop_robot()
-    drill.run(drill.seconds + 10)
+    drill.wait(10)
     online(kind, seed=2)
     assert len(ids) == 3
     assert ids[0] == ids[1] != ids[2]
@@ -157,7 +157,7 @@ def test_reports_get_through_however_long_the_names_are(kind: str) -> None:
 @pytest.mark.parametrize("loss", ["broker", "wifi"])
 def test_it_reconnects_after_more_days_than_ticks_can_measure(loss: str) -> None:
     drill = online("benjr")
-    drill.run(drill.seconds + 5)
+    drill.wait(5)
     lose, restore = {
         "broker": (drill.broker.kill, drill.broker.start),
         "wifi": (drill.network.radio.lose, drill.network.radio.restore),
@@ -167,7 +167,7 @@ def test_it_reconnects_after_more_days_than_ticks_can_measure(loss: str) -> None
         drill.turn(30.0)
     drill.network.conditions.ntp = "silent"
     restore()
-    drill.run(drill.seconds + 15)
+    drill.wait(15)
     assert drill.robot.session.connection.state == "online"
     assert abs(EPOCH_MS + drill.clock.now() * 1000 - published(drill, "online")[-1]["t"]) < 500
 
@@ -190,7 +190,7 @@ def test_a_backlog_does_not_drive_a_robot() -> None:
 def test_who_loses_the_broker_stops_at_once(kind: str) -> None:
     drill = online(kind)
     drill.command(0.0, 0.5)
-    drill.run(drill.seconds + 0.2)
+    drill.wait(0.2)
     assert any(drill.outputs())
     drill.network.radio.lose()
     drill.turn(0.01)
@@ -201,9 +201,9 @@ def test_who_loses_the_broker_stops_at_once(kind: str) -> None:
 def test_a_stop_is_repeated_until_the_shield_acknowledges_it() -> None:
     drill = online("benjr")
     drill.command(0.0, 0.5)
-    drill.run(drill.seconds + 0.2)
+    drill.wait(0.2)
     drill.failing_i2c(2.0)
-    drill.run(drill.seconds + 1.9)
+    drill.wait(1.9)
     assert any(drill.outputs())  # the shield did not receive it
     drill.board.bus.restore(0x30)
     drill.turn(0.01)
@@ -215,7 +215,7 @@ def test_a_stop_is_repeated_until_the_shield_acknowledges_it() -> None:
 def test_settings_that_are_missing_are_named_when_the_motors_are_off(kind: str) -> None:
     drill = online(kind)
     drill.command(0.0, 0.5)
-    drill.run(drill.seconds + 0.2)
+    drill.wait(0.2)
     assert any(drill.outputs())
     with pytest.raises(ValueError, match=r"robot\.id"):
         drill.board.load(kind, {})
@@ -244,7 +244,7 @@ def test_every_address_of_its_broker_has_a_turn_and_the_one_that_worked_comes_ag
     losses = drill.robot.session.connection.losses
     assert losses <= 3
     drill.drop_robot()
-    drill.run(drill.seconds + 5)
+    drill.wait(5)
     assert (drill.robot.session.connection.state, drill.robot.session.connection.losses) == ("online", losses + 1)
 
 

@@ -1,18 +1,13 @@
-"""Simulated robots with Wi-Fi on a thread of their own, and an operator on the same real broker."""
+"""Simulated robots with Wi-Fi on a thread of their own."""
 
 from __future__ import annotations
 
-import json
 import threading
-import time
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
-
-from paho.mqtt.client import Client, MQTTMessageInfo
-from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble.config import Security
 from pebble.contract.identity import Identity
@@ -76,46 +71,6 @@ class Robots:
 
     def _run(self) -> None:
         self.fleet.run(lambda: not self._ending.is_set())
-
-
-class Operator:
-    """An operator that drives robots and receives their heartbeats; it reconnects by itself."""
-
-    def __init__(self, port: int) -> None:
-        self.heartbeats: dict[str, list[tuple[float, dict[str, Any]]]] = {kind: [] for kind in KINDS}
-        self._client = Client(CallbackAPIVersion.VERSION2)
-        self._client.reconnect_delay_set(1, 1)
-        self._client.on_connect = lambda client, *_: client.subscribe("pebble/robots/+/outgoing/online", 0)
-        self._client.on_message = self._receive
-        self._client.connect("127.0.0.1", port)
-        self._client.loop_start()
-
-    def __enter__(self) -> Self:
-        assert until(self._client.is_connected)
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self._client.disconnect()
-        self._client.loop_stop()
-
-    def send(
-        self, kind: str, payload: bytes | str, *, qos: int = 1, retain: bool = False, metric: str = "drive-values"
-    ) -> MQTTMessageInfo | None:
-        """Nothing while there is no connection: no command waits in here."""
-        if not self._client.is_connected():
-            return None
-        return self._client.publish(f"pebble/robots/{kind}/incoming/{metric}", payload, qos, retain)
-
-    def drive(self, kind: str, x: float, z: float, *, qos: int = 1) -> MQTTMessageInfo | None:
-        return self.send(kind, json.dumps({"x": x, "z": z}), qos=qos)
-
-    def beating(self, kind: str, since: float) -> int:
-        """Live heartbeats after that time."""
-        return sum(at > since and body["online"] for at, body in list(self.heartbeats[kind]))
-
-    def _receive(self, _client: Client, _data: Any, message: Any) -> None:
-        if not message.retain:
-            self.heartbeats[message.topic.split("/")[2]].append((time.monotonic(), json.loads(message.payload)))
 
 
 def _note(moves: list[tuple[float, tuple[float, float]]], at: float, motors: tuple[float, float]) -> None:

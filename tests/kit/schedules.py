@@ -84,10 +84,10 @@ class RandomSteps:
 
 @dataclass
 class Outcome:
-    """The outcome of a schedule. ``counts`` are for the table; ``log`` says what happened."""
+    """The outcome of a schedule. ``counts`` are summed and printed; ``log`` says what happened."""
 
     problems: list[str] = field(default_factory=list)
-    counts: dict[str, float] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
     log: Callable[[], str] = str
 
 
@@ -99,7 +99,7 @@ class Result:
     number: int
     seconds: float
     problems: list[str]
-    counts: dict[str, float]
+    counts: dict[str, int]
     log: str
 
     def __str__(self) -> str:
@@ -119,7 +119,7 @@ class Engine:
     jobs: int = 1  # processes
     repeats: bool = True  # the same schedule violates the same rule, so it can be made short
 
-    def run(self, kind: str, seed: int, numbers: Iterable[int], *, verbose: bool = False) -> Iterator[Result]:
+    def run(self, kind: str, seed: int, numbers: Iterable[int]) -> Iterator[Result]:
         """Perform these schedules in as few worlds as possible: after a violation a new world is made."""
         waiting = deque(numbers)
         while waiting:
@@ -128,7 +128,7 @@ class Engine:
                     number = waiting.popleft()
                     began = time.monotonic()
                     one = self._outcome(world, self.draw(kind, seed, number))
-                    log = one.log() if one.problems or verbose else ""
+                    log = one.log() if one.problems else ""
                     yield Result(kind, number, time.monotonic() - began, one.problems, one.counts, log)
                     if one.problems:
                         break
@@ -193,23 +193,21 @@ def main(arguments: list[str]) -> int:
 
 def _schedules(options: argparse.Namespace, engine: Engine, module: str) -> int:
     kinds = [kind for kind in engine.kinds if kind == options.kind] or [k for k in engine.kinds if options.kind in k]
-    results: list[Result] = []
-    rules, began, shown = Counter[str](), time.monotonic(), 0.0
-    for part in _map(
-        options.jobs, _part, repeat((module, options.seed, options.verbose)), _parts(options, kinds, engine)
-    ):
+    rules, counts, began, shown, number = Counter[str](), Counter[str](), time.monotonic(), 0.0, 0
+    for part in _map(options.jobs, _part, repeat((module, options.seed)), _parts(options, kinds, engine)):
         for one in part:
-            results.append(one)
+            number += 1
             rules.update(one.problems)
-            if one.problems or options.verbose:
+            counts.update(one.counts)
+            if one.problems:
                 _show(options, engine, one, new=any(rules[rule] == 1 for rule in one.problems))
             took = time.monotonic() - began
-            if took > shown + _PROGRESS_S or len(results) == options.schedules:
+            if took > shown + _PROGRESS_S or number == options.schedules:
                 shown = took
-                print(f"{len(results):>6} of {options.schedules}, {took:.0f} s: {one}, {one.seconds:.2f} s", flush=True)
-            if one.problems and options.first:
-                return 1
-    print(f"\n{options.engine}, seed {options.seed}, {time.monotonic() - began:.0f} s\n{table(results)}")
+                print(f"{number:>6} of {options.schedules}, {took:.0f} s: {one}, {one.seconds:.2f} s", flush=True)
+    print(
+        f"\n{options.engine}, seed {options.seed}, {number} schedules, {time.monotonic() - began:.0f} s", dict(counts)
+    )
     print(*(f"{times:>6}  {rule}" for rule, times in rules.most_common()), sep="\n")
     return 1 if rules else 0
 
@@ -222,14 +220,14 @@ def _parts(options: argparse.Namespace, kinds: list[str], engine: Engine) -> Ite
         yield from ((kind, numbers[at : at + engine.per_world]) for at in range(0, share, engine.per_world))
 
 
-def _part(what: tuple[str, int, bool], part: tuple[str, range]) -> Iterable[Result]:
-    module, seed, verbose = what
+def _part(what: tuple[str, int], part: tuple[str, range]) -> Iterable[Result]:
+    module, seed = what
     logging.disable(logging.CRITICAL)
     engine: Engine = import_module(module).ENGINE
-    return engine.run(part[0], seed, part[1], verbose=verbose)
+    return engine.run(part[0], seed, part[1])
 
 
-def _whole_part(what: tuple[str, int, bool], part: tuple[str, range]) -> list[Result]:
+def _whole_part(what: tuple[str, int], part: tuple[str, range]) -> list[Result]:
     return list(_part(what, part))
 
 
@@ -253,21 +251,6 @@ def _map(jobs: int, work: Callable[..., Any], *arguments: Iterable[Any]) -> Iter
         yield from pool.map(_whole_part if work is _part else work, *arguments)
 
 
-def table(results: list[Result]) -> str:
-    """Return a line for each kind of world, and one for all; counts are summed, or those of the slowest."""
-    groups: dict[str, list[Result]] = {}
-    for name, one in [(one.kind, one) for one in results if one.kind] + [("all", one) for one in results]:
-        groups.setdefault(name, []).append(one)
-    names = list(dict.fromkeys(name for one in results for name in one.counts))
-    rows = [("", "schedules", *names, "violations", "slowest")]
-    for name, group in groups.items():
-        totals = ((max if count.startswith("slowest") else sum, count) for count in names)
-        counts = (f"{total(one.counts.get(count, 0) for one in group):g}" for total, count in totals)
-        bad, slowest = sum(len(one.problems) for one in group), max(one.seconds for one in group)
-        rows.append((name, str(len(group)), *counts, str(bad), f"{slowest:.2f} s"))
-    return "\n".join(f"{row[0]:36}" + "".join(f"{cell:>13}" for cell in row[1:]) for row in rows)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m tests.kit.schedules", description=__doc__)
     parser.add_argument("engine", choices=ENGINES)
@@ -276,9 +259,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--number", type=int, default=0, help="of the first schedule")
     parser.add_argument("--kind", default="", help="only worlds whose kind contains this")
     parser.add_argument("--jobs", type=int, help="processes")
-    parser.add_argument("--first", action="store_true", help="end at the first violation")
     parser.add_argument("--log", type=Path, help="folder for what happened in schedules with a violation")
-    parser.add_argument("--verbose", action="store_true", help="print what happened in each")
     return parser
 
 

@@ -1,11 +1,9 @@
-"""What a stranger at the broker may send: ``python -m tests.robot.flood actions --port 1883 --seconds 5``."""
+"""What a stranger at the broker may send."""
 
 from __future__ import annotations
 
-import argparse
 import secrets
 import socket
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -13,7 +11,7 @@ from dataclasses import dataclass
 
 from tests.kit.mqtt_bytes import connect, publish
 from tests.robot.rig import BASE
-from tests.support import ROOT, Child
+from tests.transports.forked import Forked
 
 _SLICE_S = 0.02
 _CONNACK_BYTES = 4
@@ -49,10 +47,9 @@ FLOODS = {
 
 
 @contextmanager
-def flooding(name: str, port: int, seconds: float) -> Iterator[Child]:
+def flooding(name: str, port: int, seconds: float) -> Iterator[Forked]:
     """Floods from a process of its own, which removes afterwards what was retained; waits for its end."""
-    words = [sys.executable, "-m", "tests.robot.flood", name, "--port", str(port), "--seconds", str(seconds)]
-    process = Child(words, cwd=ROOT)
+    process = Forked("tests.robot.flood", name, port, seconds)
     yield process
     process.wait(seconds + 60)
 
@@ -68,21 +65,10 @@ def send(broker: socket.socket, flood: Flood, seconds: float) -> int:
     return sent
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.robot.flood", description=__doc__)
-    parser.add_argument("flood", choices=FLOODS)
-    parser.add_argument("--port", type=int, required=True)
-    parser.add_argument("--seconds", type=float, default=10.0)
-    options = parser.parse_args()
-    chosen = FLOODS[options.flood]
-    with suppress(ConnectionError), socket.create_connection(("127.0.0.1", options.port)) as broker:
+def main(name: str, port: int, seconds: float) -> None:
+    flood = FLOODS[name]
+    with suppress(ConnectionError), socket.create_connection(("127.0.0.1", port)) as broker:
         broker.sendall(connect(None, None, client_id=f"flood-{secrets.token_hex(4)}"))
         broker.recv(_CONNACK_BYTES)
-        sent = send(broker, chosen, options.seconds)
-        for packet in chosen.removals(sent):
+        for packet in flood.removals(send(broker, flood, seconds)):
             broker.sendall(packet)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -21,15 +21,10 @@ _ids = itertools.count()
 
 
 class Hall(FleetBroker):
-    """The broker of a fleet, as a robot's remote broker: without TLS, because it is on loopback.
+    """The broker of a fleet, as a robot's remote broker: without TLS, because it is on loopback."""
 
-    ``people``: the roles of accounts by name; one of them is *boss*.
-    """
-
-    def __init__(
-        self, folder: Path, level: Literal["login", "named"] = "named", people: Mapping[str, str] = PEOPLE
-    ) -> None:
-        known = {name: Account(roles=tuple(roles.split(","))) for name, roles in people.items()}
+    def __init__(self, folder: Path, level: Literal["login", "named"] = "named") -> None:
+        known = {name: Account(roles=tuple(roles.split(","))) for name, roles in PEOPLE.items()}
         robot = {"rover": Account(roles=("robot",), bases=(BASE,))}
         self.plain_port = free_port()
         super().__init__(folder, known | robot, level=level, unencrypted=self.plain_port)

@@ -375,3 +375,14 @@ def _program(pid: int) -> str:
 def descendants(pid: int) -> list[int]:
     """The processes that ``pid`` and its descendants have started and that still run."""
     return [found for child in children(pid) for found in (child, *descendants(child))]
+
+
+def saved_by(broker: Broker) -> dict[Path, bytes]:
+    """Let a broker with persistence save; return its files."""
+    broker.save()
+    return {file: file.read_bytes() for file in broker.store.iterdir()}
+
+
+def restore(files: dict[Path, bytes]) -> None:
+    for file, saved in files.items():
+        file.write_bytes(saved)

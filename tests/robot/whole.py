@@ -1,7 +1,7 @@
 """Random schedules of a whole robot: two people who take control of it from each other, its scripts, stops and faults.
 
 ``python -m tests.kit.schedules robot`` runs hundreds. The robot refuses strangers, so that each line of a person had a
-key. At the level named each person also commands by the other's name and with the other's key, which must move nothing.
+key.
 """
 
 from __future__ import annotations
@@ -25,15 +25,13 @@ from pebble.transports import Message
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps
 from tests.kit.stalls import Stalls, lost_s
 from tests.robot.alive import Alive
-from tests.robot.named import Hall, Named
 from tests.robot.operator import Operator, ReceivedMessage
-from tests.robot.rig import BASE, Rig, descendants
+from tests.robot.rig import BASE, Rig, descendants, restore, saved_by
 from tests.robot.whole_rules import History, Seen, by_script
 from tests.support import Broker, until
 
 STATE, STOPPED = "outgoing/control/serial", "outgoing/estop/serial"
 SPEEDS = {"ann": 0.3, "otto": 0.5}
-FORGED = 0.7  # the speed of what has another's name or key
 FILES = ("cruise", "cruise", "busy", "stubborn")
 _STOP_TIMEOUT_S = 1.5
 _PERIOD_S = 0.06
@@ -55,7 +53,6 @@ _FAULTS = (
     "launcher",
     "power",
 )
-_ROLES = "driver,safety,maintainer"
 _WEIGHTS = {
     "hold": 4, "take": 4, "release": 2, "drive": 6, "let_go": 3, "lose": 1, "stop": 3, "look": 2, "reset": 3,
     "start": 4, "end": 2, "kill": 3, "freeze": 2, "go_silent": 1, "cut": 1, "restart_broker": 1, "freeze_broker": 1,
@@ -66,11 +63,11 @@ _WEIGHTS = {
 class Person:
     """Repeats a request for control, a drive command and stops, each while it is wanted; a key is used for ever.
 
-    ``by``: what the topics of its commands have before the metric. ``heard``: what its robot has published.
+    ``heard``: what its robot has published.
     """
 
-    def __init__(self, name: str, operator: Operator, heard: list[ReceivedMessage], by: str = "") -> None:
-        self.name, self.id, self.operator, self._by, self._heard = name, secrets.token_hex(4), operator, by, heard
+    def __init__(self, name: str, operator: Operator, heard: list[ReceivedMessage]) -> None:
+        self.name, self.id, self.operator, self._heard = name, secrets.token_hex(4), operator, heard
         self.key = ""
         self.wants = self.drives = False
         self.stops: list[StopSender] = []
@@ -86,7 +83,7 @@ class Person:
         self.operator.close()
 
     def send(self, metric: str, body: Any) -> None:
-        self.operator.send(f"incoming/{self._by}{metric}", body)
+        self.operator.send(f"incoming/{metric}", body)
 
     def request(self, topic: str = "control", want: str = "hold") -> None:
         self.wants = want == "hold"
@@ -137,27 +134,17 @@ class World:
     """A robot, its brokers and two people; ``history`` is that of the present schedule."""
 
     def __init__(self, kind: str) -> None:
-        self.history, self.kind = History(), kind
-        transport, *named = kind.split()
+        self.history = History()
         manager = {"stop_timeout_seconds": _STOP_TIMEOUT_S}
-        options: dict[str, Any] = {"mirror": transport == "zenoh", "scripts": tuple(set(FILES))}
-        options["autonomy_manager"] = manager
+        options: dict[str, Any] = {"mirror": kind == "zenoh", "scripts": tuple(set(FILES))}
         with ExitStack() as opened:
             folder = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="pbls")))
-            if named:
-                hall = opened.enter_context(Hall(folder / "hall", people=dict.fromkeys(("boss", *SPEEDS), _ROLES)))
-                self.rig: Rig = opened.enter_context(
-                    Named(transport, hall, {"level": "named"}, direct=False, **options)
-                )
-                people = [(name, hall.client(name, STATE), f"by/{name}/") for name in SPEEDS]
-                self.thief = opened.enter_context(closing(hall.client("rover", STATE)))
-            else:
-                remote = Broker(folder, persistence=True, autosave=False)
-                strangers = {"security": {"strangers": "refuse"}}
-                self.rig = opened.enter_context(Rig(transport, remote=remote, top=strangers, **options))
-                people = [(name, Operator(remote.port, BASE, STATE), "") for name in SPEEDS]
+            self._remote = Broker(folder, persistence=True, autosave=False)
+            options |= {"autonomy_manager": manager, "top": {"security": {"strangers": "refuse"}}}
+            self.rig = opened.enter_context(Rig(kind, remote=self._remote, **options))
             heard = self.rig.operator.seen
-            self.people = [opened.enter_context(closing(Person(name, own, heard, by))) for name, own, by in people]
+            people = [Person(name, Operator(self._remote.port, BASE, STATE), heard) for name in SPEEDS]
+            self.people = [opened.enter_context(closing(person)) for person in people]
             local = (self.rig.local or self.rig.remote).port
             self.watcher = opened.enter_context(closing(Operator(local, BASE, "outgoing/+/serial")))
             assert until(lambda: self.watcher.last(STATE) is not None, 15), "nothing is mirrored"
@@ -192,16 +179,14 @@ class World:
         seen = Seen(self.history, lines, motors, states, list(self.alive.overlaps), SPEEDS, self._planted)
         stalls = [*self._stalls.found, *self.rig.mcu.late(began)]
         found = seen.problems(stalls)
-        allowed = len(seen.problems()) - len(found)
-        found += [*self._out_of_turn(began), *self._by_another_name(began)]
         counts = {
-            "lines": float(len(lines)),
-            "passed on": float(len(self._holders(began, ended))),
-            "stops": float(len(self.history.events("estop"))),
-            "stalled s": round(lost_s(stalls, began, ended), 2),
-            "allowed": float(allowed),
+            "lines": len(lines),
+            "passed on": len(self._holders(began, ended)),
+            "stops": len(self.history.events("estop")),
+            "stalled ms": round(1000 * lost_s(stalls, began, ended)),
+            "allowed": len(seen.problems()) - len(found),
         }
-        return Outcome(found + left, counts, log=lambda: self._log(began))
+        return Outcome([*found, *self._out_of_turn(began), *left], counts, log=lambda: self._log(began))
 
     # -- what people do; what is short or long with the number ``b``
 
@@ -267,25 +252,6 @@ class World:
 
     def _end(self, person: Person) -> None:
         person.send("autonomy-command", {"action": "stop"})
-
-    def do_pose(self, person: Person, b: int) -> None:
-        """Drive, or take control, as the other one; or by the robot's account, which speaks for others by name only."""
-        other = next(one for one in self.people if one is not person)
-        drive = {"x": 0, "z": FORGED, "key": other.key, "by": other.name}
-        taken = {"want": "hold", "id": f"{b:08x}", "by": other.name}
-        ways: list[tuple[Operator, str, dict[str, Any]]] = [
-            (person.operator, f"by/{person.name}/drive-values", drive),
-            (person.operator, f"by/{other.name}/drive-values", drive),
-            (person.operator, "drive-values", drive),
-            (person.operator, f"by/{other.name}/control/take", taken),
-            (person.operator, "control/take", taken),
-            (self.thief, "drive-values", drive),
-            (self.thief, "control/take", taken),
-        ]
-        self._note(f"poses, way {b % len(ways)}", person)
-        operator, metric, body = ways[b % len(ways)]
-        for _ in range(5):
-            operator.send(f"incoming/{metric}", body)
 
     # -- faults
 
@@ -353,30 +319,25 @@ class World:
 
     def do_freeze_broker(self, _: Person, b: int) -> None:
         broker = self._broker(b)
-        if isinstance(broker, Broker):
-            with self._fault("a broker is frozen", 1.5):
-                broker.freeze()
-                time.sleep(_FROZEN_S[b % len(_FROZEN_S)])
-                broker.thaw()
+        with self._fault("a broker is frozen", 1.5):
+            broker.freeze()
+            time.sleep(_FROZEN_S[b % len(_FROZEN_S)])
+            broker.thaw()
 
     def do_restore_broker(self, _: Person, __: int) -> None:
         """The first time its memory is saved; later it is killed, and has its older memory."""
-        if not isinstance(self.rig.remote, Broker):
-            return
         if not self._older:
-            self.rig.remote.save()
-            self._older = {file: file.read_bytes() for file in self.rig.remote.store.iterdir()}
+            self._older = saved_by(self._remote)
             return
         with self._fault("a broker of before", 1.5):
-            self.rig.remote.kill()
-            for file, saved in self._older.items():
-                file.write_bytes(saved)
-            self.rig.remote.start()
+            self._remote.kill()
+            restore(self._older)
+            self._remote.start()
 
     def do_plant_stop(self, _: Person, b: int) -> None:
         """A stop reaches the broker while the robot is away, retained: it receives only the copy."""
         operator = self.rig.operator
-        if not isinstance(self.rig.remote, Broker) or self.rig.local is None:
+        if self.rig.local is None:
             return  # its programs are not away from their own
         if not until(lambda: operator.is_connected, 5.0):
             return  # what it sent would arrive later, live
@@ -398,10 +359,10 @@ class World:
     # -- rules
 
     def _holders(self, since: float, until_: float = float("inf")) -> list[str]:
-        """Return whose accounts had control, in turn, as the robot has published it on its own side."""
+        """Return who had control, in turn, as the robot has published it on its own side."""
         seen = [one for one in self.watcher.on(STATE) if one.payload]
         before = [one for one in seen if one.at < since][-1:]
-        names = [_account(one) for one in (*before, *(one for one in seen if since <= one.at < until_))]
+        names = [one.json["by"] for one in (*before, *(one for one in seen if since <= one.at < until_))]
         return [name for name, _ in groupby(names)]
 
     def _out_of_turn(self, since: float) -> Iterator[str]:
@@ -420,16 +381,6 @@ class World:
         for name, _ in groupby(driven):
             if name not in turns:
                 yield f"the wheels obey {name} out of turn: {driven[-5:]}, control of {self._holders(since)}"
-                return
-
-    def _by_another_name(self, since: float) -> Iterator[str]:
-        """Find a line of what was forged, or control of what the account's own program has not asked for."""
-        if any(FORGED in wheels for _, wheels in self.rig.mcu.drives(since)):
-            yield "the wheels obey another's name or key"
-        ids = {person.id: person.name for person in self.people} | {"": ""}
-        for state in [one for one in self.watcher.on(STATE, since) if one.payload]:
-            if ids.get(state.json["id"]) != _account(state):
-                yield f"control by another's name: {state.json}"
                 return
 
     # -- the end: stops are confirmed, each of the two gets control and drives alone, and a script can be used
@@ -548,21 +499,12 @@ def _state(seen: ReceivedMessage) -> EstopState:
     return state
 
 
-def _account(state: ReceivedMessage) -> str:
-    """Return who has control; a name that is checked has the account before the person."""
-    name: str = state.json["by"]
-    return name.partition("/")[0]
-
-
 _BEGIN = (("start", 0, None), ("take", 0, None), ("drive", 0, None))
-_AS_THEMSELVES = RandomSteps(_WEIGHTS, length=24, layouts=1, begin=_BEGIN)
-_AS_OTHERS = RandomSteps(_WEIGHTS | {"pose": 6}, length=28, layouts=1, begin=_BEGIN)
-
 ENGINE = Engine(
-    draw=lambda kind, seed, number: (_AS_OTHERS if "named" in kind else _AS_THEMSELVES)(kind, seed, number),
+    draw=RandomSteps(_WEIGHTS, length=24, layouts=1, begin=_BEGIN),
     world=lambda kind: closing(World(kind)),
     perform=lambda world, schedule: world.perform(schedule),
-    kinds=("zenoh", "mqtt", "single", "zenoh named", "mqtt named"),
+    kinds=("zenoh", "mqtt", "single"),
     schedules=400,
     per_world=20,
     repeats=False,

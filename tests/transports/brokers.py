@@ -33,13 +33,12 @@ def found(program: str) -> str | None:
 
 class Maker(NamedTuple):
     """``make``: starts one in a folder. ``closes``: on a forbidden message. ``by_name``: what it retains comes only to
-    subscriptions of exact names. ``bridge_mode``: it has that of MQTT 3.1.1."""
+    subscriptions of exact names."""
 
     make: Callable[[Path], Broker]
     missing: Callable[[], bool]
     closes: bool = False
     by_name: bool = False
-    bridge_mode: bool = False
 
 
 class _Other(Broker):
@@ -187,10 +186,8 @@ def sparing_aedes(folder: Path) -> Broker:
 
 
 MAKERS = {
-    "mosquitto": Maker(_mosquitto, lambda: False, bridge_mode=True),
+    "mosquitto": Maker(_mosquitto, lambda: False),
     "nats": Maker(_nats, lambda: found("nats-server") is None),
     "rabbitmq": Maker(_RabbitMq, lambda: not _RABBITMQ.exists(), closes=True, by_name=True),
-    "aedes": Maker(
-        _aedes, lambda: not (_AEDES / "node_modules/aedes").exists() or found("node") is None, True, bridge_mode=True
-    ),
+    "aedes": Maker(_aedes, lambda: not (_AEDES / "node_modules/aedes").exists() or found("node") is None, True),
 }

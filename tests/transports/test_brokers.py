@@ -23,7 +23,6 @@ from tests.services.mqtt_bridge.bridge_rig import Quiet
 from tests.sparing_broker import SparingBroker
 from tests.support import Broker, beside, until
 from tests.transports.brokers import MAKERS, ROBOT, Maker, sparing_aedes
-from tests.transports.net import ProcessPeer
 from tests.transports.received import Received
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # deadlines are checked; make long PART=brokers runs it
@@ -65,47 +64,6 @@ def settings(broker: Broker, **more: Any) -> MqttSettings:
 @pytest.fixture
 def base(request: pytest.FixtureRequest) -> str:
     return f"pebble/robots/{request.node.originalname.rpartition('_')[2]}"
-
-
-def test_every_retained_message_comes_by_its_exact_name_and_wildcard_where_the_broker_has_that(
-    maker: Maker, broker: Broker, base: str
-) -> None:
-    names = [f"{base}/outgoing/state-{number}" for number in range(30)]
-    with MqttTransport("writer", settings(broker, as_published=True)) as writer:
-        assert writer.as_published is maker.bridge_mode
-        for name in names:
-            writer.publish(name, b"1", qos=QoS.DELIVERED, retain=True)
-        assert until(lambda: not writer.outgoing.waiting)
-        with MqttTransport("late", settings(broker)) as late:
-            seen = Received()
-            late.subscribe(f"{base}/#", seen)
-            assert until(lambda: maker.by_name or len(seen.messages) == len(names))
-            assert len(seen.messages) == (0 if maker.by_name else len(names))
-            late.ask(names)
-            assert until(lambda: {one.topic for one in seen.messages if one.retain} == {*names})
-        for name in names:
-            writer.publish(name, b"", qos=QoS.DELIVERED, retain=True)
-    with MqttTransport("later", settings(broker)) as later:
-        left = Received()
-        later.subscribe(f"{base}/#", left)
-        later.ask(names)
-        time.sleep(0.2)
-        assert left.messages == []
-
-
-def test_a_will_is_published_at_once_and_retained(broker: Broker, base: str) -> None:
-    topic, seen, late = f"{base}/outgoing/online", Received(), Received()
-    will = Message(topic, b"gone", QoS.DELIVERED, retain=True)
-    with MqttTransport("operator", settings(broker)) as operator:
-        operator.subscribe(topic, seen)
-        robot = ProcessPeer("mqtt", "robot", settings(broker, as_published=True), will)
-        robot.publish(topic, b"here", retain=True)
-        assert until(lambda: seen.payloads == [b"here"])
-        robot.kill()
-        assert until(lambda: seen.payloads == [b"here", b"gone"])
-        with MqttTransport("late", settings(broker)) as transport:
-            transport.subscribe(topic, late)
-            assert late.until(b"gone")
 
 
 def test_what_an_account_may_not_publish_costs_it_that_and_is_reported(

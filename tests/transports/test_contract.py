@@ -82,19 +82,6 @@ def test_T01_filters_match_as_in_paho(net: Net, base: str) -> None:
     assert sum(len(received.payloads) for received in handlers.values()) > 60
 
 
-def test_T01_a_hash_matches_its_parent_and_a_plus_one_level(net: Net, base: str) -> None:
-    client = net.client("matcher")
-    rest, one, empty = Received(), Received(), Received()
-    client.subscribe(f"{base}/a/#", rest)
-    client.subscribe(f"{base}/a/+", one)
-    client.subscribe(f"{base}/a//+", empty)
-    for topic in ("a", "a/", "a/b", "a/b/c", "a//c", "ab"):
-        client.publish(f"{base}/{topic}", topic.encode(), qos=DELIVERED)
-    assert rest.until(b"a", b"a/", b"a/b", b"a/b/c", b"a//c")
-    assert one.until(b"a/", b"a/b")
-    assert empty.until(b"a//c")
-
-
 def test_T02_every_allowed_topic_works(net: Net, base: str) -> None:
     client, received, rooted = net.client("odd-topics"), Received(), Received()
     client.subscribe(f"{base}/#", received)

@@ -7,12 +7,15 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from threading import Event
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from pebble.transports import MqttSettings, QoS, State, Transport, create
 from pebble.transports.hosts import HANDSHAKE_S, STEADY_S, Address, AddressRound, HostPort
+from pebble.transports.mqtt.dialler import Dialler
+from pebble.transports.mqtt.ending import Absent, Lost, Silent
 from tests.fakes.bad_brokers import BEHAVIOURS, mute, serving
 from tests.support import Broker, free_port, some
 
@@ -157,6 +160,30 @@ def test_where_tls_took_long_it_may_be_silent_for_longer(attempts: str, patient:
         WENT[word](turns)
         turns.failed("x")
     assert seen == patient
+
+
+LOSSES = {"lost": Lost, "silent": Silent, "absent": Absent}
+
+
+@pytest.mark.parametrize(
+    ("events", "ended"),  # what ended a connection (in capitals) or an attempt to connect, and when
+    [
+        ("LOST@0", True),
+        ("SILENT@0", False),  # it may be we who stood still
+        ("LOST@0 lost@0.9", True),  # as it ends, it accepts connections and hangs up
+        ("LOST@0 lost@1.1", False),
+        ("LOST@0 absent@5 lost@5.9", True),
+        ("LOST@0 silent@0.5", False),
+        ("LOST@0 lost@2 absent@3", False),
+    ],
+)
+def test_whether_the_broker_has_ended(events: str, ended: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, verdict, dialler = 0.0, True, Dialler("tool", MqttSettings(host="b"), None)
+    monkeypatch.setattr("pebble.transports.mqtt.dialler.time", SimpleNamespace(monotonic=lambda: now))
+    for event in events.split():
+        word, now = event.partition("@")[0], float(event.partition("@")[2])
+        verdict = dialler.is_gone(LOSSES[word.lower()]("x"), connected=word.isupper(), was_ended=verdict)
+    assert verdict is ended
 
 
 def test_a_name_without_addresses_is_a_problem() -> None:

@@ -8,7 +8,7 @@ import pytest
 from paho.mqtt.client import topic_matches_sub
 
 from pebble.errors import TransportError
-from pebble.transports.topics import check_filter, check_topic, is_pattern, matches
+from pebble.transports.topics import check_filter, check_topic, matches
 from tests.support import cases
 
 TRIED = cases(4_000, 20_000)
@@ -43,9 +43,3 @@ def test_errors_name_what_is_wrong() -> None:
         check_topic("x" * 1025)
     with pytest.raises(TransportError, match="200 levels"):
         check_topic("/" * 200)
-
-
-def test_is_pattern() -> None:
-    assert is_pattern("a/+")
-    assert is_pattern("#")
-    assert not is_pattern("a/b")

@@ -7,7 +7,7 @@ from msgspec.structs import asdict, replace
 
 from pebble.config.problems import Notes, Path
 from pebble.config.reader import Reader, Rule
-from pebble.config.rules.doors import check_doors
+from pebble.config.rules.doors import ENCRYPTED, check_doors
 from pebble.config.rules.exposure import warn_if_readable, warn_of_known_id, warn_of_logins_in_clear
 from pebble.config.rules.shared_topics import shared_topics
 from pebble.config.text_files import NotTextError, text_of
@@ -18,7 +18,6 @@ from pebble.contract.identity import GATEWAYS, SERVERS
 from pebble.errors import PebbleError
 from pebble.ownership import read_for
 
-_TLS = ("tls/", "quic/")  # endpoints of Zenoh that are encrypted
 #: Words in commands of the original's configs, and why they do harm, or nothing, here.
 _OF_ORIGINAL = (
     (re.compile(r"\bpebble-control\b").search, "starts the original, too, at the same serial port"),
@@ -40,16 +39,15 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
     root = _without_uplink(reader.notes, root)
     kind, platform = root.transport.kind, root.robot.platform
     if root.transport.mqtt_mirror is not None and kind != "zenoh":
-        reader.notes.doubt(
-            ("transport", "mqtt_mirror"), f'only a Zenoh robot has a mirror and kind is "{kind}": leave it out'
-        )
+        why = f'only a Zenoh robot has a mirror and kind is "{kind}": leave it out'
+        reader.notes.doubt(("transport", "mqtt_mirror"), why)
     if root.robot.type in (SERVERS, GATEWAYS):
         reader.notes.problem(("robot", "type"), f'must not be "{root.robot.type}": those are no robots')
     if platform != "linux" and kind != "mqtt":
         reader.notes.doubt(("transport", "kind"), f'must be "mqtt" where robot.platform is "{platform}"')
     if not reader.notes.problems:
-        for path, other in shared_topics(root):
-            reader.notes.problem(path, f"is also the topic of {other.suffix}, choose another")
+        for path, channel in shared_topics(root):
+            reader.notes.problem(path, f"is also the topic of {channel.suffix}, choose another")
         warn_of_logins_in_clear(reader.notes, root)
         warn_of_known_id(reader.notes, root)
     check_doors(reader.notes, root)
@@ -58,21 +56,20 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
 
 def _transport(reader: Reader, transport: TransportSection, path: Path) -> TransportSection:
     """Check that a Zenoh robot which other machines reach is encrypted: certificates decide who may connect."""
-    encrypted = next((endpoint for endpoint in transport.listen if endpoint.startswith(_TLS)), None)
-    if transport.allowed_names is not None and not any(
-        endpoint.startswith(_TLS) for endpoint in (*transport.listen, *transport.connect)
-    ):
+    listens = [endpoint for endpoint in transport.listen if endpoint.startswith(ENCRYPTED)]
+    connects = [endpoint for endpoint in transport.connect if endpoint.startswith(ENCRYPTED)]
+    if transport.allowed_names is not None and not (listens or connects):
         reader.notes.warning((*path, "allowed_names"), "has no effect: no tls/ or quic/ endpoint is listed")
     if transport.allowed_names is not None and transport.access is not None:
         reader.notes.problem((*path, "allowed_names"), "must be left out: access says what each name may do")
-    if transport.kind != "zenoh" or encrypted is None:
+    if transport.kind != "zenoh" or not listens:
         return transport
     if not transport.tls.enabled:
-        reader.notes.doubt((*path, "tls", "enabled"), f"must be true, {encrypted} needs certificates")
+        reader.notes.doubt((*path, "tls", "enabled"), f"must be true, {listens[0]} needs certificates")
     elif transport.tls.ca_cert is None:
         reader.notes.doubt(
             (*path, "tls", "ca_cert"),
-            f"is missing: without it anybody may connect to {encrypted}; "
+            f"is missing: without it anybody may connect to {listens[0]}; "
             "write the authority that signs the certificates of those who may",
         )
     return transport
@@ -85,12 +82,11 @@ def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
         if bridge.enabled and (reasons := [reason for names, reason in _OF_ORIGINAL if names(words)]):
             notes.warning((*path, section, "command"), f"{', and '.join(reasons)}: write `{instead}`")
     if link.kbit is not None and link.profile == "wide":
-        notes.problem(
-            (*path, "link", "kbit"), 'has no effect at profile "wide": write "thin" or "auto", or leave it out'
-        )
+        why = 'has no effect at profile "wide": write "thin" or "auto", or leave it out'
+        notes.problem((*path, "link", "kbit"), why)
     if link.profile == "auto" and remote is not None and remote.kind != "mqtt":
-        text = f'cannot be "auto": only MQTT connections are measured, and remote.kind is "{remote.kind}"; write "thin"'
-        notes.problem((*path, "link", "profile"), text)
+        why = f'cannot be "auto": only MQTT connections are measured, and remote.kind is "{remote.kind}"; write "thin"'
+        notes.problem((*path, "link", "profile"), why)
     if remote is not None and remote.kind != "mqtt":
         if bridge.remote_mqtt.host:
             notes.warning((*path, "remote_mqtt"), f'not used: remote.kind is "{remote.kind}"')
@@ -132,27 +128,24 @@ def _serial(reader: Reader, serial: SerialBridge, path: Path) -> SerialBridge:
         return serial
     lines = {(*path, "instances", name): line for name, line in serial.instances.items()}
     if serial.serial.port is not None or not any(line.enabled for line in lines.values()):
-        lines = {path: serial, **lines}
-    ports: dict[str, str] = {}
+        lines = {path: serial, **lines}  # else the section only holds what its instances share
+    ports: dict[str, str] = {}  # names of lines by their ports
     for place, line in lines.items():
-        if line.enabled:
-            _serial_line(reader, line, place, ports)
+        port = line.serial.port
+        if not line.enabled:
+            continue
+        if port is None:
+            reader.notes.doubt((*place, "serial", "port"), "is missing, write the device: ls /dev/serial/by-id/*")
+        elif port in ports:
+            reader.notes.problem(place, f"shares {port} with {ports[port]}, write another serial.port")
+        else:
+            ports[port] = str(place[-1])
     for name in serial.instances:
         if not _INSTANCE_NAME(name):
             reader.notes.problem((*path, "instances", name), "must be named with 1 to 32 of A-Z a-z 0-9 _ . -")
     if path in lines and "serial" in serial.instances:
         reader.notes.problem((*path, "instances", "serial"), "is what the line of this section is called, rename it")
     return serial
-
-
-def _serial_line(reader: Reader, line: SerialBridge, path: Path, ports: dict[str, str]) -> None:
-    name, port = str(path[-1]), line.serial.port
-    if port is None:
-        reader.notes.doubt((*path, "serial", "port"), "is missing, write the device: ls /dev/serial/by-id/*")
-    elif port in ports:
-        reader.notes.problem(path, f"shares {port} with {ports[port]}, write another serial.port")
-    else:
-        ports[port] = name
 
 
 def _tls(reader: Reader, tls: Tls, path: Path) -> Tls:
@@ -167,13 +160,11 @@ def _tls(reader: Reader, tls: Tls, path: Path) -> Tls:
     if tls.client_key is not None:
         warn_if_readable(reader.notes, (*path, "client_key"), tls.client_key, "this key")
     if tls.insecure:
-        reader.notes.warning(
-            (*path, "insecure"),
-            "is true: another machine with a certificate of a trusted authority can pose as this one",
-        )
-    for key, other in (("client_cert", "client_key"), ("client_key", "client_cert")):
-        if key in named and other not in named:
-            reader.notes.doubt((*path, other), f"is missing, it belongs to {key}")
+        why = "is true: another machine with a certificate of a trusted authority can pose as this one"
+        reader.notes.warning((*path, "insecure"), why)
+    for key, partner in (("client_cert", "client_key"), ("client_key", "client_cert")):
+        if key in named and partner not in named:
+            reader.notes.doubt((*path, partner), f"is missing, it belongs to {key}")
     return tls
 
 

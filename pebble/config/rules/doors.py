@@ -10,7 +10,7 @@ from pebble.config.rules.shared_topics import renamed_commands
 from pebble.config.transport import Mqtt, ZenohClient
 from pebble.config.tree import Root
 
-_ZENOH_ENCRYPTED = ("tls/", "quic/")
+ENCRYPTED = ("tls/", "quic/")  # endpoints of Zenoh
 _ZENOH_LOCAL = ("unixsock-stream/", "unixpipe/", "vsock/")
 _BARE_HOST = re.compile(r"^[a-z0-9-]+/\[?([^\]/]*?)\]?(?::\d+)?(?:[?#].*)?$")
 
@@ -43,31 +43,26 @@ def _check_links(notes: Notes, root: Root) -> None:
         if is_loopback(mqtt.host):
             continue
         if not mqtt.tls.enabled and root.robot.platform != "esp8266":  # which has no memory for it
-            notes.problem(
-                (*path, "tls", "enabled"), f'must be true at security.level "{level}": {mqtt.host} is another machine'
-            )
+            why = f'must be true at security.level "{level}": {mqtt.host} is another machine'
+            notes.problem((*path, "tls", "enabled"), why)
         if mqtt.tls.enabled and mqtt.tls.insecure:
             notes.problem((*path, "tls", "insecure"), f'must be false at security.level "{level}"')
         if not mqtt.username:
-            notes.problem(
-                (*path, "username"),
-                f'is missing at security.level "{level}": `pebble fleet add NAME --role robot` makes an account',
-            )
+            why = f'is missing at security.level "{level}": `pebble fleet add NAME --role robot` makes an account'
+            notes.problem((*path, "username"), why)
     for path, endpoint in _endpoints(root):
-        if not endpoint.startswith(_ZENOH_ENCRYPTED):
+        if not endpoint.startswith(ENCRYPTED):
             notes.problem(path, f'{endpoint} is not encrypted: write tls/… at security.level "{level}"')
     for path, section in connections(root):
-        ways = [endpoint for place, endpoint in _endpoints(root) if place[:-1] == path]
-        if ways and getattr(section, "account", None) == "":
-            notes.problem(
-                (*path, "account"),
-                f'is missing at security.level "{level}": `pebble fleet certificate NAME` prints what belongs there',
-            )
+        leaves_machine = any(place[:-1] == path for place, _ in _endpoints(root))
+        if leaves_machine and getattr(section, "account", None) == "":
+            why = f'is missing at security.level "{level}": `pebble fleet certificate NAME` prints what belongs there'
+            notes.problem((*path, "account"), why)
 
 
 def _endpoints(root: Root) -> Iterator[tuple[Path, str]]:
     """Yield the Zenoh endpoints that lead beyond this machine, with their places in the config."""
-    return (row for row in zenoh_endpoints(root) if not _is_near(row[1]))
+    return ((path, endpoint) for path, endpoint in zenoh_endpoints(root) if not _is_near(endpoint))
 
 
 def zenoh_endpoints(root: Root) -> Iterator[tuple[Path, str]]:

@@ -12,7 +12,7 @@ _SERIAL = ("services", "serial_mcu_bridge")
 
 
 def shared_topics(root: Root) -> Iterator[tuple[Path, Channel]]:
-    """Yield each key whose topic also belongs to another channel, with that channel.
+    """Yield each key with a topic that belongs to another channel as well, and that channel.
 
     Several serial lines may share the topics of one channel: all of them obey a drive command.
     """

@@ -41,8 +41,9 @@ def view_of(tag: Tag, size: tuple[int, int]) -> View | None:
     if share < LEAST_SHARE:
         return None
     x, y = tag.corners.mean(axis=0)
-    distance = 0 if share >= _NEAR else 1 if share >= _MIDDLE else 2
-    return _ROWS[int(3 * y / height)], _COLUMNS[int(3 * x / width)], _DISTANCES[distance]
+    near, between, far = _DISTANCES
+    distance = near if share >= _NEAR else between if share >= _MIDDLE else far
+    return _ROWS[int(3 * y / height)], _COLUMNS[int(3 * x / width)], distance
 
 
 def collect(
@@ -53,8 +54,8 @@ def collect(
     ``still``: every picture counts. Otherwise the tag must be at rest, and 15 well-spread places are enough.
     """
     by_view: dict[View, Floats] = {}
-    size, resting = (0, 0), 0
-    before: Floats | None = None
+    size, resting = (0, 0), 0  # resting: pictures in a row in which the tag rests
+    before: Floats | None = None  # the tag's corners in the last picture
     for picture in pictures:
         size = picture.shape[1], picture.shape[0]
         tag = largest(finder.find(picture), tag_id)
@@ -67,7 +68,8 @@ def collect(
         if view is None or view in by_view:
             continue
         by_view[view] = tag.corners
-        missing = [name for names in (_ROWS, _COLUMNS, _DISTANCES) for name in names if name not in {*chain(*by_view)}]
+        seen = {*chain(*by_view)}
+        missing = [name for name in (*_ROWS, *_COLUMNS, *_DISTANCES) if name not in seen]
         person.tell(
             f"{len(by_view)} of {LEAST_PICTURES}: {' '.join(view)}; next: {', '.join(missing) or 'another place'}"
         )

@@ -74,12 +74,12 @@ def wheels(
     results: list[Calibration] = []
     _run(config, lambda robot: results.append(calibrate(robot, _Terminal(), wanted)))
     (result,), (left, right) = results, expected.step_mm
-    for name, value, before in (
+    for name, value, expected_mm in (
         ("left step", result.left_step_mm, left),
         ("right step", result.right_step_mm, right),
         ("track", result.track_mm, track),
     ):
-        typer.echo(f"{name:<11} {value:8.3f} mm, {100 * (value / before - 1):+.2f} % of what was expected")
+        typer.echo(f"{name:<11} {value:8.3f} mm, {100 * (value / expected_mm - 1):+.2f} % of what was expected")
     typer.echo(f"written: {config.parent / 'odometry.json'}; wheel-odometry uses it from its next start")
     return 0
 
@@ -100,14 +100,14 @@ def camera(
         pebble calibrate camera goob.json --tag 13 --size 0.25
         pebble calibrate camera goob.json --pictures shots/
     """
-    if pictures is not None and not pictures.is_dir():
-        raise typer.BadParameter(f"{pictures} is no folder", param_hint="--pictures")
-    if pictures is not None:
-        from pebble.extensions.calibrate.camera import read_folder
-
-        _calibrate_camera(config, read_folder(pictures), tag, size, still=True)
-    else:
+    if pictures is None:
         _run(config, lambda robot: _calibrate_camera(config, robot.camera(timeout=10), tag, size), drives=False)
+        return 0
+    if not pictures.is_dir():
+        raise typer.BadParameter(f"{pictures} is no folder", param_hint="--pictures")
+    from pebble.extensions.calibrate.camera import read_folder
+
+    _calibrate_camera(config, read_folder(pictures), tag, size, still=True)
     return 0
 
 
@@ -134,7 +134,7 @@ def _calibrate_camera(config: Path, pictures: Any, tag: int, size: float, *, sti
 def _run(config: Path, main: Any, *, drives: bool = True) -> None:
     """Run ``main`` as a script. Raises PebbleError, which also says that no file was written."""
 
-    def ended(robot: Robot) -> None:
+    def run(robot: Robot) -> None:
         try:
             main(robot)
         except Stopped:
@@ -143,4 +143,4 @@ def _run(config: Path, main: Any, *, drives: bool = True) -> None:
         except PebbleError as error:
             raise PebbleError(f"{error}; {_NOTHING}") from None
 
-    run_for(config, ended, name="calibrate", drives=drives)
+    run_for(config, run, name="calibrate", drives=drives)

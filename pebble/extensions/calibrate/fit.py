@@ -23,7 +23,7 @@ class Run(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """The rms errors of the measured truth."""
+    """The rms errors with which the true movement is measured."""
 
     mm: float
     straight_rad: float
@@ -69,37 +69,40 @@ def fit(runs: Sequence[Run], noise: Noise, step_mm: tuple[float, float], track_m
         differences, slopes = _equations(runs, noise, wheels)
         wheels = wheels + np.linalg.lstsq(slopes, differences, rcond=None)[0]
     differences, _ = _equations(runs, noise, wheels)
-    residuals = iter(np.abs(differences))
+    residuals = [float(abs(difference)) for difference in differences]
     sigma, mm = [], []
     for run in runs:
-        way, turn = (0.0 if run.mm is None else float(next(residuals))), float(next(residuals))
+        way = 0.0 if run.mm is None else residuals.pop(0)  # in the order of the equations
+        turn = residuals.pop(0)
         sigma.append(max(way, turn))
-        mm.append(math.hypot(way * _way_mm(run, noise), turn * _turn_rad(run, noise, wheels[2]) * wheels[2] / 2))
+        turn_mm = turn * _turn_noise_rad(run, noise, wheels[2]) * wheels[2] / 2  # of each wheel
+        mm.append(math.hypot(way * _way_noise_mm(run, noise), turn_mm))
     left, right, track = map(float, wheels)
     return Fit(left, right, track, mm, sigma)
 
 
 def _equations(runs: Sequence[Run], noise: Noise, wheels: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the residuals of the equations, divided by the noise, and their derivatives by the three lengths."""
+    """Return the residuals of the equations, divided by their noise, and their derivatives by the three lengths."""
     left_mm, right_mm, track = wheels
     differences, slopes = [], []
     for run in runs:
         left, right = run.left * left_mm, run.right * right_mm
         if run.mm is not None:
-            part = _way_mm(run, noise)
-            differences.append((run.mm - (left + right) / 2) / part)
-            slopes.append([run.left / 2 / part, run.right / 2 / part, 0.0])
-        turn, part = (right - left) / track, _turn_rad(run, noise, track)
-        differences.append((run.turn_rad - turn) / part)
-        slopes.append([-run.left / track / part, run.right / track / part, -turn / track / part])
+            sigma = _way_noise_mm(run, noise)
+            differences.append((run.mm - (left + right) / 2) / sigma)
+            slopes.append([run.left / 2 / sigma, run.right / 2 / sigma, 0.0])
+        turn, sigma = (right - left) / track, _turn_noise_rad(run, noise, track)
+        differences.append((run.turn_rad - turn) / sigma)
+        slopes.append([-run.left / track / sigma, run.right / track / sigma, -turn / track / sigma])
     return np.array(differences), np.array(slopes)
 
 
-def _way_mm(run: Run, noise: Noise) -> float:
+def _way_noise_mm(run: Run, noise: Noise) -> float:
+    """Return the rms error of a straight run's way: of its truth, and of slipping wheels."""
     return math.hypot(noise.mm, _SLIP * (run.mm or 0.0) / math.sqrt(2))
 
 
-def _turn_rad(run: Run, noise: Noise, track_mm: float) -> float:
+def _turn_noise_rad(run: Run, noise: Noise, track_mm: float) -> float:
     if run.mm is None:
         return math.hypot(noise.spin_rad, _SLIP * run.turn_rad / math.sqrt(2))
     return math.hypot(noise.straight_rad, _SLIP * math.sqrt(2) * run.mm / track_mm)

@@ -55,8 +55,8 @@ class Legs:
         self._picture: Any = None
         self._odometry = Odometry(expected, clock())
         self._inputs: queue.SimpleQueue[tuple[Callable[..., None], Any, float]] = queue.SimpleQueue()
-        self._samples, self._seen_at = 0, clock()
-        self._turned = self._heading = 0.0
+        self._samples, self._seen_at = 0, clock()  # of the hall sensors; when the tag was last seen
+        self._turned = self._heading = 0.0  # the sum of all turns, and the heading, which wraps
         for channel, take in (
             (MOTOR_POWER, self._odometry.power),
             (TOUCH_SENSORS, self._touch),
@@ -109,8 +109,8 @@ class Legs:
         if start is not None:
             slow_s = mm / abs(turns) * POWER / _SLOW_POWER / self._mm_s
             late = f"it does not see tag {self._tag_id} again"
-            for way in (side, -side):  # back, if it has rolled past
-                self._drive(name, (way * _SLOW_POWER, 0.0), slow_s, lambda _: self._is_at(start), late)
+            for direction in (side, -side):  # back, if it has rolled past
+                self._drive(name, (direction * _SLOW_POWER, 0.0), slow_s, lambda _: self._is_at(start), late)
                 if self._sees():
                     break
         return _difference(began, self._counts())
@@ -167,6 +167,7 @@ class Legs:
             raise PebbleError(f"{name}: it has lost tag {self._tag_id}")
 
     def _sees(self) -> bool:
+        """True if the tag is in a picture of the robot at rest."""
         until = self._clock() + _GLANCE_S
         while self._clock() < until:
             if self._sight(_REST_S) is not None:
@@ -181,9 +182,9 @@ class Legs:
         """Return the place of the tag in a picture of the last ``max_age`` seconds; None if it is in none."""
         assert self._finder is not None  # noqa: S101 - only a calibration with a tag looks
         self._wait(0.01)
-        before, picture = self._picture, self._robot.picture(max_age)
-        self._picture = picture
-        if picture is None or picture is before:
+        last_picture, self._picture = self._picture, self._robot.picture(max_age)
+        picture = self._picture
+        if picture is None or picture is last_picture:
             return None
         tag = largest(self._finder.find(picture), self._tag_id)
         return None if tag is None else tag.place

@@ -20,7 +20,7 @@ from pebble.runtime.whole_file import write
 LEAST_STRAIGHTS, LEAST_SPINS = 4, 2
 _REST_S = 5.0
 _REPEATS = 2  # of a run
-_ODD = 0.25  # of the counted way: a typed one that differs more is a slip of the keys
+_MOST_DIFFERENCE = 0.25  # of the counted way: a typed one that differs more is mistyped
 _AHEAD_M = 0.2  # more than the tag's least distance, at the end of a straight
 
 
@@ -98,10 +98,12 @@ class _Session:
             camera = CameraModel.find([robot.config.folder])
             self._legs.watch(TagFinder(wanted.tag_size_m, camera, wanted.family), wanted.tag)
         kinds = [self._straight] * wanted.straights + [self._spin] * wanted.spins
+        #: What drives each run, and its sign: there or left, then back or right.
         self._drives = [(drive, 1 if number % 2 == 0 else -1) for number, drive in enumerate(kinds)]
         self.runs: list[Run] = []
 
     def run(self) -> Fit:
+        """Drive all runs and fit the wheels; repeat the run that fits worst until noise explains all residuals."""
         self._person.tell(f"It rests {_REST_S:g} s; then {self._plan()}. STOP, Space on the page or Ctrl-C end it.")
         self._legs.rest(_REST_S)
         for number in range(len(self._drives)):
@@ -113,10 +115,12 @@ class _Session:
                 raise PebbleError(f"{name} stays {off}: does a wheel slip, or a magnet miss?")
             repeats[worst] += 1
             self._person.tell(f"{name} is {off}, more than {LIMIT_SIGMA:g}: it is repeated")
-            there = worst // 2 * 2  # the even one of a pair of straight runs
-            repeated = (there, there + 1) if self.runs[worst].mm is not None else (worst,)
-            for number in repeated:
-                self.runs[number] = self._drive(number)  # there and back: it ends where it began
+            first, last = worst, worst
+            if self.runs[worst].mm is not None:  # a straight one: there and back, so that it ends where it began
+                first = worst // 2 * 2
+                last = first + 1
+            for number in range(first, last + 1):
+                self.runs[number] = self._drive(number)
             result = self._fit()
         for run, mm, sigma in zip(self.runs, result.mm, result.sigma, strict=True):
             self._person.tell(f"  {run.name:<22} residual {mm:5.1f} mm, {sigma:.1f} sigma")
@@ -141,10 +145,10 @@ class _Session:
         name = f"{number}, straight {'there' if sign > 0 else 'back'}"
         wanted, mm = self._wanted, sign * self._wanted.length_m * 1000
         if wanted.truth == "tag":
-            start = self._legs.look()
-            if sign > 0 and start.distance_m < (least := wanted.length_m + NEAREST_M + _AHEAD_M):
+            start, least_m = self._legs.look(), wanted.length_m + NEAREST_M + _AHEAD_M
+            if sign > 0 and start.distance_m < least_m:
                 raise PebbleError(
-                    f"the tag is {start.distance_m:.2f} m away: {least:.2f} m are needed, or a shorter --length"
+                    f"the tag is {start.distance_m:.2f} m away: {least_m:.2f} m are needed, or a shorter --length"
                 )
             self._person.tell(f"{name} …")
             counts = self._legs.straight(name, mm)
@@ -170,20 +174,28 @@ class _Session:
         elif start is not None:
             turn_rad = turns * math.tau + self._legs.look().angle_rad - start.angle_rad
         else:
-            past = self._numbers("degrees past its mark (short of it: minus)", 1, lambda numbers: abs(numbers[0]) < 180)
-            turn_rad = turns * math.tau + sign * math.radians(past[0])
+            question = "degrees past its mark (short of it: minus)"
+            (past_deg,) = self._numbers(question, 1, lambda numbers: abs(numbers[0]) < 180)
+            turn_rad = turns * math.tau + sign * math.radians(past_deg)
         self._tell(name, counts, f"turned {math.degrees(turn_rad):+.1f}°")
         return Run(name, counts.left, counts.right, turn_rad)
 
     def _typed(self, sign: int, counts: Counts) -> _Movement:
+        """Return the movement of a straight run: its way is typed, its turn by what is typed or by the gyroscope."""
         left, right = self._wanted.expected.step_mm
         counted = abs(counts.left * left + counts.right * right) / 2
-        side = self._wanted.truth == "tape"
-        half = 0.0 if side else self._gyro(counts) / 2
-        what = "mm along the line" + (" and mm to the left of it (right: minus), such as 1497 -12" if side else "")
-        numbers = self._numbers(what, 1 + side, lambda numbers: abs(numbers[0] - counted) < _ODD * counted)
-        along = sign * numbers[0]
-        return arc(along, numbers[1] if side else along * math.tan(half))
+
+        def is_plausible(numbers: list[float]) -> bool:
+            return abs(numbers[0] - counted) < _MOST_DIFFERENCE * counted
+
+        what = "mm along the line"
+        if self._wanted.truth == "tape":
+            what += " and mm to the left of it (right: minus), such as 1497 -12"
+            along, aside = self._numbers(what, 2, is_plausible)
+            return arc(sign * along, aside)
+        half_rad = self._gyro(counts) / 2
+        (along,) = self._numbers(what, 1, is_plausible)
+        return arc(sign * along, sign * along * math.tan(half_rad))
 
     def _numbers(self, what: str, count: int, plausible: Callable[[list[float]], bool]) -> list[float]:
         """Ask for ``count`` numbers until they are plausible; return them."""
@@ -194,9 +206,11 @@ class _Session:
                 numbers = []
             if len(numbers) == count and all(map(math.isfinite, numbers)) and plausible(numbers):
                 return numbers
-            self._person.tell(f"    type {count} number{'s' * (count > 1)} near what its wheels have counted")
+            what_to_type = "1 number" if count == 1 else f"{count} numbers"
+            self._person.tell(f"    type {what_to_type} near what its wheels have counted")
 
     def _gyro(self, counts: Counts) -> float:
+        """Return the turn by the gyroscope, in radians. Raises PebbleError without one."""
         if counts.gyro_rad is None:
             raise PebbleError("no inertial sensor that agrees with the wheels: use --truth tape or tag")
         return counts.gyro_rad
@@ -207,22 +221,26 @@ class _Session:
 
 def arc(along_mm: float, left_mm: float) -> _Movement:
     """Return the movement on an arc to a place, measured along and left of the first heading; backwards is negative."""
-    half = math.atan2(math.copysign(1.0, along_mm) * left_mm, abs(along_mm))
-    return _along(math.copysign(math.hypot(along_mm, left_mm), along_mm), half)
+    half_turn = math.atan2(math.copysign(1.0, along_mm) * left_mm, abs(along_mm))
+    return _on_arc(math.copysign(math.hypot(along_mm, left_mm), along_mm), half_turn)
 
 
 def between(start: Place, end: Place) -> _Movement:
-    """Return the movement on an arc between two places from which one tag was seen."""
-    (near, right), (far, far_right) = ((_floor(place) * 1000, place.angle_rad) for place in (end, start))
-    half = math.atan2(
-        near * math.sin(right) - far * math.sin(far_right), near * math.cos(right) + far * math.cos(far_right)
+    """Return the movement on an arc from which one tag was seen at ``start`` and at ``end`` of it."""
+    before_mm, before_rad = _on_floor_mm(start), start.angle_rad
+    after_mm, after_rad = _on_floor_mm(end), end.angle_rad
+    half_turn = math.atan2(
+        after_mm * math.sin(after_rad) - before_mm * math.sin(before_rad),
+        after_mm * math.cos(after_rad) + before_mm * math.cos(before_rad),
     )
-    return _along(far * math.cos(far_right + half) - near * math.cos(right - half), half)
+    chord_mm = before_mm * math.cos(before_rad + half_turn) - after_mm * math.cos(after_rad - half_turn)
+    return _on_arc(chord_mm, half_turn)
 
 
-def _floor(place: Place) -> float:
-    return math.sqrt(place.distance_m**2 - place.down_m**2)
+def _on_floor_mm(place: Place) -> float:
+    return math.sqrt(place.distance_m**2 - place.down_m**2) * 1000
 
 
-def _along(chord_mm: float, half_rad: float) -> _Movement:
-    return _Movement(chord_mm * (half_rad / math.sin(half_rad) if half_rad else 1.0), 2 * half_rad)
+def _on_arc(chord_mm: float, half_turn_rad: float) -> _Movement:
+    ratio = half_turn_rad / math.sin(half_turn_rad) if half_turn_rad else 1.0  # of the arc to its chord
+    return _Movement(chord_mm * ratio, 2 * half_turn_rad)

@@ -48,10 +48,13 @@ def run(
         refresh()
         if not check.binds(subject):
             continue
-        why = next((why for need in check.needs if (why := need(subject))), "")
+        lacks = (need(subject) for need in check.needs)
+        why = next(filter(None, lacks), "")
         try:
             results = skipped(why) if why else check.run(subject)
-            for result in (results,) if isinstance(results, CheckResult) else results:
+            if isinstance(results, CheckResult):
+                results = (results,)
+            for result in results:
                 yield check, replace(result, what=result.what or check.name)
         except (PebbleError, OSError) as error:  # a connection was lost
             yield check, failed(str(error), "run it again", what=check.name)

@@ -85,9 +85,11 @@ def _program(names: tuple[str, ...], fix: str) -> CheckResult:
 def loudspeaker(config: Config) -> Iterator[CheckResult]:
     """Check that the players of sounds and of an operator's voice are installed, if the config uses them."""
     devices, sounds = config.section(AvDaemon), config.section(SoundboardHandler)
-    talk_back = devices.enabled and devices.audio.enabled
-    wav, raw = sounds.playback.player_command, config.section(Media).audio_receiver.command
-    commands = [wav] * sounds.enabled + [raw] * talk_back
+    commands = []
+    if sounds.enabled:
+        commands.append(sounds.playback.player_command)
+    if devices.enabled and devices.audio.enabled:
+        commands.append(config.section(Media).audio_receiver.command)
     for name in dict.fromkeys(command[0] for command in commands):
         if shutil.which(name) is not None:
             yield ok(f"uses {name}")

@@ -48,9 +48,12 @@ def _suffix_of(field: FieldInfo) -> str:
 
 
 def _section_of(field: FieldInfo) -> type[Section] | None:
+    """Return the class of the section that a key holds, perhaps inside a table or list; None for other values."""
     kind, _ = unwrap(field.type)
-    if get_origin(kind) in (dict, tuple):
-        kind = get_args(kind)[get_origin(kind) is dict]  # of a table's values, or a list's entries
+    if get_origin(kind) is dict:
+        _, kind = get_args(kind)  # of a table's values
+    elif get_origin(kind) is tuple:
+        kind = get_args(kind)[0]  # of a list's entries
     return kind if isinstance(kind, type) and issubclass(kind, Section) else None
 
 
@@ -66,7 +69,8 @@ def _allowed(field: FieldInfo) -> str:
         return " A list."
     if get_origin(kind) is dict:
         return " An object."
-    if kind in (bool, str) and not any(set(meta.extra or ()) - {"parse"} for meta in metas):
+    has_limits = any(set(meta.extra or ()) - {"parse"} for meta in metas)
+    if kind in (bool, str) and not has_limits:
         return ""
     text = expected(kind, metas).partition(":")[0]  # the rules of topics are in the text above
     return f" {text[:1].upper()}{text[1:]}."

@@ -46,11 +46,11 @@ class Observer:
         self._names, self.view = names, RobotView(self.base)
         self.records: deque[Record] = deque(maxlen=_MOST)
         self.listeners: list[Callable[[Message, float], None]] = []  # get each message, and when it arrived (monotonic)
-        #: Returns when the wheels changed (monotonic), and to what, left and right, as seen from outside; else nothing.
-        self.eyes: Callable[[], list[tuple[float, list[float]]]] = list
+        #: Returns each change of the wheels' speeds as seen from outside: when (monotonic), and left and right.
+        self.eyes: Callable[[], list[tuple[float, list[float]]]] = list  # nothing is seen from outside
         self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))
         self._slowest_s = ANSWER_S / 4  # of its answers
-        self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_MOST)
+        self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_MOST)  # with the times, monotonic and epoch
         put_names(transport, names, lambda base: base == self.base and self.view.named)
         for filter_ in filters or (f"{self.base}/{c.OUTGOING}/#",):
             transport.subscribe(filter_, self._take, qos=QoS.DELIVERED, direct=True)
@@ -61,6 +61,7 @@ class Observer:
     # -- what arrives
 
     def read(self) -> None:
+        """Handle the messages that have arrived."""
         while self._arrived:
             message, at, wall = self._arrived.popleft()
             record = self.record_of(message, at)
@@ -71,6 +72,7 @@ class Observer:
                 listener(message, at)
 
     def record_of(self, message: Message, at: float) -> Record:
+        """Return a message with its channel and its decoded value."""
         channel = self._names.channel(message.topic)
         value, wrong = None, ""
         try:
@@ -93,12 +95,7 @@ class Observer:
 
     def wait(self, condition: Callable[[], object], seconds: float) -> bool:
         """Read messages until ``condition`` holds; return False if it does not within ``seconds``."""
-
-        def holds() -> object:
-            self.read()
-            return condition()
-
-        return wait_for(holds, seconds)
+        return wait_for(condition, seconds, self.read)
 
     def look(self, seconds: float) -> float:
         """Read messages for ``seconds``; return the time when that began."""
@@ -109,10 +106,10 @@ class Observer:
     def answers(self, condition: Callable[[], object], seconds: float = ANSWER_S) -> bool:
         """True if ``condition`` becomes true within the time that a robot has for an answer."""
         began = time.monotonic()
-        done = self.wait(condition, seconds)
-        if done:
+        is_met = self.wait(condition, seconds)
+        if is_met:
             self._slowest_s = max(self._slowest_s, time.monotonic() - began)
-        return done
+        return is_met
 
     @property
     def patience_s(self) -> float:

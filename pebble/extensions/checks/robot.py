@@ -56,8 +56,8 @@ def who_drives(config: Config) -> Iterator[CheckResult]:
         yield warn(warning, "pebble fleet init, then the account of this robot")
         return
     yield ok(f"level {level}: it is driven by {_DRIVERS[level]}")
-    folders = _folders(config) if level != "open" else []
-    for folder in folders:
+    folder = _fleet_folder(config) if level != "open" else None
+    if folder is not None:
         try:
             yield ok(_accounts(load(folder)), what=_WHO)
         except FleetError as error:
@@ -81,11 +81,11 @@ def _accounts(fleet: Fleet) -> str:
     return f"{some_of(names, _NAMES_SHOWN) or 'no account'}; programs on the robot itself, too"
 
 
-def _folders(config: Config) -> list[Path]:
-    """Return the folders of the robot's fleet: beside its config, or that of the authority which it trusts."""
+def _fleet_folder(config: Config) -> Path | None:
+    """Return the folder of the robot's fleet, if it is here: beside its config, or beside the authority it trusts."""
     ca_cert = config.services.mqtt_bridge.remote_mqtt.tls.ca_cert
-    places = [config.folder, *([] if ca_cert is None else [Path(ca_cert).parent])]
-    return [folder for folder in (place.absolute() for place in places) if (folder / FLEET).is_file()][:1]
+    folders = [config.folder] if ca_cert is None else [config.folder, Path(ca_cert).parent]
+    return next((folder.absolute() for folder in folders if (folder / FLEET).is_file()), None)
 
 
 def state_directory(path: Path) -> CheckResult:

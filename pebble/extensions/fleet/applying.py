@@ -119,7 +119,7 @@ def pid_of(folder: Path) -> int | None:
 def _is_broker(pid: int) -> bool:
     """True if this process is mosquitto. The pid file is no proof: the folder's owner can write any number there."""
     try:
-        if is_root():  # others see that of their own only; " (deleted)" is behind it after an upgrade
+        if is_root():  # other users see the file of their own processes only; an upgrade adds " (deleted)" to its name
             return bytes(Path(f"/proc/{pid}/exe").readlink()).removesuffix(b" (deleted)").endswith(b"/mosquitto")
         return b"mosquitto" in Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
@@ -128,14 +128,15 @@ def _is_broker(pid: int) -> bool:
 
 def obeys_plugin(folder: Path) -> bool:
     """True if mosquitto uses the dynamic-security plugin, by its configuration or in the running process."""
-    configured, pid = "", pid_of(folder)
+    pid = pid_of(folder)
     with suppress(FileNotFoundError):
         lines = read_plain(folder / CONF).decode().splitlines()
-        configured = "\n".join(line for line in lines if line.startswith("plugin "))
-    # Where it runs as somebody else this may fail, and SIGHUP by this process does not reach it either.
+        if any(line.startswith("plugin ") and _PLUGIN in line for line in lines):
+            return True
+    # Where it runs as another user this may fail, and SIGHUP by this process does not reach it either.
     with suppress(OSError), as_before():
-        configured += Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")
-    return _PLUGIN in configured
+        return _PLUGIN in Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")
+    return False
 
 
 def passwords_of(folder: Path) -> dict[str, broker_files.Hashed]:
@@ -168,7 +169,7 @@ def _reload(folder: Path) -> str:
         with as_before():  # the broker may run as another user than the folder's
             process = os.pidfd_open(pid)
             try:
-                if _is_broker(pid):  # still
+                if _is_broker(pid):  # and no other process that has got its number meanwhile
                     if not _handles_signal(pid):
                         raise FleetError(f"mosquitto (process {pid}) would end by SIGHUP: give this command again")
                     signal.pidfd_send_signal(process, signal.SIGHUP)
@@ -180,15 +181,12 @@ def _reload(folder: Path) -> str:
 
 
 def _handles_signal(pid: int) -> bool:
-    """Wait until mosquitto handles SIGHUP; return whether it does.
-
-    It listens before that, and the signal would end it (2.0.11, measured).
-    """
+    """True if mosquitto handles SIGHUP, now or soon. Just after its start SIGHUP would end it (2.0.11, measured)."""
     deadline = time.monotonic() + _STARTING_S
     while time.monotonic() < deadline:
         status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
-        caught = next((line.split()[1] for line in status.splitlines() if line.startswith("SigCgt:")), "0")
-        if int(caught, 16) >> (signal.SIGHUP - 1) & 1:
+        mask = next((line.split()[1] for line in status.splitlines() if line.startswith("SigCgt:")), "0")
+        if int(mask, 16) >> (signal.SIGHUP - 1) & 1:  # a bit for each signal that it handles
             return True
         time.sleep(0.01)
     return False

@@ -59,8 +59,9 @@ class Audit:
     def write(
         self, what: str, *, ref: str = "", user: str = "", device: str = "", address: str = "", detail: str = ""
     ) -> None:
-        texts = dict(zip(_FIELDS, map(_storable, (ref, user, device, address, detail)), strict=True))
-        refused = what in REFUSED
+        fields = zip(_FIELDS, (ref, user, device, address, detail), strict=True)
+        texts = {field: text[:_MAX_TEXT].encode(errors="replace").decode() for field, text in fields}
+        refused = what in REFUSED  # of these, one row stands for all of a network, whatever names they try
         like = (what, network_of(address)) if refused else None
         self._writer.add({"t": time.time(), "what": what, **texts}, like, OF_STRANGERS if refused else DIFFERENT)
 
@@ -118,7 +119,3 @@ def _take_over(database: sqlite3.Connection) -> None:
         database.execute("DROP TABLE refused")
     database.execute("DROP TABLE IF EXISTS marks")
     database.execute("COMMIT")
-
-
-def _storable(text: str) -> str:
-    return text[:_MAX_TEXT].encode(errors="replace").decode()

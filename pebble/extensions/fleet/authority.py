@@ -105,13 +105,17 @@ def _is_address(host: str) -> bool:
 
 
 def _check_permitted(authority: Authority, hosts: Sequence[str]) -> None:
+    """Raise CertificateError for a host outside of the authority's name constraints."""
     constraints = authority.certificate.extensions.get_extension_for_class(x509.NameConstraints).value
     permitted = constraints.permitted_subtrees or ()
     domains = [f".{name.value}" for name in permitted if isinstance(name, x509.DNSName)]
     networks: list[Any] = [name.value for name in permitted if isinstance(name, x509.IPAddress)]
     for host in hosts:
-        is_in = any(ip_address(host) in net for net in networks) if _is_address(host) else False
-        if not (is_in or f".{host}".endswith(tuple(domains))):
+        if _is_address(host):
+            is_permitted = any(ip_address(host) in network for network in networks)
+        else:
+            is_permitted = f".{host}".endswith(tuple(domains))
+        if not is_permitted:
             raise CertificateError(
                 f"the authority in {authority.file.parent} may not sign for {host}, only for addresses of local "
                 f"networks, names that end in {', '.join(_DOMAINS)}, and those it was made for: use one, or make "

@@ -67,10 +67,11 @@ def conf_text(fleet: Fleet, folder: Path, user: str) -> str:
 
 def acl_text(fleet: Fleet) -> str:
     """Return the text of the file `acl`: the rules of all accounts."""
-    return "".join(
-        f"user {name}\n" + "".join(f"topic {access} {filter_}\n" for access, filter_ in fleet.rules_of(name)) + "\n"
-        for name in fleet.accounts
-    )
+    lines = []
+    for name in fleet.accounts:
+        rules = (f"topic {access} {filter_}" for access, filter_ in fleet.rules_of(name))
+        lines += [f"user {name}", *rules, ""]
+    return "".join(f"{line}\n" for line in lines)
 
 
 def passwords_text(passwords: Mapping[str, Hashed]) -> str:
@@ -91,7 +92,7 @@ def passwords_in(text: str) -> dict[str, Hashed]:
 
 
 def rules_in(acl: str) -> Iterator[str]:
-    """Yield each rule with its account's name; "" for rules before the first account, which apply to all."""
+    """Yield each rule behind its account's name, or behind ``everybody`` if it is before the first account."""
     name = "everybody"
     for line in filter(None, map(str.strip, acl.splitlines())):
         word, _, rest = line.partition(" ")

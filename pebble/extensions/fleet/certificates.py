@@ -112,6 +112,7 @@ def hosts_of(names: Iterable[str]) -> list[str]:
         raise CertificateError(f"a certificate's name {error}") from None
     if not hosts:
         raise CertificateError("name the addresses by which browsers reach the server: robot-lab.local 192.168.1.20")
-    if odd := next((host for host in hosts if "%" in host or "_" in host), ""):
-        raise CertificateError(f"{odd}: a certificate names no network card and no _, leave out what has one")
+    for host in hosts:
+        if "%" in host or "_" in host:
+            raise CertificateError(f"{host}: a certificate names no network card and no _, leave out what has one")
     return hosts

@@ -23,12 +23,12 @@ def of_rules(folder: Path, fleet: Fleet) -> list[str]:
 
 
 def _certificates(folder: Path, fleet: Fleet) -> Iterator[str]:
-    renewed = {folder / certificates.SERVER_CERT: f"`pebble cert renew --folder {folder}`, then restart mosquitto"}
+    renewals = {folder / certificates.SERVER_CERT: f"`pebble cert renew --folder {folder}`, then restart mosquitto"}
     for name in fleet.accounts:
         file = folder / certificates.ACCOUNTS / f"{name}.pem"
         if file.exists():
-            renewed[file] = f"`pebble fleet certificate {name}`, with its hosts, and move it to its machine"
-    for file, how in renewed.items():
+            renewals[file] = f"`pebble fleet certificate {name}`, with its hosts, and move it to its machine"
+    for file, how in renewals.items():
         days = certificates.show(file).days_left
         if days < _SOON_DAYS:
             yield f"{file} ends in {days:.0f} days: {how}"

@@ -54,8 +54,9 @@ class Database:
     @property
     def removed(self) -> str:
         """Return an error text if the file was removed or replaced; else empty."""
-        gone = self._own is not None and not self._own.in_place
-        return f"{self._path} was removed or replaced: put it back, or start the page again" if gone else ""
+        if self._own is None or self._own.in_place:
+            return ""
+        return f"{self._path} was removed or replaced: put it back, or start the page again"
 
     def rows(self, statement: str, values: Sequence[Any] = ()) -> list[Any]:
         """Return the rows that a statement yields. Raises DatabaseError."""
@@ -80,7 +81,7 @@ class Database:
     def _errors(self) -> Iterator[None]:
         try:
             yield
-        except sqlite3.IntegrityError:
+        except sqlite3.IntegrityError:  # for the caller
             raise
         except (OSError, sqlite3.Error) as error:
             raise DatabaseError(self._path, error) from None

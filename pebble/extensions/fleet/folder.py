@@ -16,7 +16,7 @@ from pebble.config import hosts
 from pebble.contract.identity import SERVERS, Identity
 from pebble.contract.names import NAME
 from pebble.errors import ConfigError, PebbleError
-from pebble.extensions.fleet.roles import GATEWAYS, Account, Extra, ProgramRole, Right, Rule, add_up, covered, rules
+from pebble.extensions.fleet.roles import GATEWAYS, Account, Extra, ProgramRole, Right, Rule, conflict, covered, rules
 from pebble.ownership import read_plain
 from pebble.runtime.whole_file import write
 
@@ -122,29 +122,30 @@ def refused(fleet: Fleet, name: str, account: Account) -> str:
         return f"{name!r} is no name: use 1 to 32 of a-z, 0-9, _ and -"
     if name in fleet.accounts:
         return f"{name} exists already, as {', '.join(fleet.accounts[name].roles)}"
-    if why := add_up(account.roles):
+    if why := conflict(account.roles):
         return why
-    gateway = any(role in account.roles for role in (ProgramRole.GATEWAY, ProgramRole.BOARDS))
-    robot = any(role in account.roles for role in (ProgramRole.ROBOT, ProgramRole.NEIGHBOUR))
-    if robot != (len(account.bases) == 1) and not gateway:
+    is_gateway = any(role in account.roles for role in (ProgramRole.GATEWAY, ProgramRole.BOARDS))
+    is_robot = any(role in account.roles for role in (ProgramRole.ROBOT, ProgramRole.NEIGHBOUR))
+    if not is_gateway and len(account.bases) != (1 if is_robot else 0):
         return "a robot, or a neighbour, has one base (--base pebble/robots/goob), and no other account has any"
-    if account.plain and not robot:
+    if account.plain and not is_robot:
         return "only a robot can be plain"
     if account.people and ProgramRole.PAGE not in account.roles:
         return "only a page has people of its own"
     for base in account.bases:
-        if why := _refused_base(base, several=gateway):
+        if why := _refused_base(base, may_be_filter=is_gateway):
             return why
-        same = (user for user, other in fleet.accounts.items() if base in other.bases and other.roles == account.roles)
-        if robot and (owner := next(same, None)) is not None:
-            return f"{base} belongs to {owner}"
+        for owner, other in fleet.accounts.items() if is_robot else ():
+            if base in other.bases and other.roles == account.roles:
+                return f"{base} belongs to {owner}"
     return ""
 
 
-def _refused_base(base: str, *, several: bool) -> str:
+def _refused_base(base: str, *, may_be_filter: bool) -> str:
+    """Return why this base cannot be used; empty if it can. ``may_be_filter``: its levels may be ``+``."""
     levels = base.split("/")
     try:
-        Identity(*(level if level != "+" or not several else "any" for level in levels))
+        Identity(*("any" if level == "+" and may_be_filter else level for level in levels))
     except (ConfigError, TypeError):
         return f"{base!r} is no base: write SYSTEM/TYPE/ID, such as pebble/robots/goob"
     if any(character.isspace() or character == "%" for character in base):

@@ -23,7 +23,6 @@ from pebble.transports.zenoh.session import ALL_MESSAGES, LOCAL, OTHER_MACHINES
 IN, OUT = ("ingress",), ("egress",)  # as the hub sees it
 _COMMANDS = {"priority": "interactive_high", "congestion_control": "drop"}
 _STOPS = {"priority": "real_time", "congestion_control": "block"}
-_FIELDS = ("flows", "messages", "key_exprs")
 
 
 class Grant(NamedTuple):
@@ -57,7 +56,7 @@ class _File(msgspec.Struct, frozen=True):
 
 
 class Access(NamedTuple):
-    """The content of the access file: rules, accounts by their certificate's name, and priorities (:func:`first`)."""
+    """The content of the access file: rules, accounts by their certificate's name, and :func:`priorities`."""
 
     control: Mapping[str, Any]
     accounts: Mapping[str, HubAccount]
@@ -93,7 +92,7 @@ def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dic
     subjects: list[Mapping[str, Any]] = []
     policies: list[dict[str, Any]] = []
     for subject, grants in [(LOCAL, EVERYTHING), *((_named(names), grants) for names, grants in rows if names)]:
-        granted = [rules.setdefault(grant, _rule(len(rules), grant)) for grant in grants if grant.keys]
+        granted = [rules.setdefault(grant, _rule(f"r{len(rules)}", grant)) for grant in grants if grant.keys]
         subjects.append(subject)
         policies.append({"rules": [rule["id"] for rule in granted], "subjects": [subject["id"]]})
     return {
@@ -105,7 +104,7 @@ def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dic
     }
 
 
-def first(commands: Sequence[str], stops: Sequence[str]) -> dict[str, Any]:
+def priorities(commands: Sequence[str], stops: Sequence[str]) -> dict[str, Any]:
     """Return Zenoh's setting ``qos``: from other machines only ``stops`` get the first priority, and only they block.
 
     Otherwise the sender would choose: commands with the first priority would delay stops, and a blocking sender would
@@ -117,8 +116,9 @@ def first(commands: Sequence[str], stops: Sequence[str]) -> dict[str, Any]:
     return {"network": network}
 
 
-def _rule(number: int, grant: Grant) -> dict[str, Any]:
-    return {"id": f"r{number}", "permission": "allow", **dict(zip(_FIELDS, grant, strict=True))}
+def _rule(name: str, grant: Grant) -> dict[str, Any]:
+    allowed = {"flows": grant.flows, "messages": grant.messages, "key_exprs": grant.keys}
+    return {"id": name, "permission": "allow", **allowed}
 
 
 def _named(names: Sequence[str]) -> dict[str, Any]:
@@ -153,20 +153,22 @@ class AccountAdmission(Admission):
             return None
         offered = hello.own if rules.retains else {}
         allowed = {key: digest for key, digest in offered.items() if _any(rules.retains, key_to_topic(key))}
-        return replace(hello, will=self._of_account(account, rules, hello.will), own=allowed)
+        return replace(hello, will=self._allowed_will(account, rules, hello.will), own=allowed)
 
     def owns(self, account: str, session: str) -> bool:
         return not account or session.startswith(account + wire.OF)
 
-    def _of_account(self, account: str, known: HubAccount, will: wire.Will | None) -> wire.Will | None:
+    def _allowed_will(self, account: str, rules: HubAccount, will: wire.Will | None) -> wire.Will | None:
+        """Return a client's will as one of its account; None if there is none, or the account may not leave it."""
         if will is None:
             return None
-        will = replace(will, client=f"{account}{wire.OF}{will.client}")  # so that it is no one else's predecessor
-        if _any(known.wills, will.topic):
+        will = replace(will, client=f"{account}{wire.OF}{will.client}")  # so it replaces no other account's will
+        if _any(rules.wills, will.topic):
             return will
         self.refuse_will(will, "an account leaves a will for its own robot only")
         return None
 
 
 def _any(filters: Sequence[str], topic: str) -> bool:
+    """True if one of the filters matches the topic."""
     return any(matches(filter_, topic) for filter_ in filters)

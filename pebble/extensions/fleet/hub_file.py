@@ -33,8 +33,8 @@ class HubFile(ZenohSection, frozen=True, kw_only=True):
     ] = 1000
 
 
-def load_hub(path: Path) -> tuple[HubFile, Path]:
-    """Read the file; return it and its run directory. Raises ConfigError with all problems."""
+def load_hub(path: Path) -> ZenohSettings:
+    """Read the file; return the settings of its hub. Raises ConfigError with all problems."""
     path = path.absolute()
     raw = decode(read_text(path), path.name)
     reader = Reader(path.parent, os.environ, CHECKS, file=path)
@@ -43,13 +43,8 @@ def load_hub(path: Path) -> tuple[HubFile, Path]:
         reader.notes.problem(("listen",), 'is missing: a hub is reached there, such as ["tls/0.0.0.0:7447"]')
     if reader.notes.problems:
         raise ConfigError(list(dict.fromkeys(f"{path.name}: {problem}" for problem in reader.notes.problems)))
-    return hub, hub.run_dir or default_run_folder(f"hub {path}", os.environ)
-
-
-def settings_of(hub: HubFile, run_dir: Path) -> ZenohSettings:
-    """Return the transport settings of a hub for several robots."""
     return ZenohSettings(
-        run_dir=run_dir,
+        run_dir=hub.run_dir or default_run_folder(f"hub {path}", os.environ),
         listen=hub.listen,
         connect=hub.connect,
         tls=tls_settings(hub.tls),

@@ -15,7 +15,7 @@ from pebble.contract import DRIVE, GROUP, INCOMING, Channel, codec, groups
 from pebble.contract.names import BY, NO_ACCOUNT, stop_topic, unchecked, without_name
 from pebble.contract.payloads import AutonomyCommand, Drive, EstopCommand, MediaRequest, SoundboardCommand
 from pebble.errors import PayloadError
-from pebble.extensions.fleet.rights import WRITES, Right
+from pebble.extensions.fleet.roles import WRITES, Right
 from pebble.forwarding.names import Names, Sender, Signed
 from pebble.forwarding.routing import Drop
 from pebble.forwarding.subjects import Subjects
@@ -53,13 +53,13 @@ class CheckedNames(Names):
     def _find(self, topic: str) -> Sender:
         if not topic.startswith(self._below):
             return Sender(NO_ACCOUNT, topic, self._subjects[topic])
-        bare = without_name(topic)
-        if bare is None:
-            plain = stop_topic(topic)
-            if plain is not None:
-                return Sender(NO_ACCOUNT, plain, self._subjects[plain])
-            return Sender(NO_ACCOUNT, topic, None, Drop.MISNAMED)
-        return Sender(bare.account, bare.topic, self._subjects[bare.topic])
+        named = without_name(topic)
+        if named is not None:
+            return Sender(named.account, named.topic, self._subjects[named.topic])
+        plain = stop_topic(topic)  # a stop counts, whatever name is in its topic
+        if plain is not None:
+            return Sender(NO_ACCOUNT, plain, self._subjects[plain])
+        return Sender(NO_ACCOUNT, topic, None, Drop.MISNAMED)
 
     def sign(self, sender: Sender, message: Message) -> Signed | Drop:
         """Return ``message`` with its sender in the payload, or why it is refused. Called for each message.
@@ -77,21 +77,20 @@ class CheckedNames(Names):
                 return Drop.UNNAMED
         elif (message.retain or message.retain_requested) and payload_type is not EstopCommand:
             return Drop.STALE
-        fields, by = _object(payload), account
         if channel is GROUP and not _is_group(payload):
             return Drop.UNREADABLE
-        if fields is None:
-            if channel is not None and payload_type not in _MAY_BE_BARE:
-                return Drop.UNREADABLE
-        else:
+        fields, by = _object(payload), account
+        if fields is not None:
             body = _body(fields)
             claim = body.get("by")
             if account != NO_ACCOUNT and isinstance(claim, str) and claim:
                 by = _with_person(account, claim[:_LONGEST])
             if payload_type not in _UNSIGNED:
-                fields.pop("by", None)
+                fields.pop("by", None)  # also a claim outside of ``body``
                 body["by"] = by
                 payload = _encoder.encode(fields)
+        elif channel is not None and payload_type not in _MAY_BE_BARE:
+            return Drop.UNREADABLE
         return Signed(_moved(message, sender.topic, payload), by)
 
 
@@ -111,8 +110,9 @@ def _doubted(payload: bytes) -> bytes:
 
 
 def _body(command: dict[str, Any]) -> dict[str, Any]:
-    """Return the JSON object that holds the message's fields."""
-    return inner if isinstance(inner := command.get("value"), dict) else command
+    """Return the JSON object that holds the message's fields: the command itself, or its ``value``."""
+    value = command.get("value")
+    return value if isinstance(value, dict) else command
 
 
 def _is_zero(channel: Channel, payload: bytes) -> bool:
@@ -134,7 +134,7 @@ def _object(payload: bytes) -> dict[str, Any] | None:
     """Return the JSON object in ``payload`` as every reader of the contract parses it; None if they cannot."""
     try:
         usual = payload[:1] == b"{" and payload[-1:] == b"}" and len(payload) <= _USUAL_BYTES
-        if usual and payload.isascii() and b"\0" not in payload:  # else there may be something around it
+        if usual and payload.isascii() and b"\0" not in payload:  # nothing is around the object
             fields = _decoder.decode(payload)
         else:
             fields = codec.plain(DRIVE, payload)

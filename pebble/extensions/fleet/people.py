@@ -76,13 +76,13 @@ class People:
     ) -> None:
         self._lock = threading.Lock()
         self._database = Database(path, _TABLES)
-        self._removed = ""
+        self._removed = ""  # the error that was logged last, if the file was removed
         self._log = RateLimitedLog(log, period_s=60.0)
         #: What the file said of each session when it could be read last, and when that session ends.
         self._seen = BoundedTable[tuple[Session, float]](_SESSIONS, _SESSIONS << 10, lambda _: 1)
         self._clock = clock
         self._addresses, self._names = Tries(monotonic), Tries(monotonic)
-        self._no_hash = _no_hash()  # compared where the name is unknown: the same time
+        self._no_hash = _no_hash()  # compared where the name is unknown, so that this takes as long
 
     def close(self) -> None:
         with self._lock:
@@ -142,7 +142,7 @@ class People:
         looked_up = name if NAME.fullmatch(name) else ""
         rows = self._rows("SELECT name, role, salt, hash FROM people WHERE name = ?", looked_up)
         stored_name, role, salt, expected = rows[0] if rows else ("", "", b"no such person..", self._no_hash)
-        typed = password[: 2 * MAX_PASSWORD]  # so long may one be whose accents are letters of their own
+        typed = password[: 2 * MAX_PASSWORD]  # twice: an accent may be typed as a character beside its letter
         hashes = [_hash(spelling, salt) for spelling in _spellings(typed)]
         is_right = any(hmac.compare_digest(digest, expected) for digest in hashes)
         if not is_right or not stored_name or len(normalize("NFC", typed)) > MAX_PASSWORD:
@@ -155,22 +155,13 @@ class People:
         """Start a session; return its token, which is stored nowhere."""
         token = secrets.token_urlsafe(32)
         now = self._clock()
+        values = (_digest(token), secrets.token_hex(4), user.name, address, now, now + SESSION_S)
         self._change("DELETE FROM sessions WHERE expires <= ?", now)
+        newest = "SELECT digest FROM sessions WHERE name = ? ORDER BY started DESC LIMIT ?"
+        others = f"DELETE FROM sessions WHERE name = ? AND digest NOT IN ({newest})"  # noqa: S608
+        self._change(others, user.name, user.name, _SESSIONS_EACH - 1)
         self._change(
-            "DELETE FROM sessions WHERE name = ? AND digest NOT IN "
-            "(SELECT digest FROM sessions WHERE name = ? ORDER BY started DESC LIMIT ?)",
-            user.name,
-            user.name,
-            _SESSIONS_EACH - 1,
-        )
-        self._change(
-            "INSERT INTO sessions (digest, id, name, address, started, expires) VALUES (?, ?, ?, ?, ?, ?)",
-            _digest(token),
-            secrets.token_hex(4),
-            user.name,
-            address,
-            now,
-            now + SESSION_S,
+            "INSERT INTO sessions (digest, id, name, address, started, expires) VALUES (?, ?, ?, ?, ?, ?)", *values
         )
         return token
 
@@ -263,7 +254,8 @@ def has_user(path: Path | None, name: str = "") -> bool:
 
 
 def _has_user(path: Path, name: str) -> bool:
-    # Writes nothing. What is in a write-ahead log is read, too, which needs a file of SQLite's that only then is there
+    # Writes nothing: ``immutable`` keeps SQLite from making its shared-memory file. Beside a write-ahead log, which has
+    # to be read, that file is there already.
     unchanged = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{unchanged}", uri=True)) as connection:

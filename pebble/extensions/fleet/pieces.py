@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from pebble.extensions.fleet import certificates
-from pebble.extensions.fleet.folder import ZENOH, Fleet, Server
+from pebble.extensions.fleet.folder import ZENOH, Fleet
 from pebble.extensions.fleet.roles import ProgramRole
 
 HUB_PORT = 7447
@@ -60,10 +60,6 @@ def boards_file(fleet: Fleet, name: str, below: str) -> dict[str, Any]:
     return {"id": name, "boards": {"host": server.host, "port": server.port, **login}, "neighbours": neighbours}
 
 
-def host_and_port(server: Server) -> str:
-    return f"[{server.host}]:{server.port}" if ":" in server.host else f"{server.host}:{server.port}"
-
-
 def _at_hub(fleet: Fleet, name: str, ca: str, keys: str) -> dict[str, Any]:
     """Return the settings by which this account connects to the fleet's hub."""
     return {"account": name, "connect": [f"tls/{fleet.brokers[0].host}:{HUB_PORT}"], "tls": _tls(ca, keys)}
@@ -80,5 +76,6 @@ def _who(fleet: Fleet, name: str) -> dict[str, Any]:
     """
     account = fleet.accounts[name]
     parts = dict(zip(("system", "type", "id"), account.bases[0].split("/"), strict=True))
-    robot = {key: part for key, part in parts.items() if key == "id" or part != {"system": "pebble"}.get(key, "robots")}
+    defaults = {"system": "pebble", "type": "robots"}
+    robot = {key: part for key, part in parts.items() if part != defaults.get(key)}
     return {"robot": robot, "security": {"level": "login" if account.plain else fleet.level}}

@@ -17,7 +17,7 @@ import msgspec
 from pebble.config import Config
 from pebble.contract import AUTONOMY_COMMAND, CONTROL, CONTROL_TAKE, ESTOP, ESTOP_RESET, Channel, Kind, codec
 from pebble.contract.names import NO_ACCOUNT
-from pebble.contract.payloads import ControlState, EstopCommand
+from pebble.contract.payloads import AutonomyCommand, ControlState, EstopCommand
 from pebble.errors import PayloadError
 from pebble.extensions.fleet.row_writer import OF_STRANGERS, Row, RowWriter
 from pebble.forwarding.observer import ROBOT, Observer
@@ -40,11 +40,7 @@ _COMMANDS: dict[str, Callable[[Any], Row]] = {
     ESTOP_RESET.suffix: lambda _: {"what": "reset"},
     CONTROL.suffix: lambda request: {"what": "control-released", "id": request.id} if request.ends() else {},
     CONTROL_TAKE.suffix: lambda request: {"what": "control-demanded", "id": request.id},
-    AUTONOMY_COMMAND.suffix: lambda script: (
-        {"what": "script-stop" if script.ends() else "script-start", "file": (script.file or "")[:_FILE]}
-        if script.ends() or script.file
-        else {}
-    ),
+    AUTONOMY_COMMAND.suffix: lambda request: _script_row(request),
 }
 
 
@@ -62,7 +58,7 @@ class Audit(Observer):
         self._level = config.security.level
         self._writer = RowWriter(self._append, clock)
         self._holder: ControlState | None = None  # None: not known yet
-        self._stops = deque[tuple[str, str]](maxlen=_STOPS)
+        self._stops = deque[tuple[str, str]](maxlen=_STOPS)  # those that have a row: name and sender
 
     def start(self) -> None:
         self._writer.start()
@@ -77,18 +73,18 @@ class Audit(Observer):
 
     def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
         """Add a row for a message that passed, without its parameters and keys."""
-        says = _COMMANDS.get(channel.suffix)
-        if says is None and channel.kind not in (Kind.FLAG, Kind.ACTION):
+        row_of = _COMMANDS.get(channel.suffix)
+        if row_of is None and channel.kind not in (Kind.FLAG, Kind.ACTION):
             return
         with suppress(PayloadError):
-            if says is not None:
+            if row_of is not None:
                 command = codec.decode(channel, payload)
-                row, who = says(command), _sender(by, command)
+                row, who = row_of(command), _sender(by, command)
                 if row and not self._noted_before(row.get("stop", ""), who):
                     self.note(who=who, **_place(by), **row)
             else:
                 on = bool(payload) and bool(codec.decode(channel, payload))
-                if on or channel.kind is Kind.FLAG:
+                if on or channel.kind is Kind.FLAG:  # an action that is not "on" does nothing
                     name = channel.metric.removeprefix("flags/")
                     self.note(channel.kind.name.lower(), _sender(by), **_place(by), name=name, on=on)
 
@@ -141,6 +137,12 @@ class Audit(Observer):
             raise
         finally:
             os.close(file)
+
+
+def _script_row(request: AutonomyCommand) -> Row:
+    if not request.ends() and not request.file:
+        return {}
+    return {"what": "script-stop" if request.ends() else "script-start", "file": (request.file or "")[:_FILE]}
 
 
 def _sender(by: str | None, command: Any = None) -> str:

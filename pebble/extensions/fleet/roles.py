@@ -1,7 +1,7 @@
 """The table of roles and the rights of each.
 
 The rules of brokers, the rights of people on the operator page, and the tables of docs/ext/fleet.md are made from it.
-The channels of each right are in rights.py.
+A robot uses ``WRITES``, the commands that each right permits, for commands without an account.
 """
 
 import re
@@ -18,10 +18,48 @@ from pebble.contract import channels as c
 from pebble.contract.identity import GATEWAYS as GATEWAYS
 from pebble.contract.identity import SERVERS
 from pebble.contract.names import BY
-from pebble.extensions.fleet.rights import WRITES as WRITES
-from pebble.extensions.fleet.rights import Right as Right
 
 _ANY = "+/+/+"  # any component
+
+
+class Right(StrEnum):
+    """A right on a robot, or at the page."""
+
+    LOOK = "look"
+    STOP = "stop"
+    DRIVE = "drive"
+    RESET = "reset"
+    TAKE = "take"
+    SYSTEM = "system"
+    EXPAND = "expand"
+    PEOPLE = "people"
+
+
+#: The commands that a right allows: channels of the contract, or metrics below ``incoming/``.
+WRITES: Mapping[Right, tuple[Channel | str, ...]] = {
+    Right.LOOK: (c.VIDEO_CONTROL,),
+    Right.STOP: (c.ESTOP,),
+    Right.DRIVE: (
+        c.DRIVE,
+        c.GROUP,  # all that may be in it is in this right
+        c.CONTROL,
+        c.LIGHTS_SOLID,
+        c.LIGHTS_FLASH,
+        c.AUDIO_CONTROL,
+        c.AUDIO_STREAM,
+        c.SOUNDBOARD_COMMAND,
+        c.AUTONOMY_COMMAND,
+        c.MCU_COMMAND,
+        c.OUTLET_COMMAND,
+        c.MIP_RAW,
+        c.MQTT_AUDIO,
+        c.MQTT_VIDEO,
+    ),
+    Right.RESET: (c.ESTOP_RESET,),
+    Right.TAKE: (c.CONTROL_TAKE,),
+    Right.SYSTEM: (c.REBOOT, c.SERVICE_RESTART, c.GIT_PULL, c.REMOTE_MIRROR),
+    Right.EXPAND: (c.EXPANDER,),  # who may not publish streams must not say so: a robot would send none by themselves
+}
 
 
 class Role(StrEnum):
@@ -63,8 +101,7 @@ _RIGHTS: Mapping[str, frozenset[Right]] = {
     ProgramRole.EXPANDER: frozenset({Right.EXPAND}),
 }
 ROLES = tuple(_RIGHTS)
-#: Roles that go with no other one, but for a page that is also an expander.
-_ALONE = frozenset(ProgramRole)
+_ALONE = frozenset(ProgramRole)  # roles that go with no other one, but for these two:
 _BOTH = {ProgramRole.PAGE, ProgramRole.EXPANDER}
 
 
@@ -105,7 +142,7 @@ class Session:
     role: Role
 
 
-#: What a browser on the same machine gets where there is no login.
+#: The login of a browser on the same machine where there is no login.
 LOCAL = Session("local", "local", Role.ADMIN)
 
 
@@ -128,13 +165,15 @@ def right_of(channel: Channel) -> str:
     return next(right.value for right, channels in WRITES.items() if channel in channels)
 
 
-def add_up(roles: Sequence[str]) -> str:
+def conflict(roles: Sequence[str]) -> str:
     """Return why these roles cannot be combined in one account; empty if they can."""
-    unknown = [role for role in roles if role not in _RIGHTS]
-    if unknown or not roles:
-        return f"{unknown[0] if unknown else ''!r} is no role: use {', '.join(ROLES)}"
+    for role in roles or ("",):
+        if role not in _RIGHTS:
+            return f"{role!r} is no role: use {', '.join(ROLES)}"
+    if len(set(roles)) == 1 or set(roles) == _BOTH:
+        return ""
     alone = [role for role in roles if role in _ALONE]
-    return f"{alone[0]} goes with no other role" if alone and len(set(roles)) > 1 and set(roles) != _BOTH else ""
+    return f"{alone[0]} goes with no other role" if alone else ""
 
 
 def rules(
@@ -176,18 +215,20 @@ def covered(right: Right, metric: str) -> str:
 
 def _overlap(filter_: str, other: str) -> bool:
     """True if some topic matches both filters, which have no #."""
-    levels = filter_.split("/"), other.split("/")
-    same = all("+" in pair or pair[0] == pair[1] for pair in zip(*levels, strict=False))
-    return len(levels[0]) == len(levels[1]) and same
+    levels, other_levels = filter_.split("/"), other.split("/")
+    pairs = zip(levels, other_levels, strict=False)
+    return len(levels) == len(other_levels) and all(level == other or "+" in (level, other) for level, other in pairs)
 
 
 def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
+    """Yield the rules of an account for its bases: of a robot, a neighbour or a gateway."""
     for base in account.bases:
         if ProgramRole.NEIGHBOUR in account.roles:
-            yield from _of_neighbour(base) if at_hub else ()
-        elif ProgramRole.BOARDS in account.roles and at_hub:
-            return
+            if at_hub:
+                yield from _of_neighbour(base)
         elif ProgramRole.ROBOT in account.roles or ProgramRole.BOARDS in account.roles:
+            if at_hub and ProgramRole.BOARDS in account.roles:
+                return  # its robots are at a broker
             yield from (Rule(access, f"{base}/#") for access in ("read", "write"))
             if ProgramRole.ROBOT in account.roles and not at_hub:
                 yield Rule("write", f"{c.SHORT}{name}")

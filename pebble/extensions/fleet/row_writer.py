@@ -29,11 +29,12 @@ class RowWriter:
     def __init__(self, store: Callable[[list[Row]], None], clock: Callable[[], float] = time.monotonic) -> None:
         self._store, self._clock = store, clock
         self._lock = threading.Lock()  # guards what follows
-        self._counts: dict[Hashable, tuple[Row, int]] = {}  # of this window: the newest similar row, copies not stored
-        self._since = 0.0
+        #: By a key that similar rows share: the newest one in this window, and how many were not stored.
+        self._counts: dict[Hashable, tuple[Row, int]] = {}
+        self._since = 0.0  # when the window began
         self._rows: list[Row] = []  # that wait
-        self._lost = 0
-        self._saved = True
+        self._lost = 0  # rows for which there was no room
+        self._saved = True  # did ``store`` take the rows when it was called last?
         self._wake, self._closing = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
 
@@ -91,6 +92,7 @@ class RowWriter:
             self._store_all()
 
     def _store_all(self) -> None:
+        """Store the waiting rows, and how many are lost; if that fails, they go on waiting."""
         with self._lock:
             waiting, lost = len(self._rows), self._lost
             rows = [*self._rows]

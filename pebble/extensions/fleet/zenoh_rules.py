@@ -13,7 +13,7 @@ from pebble.extensions.fleet.hub_access import (
     Grant,
     HubAccount,
     access_control,
-    first,
+    priorities,
     written,
 )
 from pebble.extensions.fleet.roles import Account, ProgramRole, Rule
@@ -34,7 +34,7 @@ def zenoh_text(fleet: Fleet) -> bytes:
         for name, account in fleet.accounts.items()
     )
     stops = _keys((_STOP, with_name(_STOP, "+")))
-    return written(Access(access_control(rows), accounts, first(_keys([f"{_ANY}/{INCOMING}/#"]), stops)))
+    return written(Access(access_control(rows), accounts, priorities(_keys([f"{_ANY}/{INCOMING}/#"]), stops)))
 
 
 def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
@@ -43,9 +43,9 @@ def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
     A robot may retain what it publishes, and leave its will there. Others may retain flags without an account's name.
     """
     writes = [rule.filter for rule in held if rule.access == "write"]
-    robot = ProgramRole.ROBOT in account.roles
-    wills = [f"{base}/{OUTGOING}/#" for base in account.bases if robot]
-    whole = [filter_ for filter_ in writes if robot and filter_.endswith("/#")]
+    is_robot = ProgramRole.ROBOT in account.roles
+    wills = [f"{base}/{OUTGOING}/#" for base in account.bases if is_robot]
+    whole = [filter_ for filter_ in writes if is_robot and filter_.endswith("/#")]
     flags = [filter_ for filter_ in writes if filter_.endswith(_FLAGS)]
     return HubAccount(tuple(wills), tuple(dict.fromkeys((*wills, *whole, *flags))))
 
@@ -57,7 +57,7 @@ def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: 
         return
     reads, writes = (_keys(rule.filter for rule in held if rule.access == access) for access in ("read", "write"))
     asks = tuple(wire.asked(kind, name) for kind in (wire.HELLO, wire.BYE))
-    retained, hubs, counts = _retained(reads), (f"{wire.UP}*",), (f"{wire.SYNC}*",)
+    retained, running_hubs, counts = _retained(reads), (f"{wire.UP}*",), (f"{wire.SYNC}*",)
     yield Grant(OUT, ("put",), reads)
     yield Grant(IN, ("declare_subscriber",), reads)
     yield Grant(IN, ("put",), (*writes, *_retained(_keys(retains))))
@@ -67,8 +67,8 @@ def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: 
         yield Grant(IN, ("query",), keys)
         yield Grant(OUT, ("reply", "declare_queryable"), keys)
     yield Grant(IN, ("liveliness_token",), (f"{wire.LIVE}{name}{wire.OF}$*",))
-    yield Grant(IN, ("liveliness_query", "declare_liveliness_subscriber"), hubs)
-    yield Grant(OUT, ("liveliness_token",), hubs)
+    yield Grant(IN, ("liveliness_query", "declare_liveliness_subscriber"), running_hubs)
+    yield Grant(OUT, ("liveliness_token",), running_hubs)
 
 
 def _retained(keys: Iterable[str]) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from pebble.runtime.connections import REMOTE_RECONNECT_S
 from pebble.transports import MqttSettings
 
 if TYPE_CHECKING:
-    from pebble.extensions.foxglove.run import Settings, Summary
+    from pebble.extensions.foxglove.run import Summary
 
 
 def foxglove(
@@ -51,7 +51,7 @@ def foxglove(
             f"--host {host}: other machines could watch and listen without a login, because Foxglove's protocol has "
             f"none: use `ssh -L {port}:127.0.0.1:{port} MACHINE` from there, or add --no-login"
         )
-    from pebble.extensions.foxglove.run import run
+    from pebble.extensions.foxglove.run import Settings, run
 
     target = Target(
         config=config,
@@ -62,17 +62,12 @@ def foxglove(
         ca_cert=ca_cert,
         program="foxglove",
     )
-    _print_end(run(_settings(target, host, port), _print_ready))
-    return 0
-
-
-def _settings(target: Target, host: str, port: int) -> Settings:
-    from pebble.extensions.foxglove.run import Settings
-
     _, broker, names, where = resolve(target)
     if not isinstance(broker, MqttSettings):
         raise PebbleError("Foxglove needs the robots' broker: use --url mqtt://HOST[:PORT] or mqtts://…")
-    return Settings(replace(broker, reconnect_max_s=REMOTE_RECONNECT_S), where, names.base, host, port)
+    broker = replace(broker, reconnect_max_s=REMOTE_RECONNECT_S)
+    _print_end(run(Settings(broker, where, names.base, host, port), _print_ready))
+    return 0
 
 
 def _print_ready(address: str) -> None:
@@ -82,8 +77,9 @@ def _print_ready(address: str) -> None:
 
 
 def _print_end(summary: Summary) -> None:
-    lost = [f", {summary.dropped:,} dropped"] * bool(summary.dropped)
-    refused = [f", {summary.refused:,} that cannot be shown"] * bool(summary.refused)
-    typer.echo(
-        "".join([f"Showed {summary.robots} robots in {summary.published:,} messages", *lost, *refused]), err=True
-    )
+    line = f"Showed {summary.robots} robots in {summary.published:,} messages"
+    if summary.dropped:
+        line += f", {summary.dropped:,} dropped"
+    if summary.refused:
+        line += f", {summary.refused:,} that cannot be shown"
+    typer.echo(line, err=True)

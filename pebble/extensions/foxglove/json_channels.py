@@ -27,14 +27,14 @@ def json_spec(topic: str, channel: Channel | None) -> ChannelSpec:
 
 @cache
 def _schema_of(suffix: str, payload: type) -> tuple[str, bytes]:
-    document = schemas()
-    fitted = _value(document["topics"][suffix], document["$defs"], 0)
-    if payload is AnyObject or fitted is None or fitted["type"] != "object":
+    document, name = schemas(), f"pebble.{payload.__name__}"
+    reduced = _reduced(document["topics"][suffix], document["$defs"], 0)
+    if payload is AnyObject or reduced is None or reduced["type"] != "object":
         return _ANY, b""
-    return f"pebble.{payload.__name__}", msgspec.json.encode({"title": f"pebble.{payload.__name__}", **fitted})
+    return name, msgspec.json.encode({"title": name, **reduced})
 
 
-def _value(schema: dict[str, Any], definitions: dict[str, Any], depth: int) -> dict[str, Any] | None:
+def _reduced(schema: dict[str, Any], definitions: dict[str, Any], depth: int) -> dict[str, Any] | None:
     """Return a schema in the subset that Foxglove reads: plain types, objects with known fields, arrays of these.
 
     None if it cannot be expressed so.
@@ -42,17 +42,17 @@ def _value(schema: dict[str, Any], definitions: dict[str, Any], depth: int) -> d
     if depth > _DEEPEST:
         return None
     if "$ref" in schema:
-        return _value(definitions[schema["$ref"].rpartition("/")[2]], definitions, depth + 1)
+        return _reduced(definitions[schema["$ref"].rpartition("/")[2]], definitions, depth + 1)
     if "anyOf" in schema:
         kinds = [kind for kind in schema["anyOf"] if kind.get("type") != "null"]
-        return _value(kinds[0], definitions, depth + 1) if len(kinds) == 1 else None
+        return _reduced(kinds[0], definitions, depth + 1) if len(kinds) == 1 else None
     kind = schema.get("type")
     if kind in _PLAIN:
         return {"type": kind}
     if kind == "object" and schema.get("properties"):
-        fields = {name: _value(field, definitions, depth + 1) for name, field in schema["properties"].items()}
+        fields = {name: _reduced(field, definitions, depth + 1) for name, field in schema["properties"].items()}
         return None if None in fields.values() else {"type": "object", "properties": fields}
     if kind == "array" and isinstance(schema.get("items"), dict):
-        item = _value(schema["items"], definitions, depth + 1)
+        item = _reduced(schema["items"], definitions, depth + 1)
         return None if item is None or item["type"] == "array" else {"type": "array", "items": item}
     return None

@@ -61,7 +61,7 @@ class MediaFeed:
         self._work = asyncio.Event()
         self._robot, self._medium = robot, medium
         self._server, self._schemas, self._media = server, schemas, Media(schemas)
-        self._topic = _CHANNEL[medium].topic(robot.base)  # the robot's; the channels are below it
+        self._topic = _CHANNEL[medium].topic(robot.base)  # the robot's; Foxglove's channels are below it
         self._request = SharedRequest(broker, robot.base, medium, self.receive)
         self._sequence = PictureSequence()
         self._arriving = ""  # the encoding of the newest picture
@@ -77,7 +77,7 @@ class MediaFeed:
         return channels
 
     def wake(self, ending: str, *, subscribed: bool) -> None:
-        """Note that a client has subscribed or unsubscribed."""
+        """Note that a client has subscribed to the channel with this end of its topic, or unsubscribed."""
         self.wants_keyframe = self.wants_keyframe or (subscribed and ending == VIDEO[1])
         self._request.want(self._is_wanted())
 
@@ -88,6 +88,7 @@ class MediaFeed:
             tasks.create_task(self._run_conversion())
 
     def receive(self, payload: bytes) -> None:
+        """Keep a payload of the robot for conversion, or refuse it."""
         is_readable = self._take_picture(payload) if self._medium == "video" else payload.startswith(PBAT)
         if not is_readable or len(payload) > MAX_PAYLOAD:
             self.refused += 1
@@ -137,6 +138,7 @@ class MediaFeed:
     # -- requests
 
     def _kinds(self) -> tuple[tuple[str, str], ...]:
+        """Return the Foxglove channels for this medium: schema, and end of the topic."""
         if self._medium == "audio":
             return (SOUND,)
         return (VIDEO, IMAGE) if "h264" in offered(self._robot.capabilities, "video") else (IMAGE,)
@@ -210,6 +212,7 @@ class MediaFeed:
                     self._publish(convert, waiting)
 
     def _converters(self, waiting: Waiting) -> list[tuple[Callable[[str, bytes], Converted | None], str]]:
+        """Return how this payload is converted for each channel that can show it, with the end of its topic."""
         if self._medium == "audio":
             return [(self._media.sound, SOUND[1])]
         image = (self._media.image, IMAGE[1])

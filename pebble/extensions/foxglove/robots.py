@@ -28,9 +28,13 @@ _MEDIA: Final[tuple[Medium, ...]] = ("video", "audio")
 
 
 def filters(base: str) -> list[str]:
-    """Return the topic filters for the telemetry of these robots, without pictures and sound."""
-    every = list(dict.fromkeys(channel.filter(base) for channel in (*FLEET, *WATCHED, *SYNONYMS)))
-    return [filter_ for filter_ in every if not any(other != filter_ and matches(other, filter_) for other in every)]
+    """Return the topic filters for the telemetry of these robots, without pictures and sound. None covers another."""
+    filters_ = list(dict.fromkeys(channel.filter(base) for channel in (*FLEET, *WATCHED, *SYNONYMS)))
+
+    def is_covered(filter_: str) -> bool:
+        return any(wider != filter_ and matches(wider, filter_) for wider in filters_)
+
+    return [filter_ for filter_ in filters_ if not is_covered(filter_)]
 
 
 class Robots:
@@ -42,7 +46,7 @@ class Robots:
         self._broker, self._server, self._schemas = broker, server, schemas
         self._telemetry = Telemetry(schemas)
         self._feeds: dict[tuple[str, Medium], MediaFeed] = {}
-        self._by_channel: dict[str, MediaFeed] = {}
+        self._by_channel: dict[str, MediaFeed] = {}  # by the topic of a Foxglove channel
         self._tasks: set[asyncio.Task[None]] = set()
         broker.is_named = lambda base: base in self.robots and self.robots[base].named
 

@@ -46,10 +46,15 @@ async def serve(
 ) -> Summary:
     """Serve until the event of ``ending`` is set; ``on_ready`` gets the address. Raises PebbleError."""
     loop, broker, schemas = asyncio.get_running_loop(), Broker(settings.broker, "pebble-foxglove"), Schemas()
-    server = Server("Pebble", lambda topic, on: _call(loop, robots, topic, on))
+    server = Server("Pebble", lambda topic, subscribed: _wake(loop, robots, topic, subscribed))
     robots = Robots(broker, server, schemas)
     address = server.start(settings.host, settings.port)
-    broker.on_state(lambda: None if broker.connected else server.report(f"{settings.where}: {broker.problem}"))
+
+    def report_connection() -> None:
+        if not broker.connected:
+            server.report(f"{settings.where}: {broker.problem}")
+
+    broker.on_state(report_connection)
     work = asyncio.create_task(_show(settings, broker, robots, lambda: on_ready(address)))
     try:
         with ending as ended:
@@ -78,7 +83,7 @@ async def _show(settings: Settings, broker: Broker, robots: Robots, on_ready: Ca
     await asyncio.Event().wait()
 
 
-def _call(loop: asyncio.AbstractEventLoop, robots: Robots, topic: str, on: bool) -> None:
-    """Call ``robots`` on the event loop's thread after a subscription or its end; do nothing if the loop has ended."""
+def _wake(loop: asyncio.AbstractEventLoop, robots: Robots, topic: str, subscribed: bool) -> None:
+    """Call ``robots.wake`` on the event loop's thread; do nothing if the loop has ended."""
     with contextlib.suppress(RuntimeError):
-        loop.call_soon_threadsafe(lambda: robots.wake(topic, subscribed=on))
+        loop.call_soon_threadsafe(lambda: robots.wake(topic, subscribed=subscribed))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 BACKLOG, MAX_BYTES = 128, 1 << 20
 #: Of one remembered message, and of all together.
 MAX_REMEMBERED, MAX_REMEMBERED_BYTES = 64 << 10, 32 << 20
-_PAUSE_EVERY, _PAUSE_S = 16, 0.002  # new channels: the SDK ends a client for whom 128 of them wait
+_PAUSE_EVERY, _PAUSE_S = 16, 0.002  # after so many new channels: the SDK ends a client for whom 128 of them wait
 _HOW: Final = 'pip install "pebble-robot[foxglove]"'
 
 
@@ -115,14 +115,14 @@ class Server:
         ``remember``: send it to clients that subscribe later, too.
         """
         channel = self._channels.get(topic)
-        fits = channel is not None and len(data) <= MAX_BYTES
         with self._lock:
-            self.published += fits
-            self.dropped += not fits
-            if fits and (remember or topic in self._remembered):
+            if channel is None or len(data) > MAX_BYTES:
+                self.dropped += 1
+                return
+            self.published += 1
+            if remember or topic in self._remembered:
                 self._remember(topic, _Remembered(data, log_ns))
-        if channel is not None and fits:
-            channel.log(data, log_time=log_ns)
+        channel.log(data, log_time=log_ns)
 
     def report(self, text: str) -> None:
         """Show a problem to Foxglove's users."""

@@ -1,4 +1,4 @@
-"""Simulated robots, the demo, comparisons, and the rig that starts them."""
+"""Simulated robots, the demo, the comparisons of ``pebble bench``, and the rig, which starts their processes."""
 
 from pebble.extension import Command, Extension
 

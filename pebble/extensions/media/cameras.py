@@ -67,29 +67,28 @@ class Camera:
     def __next__(self) -> Picture:
         end = None if self._timeout is None else time.monotonic() + self._timeout
         while True:
-            frame = self._reader.read(None if end is None else max(0.0, end - time.monotonic()))
+            remaining_s = None if end is None else max(0.0, end - time.monotonic())
+            frame = self._reader.read(remaining_s)
             if frame is None and self._reader.closed:
                 raise StopIteration
             if frame is None:
                 raise DeviceError(f"no picture for {self._timeout:g} s from the camera in {self._run_dir}")
-            try:
-                return self._picture(frame)
-            except PayloadError as error:
-                log.warning("%s", error)
+            picture = self._picture(frame)
+            if picture is not None:
+                return picture
 
     def newest(self) -> Picture | None:
         """Return the newest picture that was not returned before, or None. Does not wait."""
         frame = self._reader.read(0.0)
-        if frame is None:
-            return None
+        return None if frame is None else self._picture(frame)
+
+    def _picture(self, frame: Frame) -> Picture | None:
+        """Return the picture of a frame; None, with a warning, if it cannot be decoded."""
         try:
-            return self._picture(frame)
+            picture = frame.picture(self._width)
         except PayloadError as error:
             log.warning("%s", error)
             return None
-
-    def _picture(self, frame: Frame) -> Picture:
-        picture = frame.picture(self._width)
         self.frame = frame
         return picture
 
@@ -109,7 +108,9 @@ class Camera:
 
 
 def _run_dir(robot: str | Path, env: Mapping[str, str]) -> Path:
+    """Return the run directory of a running robot, named as in :func:`camera`. Raises DeviceError."""
     text, path = str(robot), Path(robot)
+    # A text such as "goob" is an id, also where there is a folder of that name.
     if path.is_dir() and (isinstance(robot, Path) or path.is_absolute()):
         return path.absolute()
     places = [load(path, env, lenient=True).run_dir()] if text.endswith(".json") else _usual_places(text, env)
@@ -124,11 +125,11 @@ def _run_dir(robot: str | Path, env: Mapping[str, str]) -> Path:
 
 
 def _usual_places(robot: str, env: Mapping[str, str]) -> list[Path]:
-    """Return the usual run directories of a robot: in this environment, and without a login's folder."""
+    """Return the usual run directories of a robot: that in this environment, and that of a robot without a login."""
     levels = robot.split("/")
     if len(levels) not in (1, 3):
         raise ConfigError(f"camera: {robot} is neither a robot's id nor a base topic nor a config file")
-    usual = Robot(id=robot)
-    identity = Identity(*levels) if len(levels) == 3 else Identity(usual.system, usual.type, usual.id)
-    bare = {name: value for name, value in env.items() if name not in ("XDG_RUNTIME_DIR", "RUNTIME_DIRECTORY")}
-    return list(dict.fromkeys(default_run_folder(identity.base, variables) for variables in (env, bare)))
+    defaults = Robot(id=robot)
+    identity = Identity(*levels) if len(levels) == 3 else Identity(defaults.system, defaults.type, robot)
+    without_login = {key: text for key, text in env.items() if key not in ("XDG_RUNTIME_DIR", "RUNTIME_DIRECTORY")}
+    return list(dict.fromkeys(default_run_folder(identity.base, variables) for variables in (env, without_login)))

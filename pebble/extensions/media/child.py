@@ -64,7 +64,7 @@ class Child:
         with self._lock:
             if self.code is None:
                 with suppress(ProcessLookupError, PermissionError):
-                    os.killpg(self.pid, signal.SIGKILL)
+                    os.killpg(self.pid, signal.SIGKILL)  # the programs that it started
                 self.code = self._process.wait()
         return self.code
 
@@ -80,7 +80,7 @@ class Child:
         threading.Thread(target=lambda: ended(self.wait() or 0), name=name, daemon=True).start()
 
     def _has_ended(self, *, wait: bool) -> bool:
-        """True if the program is a zombie, or was reaped by another thread."""
+        """True if the program is a zombie, or was reaped by another thread. ``wait``: for the program's end."""
         try:
             return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT | (0 if wait else os.WNOHANG)) is not None
         except ChildProcessError:

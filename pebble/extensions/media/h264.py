@@ -60,7 +60,7 @@ class H264Encoder:
         self._context: av.VideoCodecContext | None = None
         self._opened_for: tuple[object, ...] = ()
         self._count = 0
-        self._i420: Pixels | None = None
+        self._i420: Pixels | None = None  # the last picture as the codec takes it; cv2 writes the next one into it
         self._reduced: Pixels | None = None  # the picture with which others are compared
         self._resting = 0  # pictures that have not differed from it
 
@@ -69,16 +69,17 @@ class H264Encoder:
         height, width = picture.shape[0] & ~1, picture.shape[1] & ~1
         if min(height, width) < SMALLEST_EDGE:
             raise PebbleError(f"h264: a picture of {picture.shape[1]}x{picture.shape[0]} is too small")
-        context = self._ready(width, height, quality, rests=self._rests(picture))
-        even, buffer = picture[:height, :width], self._fitting(width, height)
-        self._i420 = cast(Pixels, cv2.cvtColor(even, cv2.COLOR_BGR2YUV_I420, buffer))
+        settings = (width, height, quality, self._rests(picture))
+        if self._context is None or self._opened_for != settings:
+            self._context, self._opened_for = self._open(*settings), settings
+        self._i420 = cast(Pixels, cv2.cvtColor(picture[:height, :width], cv2.COLOR_BGR2YUV_I420, self._i420))
         frame = self._av.VideoFrame.from_ndarray(self._i420, "yuv420p")
         frame.pts = self._count
         self._count += 1
         if keyframe:
             frame.pict_type = self._av.video.frame.PictureType.I
         try:
-            packets = context.encode(frame)
+            packets = self._context.encode(frame)
         except self._av.error.FFmpegError as error:
             self._context = None
             raise PebbleError(f"h264: {error}") from None
@@ -93,13 +94,7 @@ class H264Encoder:
         self._resting += 1
         return self._resting > self._rate * _REST_S
 
-    def _ready(self, width: int, height: int, quality: float, *, rests: bool) -> av.VideoCodecContext:
-        settings = (width, height, quality, rests)
-        if self._context is None or self._opened_for != settings:
-            self._context, self._opened_for = self._open(width, height, quality, rests=rests), settings
-        return self._context
-
-    def _open(self, width: int, height: int, quality: float, *, rests: bool) -> av.VideoCodecContext:
+    def _open(self, width: int, height: int, quality: float, rests: bool) -> av.VideoCodecContext:
         context: av.VideoCodecContext = self._av.CodecContext.create("libx264", "w")
         context.width, context.height, context.pix_fmt = width, height, "yuv420p"
         context.time_base, context.framerate = 1 / self._rate, self._rate
@@ -109,14 +104,10 @@ class H264Encoder:
         context.colorspace = 6  # SMPTE 170M, what cv2 converts to
         context.color_range = 1  # 16..235
         # No look-ahead, no waiting; veryfast: 3 ms for 640x480 where medium takes 10 and saves nothing at this latency.
-        more = "scenecut=0" + (f":ipratio={_SHARPER}" if rests else "")
-        options = {"preset": "veryfast", "tune": "zerolatency", "forced-idr": "1", "x264-params": more}
+        parameters = "scenecut=0" + (f":ipratio={_SHARPER}" if rests else "")
+        options = {"preset": "veryfast", "tune": "zerolatency", "forced-idr": "1", "x264-params": parameters}
         context.options = options | {"crf": f"{quality_to_crf(quality):.2f}"}
         return context
-
-    def _fitting(self, width: int, height: int) -> Pixels | None:
-        shape = (height * 3 // 2, width)
-        return self._i420 if self._i420 is not None and self._i420.shape == shape else None
 
 
 class H264Decoder:

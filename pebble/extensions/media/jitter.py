@@ -10,8 +10,8 @@ import numpy as np
 
 from pebble.errors import PayloadError
 from pebble.extensions.media.packets import SEQUENCE_LIMIT, Sound
-from pebble.extensions.media.pcm import Samples, to_bytes, to_int16
-from pebble.extensions.media.sound import ReceivedSound, SoundDecoder, unpack
+from pebble.extensions.media.pcm import Samples, to_int16
+from pebble.extensions.media.sound import DecodedSound, ReceivedSound, SoundDecoder, unpack
 from pebble.transports.counters import Counters
 
 _NUMBERS: Final = SEQUENCE_LIMIT - 1  # 1 to 0xFFFFFFFF: 0 is not used
@@ -25,22 +25,10 @@ _DELAY_LIMIT_S: Final = 0.2  # a caller that takes this late does not have to ca
 
 
 @dataclass(frozen=True, slots=True)
-class Chunk:
-    """Samples to play next: (samples, channels)."""
+class Chunk(DecodedSound):
+    """The sound to play next."""
 
-    samples: Samples
-    rate: int
-    channels: int
     concealed: bool = False
-
-    @property
-    def pcm(self) -> bytes:
-        """Interleaved s16le."""
-        return to_bytes(self.samples)
-
-    @property
-    def seconds(self) -> float:
-        return len(self.samples) / self.rate
 
 
 def ahead(sequence: int, of: int) -> int:
@@ -63,13 +51,14 @@ class Depth:
 
     def __init__(self, target_s: float) -> None:
         self.target_s = self._least_s = target_s
-        self._lowest = float("inf")
+        self._lowest = float("inf")  # seconds of sound that waited at least, in this window
         self._window_began = self._calm_since = float("-inf")
 
     def begin(self, now: float) -> None:
         self._lowest, self._window_began, self._calm_since = float("inf"), now, now
 
     def late(self, seconds: float, now: float) -> None:
+        """Note that a packet came so late: raise the target by it."""
         self.target_s = max(self._least_s, min(self.target_s + seconds, self.HIGHEST_S))
         self._calm_since = now
 
@@ -104,12 +93,12 @@ class JitterBuffer:
         self._decoder = SoundDecoder()
         self._waiting: dict[int, Sound] = {}  # by sequence number
         self._expected: int | None = None  # the number that is played next; None before the first
-        self._newest_ms = 0  # capture time
+        self._newest_ms = 0  # the latest capture time of a packet
         self._behind = 0  # packets in a row that seemed old
         self._playing = False
-        self._due = 0.0  # of the next chunk
-        self._last: ReceivedSound | None = None
-        self._concealed = 0  # samples concealed since
+        self._due = 0.0  # when the next chunk is to be played
+        self._last: ReceivedSound | None = None  # the packet that was played last
+        self._concealed = 0  # samples of estimated sound since that packet
         self._spare: Samples | None = None  # concealed by the codec and not played yet
 
     def __len__(self) -> int:
@@ -162,9 +151,10 @@ class JitterBuffer:
             del self._waiting[self._first()]
             self.counters.add("overflow")
             if self._expected is not None:
-                self._expected = self._first()  # left out on purpose: not a gap
+                self._expected = self._first()  # what was left out on purpose is not a gap
 
     def _first(self) -> int:
+        """Return the number of the waiting packet that is to be played first."""
         base = next(iter(self._waiting)) if self._expected is None else self._expected
         return min(self._waiting, key=lambda number: ahead(number, base))
 
@@ -177,6 +167,7 @@ class JitterBuffer:
         return max(0.0, self._due - now)
 
     def take(self, now: float) -> Chunk | None:
+        """Return the sound to play now; None if none is due yet, or the buffer has run out."""
         if not self._playing and not self._begin(now):
             return None
         if now < self._due:
@@ -201,6 +192,7 @@ class JitterBuffer:
         return True
 
     def _next(self, now: float) -> Chunk | None:
+        """Return the next packet's sound, or estimated sound for a gap before it; None if that is used up."""
         if not self._waiting:
             if self._last is not None and not self._concealed:
                 self.counters.add("underruns")
@@ -208,7 +200,7 @@ class JitterBuffer:
         number = self._first()
         missing = 0 if self._expected is None else max(0, ahead(number, self._expected))
         if missing and self._last is not None:
-            concealed = self._conceal(missing * len(self._last.samples) / self._last.rate)
+            concealed = self._conceal(missing * self._last.seconds)
             if concealed is not None:
                 return concealed
         if missing > _GAP_LIMIT:
@@ -222,7 +214,7 @@ class JitterBuffer:
     def _play(self, number: int, now: float) -> Chunk | None:
         received = self._decode(number)
         excess = self._depth.excess(self.waiting_s, now)
-        if received is not None and excess > len(received.samples) / received.rate - _ROUNDING_S:
+        if received is not None and excess > received.seconds - _ROUNDING_S:
             received = self._leave_out(received, excess)
         if received is None:
             return self._conceal(self._budget_s)
@@ -248,8 +240,8 @@ class JitterBuffer:
     def _leave_out(self, received: ReceivedSound, excess: float) -> ReceivedSound:
         """Skip waiting packets of ``excess`` seconds; return the next, faded over from ``received``."""
         newest, remaining_s = received, excess
-        while self._waiting and remaining_s > len(newest.samples) / newest.rate - _ROUNDING_S:
-            remaining_s -= len(newest.samples) / newest.rate
+        while self._waiting and remaining_s > newest.seconds - _ROUNDING_S:
+            remaining_s -= newest.seconds
             newest = self._decode(self._first()) or newest
             self.counters.add("skipped")
         return _faded_over(received, newest)
@@ -260,7 +252,8 @@ class JitterBuffer:
         if last is None:
             return None
         allowed = round(self._budget_s * last.rate)
-        size = min(round(min(gap_s, self._budget_s) * last.rate) - self._concealed, round(_PIECE_S * last.rate))
+        remaining = round(min(gap_s, self._budget_s) * last.rate) - self._concealed
+        size = min(remaining, round(_PIECE_S * last.rate))
         if size <= 0:
             return None
         estimate = self._estimated(last, size)
@@ -277,8 +270,8 @@ class JitterBuffer:
             estimate, self._spare = self._spare[:size], self._spare[size:]
             return estimate
         length = len(last.samples)
-        way = (self._concealed + np.arange(size)) % (2 * length)
-        return last.samples[np.where(way < length, length - 1 - way, way - length)]
+        steps = (self._concealed + np.arange(size)) % (2 * length)  # on the way back and forth
+        return last.samples[np.where(steps < length, length - 1 - steps, steps - length)]
 
 
 def _faded_in(samples: Samples, rate: int) -> Samples:

@@ -10,7 +10,10 @@ GREY: Final = 128  # of a difference of nothing
 
 
 def subtract(picture: Pixels, reference: Pixels, out: Pixels | None = None) -> Pixels:
-    """Return ``clip(picture - reference + 128)``; sums of bytes are exact in cv2's floats."""
+    """Return ``clip(picture - reference + 128)``; sums of bytes are exact in cv2's floats.
+
+    The result is in ``out`` if that has its size.
+    """
     return cast(Pixels, cv2.addWeighted(picture, 1, reference, -1, GREY, out))
 
 
@@ -31,35 +34,27 @@ class JpegDelta:
         self.keyframe = False  # was the last one a full picture?
         self._interval = interval
         self._since_keyframe = 0
-        self._chained = False  # does the receiver have what ``_reference`` holds?
+        self._chained = False  # does the next picture build on ``_reference``, which the receiver has?
         self._reference: Pixels | None = None
-        self._difference: Pixels | None = None
+        self._difference: Pixels | None = None  # the last one; cv2 writes the next into it
 
     def encode(self, picture: Pixels, quality: float, *, keyframe: bool = False) -> bytes:
         """Return a JPEG of ``quality`` (1..100). A picture of another size than the last becomes a full picture."""
         reference = self._reference if self._chained else None
         self.keyframe = keyframe or reference is None or reference.shape != picture.shape
+        self._since_keyframe = 0 if self.keyframe else self._since_keyframe + 1
+        is_last = self._since_keyframe + 1 >= self._interval  # the next one is a full picture, and builds on nothing
         if self.keyframe or reference is None:
-            self._since_keyframe = 0
             jpeg = _jpeg(picture, quality)
-            if self._is_reference():
+            if not is_last:
                 self._reference = decode_jpeg(jpeg)
-            return jpeg
-        self._since_keyframe += 1
-        self._difference = subtract(picture, reference, self._fitting(self._difference, picture))
-        jpeg = _jpeg(self._difference, quality)
-        if self._is_reference():
-            add(reference, decode_jpeg(jpeg), reference)
+        else:
+            self._difference = subtract(picture, reference, self._difference)
+            jpeg = _jpeg(self._difference, quality)
+            if not is_last:
+                add(reference, decode_jpeg(jpeg), reference)
+        self._chained = not is_last
         return jpeg
-
-    def _is_reference(self) -> bool:
-        """True if the next picture will be a difference from this one; remembers the answer."""
-        self._chained = self._since_keyframe + 1 < self._interval
-        return self._chained
-
-    @staticmethod
-    def _fitting(buffer: Pixels | None, picture: Pixels) -> Pixels | None:
-        return buffer if buffer is not None and buffer.shape == picture.shape else None
 
 
 def _jpeg(picture: Pixels, quality: float) -> bytes:

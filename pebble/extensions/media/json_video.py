@@ -43,7 +43,7 @@ def inflate(packed: bytes, limit: int) -> bytes:
     unpacker = zlib.decompressobj()
     try:
         plain = unpacker.decompress(packed, limit)
-        if not unpacker.eof:  # zlib may have the last byte out, and its checksum still to come
+        if not unpacker.eof:  # the content may be complete, and its checksum not read yet
             plain += unpacker.decompress(unpacker.unconsumed_tail, 1)
     except zlib.error as error:
         raise PayloadError(f"zlib: {error}") from None

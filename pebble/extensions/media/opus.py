@@ -48,14 +48,14 @@ def split(body: bytes) -> list[bytes]:
 
 
 def _pieces(body: bytes) -> Iterator[bytes]:
-    at = 0
-    while at < len(body):
-        start = at + _LENGTH.size
-        size = _LENGTH.unpack_from(body, at)[0] if start <= len(body) else 0
-        at = start + size
-        if not size or at > len(body):
+    end = 0  # of the last packet
+    while end < len(body):
+        start = end + _LENGTH.size
+        size = _LENGTH.unpack_from(body, end)[0] if start <= len(body) else 0
+        end = start + size
+        if not size or end > len(body):
             raise PayloadError("PBAT: an Opus packet is empty or cut off")
-        yield body[start:at]
+        yield body[start:end]
 
 
 def milliseconds(packet: bytes) -> float:
@@ -99,9 +99,9 @@ class OpusEncoder:
     def encode(self, frame: Samples) -> list[bytes]:
         """Return one packet; ``frame`` is (self.samples, channels)."""
         interleaved = np.ascontiguousarray(frame).reshape(1, -1)
-        handed = self._av.AudioFrame.from_ndarray(interleaved, format="s16", layout=self._layout)
-        handed.sample_rate = self._rate
-        return [bytes(packet) for packet in self._codec.encode(handed)]
+        av_frame = self._av.AudioFrame.from_ndarray(interleaved, format="s16", layout=self._layout)
+        av_frame.sample_rate = self._rate
+        return [bytes(packet) for packet in self._codec.encode(av_frame)]
 
 
 class OpusDecoder:
@@ -113,7 +113,7 @@ class OpusDecoder:
         self._codec.sample_rate, self._codec.layout = _DECODED_RATE, _layout(channels)
         self._channels = channels
         self._resampler = Resampler(_DECODED_RATE, rate, channels)
-        self._mode: bytes | None = None  # first byte of the last packet: what a concealed one is like
+        self._mode: bytes | None = None  # a packet of only the last one's first byte, which conceals one more
 
     def decode(self, packet: bytes) -> Samples:
         """Return the samples of a packet, (samples, channels). Raises PayloadError if it is no Opus packet."""

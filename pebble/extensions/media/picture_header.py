@@ -65,7 +65,7 @@ class PictureSequence:
     """A detector of missing pictures: those after a missing picture are of no use until the next key frame."""
 
     def __init__(self) -> None:
-        self.complete = False  # none is missing before the newest
+        self.complete = False  # no picture is missing before the newest
         self._last: PictureHeader | None = None
 
     def take(self, payload: bytes) -> PictureHeader | None:
@@ -81,6 +81,7 @@ class PictureSequence:
 
 
 def _after(last: PictureHeader) -> int | None:
+    """Return the number of the picture after ``last``; None if its encoding has no numbers."""
     if last.frame is None:
         return None
     return last.frame + 1 if last.encoding == "json" else (last.frame + 1) % SEQUENCE_LIMIT

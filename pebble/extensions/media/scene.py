@@ -52,7 +52,7 @@ class Scene:
         self._background = _landscape(width, self._floor)
         self._tag = _tag(max(1, self._floor // (3 * _TAG_CELLS)))
         self._ball = _disc(max(1, self._floor // 12))
-        self._cell = np.arange(width).repeat(3) * COLUMNS // width  # to which a byte of the counter's lines belongs
+        self._cell = np.arange(width).repeat(3) * COLUMNS // width  # of the counter, for each byte of a row of pixels
 
     def render(self, number: int, out: Picture) -> None:
         """Draw frame ``number`` into ``out``, of shape (height, width, 3), BGR."""
@@ -94,6 +94,7 @@ class Scene:
 
 
 def _bits(value: int) -> NDArray[np.bool_]:
+    """Return the counter's cells: the bits of ``value``, then those of its checksum."""
     raw = value.to_bytes(3)
     checked = raw + crc_hqx(raw, 0xFFFF).to_bytes(2)
     return np.unpackbits(np.frombuffer(checked, np.uint8)).astype(bool).reshape(ROWS, COLUMNS)

@@ -14,14 +14,14 @@ from pebble.extensions.media.packets import SEQUENCE_LIMIT, Codec, Sound
 from pebble.extensions.media.pcm import Resampler, Samples, remix, to_bytes, to_samples
 from pebble.transports.counters import Counters
 
-#: Those this installation can make.
+#: The encodings that this installation can make.
 SOUND_ENCODINGS: Final = pyav.available(ALL_SOUND)
 
 CHANNELS_LIMIT: Final = 8  # channels of one stream of sound
 LOWEST_RATE: Final = 4000  # Hz; a player would fail with less
 _HIGHEST_PCM_RATE = 65_535  # what the header can express
 _LONGEST_S = 1.0  # of one packet: the most the original can be configured to send
-_GAP_MS = 60  # a capture time further than this from where the last chunk ended: sound is missing between them
+_GAP_MS = 60  # if a chunk begins further than this from the end of the last one, sound is missing between them
 
 
 def sequence_numbers() -> Iterator[int]:
@@ -37,7 +37,7 @@ class _Intake:
         self.rate, self.channels = rate_out, channels_out
         self._fed_rate, self._fed_channels = rate, channels
         self._resampler = Resampler(rate, rate_out, channels_out)
-        self._left = np.zeros((0, channels_out), np.int16)
+        self._left = np.zeros((0, channels_out), np.int16)  # less than a frame, for the next one
         self._next_ms: float | None = None  # when the first sample of the next chunk should have been captured
 
     def has_gap(self, captured_ms: int) -> bool:
@@ -51,16 +51,16 @@ class _Intake:
         """Yield frames of ``size`` samples, each with the epoch milliseconds of its first sample."""
         fed = to_samples(pcm, self._fed_channels)
         start_ms = captured_ms - 1000 * len(self._left) / self.rate
-        held = np.concatenate((self._left, self._resampler.feed(remix(fed, self.channels))))
-        whole = len(held) // size * size
+        samples = np.concatenate((self._left, self._resampler.feed(remix(fed, self.channels))))
+        whole = len(samples) // size * size
         for at in range(0, whole, size):
-            yield held[at : at + size], round(start_ms + 1000 * at / self.rate)
-        self._left = held[whole:]
+            yield samples[at : at + size], round(start_ms + 1000 * at / self.rate)
+        self._left = samples[whole:]
         self._next_ms = captured_ms + 1000 * len(fed) / self._fed_rate
 
 
 class SoundEncoder:
-    """An encoder that takes any amount of s16le and returns whole packets; the rest waits for more samples.
+    """An encoder that takes any amount of s16le and returns whole packets; the remaining samples wait for more.
 
     A packet holds ``bundle`` Opus packets, or the samples unchanged if there is no ``codec``.
     """
@@ -71,8 +71,8 @@ class SoundEncoder:
         self.name = "pcm" if codec is None else "opus"
         self.rate, self.channels = intake.rate, intake.channels  # of what is sent
         self._intake, self._numbers, self._codec, self._bundle = intake, numbers, codec, bundle
-        self._samples = min(max(1, self.rate * frame_ms // 1000), _HIGHEST_PCM_RATE)
-        self._ready: list[bytes] = []
+        self._samples = min(max(1, self.rate * frame_ms // 1000), _HIGHEST_PCM_RATE)  # of a frame
+        self._ready: list[bytes] = []  # encoded frames of the packet that is not complete
         self._ready_ms = 0  # when the first of them was captured
 
     @property
@@ -96,7 +96,10 @@ class SoundEncoder:
     def _packet(self) -> bytes:
         ready, self._ready = self._ready, []
         samples, first_ms = len(ready) * self._samples, max(0, self._ready_ms)
-        codec, body = (Codec.PCM16LE, ready[0]) if self._codec is None else (Codec.OPUS, opus.join(ready))
+        if self._codec is None:
+            codec, body = Codec.PCM16LE, ready[0]
+        else:
+            codec, body = Codec.OPUS, opus.join(ready)
         return Sound(codec, self.channels, self.rate, samples, next(self._numbers), first_ms, body).pack()
 
 
@@ -124,7 +127,7 @@ def make_sound_encoder(
         rate_out = rate_out if rate_out <= _HIGHEST_PCM_RATE else opus.RATES[-1]
         return SoundEncoder(_Intake(rate, channels, rate_out, channels_out), numbers, chunk_ms)
     if name == "opus":
-        rate_out = next((rate for rate in opus.RATES if rate >= rate_out), opus.RATES[-1])
+        rate_out = next((highest for highest in opus.RATES if highest >= rate_out), opus.RATES[-1])
         intake = _Intake(rate, channels, rate_out, channels_out if channels_out <= 2 else 1)
         frame_ms = next((ms for ms in opus.FRAMES_MS if ms >= chunk_ms), opus.FRAMES_MS[-1])
         codec = OpusEncoder(rate_out, intake.channels, frame_ms=frame_ms, bitrate=bitrate)
@@ -133,20 +136,30 @@ def make_sound_encoder(
 
 
 @dataclass(frozen=True, slots=True)
-class ReceivedSound:
-    """The sound of a packet; samples are (samples, channels)."""
+class DecodedSound:
+    """Samples that can be played: (samples, channels)."""
 
     samples: Samples
     rate: int
     channels: int
-    captured_ms: int
-    sequence: int
-    encoding: str
 
     @property
     def pcm(self) -> bytes:
         """Interleaved s16le."""
         return to_bytes(self.samples)
+
+    @property
+    def seconds(self) -> float:
+        return len(self.samples) / self.rate
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedSound(DecodedSound):
+    """The sound of a packet."""
+
+    captured_ms: int
+    sequence: int
+    encoding: str
 
 
 def unpack(payload: bytes) -> Sound:

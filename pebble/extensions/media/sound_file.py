@@ -47,7 +47,7 @@ class SoundFile:
         layout = "mono" if self.channels == 1 else "stereo"
         try:
             resampler = self._av.AudioResampler(format="s16", layout=layout, rate=self.rate)
-            for frame in chain(self._container.decode(self._stream), [None]):
+            for frame in chain(self._container.decode(self._stream), [None]):  # None: the samples that it still holds
                 for samples in resampler.resample(frame):
                     yield to_bytes(samples.to_ndarray())
         except (self._av.error.FFmpegError, ValueError) as error:

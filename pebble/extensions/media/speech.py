@@ -34,6 +34,7 @@ class Speech:
 
 @lru_cache(maxsize=4)  # it takes a tenth of a second
 def _period(rate: int) -> NDArray[np.int16]:
+    """Return all samples until the sound repeats."""
     edges = [rate * PERIOD_S * number // _SYLLABLES for number in range(_SYLLABLES + 1)]
     sound = np.zeros(edges[-1], np.float32)
     for number in range(_SYLLABLES):

@@ -10,7 +10,7 @@ from pebble.extensions.media.jpeg import Pixels
 from pebble.extensions.media.jpeg_delta import JpegDelta
 from pebble.extensions.media.packets import KEY_FRAME, SEQUENCE_LIMIT, Picture, PictureKind
 
-#: Those this installation can make.
+#: The encodings that this installation can make.
 VIDEO_ENCODINGS: Final = pyav.available(ALL_VIDEO)
 
 DEFAULT_QUALITY: Final = 10

@@ -58,9 +58,9 @@ class Robot:
         self._meter = RateMeter()
         self._battery: tuple[str, float] | None = None  # metric and value
         self._services: dict[str, ServiceState] = {}
-        self._media: dict[str, MediaReport] = {}
-        self._media_t = 0  # epoch milliseconds
-        self._loss: dict[str, float] = {}
+        self._media: dict[str, MediaReport] = {}  # by stream: the newest report
+        self._media_t = 0  # of these reports, epoch milliseconds
+        self._loss: dict[str, float] = {}  # by stream: the share that was dropped between the last two reports
 
     def receive(self, channel: c.Channel | None, message: Message, now: float, wall: float) -> None:
         """Handle a message that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds)."""
@@ -70,7 +70,7 @@ class Robot:
         with suppress(PayloadError, msgspec.ValidationError):
             if channel is c.CHARGING_LEVEL:
                 level = codec.decode(channel, message.payload)
-                unit = codec.plain(channel, message.payload).get("unit")  # decoded, a missing one is that of volts
+                unit = codec.plain(channel, message.payload).get("unit")  # the decoded level has volts in place of none
                 self._battery = (_BATTERY[unit], level.value) if unit in _BATTERY else None
             elif channel is c.STATUS:
                 services = codec.decode(channel, message.payload).value.get("services")
@@ -80,6 +80,7 @@ class Robot:
                 self._take_media(status.t, _named(status.value))
 
     def _take_media(self, t: int, media: dict[str, MediaReport]) -> None:
+        """Replace the reports of all streams; compute each one's loss since the last report."""
         before, seconds = self._media, (t - self._media_t) / 1000
         self._media, self._media_t, self._loss = media, t, {}
         for name in media.keys() & before.keys():
@@ -149,7 +150,7 @@ class Robots:
 
 
 def _named(entries: dict[str, T]) -> dict[str, T]:
-    """Return the entries whose names are valid as labels."""
+    """Return the entries whose names are valid as labels, of the first 64."""
     return {name: entry for name, entry in list(entries.items())[:MOST_NAMES] if _valid_level(name)}
 
 

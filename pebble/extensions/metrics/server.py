@@ -73,9 +73,14 @@ class Exporter:
             writer.transport.abort()
 
     def _response(self, request: bytes) -> tuple[str, str]:
+        """Return the status and the text that answer a request's head."""
         line, *headers = request.split(b"\r\n")
-        fields = {name.lower(): value.strip() for name, _, value in (header.partition(b":") for header in headers)}
-        if not hmac.compare_digest(fields.get(b"authorization", b""), self._authorization) and self._authorization:
+        authorization = b""
+        for header in headers:
+            name, _, value = header.partition(b":")
+            if name.lower() == b"authorization":
+                authorization = value.strip()
+        if self._authorization and not hmac.compare_digest(authorization, self._authorization):
             return "401 Unauthorized", "the token is missing, or is another one\n"
         if line.split(b" ")[:2] != [b"GET", b"/metrics"]:
             return "404 Not Found", "only GET /metrics is here\n"

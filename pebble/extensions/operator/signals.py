@@ -1,4 +1,4 @@
-"""Handles the signals that end a command: in a ``with`` block, or as KeyboardInterrupt."""
+"""Handlers of the signals that end a command, for the duration of a ``with`` block."""
 
 from __future__ import annotations
 

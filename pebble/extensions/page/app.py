@@ -39,8 +39,8 @@ from pebble.extensions.page.setting import WebSettings
 from pebble.extensions.page.static_files import FOREVER, NO_STORE, StaticFiles, root_of
 
 _AUDIT_ROWS = 200  # that a page shows; `pebble web audit` prints more
-_CONFIRM_S = 1.5  # so long a form waits for what it tells
-_NAMED = 20  # robots, in words
+_CONFIRM_S = 1.5  # so long robots have to confirm a stop before the answer to a form says what they did
+_MOST_NAMED = 20  # robots in that answer
 _ENCODINGS = frozenset({"json", "pbvd", "h264", "jpeg"})
 _estop_decoder = msgspec.json.Decoder(EstopOp)
 
@@ -109,8 +109,8 @@ def _app(settings: WebSettings, lifespan: Lifespan[Starlette]) -> Starlette:
 async def _page(request: Request) -> Response:
     if login.session_of(request) is None:
         wanted = request.url.path + ("?watch" if "watch" in request.query_params else "")
-        then = "" if wanted == "/" else f"?next={quote(wanted)}"
-        return Response(status_code=303, headers={"location": f"{root_of(request)}login{then}", **NO_STORE})
+        query = "" if wanted == "/" else f"?next={quote(wanted)}"
+        return Response(status_code=303, headers={"location": f"{root_of(request)}login{query}", **NO_STORE})
     return _static_of(request).page(request)
 
 
@@ -150,47 +150,53 @@ async def _snapshot(request: Request) -> Response:
     still = await state.media.snapshot(ref)
     if still is None:
         return Response(status_code=204, headers=NO_STORE)
-    jpeg, at = still
-    headers = {**NO_STORE, "age": str(round(time.monotonic() - at))}
+    jpeg, received_at = still
+    headers = {**NO_STORE, "age": str(round(time.monotonic() - received_at))}
     return Response(jpeg, media_type="image/jpeg", headers=headers)
 
 
 async def _estop(request: Request) -> Response:
     """Stop robots for a page whose control socket is closed or, as a plain form, for a page that did not start."""
-    answer = _stopped_page if content_type(request.headers) == FORM else _plain
+    is_form = content_type(request.headers) == FORM
+    answer = _stopped_page if is_form else _plain
     session = login.session_of(request)
     if session is None:
         return answer(request, 401, "log in first")
     try:
-        op = await _estop_op(request)
+        op = await _estop_op(request, is_form=is_form)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         return answer(request, 400, str(error))
-    address = "" if request.client is None else request.client.host
     server = _server_of(request)
-    server.stop(op.ref, op.stop, session, "", op.why, address)
-    if answer is _plain:
+    server.stop(op.ref, op.stop, session, "", op.why, login.address_of(request))
+    if not is_form:
         return _plain(request, 202, "sent")
     until = time.monotonic() + _CONFIRM_S
-    while server.stops.robots_of(op.stop)[1] and time.monotonic() < until:
+    while server.stops.robots_of(op.stop).unconfirmed and time.monotonic() < until:
         await asyncio.sleep(TICK_S)
     return _stopped_page(request, 202, _stop_words(server, op.stop))
 
 
-async def _estop_op(request: Request) -> EstopOp:
-    if content_type(request.headers) != FORM:
+async def _estop_op(request: Request, *, is_form: bool) -> EstopOp:
+    if not is_form:
         return _estop_decoder.decode(await request.body())
     fields = dict(parse_qsl((await request.body()).decode()))
     return msgspec.convert({"ref": "", "stop": secrets.token_hex(8), "why": "form", **fields, "op": "estop"}, EstopOp)
 
 
 def _stop_words(server: Server, name: str) -> str:
+    """Return in words which robots have confirmed the stop with this name."""
     if not server.broker.connected:
         return "NOT SENT YET: the server cannot reach the broker."
-    done, missing = server.stops.robots_of(name)
-    words = "" if done or missing else " No robot has been heard of yet: assume that they move."
-    words += f" Confirmed by {len(done)} of {len(done) + len(missing)}." if done else ""
-    words += f" NOT CONFIRMED yet by {', '.join(missing[:_NAMED])}{' …' if missing[_NAMED:] else ''}" if missing else ""
-    return f"Sent, and repeated for a minute until all have confirmed it.{words}"
+    confirmed, unconfirmed = server.stops.robots_of(name)
+    words = "Sent, and repeated for a minute until all have confirmed it."
+    if not confirmed and not unconfirmed:
+        words += " No robot has been heard of yet: assume that they move."
+    if confirmed:
+        words += f" Confirmed by {len(confirmed)} of {len(confirmed) + len(unconfirmed)}."
+    if unconfirmed:
+        more = " …" if len(unconfirmed) > _MOST_NAMED else ""
+        words += f" NOT CONFIRMED yet by {', '.join(unconfirmed[:_MOST_NAMED])}{more}"
+    return words
 
 
 def _plain(_request: Request, status: int, text: str) -> Response:
@@ -234,14 +240,13 @@ async def _control(websocket: WebSocket) -> None:
 
 async def _media(websocket: WebSocket) -> None:
     media = websocket.app.state.media
-    await _serve(websocket, lambda ref, can, _: media.serve(websocket, ref, can & _ENCODINGS))
+    await _serve(websocket, lambda ref, decodes, _: media.serve(websocket, ref, decodes & _ENCODINGS))
 
 
 async def _sound(websocket: WebSocket) -> None:
     sound = websocket.app.state.sound
-    device = login.printable(websocket.query_params.get("device", ""))
-    address = "" if websocket.client is None else websocket.client.host
-    await _serve(websocket, lambda ref, can, session: sound.serve(websocket, ref, can, session, device, address))
+    device, address = login.printable(websocket.query_params.get("device", "")), login.address_of(websocket)
+    await _serve(websocket, lambda ref, plays, session: sound.serve(websocket, ref, plays, session, device, address))
 
 
 async def _replay(websocket: WebSocket) -> None:
@@ -263,28 +268,35 @@ async def _replay(websocket: WebSocket) -> None:
 async def _serve(
     websocket: WebSocket, serve: Callable[[str, frozenset[str], Session], Coroutine[Any, Any, None]]
 ) -> None:
-    """Serve a component's pictures or sound, while the session is valid."""
+    """Serve a component's pictures or sound, while the session is valid.
+
+    ``serve`` gets the component, the encodings that the page can decode, and the session.
+    """
     ref, session = websocket.query_params.get("ref", ""), login.session_of(websocket)
     if session is None or ref not in websocket.app.state.robots.components:
         await websocket.close(4401)
         return
     await websocket.accept()
-    can = frozenset(re.findall(r"[a-z0-9]+", websocket.query_params.get("can", "")))
-    await _while_allowed(websocket, session, serve(ref, can, session))
+    encodings = frozenset(re.findall(r"[a-z0-9]+", websocket.query_params.get("can", "")))
+    await _while_allowed(websocket, session, serve(ref, encodings, session))
 
 
 async def _while_allowed(websocket: WebSocket, session: Session, work: Coroutine[Any, Any, None]) -> None:
-    """Run the work of a socket until it is done, or the session is revoked."""
+    """Run the work of a socket until it is done, or the session is revoked.
+
+    The session is checked soon after people or sessions have changed, and every few seconds in any case.
+    """
     server: Server = websocket.app.state.server
-    people, check_at = server.people_version, time.monotonic() + CHECK_S
+    checked_version, check_at = server.people_version, time.monotonic() + CHECK_S
     serving = asyncio.ensure_future(work)
     try:
-        while not (await asyncio.wait({serving}, timeout=PEOPLE_S))[0]:
-            if people == server.people_version and time.monotonic() < check_at:
+        while not serving.done():
+            await asyncio.wait({serving}, timeout=PEOPLE_S)
+            if checked_version == server.people_version and time.monotonic() < check_at:
                 continue
-            people, check_at = server.people_version, time.monotonic() + CHECK_S
-            now = await asyncio.to_thread(login.session_of, websocket)
-            if now is None or now.role != session.role:
+            checked_version, check_at = server.people_version, time.monotonic() + CHECK_S
+            present = await asyncio.to_thread(login.session_of, websocket)
+            if present is None or present.role != session.role:
                 return  # it was revoked
     finally:
         serving.cancel()

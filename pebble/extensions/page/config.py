@@ -21,6 +21,8 @@ from pebble.config.types import (
 )
 from pebble.extensions.operator.client.assumed import AXES, Axis
 
+PEOPLE = "people.sqlite"  # the default database, in a state directory
+
 
 class WebHandler(ServiceSection, frozen=True, kw_only=True):
     """Runs the operator page on the robot; `web_interface` sets it up. It needs `pip install 'pebble-robot[web]'`."""
@@ -124,6 +126,7 @@ def _check(reader: Reader, web: WebInterface, path: Path) -> WebInterface:
 
 
 def _check_tls(reader: Reader, tls: WebTls, path: Path) -> WebTls:
+    """Refuse a certificate without a key or a key without a certificate; warn of files that are missing or readable."""
     for key, other in (("certificate", "key"), ("key", "certificate")):
         if getattr(tls, key) is not None and getattr(tls, other) is None:
             reader.notes.doubt((*path, other), f"is missing, it belongs to {key}")

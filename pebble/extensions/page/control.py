@@ -18,19 +18,20 @@ from pebble.extensions.operator.client.drive_reasons import WORDS, person
 from pebble.extensions.operator.client.estop_states import Reset
 from pebble.extensions.page import messages as m
 from pebble.extensions.page import robot_commands
-from pebble.extensions.page.access.login import named, printable
+from pebble.extensions.page.access.login import address_of, named, printable
 from pebble.extensions.page.drive.driven_robot import Tab
 from pebble.extensions.page.log_lines import LogReader
 from pebble.extensions.page.pace import STOP_WAITS_S, Pace
 from pebble.extensions.page.page_clock import PING_S, ClockJumpError
 from pebble.extensions.page.robots import Interest
 from pebble.extensions.page.server import Server, encode
+from pebble.transports import Message
 from pebble.transports.clock import since_boot as clock
 
 FLUSH_S = 0.05  # between two states
 HELLO_S = 5.0  # to begin with
 CHECK_S = 5.0  # between two looks at whether the session still exists, while no person and no session changes
-_WATCH_COST = 20  # it subscribes to so many topics
+_WATCH_COST = 20  # of opening a component's page, as requests: it subscribes to so many topics
 _WAITING = 64  # messages that wait to be sent, besides the state
 _NOT_NOTED = ("op", "ref", "n", "config")  # settings of a script may be secret
 
@@ -50,8 +51,8 @@ class Control:
         """Store the connection. ``check`` returns the present session; None: it was revoked."""
         self._server, self._websocket, self._session, self._check = server, websocket, session, check
         self._tab = Tab(secrets.token_urlsafe(12), session.user, "")
-        self._interest = Interest(lambda: self._wake.set())
-        self._wake = asyncio.Event()
+        self._wake = asyncio.Event()  # there is something to send
+        self._interest = Interest(self._wake.set)
         self._pace = Pace(time.monotonic())
         self._waiting: deque[m.ToPage] = deque(maxlen=_WAITING)
         self._why_not = ""  # why this page may not drive at all
@@ -67,19 +68,15 @@ class Control:
             sender = asyncio.ensure_future(self._send_all())
             while not sender.done():
                 op = await self._receive()
-                wait_s = self._pace.take(_WATCH_COST if isinstance(op, m.Watch) else 1, time.monotonic())
-                if wait_s:
-                    await asyncio.sleep(min(wait_s, STOP_WAITS_S) if isinstance(op, m.EstopOp | m.StopOp) else wait_s)
+                await self._wait_for_pace(op)
                 try:
                     self._handle(op)
                 except DatabaseError as error:
                     self._refuse(op, f"The server cannot store this: {error.why}")
-        except Leave as reason:
-            await self._leave(reason)
+        except (Leave, ClockJumpError) as error:
+            await self._leave(str(error))
         except TimeoutError:
-            await self._leave(Leave("no hello"))
-        except ClockJumpError as error:
-            await self._leave(Leave(str(error)))
+            await self._leave("no hello")
         except (WebSocketDisconnect, RuntimeError):
             pass  # the page has gone
         finally:
@@ -90,9 +87,18 @@ class Control:
                     sender.cancel()
                     await asyncio.gather(sender, return_exceptions=True)
 
+    async def _wait_for_pace(self, op: Any) -> None:
+        """Wait before a request of a page that has sent too many; a stop waits hardly at all."""
+        wait_s = self._pace.take(_WATCH_COST if isinstance(op, m.Watch) else 1, time.monotonic())
+        if isinstance(op, m.EstopOp | m.StopOp):
+            wait_s = min(wait_s, STOP_WAITS_S)
+        if wait_s:
+            await asyncio.sleep(wait_s)
+
     # -- begin and end
 
     def _begin(self, hello: Any) -> None:
+        """Answer the page's first message, restore its control, and let it be sent all states."""
         if not isinstance(hello, m.Hello):
             raise Leave("the first message must be hello")
         server, settings = self._server, self._server.settings
@@ -136,13 +142,11 @@ class Control:
             if self._interest.watched:
                 self._server.unwatch(self._interest.watched)
 
-    async def _leave(self, reason: Leave) -> None:
+    async def _leave(self, why: str) -> None:
         self._end_control()
-        try:
-            await self._websocket.send_text(encode(m.Bye(why=str(reason), again=True)))
+        with suppress(WebSocketDisconnect, RuntimeError):  # it has gone already
+            await self._websocket.send_text(encode(m.Bye(why=why, again=True)))
             await self._websocket.close(4000)
-        except (WebSocketDisconnect, RuntimeError):
-            pass  # it has gone already
 
     def _end_control(self) -> None:
         self._server.drivers.closed(self._tab, for_good=True)
@@ -212,23 +216,27 @@ class Control:
         if why := (self._why_not if robot_commands.moves(op) else "") or self._server.drivers.refusals.of_op(op):
             self._refuse(op, why)
             return
-        message = robot_commands.publication(op, self._server.robots.capabilities(op.ref))
-        joins = isinstance(op, m.LightsOp) and self._server.drivers.accompany(
-            self._tab, op.ref, robot_commands.channel_for(op), message
-        )
-        if not joins and not self._server.broker.publish(
+        if not self._publish(op, robot_commands.publication(op, self._server.robots.capabilities(op.ref))):
+            self._refuse(op, "The server cannot reach the broker")
+            return
+        self._post(m.Done(cmd=_tag(op), ref=op.ref, n=op.n))
+        if not isinstance(op, m.LightsOp | m.SoundboardOp):
+            self._audit(_tag(op), op.ref, detail=_detail(op))
+
+    def _publish(self, op: m.RobotOp, message: Message) -> bool:
+        """Publish a command, or keep lights for the next drive command; return False if it was not accepted."""
+        if isinstance(op, m.LightsOp):
+            channel = robot_commands.channel_for(op)
+            if self._server.drivers.accompany(self._tab, op.ref, channel, message):
+                return True
+        return self._server.broker.publish(
             message.topic,
             message.payload,
             retain=message.retain,
             remember=False,
             qos=message.qos,
             by=self._session.user,
-        ):
-            self._refuse(op, "The server cannot reach the broker")
-            return
-        self._post(m.Done(cmd=_tag(op), ref=op.ref, n=op.n))
-        if not isinstance(op, m.LightsOp | m.SoundboardOp):
-            self._audit(_tag(op), op.ref, detail=_detail(op))
+        )
 
     def _drive(self, op: m.DriveOp) -> None:
         if not self._may("drive", op):
@@ -251,21 +259,21 @@ class Control:
             self._server.stops.end(op.stop)
 
     def _reset(self, op: m.EstopResetOp) -> None:
+        """Publish a reset of the stops that the page has shown to the person, although newer ones may be known here."""
         robot = self._server.robots.view(op.ref)
         if not self._may("reset", op) or robot is None:
             return
         reset = Reset(robot.estop, self._session.user)
-        shown = {owner.owner: (owner.boot, owner.count) for owner in op.owners}
-        reset.shown = {
-            owner: msgspec.structs.replace(state, boot=shown[owner][0], count=shown[owner][1])
-            for owner, state in reset.shown.items()
-            if owner in shown
-        }
+        known, reset.shown = reset.shown, {}
+        for shown in op.owners:
+            if shown.owner in known:
+                reset.shown[shown.owner] = replace(known[shown.owner], boot=shown.boot, count=shown.count)
         for message in reset.messages():
             self._server.broker.publish(message.topic, message.payload, qos=message.qos)
         self._audit("reset", op.ref)
 
     def _board(self, op: m.BoardOp) -> None:
+        """Allow or end the driving of a board that does not say what it can do, or clear its retained command."""
         if not self._may("drive" if op.do == "clear" else "system", op):
             return
         if why := self._server.boards.ask(op, self._session.user):
@@ -275,6 +283,7 @@ class Control:
         self._audit(f"{op.do} driving", op.ref)
 
     def _watch(self, ref: str) -> None:
+        """Note that the page has opened this component in place of another; "": it has none open."""
         before = self._interest.watched
         if ref == before:
             return
@@ -286,14 +295,15 @@ class Control:
             self._server.unwatch(before)
 
     def _control(self, op: m.Lease) -> None:
+        """Request control of a robot for this page, or release it."""
         server = self._server
         self._moved.discard(op.ref)
         if not op.take:
             if server.drivers.release(self._tab, op.ref):
                 self._audit("release", op.ref)
             return
-        robot = server.robots.view(op.ref)
-        right = "take" if op.over and server.drivers.robot(op.ref).keeps else "drive"
+        robot, driven = server.robots.view(op.ref), server.drivers.robot(op.ref)
+        right = "take" if op.over and driven.keeps else "drive"
         if not self._may(right, op):
             return
         if self._why_not or robot is None:
@@ -303,7 +313,8 @@ class Control:
         def granted() -> None:
             self._audit("take over" if op.over else "take", op.ref)
 
-        if not op.over and (state := server.drivers.robot(op.ref).published) is not None and state.id:
+        is_held = driven.published is not None and driven.published.id != ""
+        if is_held and not op.over:
             self._audit("ask", op.ref)
         server.drivers.take(self._tab, robot, granted, lambda why: self._refuse(op, why), over=op.over)
 
@@ -325,7 +336,7 @@ class Control:
         self._server.audit.write(what, ref=ref, user=session.user, device=device, address=address, detail=detail)
 
     def _address(self) -> str:
-        return "" if self._websocket.client is None else self._websocket.client.host
+        return address_of(self._websocket)
 
     # -- to the page
 
@@ -336,7 +347,7 @@ class Control:
     async def _send_all(self) -> None:
         """Send changed states at most every 50 ms, and pings twice a second."""
         ping_at, check_at = time.monotonic() + PING_S, time.monotonic() + CHECK_S
-        people = self._server.people_version
+        checked_version = self._server.people_version
         while self._websocket.application_state is WebSocketState.CONNECTED:
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), max(0.0, min(ping_at, check_at) - time.monotonic()))
@@ -345,19 +356,22 @@ class Control:
             if now >= ping_at:
                 ping_at = now + PING_S
                 self._waiting.append(self._ping())
-            if now >= check_at or people != self._server.people_version:
-                check_at, people = now + CHECK_S, self._server.people_version
+            if now >= check_at or checked_version != self._server.people_version:
+                check_at, checked_version = now + CHECK_S, self._server.people_version
                 await self._check_session()
             await self._flush(now)
             await asyncio.sleep(FLUSH_S if not self._waiting else 0)
 
     async def _flush(self, now: float) -> None:
+        """Send the waiting messages, then the changed states, then log lines."""
         while self._waiting:
             await self._websocket.send_text(encode(self._waiting.popleft()))
-        drivers = {key for key in self._interest.dirty if key[1] == "web/driver"}
+        # Each page is shown the driver in another way, so the table of robots does not have this value.
+        drivers = {(ref, metric) for ref, metric in self._interest.dirty if metric == "web/driver"}
         self._interest.dirty -= drivers
-        changed, large = self._server.robots.take(self._interest, now, large=self._large_due)
-        self._large_due = self._large_due and not large
+        changed, has_large = self._server.robots.take(self._interest, now, large=self._large_due)
+        if has_large:
+            self._large_due = False
         if self._interest.more:
             self._wake.set()
         values = changed + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)
@@ -367,18 +381,19 @@ class Control:
         await self._send_logs()
 
     def _driver(self, ref: str) -> m.DriverView:
+        """Return the robot's driver as this page shows it, with words for users without a login."""
         view, login = self._server.drivers.robot(ref).shown(self._tab, clock()), self._server.settings.login
         by = person(view.by, login=login)
-        return replace(view, by=by, device=view.device if by == view.by else "", asks=person(view.asks, login=login))
+        device = view.device if by == view.by else ""  # the words say it already
+        return replace(view, by=by, device=device, asks=person(view.asks, login=login))
 
     async def _send_logs(self) -> None:
         """Send a part of the log at each echo, so that on a slow connection no more than that delays pings."""
         ref = self._interest.watched
-        lines = self._server.robots.logs.get(ref)
-        if lines is not None and (run := self._logs.take(lines)) is not None:
-            await self._websocket.send_text(
-                encode(m.Logs(ref=ref, origin=lines.origin, first=run.first, lines=run.lines))
-            )
+        log = self._server.robots.logs.get(ref)
+        if log is not None and (run := self._logs.take(log)) is not None:
+            message = m.Logs(ref=ref, origin=log.origin, first=run.first, lines=run.lines)
+            await self._websocket.send_text(encode(message))
 
     async def _check_session(self) -> None:
         session = await asyncio.to_thread(self._check)

@@ -14,7 +14,7 @@ MAX_BYTES: Final = 256 * 1024  # of all lines together
 MAX_LINE_BYTES: Final = 16 * 1024  # of one line
 PART_BYTES: Final = 16 * 1024  # of one message to a page: echoes, without which it does not drive, wait behind it
 _TEXT, _WORD = 4000, 64  # characters of a line, and of its level and service
-_LATEST_MS = 8.6e15  # that browsers take for a date
+_LATEST_MS = 8.6e15  # the latest time that browsers can show
 _TEXTS = {"message", "msg"}
 _SYNONYMS = {"WARN": "WARNING", "ERR": "ERROR", "FATAL": "CRITICAL", "TRACE": "DEBUG", "NOTICE": "INFO"}
 
@@ -47,16 +47,20 @@ class LogLines:
             self._bytes -= len(bytes(self._lines.popleft()[1]))
 
     def after(self, number: int) -> Run | None:
-        """Return the oldest lines after this number, as many as one message may have; None if there are none."""
+        """Return the oldest lines after this number, as many as one message may have; None if there are none.
+
+        They end before a number that is missing because its line was dropped.
+        """
         run: list[msgspec.Raw] = []
         first = size = 0
-        for at, line in self._lines:
-            if at <= number:
+        for line_number, line in self._lines:
+            if line_number <= number:
                 continue
             size += len(bytes(line))
-            if run and (at != first + len(run) or size > PART_BYTES):
+            if not run:
+                first = line_number
+            elif line_number != first + len(run) or size > PART_BYTES:
                 break
-            first = first or at
             run.append(line)
         return Run(first, tuple(run)) if run else None
 
@@ -65,12 +69,14 @@ class LogReader:
     """A page's position in the lines of the component that it watches. It gets one part at each echo."""
 
     def __init__(self) -> None:
-        self._on = self._due = False  # due: the page has received the part before
-        self._sent = "", 0  # the origin and number of the last line
+        self._on = False  # the page wants lines
+        self._due = False  # the page has received the part before
+        self._origin, self._number = "", 0  # of the last line that was sent
 
     def begin(self, origin: str, number: int, *, on: bool) -> None:
         """Note that the page has the lines up to ``number``; ``on`` False: it wants no more."""
-        self._on, self._sent, self._due = on, (origin, number), True
+        self._on, self._due = on, True
+        self._origin, self._number = origin, number
 
     def end(self) -> None:
         self._on = False
@@ -80,12 +86,13 @@ class LogReader:
 
     def take(self, lines: LogLines) -> Run | None:
         """Return the lines to send now; they count as received from now on."""
-        if not (self._on and self._due):
+        if not self._on or not self._due:
             return None
-        origin, number = self._sent
-        run = lines.after(number if origin == lines.origin else 0)
+        if self._origin != lines.origin:
+            self._origin, self._number = lines.origin, 0
+        run = lines.after(self._number)
         if run is not None:
-            self._sent, self._due = (lines.origin, run.first + len(run.lines) - 1), False
+            self._number, self._due = run.first + len(run.lines) - 1, False
         return run
 
 
@@ -114,9 +121,10 @@ def line_of(payload: bytes) -> msgspec.Raw | None:
 
 
 def _line(plain: Any) -> Line:
+    """Return a log message, of any form, as a line."""
     record = plain if isinstance(plain, dict) else {"message": plain}
     if not _TEXTS & record.keys() and isinstance(record.get("value"), dict):
-        record = record | record["value"]
+        record = record | record["value"]  # {"t": …, "value": {"message": …}}
     text = next((record[name] for name in ("message", "msg", "value") if name in record), record)
     service = _word(record.get("service"))
     message = _text(text).removeprefix(f"[{service}] " if service else "")  # it is shown beside it
@@ -129,11 +137,14 @@ def _word(value: object) -> str:
 
 
 def _text(value: object) -> str:
-    text = value if isinstance(value, str) else "" if value is None else msgspec.json.encode(value).decode()
+    if value is None:
+        return ""
+    text = value if isinstance(value, str) else msgspec.json.encode(value).decode()
     return text if len(text) <= _TEXT else f"{text[:_TEXT]}…"
 
 
 def _stamp(record: dict[str, Any]) -> float | None:
+    """Return the time of a log message in epoch milliseconds; None if it has none that can be shown."""
     for name, per_ms in (("t", 1), ("timestamp", 1000)):
         stamp = record.get(name)
         if isinstance(stamp, int | float) and not isinstance(stamp, bool):

@@ -49,7 +49,7 @@ class Watch(_FromPage, frozen=True, kw_only=True, tag="watch"):
 
 
 class ReadLogs(_FromPage, frozen=True, kw_only=True, tag="read-logs"):
-    """Begin or end to send log lines of the watched component. The page has those of ``origin`` up to ``after``."""
+    """Begin, or end, to get log lines of the watched component. The page has those of ``origin`` up to ``after``."""
 
     ref: Ref
     on: bool

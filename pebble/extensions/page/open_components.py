@@ -6,7 +6,7 @@ import asyncio
 import logging
 from collections import Counter
 from collections.abc import Callable, Coroutine
-from typing import Any
+from typing import Any, NamedTuple
 
 from msgspec.structs import replace
 
@@ -28,8 +28,16 @@ KEEP_S = 5.0  # so long they are still received after the last page has closed t
 _FLAGS_METRIC = "web/flags"
 STEP_S = 1.0  # between two changes of what is received of one component: capabilities may change without end
 
-#: The component and channel of what a topic carries, where its own name does not tell them.
-_Carried = tuple[str, c.Channel] | None
+
+class _Carried(NamedTuple):
+    """The component and channel of a topic whose own name does not tell them."""
+
+    ref: str
+    channel: c.Channel
+
+
+#: Filters to subscribe to; None: the topics below them tell component and channel by their names.
+_Filters = dict[str, _Carried | None]
 
 #: Channels for which capabilities may name a topic that is subscribed to, besides overlays and flags.
 _NAMED = [
@@ -56,10 +64,10 @@ class OpenComponents:
         """Store the arguments. ``spawn`` runs a coroutine in the background."""
         self._broker, self._robots, self._spawn = broker, robots, spawn
         self._keep_s, self._step_s = keep_s, step_s
-        self._pages: Counter[str] = Counter()
+        self._pages: Counter[str] = Counter()  # that have each component open
         self._subscriptions: dict[str, dict[str, Subscription]] = {}  # by component and filter
-        self._following: set[str] = set()  # components whose task runs
-        self._wanted: dict[str, dict[str, _Carried]] = {}  # by component and filter
+        self._following: set[str] = set()  # components whose task, _follow, runs
+        self._wanted: dict[str, _Filters] = {}  # by component
         self._flags: dict[str, FlagsView] = {}
 
     @property
@@ -95,16 +103,16 @@ class OpenComponents:
 
     async def _follow(self, ref: str) -> None:
         """Subscribe and unsubscribe until there are exactly the needed subscriptions."""
-        failed: set[str] = set()  # they are tried again, but logged once
+        failed: set[str] = set()  # filters that are tried again, but logged once
         try:
-            done = self._subscriptions.setdefault(ref, {})
+            subscriptions = self._subscriptions.setdefault(ref, {})
             while True:
                 wanted = self._wanted[ref] = self._filters(ref) if ref in self._pages else {}
-                for filter_ in [filter_ for filter_ in done if filter_ not in wanted]:
-                    await self._broker.unsubscribe(done.pop(filter_))
-                for filter_ in [filter_ for filter_ in wanted if filter_ not in done]:
+                for filter_ in subscriptions.keys() - wanted:
+                    await self._broker.unsubscribe(subscriptions.pop(filter_))
+                for filter_ in [filter_ for filter_ in wanted if filter_ not in subscriptions]:
                     try:
-                        done[filter_] = await self._broker.subscribe(filter_, self._receiver(ref, filter_))
+                        subscriptions[filter_] = await self._broker.subscribe(filter_, self._receiver(ref, filter_))
                     except PebbleError as error:
                         if filter_ not in failed:
                             failed.add(filter_)
@@ -117,7 +125,7 @@ class OpenComponents:
                     self._forget(ref)
                     return
                 await asyncio.sleep(self._step_s)
-                if ref in self._pages and set(self._filters(ref)) == set(done):
+                if ref in self._pages and self._filters(ref).keys() == subscriptions.keys():
                     return
         finally:
             self._following.discard(ref)
@@ -133,16 +141,18 @@ class OpenComponents:
             self._robots.forget(ref)
 
     def _receiver(self, ref: str, filter_: str) -> Callable[[Message, float], None]:
+        """Return the callback for messages of a subscription of this component."""
+
         def take(message: Message, now: float) -> None:
             carried = self._wanted.get(ref, {}).get(filter_)
-            before = self._robots.aliases(ref)
+            aliases_before = self._robots.aliases(ref)
             if carried is None:
                 self._robots.receive(message, now)
-            elif carried[1].kind is c.Kind.FLAG:
-                self._receive_flag(ref, carried[1], message)
+            elif carried.channel.kind is c.Kind.FLAG:
+                self._receive_flag(ref, carried.channel, message)
             else:
-                self._robots.receive_as(carried[0], carried[1].metric, message, now, carried[1])
-            if self._robots.aliases(ref) != before:
+                self._robots.receive_as(carried.ref, carried.channel.metric, message, now, carried.channel)
+            if self._robots.aliases(ref) != aliases_before:
                 self.update(ref)
 
         return take
@@ -160,22 +170,23 @@ class OpenComponents:
         self._flags[ref] = view
         self._robots.set_server_metric(ref, _FLAGS_METRIC, view)
 
-    def _filters(self, ref: str) -> dict[str, _Carried]:
+    def _filters(self, ref: str) -> _Filters:
         """Return the topics that an open component needs: channels, flags, overlays, and those that it names."""
-        filters: dict[str, _Carried] = {channel.filter(ref): None for channel in WATCHED}
+        filters: _Filters = {channel.filter(ref): None for channel in WATCHED}
         for channel in _NAMED:
             self._add(filters, ref, channel)
         for metric in self._robots.aliases(ref):
             alias = c.Channel(metric=metric, kind=c.Kind.STREAM, payload=AnyObject)
-            filters.setdefault(f"{ref}/{Direction.OUTGOING}/{metric}", (ref, alias))
+            filters.setdefault(f"{ref}/{Direction.OUTGOING}/{metric}", _Carried(ref, alias))
         for flag in FLAGS.values():
-            filters[self._robots.topic(ref, flag)] = (ref, flag)
+            filters[self._robots.topic(ref, flag)] = _Carried(ref, flag)
         source = self._robots.sources.get(ref, ref)
         filters.setdefault(c.VIDEO_OVERLAYS.filter(source), None)
         self._add(filters, source, c.VIDEO_OVERLAYS)
         return filters
 
-    def _add(self, filters: dict[str, _Carried], ref: str, channel: c.Channel) -> None:
+    def _add(self, filters: _Filters, ref: str, channel: c.Channel) -> None:
+        """Add the topic of a channel, if the component's capabilities name another than the contract's."""
         topic = self._robots.topic(ref, channel)
         if topic != channel.topic(ref):
-            filters.setdefault(topic, (ref, channel))
+            filters.setdefault(topic, _Carried(ref, channel))

@@ -6,21 +6,30 @@ and the arrival of the echo, which limits the offset on both sides: so a constan
 
 from collections import deque
 from itertools import count
+from typing import NamedTuple
 
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.drive_reasons import LATE_S
 
 PING_S = 0.5
-_EXTRA_S = 0.3  # what a command may be older than the page's usual round trip
+_EXTRA_S = 0.3  # so much older than the page's shortest round trip a command may be
 _ECHO_S = 1.0  # without an echo for so long nothing is known any more
-_JUMP_S = 1.0
-_ANSWERS = 20  # ten seconds of them: clocks drift apart by less than a millisecond
-_UNANSWERED = 32
+_JUMP_S = 1.0  # by so much a clock may contradict its limits, as it drifts and is set by NTP
+_ANSWERS = 20  # echoes that are remembered, ten seconds of them: clocks drift apart by less than a millisecond
+_UNANSWERED = 32  # pings that are remembered
 _JUDGED = 4  # answers by which people are told that a connection is slow
 
 
 class ClockJumpError(PebbleError):
     """An error: the page's or the server's clock has jumped, as after a suspend. The page must connect again."""
+
+
+class _Answer(NamedTuple):
+    """An echo: the limits of the offset of the page's clock (page minus server) that follow from it. Seconds."""
+
+    lowest_offset_s: float
+    highest_offset_s: float
+    round_trip_s: float
 
 
 class PageClock:
@@ -29,9 +38,9 @@ class PageClock:
     def __init__(self) -> None:
         self.round_trip_s: float | None = None
         self._numbers = count(1)
-        self._sent: dict[int, float] = {}
+        self._sent: dict[int, float] = {}  # when each unanswered ping was sent
         self._echoed_at = float("-inf")
-        self._bounds: deque[tuple[float, float, float]] = deque(maxlen=_ANSWERS)  # of the offset, and the round trip
+        self._answers: deque[_Answer] = deque(maxlen=_ANSWERS)
 
     @property
     def shown_round_trip_s(self) -> float | None:
@@ -41,10 +50,11 @@ class PageClock:
         """
         if self.round_trip_s is None or self.round_trip_s >= LATE_S:
             return self.round_trip_s
-        newest = sorted(round_trip for _, _, round_trip in list(self._bounds)[-_JUDGED:])
-        return newest[-2:][0]
+        ordered = sorted(answer.round_trip_s for answer in list(self._answers)[-_JUDGED:])
+        return ordered[-2] if len(ordered) > 1 else ordered[0]
 
     def ping(self, now: float) -> int:
+        """Note that a ping is sent now; return its number."""
         if len(self._sent) >= _UNANSWERED:
             del self._sent[next(iter(self._sent))]
         number = next(self._numbers)
@@ -53,37 +63,42 @@ class PageClock:
 
     def echo(self, number: int, t_ms: float, now: float) -> None:
         """Handle the answer to a ping. The answer to a ping that was never sent is ignored. Raises ClockJumpError."""
-        sent = self._sent.pop(number, None)
-        if sent is None:
+        sent_at = self._sent.pop(number, None)
+        if sent_at is None:
             return
         for older in [other for other in self._sent if other < number]:
             del self._sent[older]  # TCP keeps the order: these echoes will not come
-        low, high = t_ms / 1000 - now, t_ms / 1000 - sent
-        self._check(low, high)
-        self.round_trip_s = now - sent
-        self._bounds.append((low, high, now - sent))
+        answer = _Answer(t_ms / 1000 - now, t_ms / 1000 - sent_at, now - sent_at)
+        self._check(answer.lowest_offset_s, answer.highest_offset_s)
+        self.round_trip_s = answer.round_trip_s
+        self._answers.append(answer)
         self._echoed_at = now
 
     def problem(self, now: float) -> str:
         """Return why commands of this page may move nothing now; empty if they may."""
         if now - self._echoed_at > _ECHO_S:
             return "the connection to the page is stalled"
-        waiting = max((now - sent for sent in self._sent.values()), default=0.0)
-        late = max(self.round_trip_s or 0.0, waiting)
-        return f"commands are late ({1000 * late:.0f} ms)" if late >= LATE_S else ""
+        unanswered_s = max((now - sent_at for sent_at in self._sent.values()), default=0.0)
+        late_s = max(self.round_trip_s or 0.0, unanswered_s)
+        return f"commands are late ({1000 * late_s:.0f} ms)" if late_s >= LATE_S else ""
 
     def late(self, t_ms: float, now: float) -> bool:
         """True if a message stamped ``t_ms`` by the page may be too old to move anything. Raises ClockJumpError."""
-        if not self._bounds:
+        if not self._answers:
             return True
-        low = t_ms / 1000 - now
-        self._check(low, float("inf"))
-        age = now - t_ms / 1000 + self._highest()
-        return age > min(LATE_S, min(round_trip for _, _, round_trip in self._bounds) + _EXTRA_S)
+        self._check(t_ms / 1000 - now, float("inf"))
+        oldest_age_s = now - (t_ms / 1000 - self._highest_offset_s())
+        usual_s = min(answer.round_trip_s for answer in self._answers)
+        return oldest_age_s > min(LATE_S, usual_s + _EXTRA_S)
 
-    def _highest(self) -> float:
-        return min(high for _, high, _ in self._bounds)
+    def _highest_offset_s(self) -> float:
+        return min(answer.highest_offset_s for answer in self._answers)
 
-    def _check(self, low: float, high: float) -> None:
-        if self._bounds and (low > self._highest() + _JUMP_S or high < max(self._bounds)[0] - _JUMP_S):
+    def _check(self, lowest_offset_s: float, highest_offset_s: float) -> None:
+        """Raise ClockJumpError if these limits of the offset contradict the earlier ones."""
+        if not self._answers:
+            return
+        earlier_lowest_s = max(answer.lowest_offset_s for answer in self._answers)
+        too_high = lowest_offset_s > self._highest_offset_s() + _JUMP_S
+        if too_high or highest_offset_s < earlier_lowest_s - _JUMP_S:
             raise ClockJumpError("a clock has jumped: one of the two machines was suspended")

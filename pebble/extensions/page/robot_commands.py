@@ -16,7 +16,7 @@ from pebble.transports import Message, QoS
 class _Command(NamedTuple):
     channel: Channel
     value: Any
-    names: dict[str, str] = {}  # of the channel's topic  # noqa: RUF012 - never changed
+    names: dict[str, str] = {}  # that fill the pattern of the channel's topic  # noqa: RUF012 - never changed
 
 
 _ACTIONS = {"reboot": c.REBOOT, "service-restart": c.SERVICE_RESTART, "git-pull": c.GIT_PULL}
@@ -58,20 +58,31 @@ def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
         return f"{op.name} is no command of a microcontroller"
     command = _command(op)
     section, key = PLACES.get(command.channel, ("", ""))
-    offered = section_of(capabilities, section)
-    kind = key.removesuffix("_topic")  # lights that do not flash: {"solid": true, "flash": false}
     if isinstance(op, m.ActionOp):
-        offered = next(filter(None, (section_of(capabilities, section) for section in _sections(op))), {})
-    if isinstance(op, m.OutletOp):
-        outlets = section_of(capabilities, "outlets").get("outlets")
-        named = [outlet for outlet in outlets if isinstance(outlet, dict)] if isinstance(outlets, list) else []
-        offered = next((outlet for outlet in named if outlet.get("name") == op.outlet), {})
-    refused = any(offered.get(name) is False for name in ("available", "controls", kind))
+        described = (section_of(capabilities, section) for section in _sections(op))
+        offer = next(filter(None, described), {})
+    elif isinstance(op, m.OutletOp):
+        offer = _outlet_offer(capabilities, op.outlet)
+    else:
+        offer = section_of(capabilities, section)
+    kind = key.removesuffix("_topic")  # lights that do not flash: {"solid": true, "flash": false}
+    if all(offer.get(name) is not False for name in ("available", "controls", kind)):
+        return ""
     name, metric = op.ref.rpartition("/")[2], command.channel.metric.format(**command.names)
-    return f"{name} takes no {metric} commands" if refused else ""
+    return f"{name} takes no {metric} commands"
+
+
+def _outlet_offer(capabilities: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return the part of the capabilities about this outlet; empty if there is none."""
+    outlets = section_of(capabilities, "outlets").get("outlets")
+    for outlet in outlets if isinstance(outlets, list) else ():
+        if isinstance(outlet, dict) and outlet.get("name") == name:
+            return outlet
+    return {}
 
 
 def publication(op: m.RobotOp, capabilities: dict[str, Any]) -> Message:
+    """Return the message to publish, on the topic that the capabilities name, or else on the contract's."""
     command = _command(op)
     channel = command.channel
     if isinstance(op, m.ActionOp):
@@ -86,9 +97,12 @@ def publication(op: m.RobotOp, capabilities: dict[str, Any]) -> Message:
 
 def _action_topic(op: m.ActionOp, channel: Channel, capabilities: dict[str, Any]) -> str:
     """Return the topic of an action: the first one that the capabilities name."""
-    sections = (section_of(capabilities, section) for section in _sections(op))
-    topics = (section.get(key) for section in sections for key in ("flag_topic", "topic"))
-    return next((str(topic) for topic in topics if names(op.ref, topic, channel)), channel.topic(op.ref))
+    for section in _sections(op):
+        for key in ("flag_topic", "topic"):
+            topic = section_of(capabilities, section).get(key)
+            if names(op.ref, topic, channel):
+                return str(topic)
+    return channel.topic(op.ref)
 
 
 def _sections(op: m.ActionOp) -> list[str]:
@@ -98,6 +112,7 @@ def _sections(op: m.ActionOp) -> list[str]:
 
 
 def _command(op: m.RobotOp) -> _Command:
+    """Return the channel of a request, and the value to publish there."""
     match op:
         case m.LightsOp(r=r, g=g, b=b, period=None):
             return _Command(c.LIGHTS_SOLID, p.LightsSolid(r=r, g=g, b=b))

@@ -1,5 +1,6 @@
 """The newest value of every metric of every component, and which of them each page still needs.
 
+A component is a robot, a board or a program with topics of its own; a metric is what follows the direction in a topic.
 There is no queue: a slow page gets newest values less often. A page that connects again gets all of them.
 """
 
@@ -31,11 +32,11 @@ LARGE_BYTES = 16 * 1024  # a value beyond holds up a slow connection: one is sen
 MAX_STATE_BYTES = 128 * 1024  # of values in one message: pings, by which pages drive, do not wait for thousands
 MAX_BYTES = 64 * 1024 * 1024  # of all values together, but for those of components that are open, driven or stopped
 MAX_ALIASES = 64  # of one component: topics that its microcontrollers declare besides the contract's
-_REFRESH_S = 1.0  # values that change with every heartbeat are sent this often,
-_REFRESHES_PER_S = 100  # but of so many components at most, and of those that are open
+_REFRESH_S = 1.0  # a component's values that change with every heartbeat are sent this often at most,
+_REFRESHES_PER_S = 100  # and those of so many components a second, besides the open ones
 _LONGEST_ALIAS = 200  # characters
 
-_is_level = re.compile(LEVEL).search
+_valid_level = re.compile(LEVEL).search
 
 
 class _Value(NamedTuple):
@@ -84,7 +85,7 @@ class Interest:
         self.watched = ""
         self.dirty: set[tuple[str, str]] = set()
         self.more = False  # what is dirty did not fit into the last message
-        self.gone: set[str] = set()
+        self.gone: set[str] = set()  # components that were removed since the last message
         self.notify = changed
 
 
@@ -93,17 +94,19 @@ class Robots:
 
     def __init__(self) -> None:
         self.components: dict[str, Component] = {}
-        #: Robots that get a place in any case, and those that lose it to none: they are open, driven or stopped.
+        #: True for a robot that gets a place even in a full table: it is open, driven or stopped.
         self.is_wanted: Callable[[str], bool] = lambda _ref: False
+        #: True for a robot that never loses its place to another.
         self.is_kept: Callable[[str], bool] = lambda _ref: False
         self.names: Mapping[str, str] = {}  # of components that may have none of their own
         self.omitted = 0  # messages of components, metrics and values beyond the limits
         self.interests: set[Interest] = set()
+        #: Called with a component whose retained messages are not known here (any more).
         self.on_forget: Callable[[str], object] = lambda _: None
         self.logs: dict[str, LogLines] = {}  # of watched components
         self.sources: dict[str, str] = {}  # the components whose pictures are shown on the pages of others
-        self._server: dict[tuple[str, str], _Value] = {}
-        self._bytes = 0
+        self._server: dict[tuple[str, str], _Value] = {}  # the server's own metrics, by component and metric
+        self._bytes = 0  # of all components' values
 
     # -- reading
 
@@ -140,17 +143,21 @@ class Robots:
         taken, and only with ``large``. The others, and what does not fit into this message, wait for the next.
         """
         dirty, interest.dirty = interest.dirty, set()
-        taken, has_large, room = [], False, MAX_STATE_BYTES
+        taken: list[tuple[str, str, Any, float]] = []
+        has_large, room = False, MAX_STATE_BYTES
         for ref, metric in sorted(dirty, key=lambda key: key[0] != interest.watched):
             stored = self._find(ref, metric)
             size = 0 if stored is None else len(bytes(stored.raw))
-            if room <= 0 or (size > LARGE_BYTES and (has_large or not large)):
+            is_large = size > LARGE_BYTES
+            if room <= 0 or (is_large and (has_large or not large)):
                 interest.dirty.add((ref, metric))
                 continue
-            has_large = has_large or size > LARGE_BYTES
+            has_large = has_large or is_large
             room -= size
-            value, age_ms = (None, 0.0) if stored is None else (stored.raw, 1000 * (now - stored.at))
-            taken.append((ref, metric, value, age_ms))
+            if stored is None:
+                taken.append((ref, metric, None, 0.0))
+            else:
+                taken.append((ref, metric, stored.raw, 1000 * (now - stored.at)))
         interest.more = room <= 0
         return tuple(taken), has_large
 
@@ -165,7 +172,7 @@ class Robots:
     def join(self, interest: Interest) -> None:
         """Send all values to this page."""
         self.interests.add(interest)
-        interest.dirty |= set(self._all(FLEET)) | set(self._server)
+        interest.dirty |= set(self._fleet_values()) | set(self._server)
 
     def watch(self, interest: Interest, ref: str) -> None:
         """Send this page further metrics of ``ref``."""
@@ -177,10 +184,11 @@ class Robots:
     def leave(self, interest: Interest) -> None:
         self.interests.discard(interest)
 
-    def _all(self, channels: Collection[c.Channel | None]) -> Iterator[tuple[str, str]]:
+    def _fleet_values(self) -> Iterator[tuple[str, str]]:
+        """Yield component and metric of each value that all pages show."""
         for ref, component in self.components.items():
             for metric in component.values:
-                if _channel(metric) in channels:
+                if _channel(metric) in FLEET:
                     yield ref, metric
 
     # -- changes
@@ -218,8 +226,9 @@ class Robots:
             return
         if not message.payload:
             self._remove_value(component, metric)
-        elif (raw := codec.trim(message.payload)) != message.payload:  # pages get it as it is
-            message = msgspec.structs.replace(message, payload=raw)
+        trimmed = codec.trim(message.payload)  # as pages get it as it is
+        if trimmed != message.payload:
+            message = msgspec.structs.replace(message, payload=trimmed)
         if not message.payload or self._store(component, metric, channel, message, now):
             self._interpret(component, metric, channel, message, now)
 
@@ -246,13 +255,12 @@ class Robots:
         every_s = max(_REFRESH_S, len(self.components) / _REFRESHES_PER_S)
         for component in self.components.values():
             age_s = now - component.refreshed_at
-            if component.robot.online(now) is not component.sent_online or age_s == float("inf"):
+            changed = component.robot.online(now) is not component.sent_online or age_s == float("inf")
+            ages = component.robot.live or component.sent_online is not None
+            if changed or (ages and age_s >= _REFRESH_S and component.ref in opened):
                 self._refresh(component, now)
-            elif age_s >= _REFRESH_S and (component.robot.live or component.sent_online is not None):
-                if component.ref in opened:
-                    self._refresh(component, now)
-                elif age_s >= every_s:
-                    due.append(component)
+            elif ages and age_s >= every_s:
+                due.append(component)
         due.sort(key=lambda component: component.refreshed_at)
         third = 1 + min(len(self.components), _REFRESHES_PER_S) // 3
         for component in due[:third]:
@@ -265,6 +273,7 @@ class Robots:
             self._mark(component.ref, c.ONLINE.metric)
 
     def _add(self, ref: str) -> Component | None:
+        """Add a component; None if there is no place. In a full table a wanted robot gets that of the newest other."""
         if len(self.components) >= MAX_COMPONENTS:
             if not self.omitted:
                 log.warning("more than %d components at this broker: give it accounts", MAX_COMPONENTS)
@@ -274,22 +283,24 @@ class Robots:
             newest = next((other for other in reversed(self.components) if not self.is_kept(other)), None)
             if newest is not None:
                 self.forget(newest)
-            self.on_forget(ref)  # what it published before found no place: it is asked for
+            self.on_forget(ref)  # its earlier messages found no place: they are asked for again
         component = self.components[ref] = Component(ref)
         return component
 
-    def _has_room(self, component: Component, metric: str, channel: c.Channel, grows: int) -> bool:
+    def _has_room(self, component: Component, metric: str, channel: c.Channel, more_bytes: int) -> bool:
+        """True if a value may be stored. States of motor owners always may, as stop and control depend on them."""
         if component.lists(metric):
             return True
         is_new = metric not in component.values
         if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern:
             return False
-        return self._bytes + grows <= MAX_BYTES or self.is_kept(component.ref)
+        return self._bytes + more_bytes <= MAX_BYTES or self.is_kept(component.ref)
 
     def _store(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> bool:
         """Check and store the value; return False if it is refused."""
         old = component.values.get(metric)
-        if len(message.payload) > (_MAX_CLIPS_BYTES if channel is c.SOUNDBOARD_FILES else MAX_VALUE_BYTES):
+        most_bytes = _MAX_CLIPS_BYTES if channel is c.SOUNDBOARD_FILES else MAX_VALUE_BYTES
+        if len(message.payload) > most_bytes:
             self.omitted += 1
             return False
         try:
@@ -298,11 +309,11 @@ class Robots:
             return False
         if channel is c.CAPABILITIES and component.ref in self.names:
             raw = with_name(raw, self.names[component.ref])
-        grows = len(raw) - (0 if old is None else len(bytes(old.raw)))
-        if not self._has_room(component, metric, channel, grows):
+        more_bytes = len(raw) - (0 if old is None else len(bytes(old.raw)))
+        if not self._has_room(component, metric, channel, more_bytes):
             self.omitted += 1
             return False
-        self._bytes += grows
+        self._bytes += more_bytes
         component.values[metric] = _Value(msgspec.Raw(raw), now)
         if channel is not c.ONLINE:
             self._mark(component.ref, metric)
@@ -317,23 +328,25 @@ class Robots:
         component.aliases.pop(metric, None)
 
     def _interpret(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> None:
-        robot, before = component.robot, component.robot.capabilities
-        robot.receive(channel, message, now, time.time() - (time.monotonic() - now))
+        """Update the view of the robot from a message that arrived at ``now``."""
+        robot, capabilities_before = component.robot, component.robot.capabilities
+        received_at = time.time() - (time.monotonic() - now)
+        robot.receive(channel, message, now, received_at)
         if channel is c.MCU_DESCRIBE and message.payload:
             component.aliases[metric] = _aliases(message.payload)
-        if robot.capabilities is not before and "announced" in robot.capabilities:
-            self.show_offer(component, now)
+        if robot.capabilities is not capabilities_before and "announced" in robot.capabilities:
+            self.show_announced(component, now)
         if robot.liveness.reported_offline and component.sent_online is not False:
             self._refresh(component, now)  # it may be back before the next round
 
-    def show_offer(self, component: Component, now: float) -> None:
+    def show_announced(self, component: Component, now: float) -> None:
         """Send pages the capabilities that a component announces, or is assumed to have, until it publishes its own."""
         if not component.robot.capabilities:
             self._remove_value(component, c.CAPABILITIES.metric)
             return
         payload = msgspec.json.encode({"t": int(1000 * time.time()), "value": component.robot.capabilities})
-        offer = Message(c.CAPABILITIES.topic(component.ref), payload)
-        self._store(component, c.CAPABILITIES.metric, c.CAPABILITIES, offer, now)
+        message = Message(c.CAPABILITIES.topic(component.ref), payload)
+        self._store(component, c.CAPABILITIES.metric, c.CAPABILITIES, message, now)
 
     def _log(self, component: Component, message: Message) -> None:
         lines = self.logs.get(component.ref)
@@ -352,11 +365,12 @@ class Robots:
                 interest.notify()
 
     def _mark(self, ref: str, metric: str, *, everybody: bool = False) -> None:
+        """Note that pages need this value: all pages or, for a metric of open components, those that show it."""
         channel = _channel(metric)
         everybody = everybody or channel in FLEET
         for interest in self.interests:
-            drawn = channel is c.VIDEO_OVERLAYS and self.sources.get(interest.watched) == ref
-            if everybody or drawn or interest.watched == ref:
+            is_drawn = channel is c.VIDEO_OVERLAYS and self.sources.get(interest.watched) == ref
+            if everybody or is_drawn or interest.watched == ref:
                 interest.dirty.add((ref, metric))
                 interest.notify()
 
@@ -369,12 +383,13 @@ def _aliases(payload: bytes) -> tuple[str, ...]:
     """Return the metrics that a manifest declares beyond the contract; the rest of it may be invalid."""
     manifest = codec.plain(c.MCU_DESCRIBE, payload)
     interfaces = manifest.get("interfaces") if isinstance(manifest, dict) else None
-    outgoing = [
-        str(interface.get("channel"))
-        for interface in (interfaces if isinstance(interfaces, list) else ())
-        if isinstance(interface, dict) and interface.get("dir") == "out" and isinstance(interface.get("channel"), str)
-    ]
-    return tuple(filter(_may_be_alias, outgoing[:MAX_ALIASES]))
+    metrics: list[str] = []
+    for interface in interfaces if isinstance(interfaces, list) else ():
+        if isinstance(interface, dict) and interface.get("dir") == "out":
+            metric = interface.get("channel")
+            if isinstance(metric, str):
+                metrics.append(metric)
+    return tuple(filter(_may_be_alias, metrics[:MAX_ALIASES]))
 
 
 def _may_be_alias(metric: str) -> bool:
@@ -385,5 +400,5 @@ def _may_be_alias(metric: str) -> bool:
         and not is_reserved(metric)
         and family not in ("web", "mcu")
         and len(metric) <= _LONGEST_ALIAS
-        and all(map(_is_level, metric.split("/")))
+        and all(map(_valid_level, metric.split("/")))
     )

@@ -1,4 +1,4 @@
-"""Serves the operator page until a signal ends it."""
+"""The operator page's web server: its limits for connections, and its run until a signal ends it."""
 
 from __future__ import annotations
 
@@ -45,18 +45,19 @@ async def _serve(settings: WebSettings, listener: socket.socket, on_ready: Calla
     if config.ssl is not None and settings.certificate is not None:
         renew_certificate(config.ssl, settings.certificate, settings.key)
     server = uvicorn.Server(config)
-    watching = asyncio.ensure_future(_report(server, listener, url_of(settings, listener), on_ready))
+    starting = asyncio.ensure_future(_report_start(server, listener, url_of(settings, listener), on_ready))
     try:
         await server.serve(sockets=[listener])
     finally:
-        watching.cancel()
+        starting.cancel()
     if not server.started:
         raise PebbleError("the operator page did not start: the lines above say why")
 
 
-async def _report(
+async def _report_start(
     server: uvicorn.Server, listener: socket.socket, url: str, on_ready: Callable[[str], None] | None
 ) -> None:
+    """Call ``on_ready`` with the address once the server accepts connections."""
     while not server.started:
         await asyncio.sleep(0.02)
     listener.listen(_WAITING)  # asyncio lets as many wait as it accepts at once
@@ -153,9 +154,11 @@ def url_of(settings: WebSettings, listener: socket.socket) -> str:
     if host in _ALL_ADDRESSES:  # no browser can open these
         names = certificates.show(settings.certificate).names if settings.certificate else ()
         host = next((name for name in names if name not in _ALL_ADDRESSES), socket.gethostname())
-    shown = f"[{host}]" if host.count(":") > 1 else host
-    port = "" if ":" in host and shown == host else f":{listener.getsockname()[1]}"  # a name may have its own port
-    return f"{'https' if settings.certificate else 'http'}://{shown}{port}/"
+    if host.count(":") > 1:  # an IPv6 address
+        host = f"[{host}]:{listener.getsockname()[1]}"
+    elif ":" not in host:  # a name may have its own port
+        host = f"{host}:{listener.getsockname()[1]}"
+    return f"{'https' if settings.certificate else 'http'}://{host}/"
 
 
 def _raise_limit_of_descriptors() -> None:

@@ -66,15 +66,15 @@ class Server:
             broker.is_named = self._is_named
         self._heartbeats: Heartbeats | None = None  # while a stop of all goes to further robots
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
-        # What is drawn over the picture comes from there.
+        # With another picture, a page gets the overlays of that robot.
         self.sources = ChosenSources(people, self.robots, self.open_components.update)
         self.boards = SilentBoards(self.broker, self.robots, self.drivers, people, settings)
         self.drivers.refusals.is_stopping = self.stops.holds
         self.robots.is_wanted = self._is_wanted
         self.robots.is_kept = lambda ref: self._is_wanted(ref) or self.stops.sends_to(ref)
         self.robots.on_forget = self._ask_anew
-        self._of_all: list[Subscription] = []
-        self.people_version = (0, 0)
+        self._fleet_subscriptions: list[Subscription] = []  # for the messages of all components
+        self.people_version = (0, 0)  # changes with people and sessions
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def open(self) -> None:
@@ -84,8 +84,9 @@ class Server:
         self.broker.on_state(self.drivers.renew_keys)
         self._show_broker()
         for channel in (*FLEET, *SYNONYMS):
-            deferred = channel is ONLINE or channel in SYNONYMS
-            self._of_all.append(await self.broker.subscribe(channel.filter("+/+/+"), self.receive, deferred=deferred))
+            filter_, is_heartbeat = channel.filter("+/+/+"), channel is ONLINE or channel in SYNONYMS
+            subscription = await self.broker.subscribe(filter_, self.receive, deferred=is_heartbeat)
+            self._fleet_subscriptions.append(subscription)
         self.spawn(self._tick())
         if self.settings.expand:
             self.spawn(expand(self.settings.broker))
@@ -116,6 +117,7 @@ class Server:
     # -- from the broker
 
     def receive(self, message: Message, now: float) -> None:
+        """Handle a message of any component."""
         address = parse_topic(message.topic)
         if address is None:
             return
@@ -129,12 +131,14 @@ class Server:
         if channel_of(f"outgoing/{address.metric}") in (CAPABILITIES, CONTROL_STATE):
             self.drivers.updated(ref)
         if address.metric == CAPABILITIES.metric:
-            for page_ref in (ref, *(page for page, source in self.robots.sources.items() if source == ref)):
-                self.open_components.update(page_ref)
+            self.open_components.update(ref)
+            for page, source in list(self.robots.sources.items()):
+                if source == ref:  # it shows this component's picture, with the overlays over it
+                    self.open_components.update(page)
 
     def _ask_anew(self, _ref: str) -> None:
         """Subscribe again to get this robot's retained messages once more."""
-        for subscription in self._of_all:
+        for subscription in self._fleet_subscriptions:
             subscription.renew()
 
     def _show_broker(self) -> None:
@@ -154,9 +158,10 @@ class Server:
         send(self._publish_stop, messages)
 
     def _publish_stop(self, topic: str, payload: bytes, *, qos: QoS) -> bool:
-        return any(broker.publish(topic, payload, qos=qos) for broker in (self.stop_broker, self.broker))
+        """Publish on the stops' own connection, or if that does not accept it on the other."""
+        return self.stop_broker.publish(topic, payload, qos=qos) or self.broker.publish(topic, payload, qos=qos)
 
-    def _hear(self, now: float) -> None:
+    def _stop_by_heartbeats(self, now: float) -> None:
         """During a stop of all, stop robots whose heartbeats arrive on the heartbeats' own connection."""
         if self._heartbeats is None:
             if self.stops.collecting:
@@ -187,12 +192,12 @@ class Server:
 
     def _is_wanted(self, ref: str) -> bool:
         """True if a page has the component open, drives it, or has stopped it."""
-        return ref in self.open_components or self.drivers.drives(ref) or self.stops.names(ref)
+        return ref in self.open_components or self.drivers.drives(ref) or self.stops.has_stop_of(ref)
 
     # -- names
 
     def level(self, ref: str) -> SecurityLevel:
-        """Return how strictly that robot checks accounts: as it publishes, or else by the server's config."""
+        """Return the security level of that robot: as it publishes, or else by the server's config."""
         robot = self.robots.view(ref)
         if robot is None or not robot.estop.has_capabilities:
             return self.settings.level
@@ -220,6 +225,7 @@ class Server:
     # -- what is due
 
     async def _tick(self) -> None:
+        """Do what is due, twenty times a second."""
         refresh_at = 0.0
         while True:
             await asyncio.sleep(TICK_S)
@@ -227,7 +233,7 @@ class Server:
                 self.broker.deliver()
                 now = clock()
                 self.drivers.tick(now)
-                self._hear(now)
+                self._stop_by_heartbeats(now)
                 self._send(self.stops.tick(now))
                 self.show_stops()
                 if now >= refresh_at:
@@ -235,9 +241,7 @@ class Server:
                     self.robots.refresh(time.monotonic())
                     self.boards.refresh(time.monotonic(), self.spawn)
                     self._show_broker()
-            except (
-                Exception
-            ):  # one faulty round must not end all later ones, on which the end of silent gestures depends
+            except Exception:  # later rounds must follow: the end of silent gestures depends on them
                 log.exception("a round of the server failed")
 
     async def _watch_people(self) -> None:
@@ -273,6 +277,7 @@ async def expand(settings: MqttSettings) -> None:
 
 
 def _is_base(ref: str) -> bool:
+    """True if this is a valid base topic of a component."""
     levels = ref.split("/")
     if len(levels) != 3:
         return False

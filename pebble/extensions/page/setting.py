@@ -10,13 +10,12 @@ from pebble.config import Config, Mqtt
 from pebble.config.security import SecurityLevel
 from pebble.contract.identity import Identity
 from pebble.errors import ConfigError
-from pebble.extensions.page.config import ListedRobot, WebInterface
+from pebble.extensions.page.config import PEOPLE, ListedRobot, WebInterface
 from pebble.extensions.recordings.config import Recorder
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.transports import MqttSettings
 
 DEFAULT_PORT = 8080
-PEOPLE = "people.sqlite"  # in the state directory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +60,7 @@ def settings_of(config: Config) -> WebSettings:
             f"`pebble cert init` and `pebble web user add`, and write web_interface.tls; or write 127.0.0.1"
         )
     for key in ("certificate", "key", "ca"):
-        _check(f"web_interface.tls.{key}", getattr(web.tls, key))
+        _check_readable(f"web_interface.tls.{key}", getattr(web.tls, key))
     return WebSettings(
         broker=mqtt_settings(_broker(config), reconnect_max_s=REMOTE_RECONNECT_S, program="web"),
         host=web.host,
@@ -99,17 +98,17 @@ def _listed(config: Config) -> dict[str, ListedRobot]:
 
 
 def _recordings(config: Config) -> Path | None:
-    recorder = config.section(Recorder)
-    if config.section(WebInterface).recordings is not None:
-        return config.section(WebInterface).recordings
+    web, recorder = config.section(WebInterface), config.section(Recorder)
+    if web.recordings is not None:
+        return web.recordings
     return recorder.place if recorder.enabled else None
 
 
 def _broker(config: Config) -> Mqtt:
     """Return the broker of ``web_interface.mqtt``, or else that of the robot's bridge."""
-    bridge = config.services.mqtt_bridge
-    if config.section(WebInterface).mqtt.host:
-        return config.section(WebInterface).mqtt
+    web, bridge = config.section(WebInterface), config.services.mqtt_bridge
+    if web.mqtt.host:
+        return web.mqtt
     if bridge.remote is not None and bridge.remote.kind != "mqtt":
         raise ConfigError(
             f'web_interface.mqtt.host: is missing, and the robot\'s own connection is "{bridge.remote.kind}"; '
@@ -123,7 +122,8 @@ def _broker(config: Config) -> Mqtt:
     return bridge.remote_mqtt
 
 
-def _check(key: str, file: Path | None) -> None:
+def _check_readable(key: str, file: Path | None) -> None:
+    """Raise ConfigError if there is a file and it cannot be read."""
     try:
         if file is not None:
             file.open("rb").close()

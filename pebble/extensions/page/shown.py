@@ -1,4 +1,8 @@
-"""Checks the parts of robots' payloads on which the page's cards rely, so that the page need not. Pure."""
+"""Checks of robots' payloads: the page's cards rely on some of their fields, and need not check them again. Pure.
+
+Each class lists the fields of a payload that cards read. Each function ``_NAME(payload)`` returns what pages get: the
+payload itself if all its fields are valid, else a copy without the invalid parts.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -129,24 +133,27 @@ _INSIDE = msgspec.json.Decoder(_Wrapped)
 def shown(channel: c.Channel | None, raw: bytes, payload: Any) -> bytes:
     """Return the JSON of ``payload`` for pages: ``raw`` itself if no card relies on its fields, or all are valid."""
     show = None if channel is None else _SHOWN.get(channel.metric)
-    relied = payload if show is None else show(payload)
-    if relied is payload:
+    checked = payload if show is None else show(payload)
+    if checked is payload:
         return raw
-    if isinstance(payload, dict) and relied is payload.get("value"):
+    if isinstance(payload, dict) and checked is payload.get("value"):
         return bytes(_INSIDE.decode(raw).value)  # as it was written: cheaper than to write it anew
-    return msgspec.json.encode(relied)
+    return msgspec.json.encode(checked)
 
 
 def with_name(raw: bytes, name: str) -> bytes:
     """Return the capabilities with this name if the robot has none; ``raw`` is from ``shown``."""
-    payload = msgspec.json.decode(raw)
-    value = _inner(payload)
-    if not isinstance(value, dict) or value.get("identity", {}).get("name"):
+    value = _inner(msgspec.json.decode(raw))
+    if not isinstance(value, dict):
         return raw
-    return msgspec.json.encode({"value": {**value, "identity": {**value.get("identity", {}), "name": name}}})
+    identity = value.get("identity", {})
+    if identity.get("name"):
+        return raw
+    return msgspec.json.encode({"value": {**value, "identity": {**identity, "name": name}}})
 
 
 def _inner(payload: Any) -> Any:
+    """Return the value inside ``{"t": …, "value": …}``, or a payload without that."""
     return payload["value"] if isinstance(payload, dict) and "value" in payload else payload
 
 
@@ -187,16 +194,15 @@ def _scripts(payload: Any) -> Any:
     listed = _object(_Scripts, _inner(payload))
     if not listed:
         return {}
-    files = [{**entry, "configs": _settings(entry.get("configs"))} for entry in _readable(_Script, listed["files"])]
-    return {**listed, "files": files}
-
-
-def _settings(configs: object) -> list[dict[str, Any]]:
-    return [setting.entry() for setting in forms.listed(configs)[: forms.MAX_SETTINGS]]
+    scripts = []
+    for script in _readable(_Script, listed["files"]):
+        settings = forms.listed(script.get("configs"))[: forms.MAX_SETTINGS]
+        scripts.append({**script, "configs": [setting.entry() for setting in settings]})
+    return {**listed, "files": scripts}
 
 
 def _manifest(payload: Any) -> Any:
-    """Return the valid interfaces."""
+    """Return the manifest with only its valid interfaces."""
     manifest = _object(dict[str, Any], _inner(payload))
     texts = _object(_Texts, manifest)
     return {
@@ -212,12 +218,13 @@ _SECTIONS: dict[str, Any] = dict.fromkeys(_OFFERS, dict[str, Any]) | {"identity"
 
 
 def _capabilities(payload: Any) -> Any:
-    """Return the valid sections."""
+    """Return the capabilities with only their valid sections."""
     value = _inner(payload)
     if not isinstance(value, dict):
         return {}
     valid = {name: section for name, section in value.items() if _is(_SECTIONS.get(name, Any), section)}
-    return payload if valid == value and value is not payload else {"value": valid}
+    is_wrapped = value is not payload
+    return payload if is_wrapped and valid == value else {"value": valid}
 
 
 _SHOWN: dict[str, Callable[[Any], Any]] = {

@@ -28,16 +28,16 @@ log = logging.getLogger(__name__)
 
 Spawn = Callable[[Coroutine[Any, Any, None]], None]
 
-_SETTING = "assumes "  # what a setting of the server begins with; then the component
+_SETTING = "assumes "  # begins the key of a setting in the people's database; the component follows
 _METRIC = "web/board"
 _CONFIG = "web_interface.robots"
 _NAMED = f'At level named it is driven only with "plain": true, in fleet.json and in {_CONFIG}'
 
 
 class Permission(Struct, frozen=True):
-    """A permission for pages to drive a board: its giver, and the axes; no axes: a refusal."""
+    """A permission for pages to drive a board along ``axes``; no axes: a refusal."""
 
-    by: str = ""
+    by: str = ""  # who has given it
     axes: tuple[str, ...] = ()
     at: float = 0.0
 
@@ -45,9 +45,9 @@ class Permission(Struct, frozen=True):
 class _Board(Struct):
     """A silent board. Its drive topic is read before anything is sent there, as a retained command would move it."""
 
-    heard_at: float
-    permission: Permission | None = None  # it has not been heard for long enough
-    subscription: Subscription | None = None
+    heard_at: float  # since when it is known
+    permission: Permission | None = None  # None: it has not been known for long enough
+    subscription: Subscription | None = None  # to its drive topic
 
 
 class SilentBoards:
@@ -84,7 +84,9 @@ class SilentBoards:
             return "" if sent else "The server cannot reach the broker"
         if why := self._refusal(op.ref):
             return why
-        axes = (*AXES, *["y"] * op.extra) if op.do == "allow" else ()
+        axes: tuple[str, ...] = ()  # "withdraw"
+        if op.do == "allow":
+            axes = (*AXES, "y") if op.extra else AXES
         permission = Permission(user, axes, time.time())
         self._people.set(_SETTING + op.ref, msgspec.json.encode(permission).decode())
         board.permission = permission
@@ -93,6 +95,7 @@ class SilentBoards:
         return ""
 
     def _follow(self, component: Component, board: _Board, now: float, spawn: Spawn) -> None:
+        """Go on with a board: know it for a while, read its drive topic, then let pages drive it."""
         ref, robot = component.ref, component.robot
         if board.permission is None:
             if not robot.online(now):
@@ -102,15 +105,20 @@ class SilentBoards:
                 spawn(self._subscribe(ref, board))
         elif board.subscription is not None:
             if robot.assume(board.permission.axes, self._robots.names.get(ref, "")):
-                self._robots.show_offer(component, now)
-            by, parked = board.permission.by if board.permission.axes else "", PARKED if robot.parked else ""
-            view = m.BoardView(silent=True, by=by, refused=self._refusal(ref), parked=parked, risk=RISK)
+                self._robots.show_announced(component, now)
+            view = m.BoardView(
+                silent=True,
+                by=board.permission.by if board.permission.axes else "",
+                refused=self._refusal(ref),
+                parked=PARKED if robot.parked else "",
+                risk=RISK,
+            )
             self._robots.set_server_metric(ref, _METRIC, view)
 
     def _permission(self, ref: str) -> Permission:
-        """Return the permission by the config, or else by a person."""
+        """Return the permission that the config gives or refuses, or else the one that a person has stored."""
         listed = self._listed.get(ref, ListedRobot())
-        if self._refusal(ref):
+        if self._refusal(ref):  # the config decides
             is_allowed = listed.drive and (listed.plain or not self._is_named)
             return Permission("the config", listed.axes) if is_allowed else Permission()
         try:
@@ -127,6 +135,8 @@ class SilentBoards:
         return "" if listed.drive is None else f"{_CONFIG} decides that: change it there"
 
     async def _subscribe(self, ref: str, board: _Board) -> None:
+        """Subscribe to the board's drive topic, to see whether a command is retained there."""
+
         def take(message: Message, now: float) -> None:
             if (robot := self._robots.view(ref)) is not None:
                 robot.receive(DRIVE, message, now, 0.0)

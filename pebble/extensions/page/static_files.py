@@ -31,7 +31,7 @@ _VERSION = b"{version}"  # in the pages, replaced by that of the files
 _ROOT = b"{root}"  # replaced by root_of(): a proxy may show the server below a path that only browsers know
 _START = b"{start}"  # replaced by start.js, which needs no request of its own
 _MODULES = b"{modules}"  # replaced by links to all that is imported: browsers need not discover them one by one
-#: index.html, with what that screen needs
+#: The page of each screen, made from index.html, and the screen's module.
 _SCREENS = {"fleet.html": "ui/fleet/fleet.js", "robot.html": "ui/robot/robot.js"}
 _SHEETS = {"fleet.html": "fleet.css"}  # that the screen needs beside app.css
 _IMPORT = re.compile(rb'^(?:import|export|\}).*?"(\.\.?/[^"]+)";?$', re.MULTILINE)
@@ -39,7 +39,7 @@ _AGAIN = re.compile(r"\.\d{1,4}")  # after the version: the same files once more
 _COMMENTS = re.compile(r"^[ \t]*(?:/\*.*?\*/|//[^\n]*)[ \t]*$", re.MULTILINE | re.DOTALL)
 _CASTS = re.compile(r"/\*\* @[^\n]*?\*/ ")  # types within a line
 _LINE_ENDS = re.compile(r"(?<=\S)[ \t]+//[ ][^\"'`\n]*$", re.MULTILINE)  # one with quotes may be the end of a string
-_LOOSE = re.compile(r" (?=\{$)|(^[\w-]+:) |;\n(?=})|(?<=[{};,])\n|(?<=,) ", re.MULTILINE)  # in style sheets
+_LOOSE = re.compile(r" (?=\{$)|(^[\w-]+:) |;\n(?=})|(?<=[{};,])\n|(?<=,) ", re.MULTILINE)  # needless in style sheets
 _INDENTATION = re.compile(r"^\s+", re.MULTILINE)
 
 
@@ -47,7 +47,7 @@ class StaticFiles:
     """All files below one folder. ``version`` changes with any of them, and is part of their addresses."""
 
     def __init__(self, root: Traversable) -> None:
-        self.files = dict(sorted(_read(root, "")))
+        self.files = dict(sorted(_read(root, "")))  # by name: the contents
         digest = hashlib.sha256()
         for name, content in self.files.items():
             digest.update(f"{name}\0{len(content)}\0".encode() + content)
@@ -57,7 +57,8 @@ class StaticFiles:
         self._policy = CONTENT_SECURITY_POLICY.replace("script-src", f"script-src {hashed}")
         index = self.files.pop("index.html").replace(_START, start)
         for name, screen in _SCREENS.items():
-            links = [_link(module_name) for module_name in (screen, *self._imported("main.js", screen))]
+            modules = (screen, *self._imported("main.js", screen))
+            links = [b'<link rel="modulepreload" href="{root}static/{version}/%s">' % path.encode() for path in modules]
             if name in _SHEETS:
                 sheet = _SHEETS[name].encode()
                 links.insert(0, b'<link rel="preload" as="style" href="{root}static/{version}/%s">' % sheet)
@@ -65,19 +66,18 @@ class StaticFiles:
         for name in self.files:
             if name.endswith(".html"):
                 self.files[name] = self.files[name].replace(_VERSION, self.version.encode())
-        self._first = {"main.js", *self._imported("main.js")}
+        self._first = {"main.js", *self._imported("main.js")}  # the modules that run at the start
         self._packed = {name: _packed(name, content) for name, content in self.files.items()}
 
     def _imported(self, *names: str) -> list[str]:
         """Return the modules that these import before they run, also indirectly."""
-        modules = dict.fromkeys(names)
-        for name in (waiting := list(names)):
+        modules = list(names)
+        for name in modules:  # it grows meanwhile
             for path in _IMPORT.findall(self.files.get(name, b"")):
-                other = posixpath.normpath(posixpath.join(posixpath.dirname(name), path.decode()))
-                if other not in modules:
-                    modules[other] = None
-                    waiting.append(other)
-        return [name for name in modules if name not in names]
+                imported = _imported_name(name, path)
+                if imported not in modules:
+                    modules.append(imported)
+        return modules[len(names) :]
 
     def page(self, request: Request) -> Response:
         """Return the operator page. Its address decides which screen it shows."""
@@ -100,14 +100,21 @@ class StaticFiles:
         if name not in self.files:
             return PlainTextResponse("not found", 404)
         if (query := request.scope.get("query_string", b"")).isdigit():
-            content = _IMPORT.sub(lambda match: self._renewed(name, match, query[:4]), self.files[name])
+            content = _IMPORT.sub(lambda statement: self._renewed(name, statement, query[:4]), self.files[name])
             return _response(request, name, content, _packed(name, content), headers)
         return _response(request, name, self.files[name], self._packed[name], headers)
 
-    def _renewed(self, name: str, match: re.Match[bytes], query: bytes) -> bytes:
-        path = match[1]
-        target = posixpath.normpath(posixpath.join(posixpath.dirname(name), path.decode()))
-        return match[0] if target in self._first else match[0].replace(path, path + b"?" + query)
+    def _renewed(self, name: str, statement: re.Match[bytes], query: bytes) -> bytes:
+        """Return an import statement of the module ``name`` with the query added to its path."""
+        path = statement[1]
+        if _imported_name(name, path) in self._first:
+            return statement[0]
+        return statement[0].replace(path, path + b"?" + query)
+
+
+def _imported_name(module: str, path: bytes) -> str:
+    """Return the name of the file that a module imports by a relative path."""
+    return posixpath.normpath(posixpath.join(posixpath.dirname(module), path.decode()))
 
 
 def root_of(request: Request) -> str:
@@ -125,10 +132,6 @@ def _response(request: Request, name: str, content: bytes, packed: bytes | None,
     if packed is not None and "gzip" in request.headers.get("accept-encoding", ""):
         content, headers["content-encoding"] = packed, "gzip"
     return Response(content, media_type=_TYPES[name.rpartition(".")[2]], headers=headers)
-
-
-def _link(module: str) -> bytes:
-    return b'<link rel="modulepreload" href="{root}static/{version}/%s">' % module.encode()
 
 
 def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:

@@ -5,6 +5,8 @@ The robot keeps the stop; see docs/emergency-stop.md.
 
 import logging
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
 
 from pebble.contract.identity import parse_topic
 from pebble.contract.payloads import EstopState
@@ -20,19 +22,41 @@ MAX_STOPS = 2000  # that are repeated and confirmed at once: one of each robot
 _SHOWN_S = 60.0  # so long pages see how a finished stop ended
 
 
+class RobotsOfStop(NamedTuple):
+    """The robots to which a stop is sent. Those without motors count as confirmed."""
+
+    confirmed: list[str]
+    unconfirmed: list[str]
+
+
+@dataclass(slots=True, eq=False)
+class _PressedStop:
+    """A stop that a page has sent, of one robot or of all."""
+
+    sender: StopSender
+    ref: str  # the robot; "": all
+    user: str | None  # who has pressed it; None: several people, one after another
+    pressed_at: float
+    is_over: bool = False  # it sends nothing more. Noted, as to ask a thousand robots at each heartbeat is slow
+
+    @property
+    def name(self) -> str:
+        return self.sender.order.name
+
+
 class Stops:
     """The stops of a server. Publish what its methods return, and pass robots' messages to ``receive``."""
 
-    def __init__(self, again: Callable[[], bool] = lambda: True) -> None:
-        """Make an empty table. ``again()`` returns False while sent messages still wait, so that none is repeated."""
-        self._again, self._repeats = again, True
+    def __init__(self, may_repeat: Callable[[], bool] = lambda: True) -> None:
+        """Make an empty table. ``may_repeat`` returns False while sent messages still wait, so that none is repeated.
+
+        It is asked once in each ``tick``.
+        """
+        self._may_repeat, self._repeats = may_repeat, True
         self.changed: set[str] = set()  # robots whose view may be another one now
-        self._senders: dict[str, tuple[StopSender, float]] = {}  # by name, the newest last
-        self._over: set[str] = set()  # those that send nothing more: to ask a thousand robots at each heartbeat is slow
-        self._users: dict[str, str | None] = {}  # who has pressed each of them; None: several people, one after another
-        self._refs: dict[str, str] = {}  # for which robot; "": all
-        self._names: dict[str, str] = {}  # the stop of each robot, or of all
-        self._crowded_at = float("-inf")  # when one was ended for lack of room
+        self._stops: dict[str, _PressedStop] = {}  # by name, the newest last
+        self._by_ref: dict[str, _PressedStop] = {}  # the same stops by robot; "": the one of all
+        self._crowded_at = float("-inf")  # when a stop was last ended for lack of room
         self._shown: dict[str, tuple[str, str]] = {}  # by robot: progress and words, as pages see them
 
     def press(
@@ -50,13 +74,18 @@ class Stops:
 
         ``known`` are the robots from which messages were received.
         """
-        if name in self._senders:
+        if name in self._stops:
             return []
         robots = [robot for robot in known if ref in ("", robot.base)]
         named, bases = [ref] if ref else None, [robot.base for robot in robots]
         sender = StopSender(name, by=by, why=why, now=now, robots=named, known=bases, own_only=True)
-        self._users[name] = user if self._replaced(ref, user, now) else None
-        self._senders[name], self._refs[name], self._names[ref] = (sender, now), ref, name
+        older = self._by_ref.get(ref)
+        is_only_user = older is None or older.is_over or older.user == user
+        if older is not None:
+            self._remove(older)
+        self._make_room(now)
+        stop = _PressedStop(sender, ref, user if is_only_user else None, now)
+        self._stops[name] = self._by_ref[ref] = stop
         for robot in robots:
             for message in robot.remembered.values():
                 sender.receive(message, now)
@@ -65,28 +94,31 @@ class Stops:
 
     def end(self, name: str) -> None:
         """Stop repeating this stop."""
-        if name in self._senders:
-            sender = self._senders[name][0]
+        if name in self._stops:
+            sender = self._stops[name].sender
             sender.end()
             self.changed |= set(sender.robots)
 
-    def robots_of(self, name: str) -> tuple[list[str], list[str]]:
-        """Return two lists: the robots that have confirmed this stop or have no motors, and the others."""
-        robots = self._senders[name][0].robots if name in self._senders else {}
-        done = {ref: stop.progress in (Progress.CONFIRMED, Progress.SPARED) for ref, stop in robots.items()}
-        return [ref for ref in done if done[ref]], [ref for ref in done if not done[ref]]
+    def robots_of(self, name: str) -> RobotsOfStop:
+        """Return the robots of this stop; none if it is unknown, or was over long ago."""
+        robots = RobotsOfStop([], [])
+        if name in self._stops:
+            for ref, stop in self._stops[name].sender.robots.items():
+                is_confirmed = stop.progress in (Progress.CONFIRMED, Progress.SPARED)
+                (robots.confirmed if is_confirmed else robots.unconfirmed).append(ref)
+        return robots
 
     def user(self, name: str) -> str | None:
         """Return the user of this stop; None if it is unknown here, or has several users."""
-        return self._users.get(name)
+        return self._stops[name].user if name in self._stops else None
 
-    def names(self, ref: str) -> bool:
+    def has_stop_of(self, ref: str) -> bool:
         """True if there is a stop of this robot alone."""
-        return ref in self._names
+        return ref in self._by_ref
 
     def sends_to(self, ref: str) -> bool:
         """True if any stop is sent to this robot and awaits its answer, be it a stop of all."""
-        return any(ref in sender.robots for sender, _ in self._senders.values())
+        return any(ref in stop.sender.robots for stop in self._stops.values())
 
     def holds(self, ref: str) -> bool:
         """True if a stop is being repeated to a robot that cannot latch it: a drive command would end it."""
@@ -96,11 +128,11 @@ class Stops:
     @property
     def collecting(self) -> bool:
         """True if a stop of all is still sent to newly heard robots."""
-        return "" in self._names and self._senders[self._names[""]][0].collecting
+        return "" in self._by_ref and self._by_ref[""].sender.collecting
 
     def omitted(self, now: float) -> bool:
         """True if there was no room to await the confirmation of some stopped robots."""
-        return now - self._crowded_at < _SHOWN_S or any(sender.omitted for sender, _ in self._senders.values())
+        return now - self._crowded_at < _SHOWN_S or any(stop.sender.omitted for stop in self._stops.values())
 
     def receive(self, message: Message, now: float) -> list[Message]:
         """Handle a robot's message; return the messages to publish to it now."""
@@ -108,26 +140,25 @@ class Stops:
         if address is None:
             return []
         ref, messages = address.identity.base, []
-        for name in [self._names[key] for key in (ref, "") if key in self._names]:
-            sender, began = self._senders[name]
-            if name not in self._over or now - began < COLLECT_S:
-                sender.receive(message, now)
-                messages += sender.tick_robot(ref, now, again=self._repeats)
-                self._note_progress(sender, ref)
+        for stop in [self._by_ref[key] for key in (ref, "") if key in self._by_ref]:
+            if not stop.is_over or now - stop.pressed_at < COLLECT_S:
+                stop.sender.receive(message, now)
+                messages += stop.sender.tick_robot(ref, now, again=self._repeats)
+                self._note_progress(stop, ref)
         return messages
 
     def tick(self, now: float) -> list[Message]:
         """Return the messages to publish now; call it every 50 ms."""
-        messages, self._repeats = [], self._again()
-        for name, (sender, began) in list(self._senders.items()):
-            if name not in self._over:
-                messages += sender.tick(now, again=self._repeats)
-                if sender.finished:  # else what has come of it was noted with the robot's message
-                    self._over.add(name)
-                    for ref in sender.robots:
-                        self._note_progress(sender, ref)
-            if name in self._over and now - began > _SHOWN_S:
-                self._remove(name)
+        messages, self._repeats = [], self._may_repeat()
+        for stop in list(self._stops.values()):
+            if not stop.is_over:
+                messages += stop.sender.tick(now, again=self._repeats)
+                if stop.sender.finished:  # other progress was noted when the robot's message came
+                    stop.is_over = True
+                    for ref in stop.sender.robots:
+                        self._note_progress(stop, ref)
+            if stop.is_over and now - stop.pressed_at > _SHOWN_S:
+                self._remove(stop)
         return messages
 
     def view(self, estop: RobotEstop) -> m.EstopView:
@@ -135,61 +166,57 @@ class Stops:
         name, stop = self._newest(estop.base)
         sending, text = ("", "") if stop is None else _progress(stop)
         self._shown[estop.base] = sending, text
-        by = estop.stopped_by
+        newest = estop.stopped_by
         return m.EstopView(
             available=estop.available,
             latched=bool(estop.latched),
-            by="" if by is None else by.by,
-            why="" if by is None else by.why,
-            since=0 if by is None else by.since,
+            by="" if newest is None else newest.by,
+            why="" if newest is None else newest.why,
+            since=0 if newest is None else newest.since,
             owners=tuple(_owner(owner, state) for owner, state in estop.states.items()),
             sending=sending,
             sending_text=text,
             stop=name,
         )
 
-    def _note_progress(self, sender: StopSender, ref: str) -> None:
-        if ref in sender.robots and self._shown.get(ref) != _progress(sender.robots[ref]):
+    def _note_progress(self, stop: _PressedStop, ref: str) -> None:
+        """Mark a robot as changed if pages were shown another progress of its stop."""
+        robots = stop.sender.robots
+        if ref in robots and self._shown.get(ref) != _progress(robots[ref]):
             self.changed.add(ref)
 
-    def _replaced(self, ref: str, user: str, now: float) -> bool:
-        """Remove the earlier stop of the same robots, and others if there are too many.
-
-        True if a new stop belongs to this user alone: the removed stop was another user's only if it was over.
-        """
-        is_own = True
-        if (older := self._names.get(ref)) is not None:
-            is_own = older in self._over or self._users[older] == user
-            self._remove(older)
-        while len(self._senders) >= MAX_STOPS:
-            name = min(self._senders, key=self._worth)
-            if name not in self._over:
+    def _make_room(self, now: float) -> None:
+        """Remove stops until there is room for another one."""
+        while len(self._stops) >= MAX_STOPS:
+            stop = min(self._stops.values(), key=_worth)
+            if not stop.is_over:
                 self._crowded_at = now
-                log.warning("more than %d stops at once: that of %s is not confirmed", MAX_STOPS, self._refs[name])
-            self._remove(name)
-        return is_own
+                log.warning("more than %d stops at once: that of %s is not confirmed", MAX_STOPS, stop.ref)
+            self._remove(stop)
 
-    def _worth(self, name: str) -> tuple[bool, bool, bool]:
-        """Return a sort key for removal: stops that are over first, then of robots never heard, then of one robot."""
-        robots = self._senders[name][0].robots.values()
-        heard = not self._refs[name] or any(robot.live or robot.estop.has_capabilities for robot in robots)
-        return name not in self._over, heard, not self._refs[name]
-
-    def _remove(self, name: str) -> None:
-        sender, _ = self._senders.pop(name)
-        sender.end()
-        self.changed |= set(sender.robots)
-        self._over.discard(name)
-        del self._users[name], self._names[self._refs.pop(name)]
+    def _remove(self, stop: _PressedStop) -> None:
+        stop.sender.end()
+        self.changed |= set(stop.sender.robots)
+        del self._stops[stop.name], self._by_ref[stop.ref]
 
     def _newest(self, ref: str) -> tuple[str, RobotStop | None]:
-        for name, (sender, _) in reversed(self._senders.items()):
-            if ref in sender.robots:
-                return name, sender.robots[ref]
+        """Return the newest stop that is sent to this robot: its name, and the robot's part of it."""
+        for name, stop in reversed(self._stops.items()):
+            if ref in stop.sender.robots:
+                return name, stop.sender.robots[ref]
         return "", None
 
 
+def _worth(stop: _PressedStop) -> tuple[bool, bool, bool]:
+    """Return a sort key for removal: stops that are over first, then of robots never heard, then of one robot."""
+    is_of_all = stop.ref == ""
+    robots = stop.sender.robots.values()
+    was_heard = is_of_all or any(robot.live or robot.estop.has_capabilities for robot in robots)
+    return not stop.is_over, was_heard, is_of_all
+
+
 def _progress(stop: RobotStop) -> tuple[str, str]:
+    """Return the progress of a robot's stop, and words for people; "" if it is confirmed and saved."""
     progress = stop.progress
     if progress is Progress.CONFIRMED and not stop.saved:
         return progress.value, "stopped, but not saved: after a power cut it is free"

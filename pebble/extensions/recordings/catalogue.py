@@ -9,8 +9,8 @@ from typing import Any, Final
 
 from pebble.config.visible import shown
 from pebble.extensions.recordings.files.reader import DAMAGE, RecordingFile, missing_before
-from pebble.extensions.recordings.files.recorded import Channel, Recorded, RecordingError
-from pebble.extensions.recordings.library import ACTIVE, FOREVER_NS, merged, robot_of
+from pebble.extensions.recordings.files.recorded import ACTIVE, FOREVER_NS, Channel, Recorded, RecordingError
+from pebble.extensions.recordings.library import merged, robot_of, robots_of
 from pebble.extensions.recordings.recorder.intake import EVENTS
 from pebble.transports.topics import matches
 
@@ -27,7 +27,7 @@ class FileInfo:
     messages: int = 0
     first_ns: int = 0
     last_ns: int = 0
-    missing: int = 0
+    missing: int = 0  # messages that damage has taken
     finished: bool = True
     damaged: bool = False
     readable: bool = True
@@ -46,17 +46,13 @@ def look_at(path: Path, *, whole: bool = False, since_ns: int = 0, until_ns: int
     All of it is read if it has no summary, or with ``whole``. Only messages from ``since_ns`` to before ``until_ns``
     count.
     """
-    try:
-        size = path.stat().st_size
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}") from None
-    info = FileInfo(path, size)
     with RecordingFile(path) as file:
+        info = FileInfo(path, file.size)
         is_inside = not file.chunks or (file.first_ns >= since_ns and file.last_ns < until_ns)
         if file.statistics is None or whole or not is_inside:
             _read_all(info, file, since_ns, until_ns)
         else:
-            _take_over(info, file)
+            _read_summary(info, file, file.statistics)
         metadata = file.metadata()
         info.missing = file.damage.missing + missing_before(metadata)
         info.finished = file.damage.finished
@@ -65,32 +61,27 @@ def look_at(path: Path, *, whole: bool = False, since_ns: int = 0, until_ns: int
     return info
 
 
-def _take_over(info: FileInfo, file: RecordingFile) -> None:
-    counted = file.statistics
-    if counted is not None:
-        info.messages, info.first_ns, info.last_ns = (
-            counted.message_count,
-            counted.message_start_time,
-            counted.message_end_time,
-        )
-        for number, count in counted.channel_message_counts.items():
-            if count:
-                _count(info, file.channels[number], count)
+def _read_summary(info: FileInfo, file: RecordingFile, statistics: Any) -> None:
+    info.messages = statistics.message_count
+    info.first_ns, info.last_ns = statistics.message_start_time, statistics.message_end_time
+    for number, count in statistics.channel_message_counts.items():
+        if count:
+            _count(info, file.channels[number], count)
 
 
 def _read_all(info: FileInfo, file: RecordingFile, since_ns: int, until_ns: int) -> None:
     for message in file.read(since_ns=since_ns, until_ns=until_ns):
-        if not since_ns <= message.log_ns < until_ns:
-            continue
-        info.first_ns = message.log_ns if not info.messages else info.first_ns
-        info.last_ns = message.log_ns
-        info.messages += 1
-        _count(info, message.channel, 1)
+        if since_ns <= message.log_ns < until_ns:
+            if not info.messages:
+                info.first_ns = message.log_ns
+            info.last_ns = message.log_ns
+            info.messages += 1
+            _count(info, message.channel, 1)
 
 
 def _count(info: FileInfo, channel: Channel, count: int) -> None:
     info.topics[channel.topic] += count
-    robot = robot_of(channel)
+    robot = robot_of(channel.topic)
     if robot is not None:
         info.robots.add(robot)
 
@@ -98,12 +89,18 @@ def _count(info: FileInfo, channel: Channel, count: int) -> None:
 def events(paths: Iterable[Path]) -> Iterator[dict[str, Any]]:
     """Yield the recorder's own events (begin, gaps, drops), in the order of time."""
     for message in merged(paths, chooses=lambda channel: channel.topic == EVENTS):
-        try:
-            event = json.loads(message.payload)
-        except (ValueError, RecursionError):
-            continue
-        if isinstance(event, dict) and event.get("event") in _SHOWN_EVENTS:
+        event = event_in(message.payload)
+        if event.get("event") in _SHOWN_EVENTS:
             yield {**event, "t": message.log_ns // 10**6}
+
+
+def event_in(payload: bytes) -> dict[str, Any]:
+    """Return an event of the recorder; empty if the payload is none."""
+    try:
+        event = json.loads(payload)
+    except (ValueError, RecursionError):
+        return {}
+    return event if isinstance(event, dict) else {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +112,7 @@ class Query:
     text: str | None = None  # somewhere in the payload
 
     def chooses(self, channel: Channel) -> bool:
-        if self.robot is not None and robot_of(channel) != self.robot:
+        if self.robot is not None and robot_of(channel.topic) != self.robot:
             return False
         return not self.topics or any(_matches(filter_, channel.topic) for filter_ in self.topics)
 
@@ -140,8 +137,8 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
                     return
         except RecordingError:
             return
-    check_name("robot", query.robot, {robot for channel in channels if (robot := robot_of(channel))}, places)
-    topics = {channel.topic for channel in channels if query.robot in (None, robot_of(channel))}
+    check_name("robot", query.robot, robots_of(channels), places)
+    topics = {channel.topic for channel in channels if query.robot in (None, robot_of(channel.topic))}
     for filter_ in query.topics:
         if not any(_matches(filter_, topic) for topic in topics):
             check_name("topic", filter_, {topic for topic in topics if not topic.startswith("$")}, places)
@@ -157,5 +154,5 @@ def check_name(kind: str, name: str | None, known: Collection[str], places: Iter
 
 
 def _matches(filter_: str, topic: str) -> bool:
-    below = filter_.split("/", 1)[0] in ("incoming", "outgoing")
-    return matches(f"+/+/+/{filter_}" if below else filter_, topic)
+    has_robot = filter_.split("/", 1)[0] not in ("incoming", "outgoing")
+    return matches(filter_ if has_robot else f"+/+/+/{filter_}", topic)

@@ -1,6 +1,6 @@
 """One stream of messages, in the order of time, from any number of recordings."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -9,11 +9,11 @@ from pebble.extensions.recordings.files.reader import Chooses, RecordingFile, in
 from pebble.extensions.recordings.files.recorded import ACTIVE as ACTIVE
 from pebble.extensions.recordings.files.recorded import FOREVER_NS as FOREVER_NS
 from pebble.extensions.recordings.files.recorded import SUFFIX as SUFFIX
-from pebble.extensions.recordings.files.recorded import Channel, Damage, Recorded, RecordingError
+from pebble.extensions.recordings.files.recorded import Channel, Damage, Recorded, RecordingError, present_path
 from pebble.extensions.recordings.files.records import MAGIC
 from pebble.ownership import open_plain
 
-#: What is wrong with each file that was read.
+#: The damage of each file that was read.
 Damages = dict[Path, Damage]
 
 
@@ -67,6 +67,13 @@ def merged(
     yield from in_time_order(due)
 
 
+def reported(messages: Iterable[Recorded], on_time: Callable[[int], None]) -> Iterator[Recorded]:
+    """Yield the messages; call ``on_time`` with the log time of each."""
+    for message in messages:
+        on_time(message.log_ns)
+        yield message
+
+
 def problems(damages: Damages) -> list[str]:
     """Return a line for each file that could not be read completely."""
     reports = ((path, damage.report(active=path.name.endswith(ACTIVE))) for path, damage in damages.items())
@@ -74,12 +81,11 @@ def problems(damages: Damages) -> list[str]:
 
 
 def _messages(path: Path, since_ns: int, until_ns: int, chooses: Chooses, damages: Damages) -> Iterator[Recorded]:
-    if not path.exists() and path.name.endswith(ACTIVE):  # finished meanwhile
-        path = path.with_name(path.name.removesuffix(ACTIVE) + SUFFIX)
-    if not path.exists():  # deleted meanwhile, to make room
+    present = present_path(path)
+    if present is None:  # deleted meanwhile, to make room
         return
-    with RecordingFile(path) as file:
-        damages[path] = file.damage
+    with RecordingFile(present) as file:
+        damages[present] = file.damage
         for message in file.read(chooses=chooses, since_ns=since_ns, until_ns=until_ns):
             if since_ns <= message.log_ns < until_ns:
                 yield message
@@ -93,11 +99,12 @@ def _begins_as_mcap(path: Path) -> bool:
         raise RecordingError(f"{path}: {error.strerror or error}") from None
 
 
-def robot_of(channel: Channel) -> str | None:
-    """Return ``system/type/id`` of a channel's topic; None if it has none."""
-    return robot_in(channel.topic)
-
-
-def robot_in(topic: str) -> str | None:
+def robot_of(topic: str) -> str | None:
+    """Return ``system/type/id`` of a topic; None if it has none."""
     parsed = parse_topic(topic)
     return None if parsed is None else parsed.identity.base
+
+
+def robots_of(channels: Iterable[Channel]) -> set[str]:
+    """Return the robots in the channels' topics."""
+    return {robot for robot in (robot_of(channel.topic) for channel in channels) if robot is not None}

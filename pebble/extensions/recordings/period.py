@@ -6,7 +6,7 @@ from typing import Final, NoReturn
 from zoneinfo import ZoneInfo
 
 from pebble.errors import PebbleError
-from pebble.extensions.recordings.library import FOREVER_NS
+from pebble.extensions.recordings.files.recorded import FOREVER_NS
 
 #: For the help of options.
 SINCE_HELP: Final = (

@@ -53,7 +53,7 @@ def shifted(payload: bytes, by_ns: int) -> bytes:
     if payload[:1] == b"{":
         return _shifted_json(payload, by_ns)
     header = _media_header(payload)
-    if header is None or not _moves(_in_ns(header.captured_ms, 10**6), by_ns):
+    if header is None or not _can_move(_in_ns(header.captured_ms, 10**6), by_ns):
         return payload
     return replace(header, captured_ms=header.captured_ms + by_ns // 10**6).pack()
 
@@ -99,7 +99,8 @@ def _unit(stamp: float) -> int:
     return 10**6 if stamp >= _MILLISECONDS_FROM else 10**9
 
 
-def _moves(ns: int, by_ns: int) -> bool:
+def _can_move(ns: int, by_ns: int) -> bool:
+    """True if a stamp counts from 1970, and is still one after it was moved."""
     return ns >= CLOCK_FROM_NS and 0 < ns + by_ns <= _LATEST_NS
 
 
@@ -111,8 +112,8 @@ def _shifted_json(payload: bytes, by_ns: int) -> bytes:
     moved = {}
     for name in _Stamped.__struct_fields__:
         stamp = plain.get(name)
-        if not isinstance(stamp, int | float) or isinstance(stamp, bool) or not _moves(_in_ns(stamp), by_ns):
+        if not isinstance(stamp, int | float) or isinstance(stamp, bool) or not _can_move(_in_ns(stamp), by_ns):
             continue
-        unit = _unit(stamp)
+        unit = _unit(stamp)  # a whole number stays one
         moved[name] = stamp + (by_ns / unit if isinstance(stamp, float) else by_ns // unit)
     return msgspec.json.encode(plain | moved) if moved else payload

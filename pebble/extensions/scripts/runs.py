@@ -9,7 +9,6 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import reduce
 from pathlib import Path
 
 from pebble.config import Config
@@ -84,7 +83,11 @@ class LocalScripts:
 
 def newest(runs: Iterable[int]) -> int:
     """Return the newest of ``runs``, where 0 stands for none."""
-    return reduce(lambda newest, run: run if newer(run, newest) else newest, runs, 0)
+    newest_run = 0
+    for run in runs:
+        if newer(run, newest_run):
+            newest_run = run
+    return newest_run
 
 
 def following(run: int) -> int:
@@ -150,7 +153,10 @@ def _from_clock(wall_clock: Callable[[], float]) -> int:
 
 
 def _above(barred: int, *used: int) -> int:
-    """Return the number after the newest of ``barred`` and ``used``, except those too far ahead to have a successor."""
+    """Return the number after the newest of ``barred`` and ``used``.
+
+    Numbers so far ahead of ``barred`` that their successor would count as older than it are left out.
+    """
     base = barred or newest(used)
-    ahead = ((run - base) & LAST_RUN for run in used if run and newer(following(run), base))
-    return following((base + max(ahead, default=0)) & LAST_RUN)
+    steps_ahead = [(run - base) & LAST_RUN for run in used if run and newer(following(run), base)]
+    return following((base + max(steps_ahead, default=0)) & LAST_RUN)

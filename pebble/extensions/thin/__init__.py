@@ -1,4 +1,8 @@
-"""A bridge over a thin link: it measures what the link carries, sends no more than that, and tells operators."""
+"""A bridge over a thin link: it measures what the link carries, sends no more than that, and tells operators.
+
+A *group* is one message with several commands for a robot, or with the newest values of several of its streams. An
+*expander* beside the remote broker takes groups of streams apart again.
+"""
 
 from pebble.extension import Extension
 

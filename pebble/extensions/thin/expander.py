@@ -1,4 +1,4 @@
-"""Splits groups of streams beside a broker, so that every tool there sees the plain topics."""
+"""An expander: it splits groups of streams beside a broker, so that every tool there sees the plain topics."""
 
 import logging
 import re
@@ -31,21 +31,21 @@ class _Robot:
     """The state of a robot that sends groups, as an expander knows it; times are on the expander's clock."""
 
     def __init__(self) -> None:
-        self.named = False
-        self.dictionaries: dict[int, bytes] = {}  # the newest, and the one before
-        self.other_at = -inf  # when one with a smaller id was heard
-        self.own_at = -inf  # when this one said what it has heard last of itself
+        self.named = False  # it takes commands only on topics with an account's name
+        self.dictionaries: dict[int, bytes] = {}  # by number: the newest, and the one before
+        self.other_at = -inf  # when an announcement of an expander with a smaller id was heard
+        self.own_at = -inf  # when this expander sent the newest of its announcements that came back from the broker
         self.works = False  # this expander, not another one, takes its groups apart
-        self.short, self.short_at = "", -inf  # the topic of its groups besides the plain one, and when it was heard
+        self.short, self.short_at = "", -inf  # its short topic for groups, and when a group last came there
 
 
 class Expander:
     """An expander of groups on a connection; its owner calls :meth:`announce` every ANNOUNCE_S.
 
-    If there are several, the one with the smallest id works. Each goes by the announcements as the broker passes them
-    on, its own included: all see them between the same groups, so no group is taken apart twice, and what comes long
-    after its last announcement has waited, and is dropped. Members become nothing but streams: no state, stop or
-    command is published for a robot. While two robots claim a short name, neither has it.
+    If there are several, the one with the smallest id works. Each decides by the announcements that the broker passes
+    on, its own among them: all expanders see these between the same groups, so no group is taken apart twice. A group
+    that comes long after this expander's last announcement has waited, and is dropped. Only streams are published: no
+    state, stop or command of a robot. While two robots claim a short name, neither has it.
     """
 
     def __init__(self, transport: Transport, clock: Callable[[], float] = time.monotonic, id_: str = "") -> None:
@@ -53,14 +53,14 @@ class Expander:
         self.counts: Counter[str] = Counter()
         self._transport, self._clock = transport, clock
         self._robots: dict[str, _Robot] = {}
-        self._number, self._said_at = 0, dict[int, float]()  # of announcements
+        self._number, self._sent_at = 0, dict[int, float]()  # of the newest announcement; by number, when it was sent
         self._lock = threading.RLock()
 
     def start(self) -> None:
-        """Subscribe, first to the announcements of other expanders."""
+        """Subscribe, first to announcements: they tell which expander works."""
         for suffix, receive in (
-            (EXPANDER.suffix, self._receive_other),
-            (f"{INCOMING}/{BY}/+/{EXPANDER.metric}", self._receive_other),
+            (EXPANDER.suffix, self._receive_announcement),
+            (f"{INCOMING}/{BY}/+/{EXPANDER.metric}", self._receive_announcement),
             (WIRE.suffix, self._receive_wire),
             (STREAMS.suffix, self._receive_group),
         ):
@@ -71,13 +71,14 @@ class Expander:
         """Announce this expander to robots that send groups, unless another expander works."""
         with self._lock:
             self._number = (self._number + 1) % _NUMBERS
-            self._said_at[self._number] = now = self._clock()
+            self._sent_at[self._number] = now = self._clock()
             silent_since = now - HEARD_S
             robots = [(base, robot) for base, robot in self._robots.items() if robot.other_at < silent_since]
         for base, robot in robots:
-            short = {"short": robot.short} if robot.short_at >= silent_since else {}
-            said = {"id": self.id, "n": self._number, **short}
-            self._transport.publish(EXPANDER.topic(base), msgspec.json.encode(said), qos=QoS.DELIVERED)
+            announcement: dict[str, object] = {"id": self.id, "n": self._number}
+            if robot.short_at >= silent_since:
+                announcement["short"] = robot.short
+            self._transport.publish(EXPANDER.topic(base), msgspec.json.encode(announcement), qos=QoS.DELIVERED)
 
     def is_named(self, base: str) -> bool:
         """True if a robot takes commands only on topics with an account's name."""
@@ -86,24 +87,28 @@ class Expander:
 
     # -- the transport's thread
 
-    def _receive_other(self, message: Message) -> None:
+    def _receive_announcement(self, message: Message) -> None:
+        """Handle an announcement to a robot, of this expander or of another one."""
         base = _base(message.topic)
         with self._lock:
             robot = self._robots.get(base)
             if robot is None or message.retain:
                 return
             try:
-                said = codec.plain(EXPANDER, message.payload)
+                announcement = codec.plain(EXPANDER, message.payload)
             except PayloadError:
                 return
-            name, number = (said.get("id"), said.get("n")) if isinstance(said, dict) else (None, None)
-            if name == self.id:
-                robot.own_at = self._said_at.get(number, -inf) if isinstance(number, int) else -inf
+            if not isinstance(announcement, dict):
+                return
+            id_, number = announcement.get("id"), announcement.get("n")
+            if id_ == self.id:
+                robot.own_at = self._sent_at.get(number, -inf) if isinstance(number, int) else -inf
                 robot.works = self._clock() - robot.other_at > HEARD_S
-            elif isinstance(name, str) and name < self.id:
+            elif isinstance(id_, str) and id_ < self.id:
                 robot.works, robot.other_at = False, self._clock()
 
     def _receive_wire(self, message: Message) -> None:
+        """Note how a robot sends its groups: short topic, dictionary. An empty message: it sends none any more."""
         base = _base(message.topic)
         with self._lock:
             if not message.payload:
@@ -120,9 +125,11 @@ class Expander:
             if short != robot.short:
                 robot.short, robot.short_at = short, -inf
             if isinstance(wire.dict_id, int) and isinstance(wire.dict, str):
-                robot.dictionaries.pop(wire.dict_id, None)
-                former = list(robot.dictionaries.items())[-1:]
-                robot.dictionaries = {**dict(former), wire.dict_id: wire.dict.encode()}
+                others = [entry for entry in robot.dictionaries.items() if entry[0] != wire.dict_id]
+                newest = (wire.dict_id, wire.dict.encode())
+                robot.dictionaries = dict(
+                    [*others[-1:], newest]
+                )  # a new one: _expand reads the old one without the lock
 
     def _receive_short(self, message: Message) -> None:
         with self._lock:
@@ -137,6 +144,7 @@ class Expander:
             self._expand(_base(message.topic), message.payload)
 
     def _expand(self, base: str, raw: bytes) -> None:
+        """Publish the streams of a robot's group, if this expander works and the group has not waited."""
         with self._lock:
             robot = self._robots.get(base)
             if robot is None or not robot.works:
@@ -152,16 +160,14 @@ class Expander:
             return
         for metric, payload in streams.items():
             channel = channel_of(f"{OUTGOING}/{metric}")
-            if not (is_stream(channel) if channel is not None else not is_reserved(metric)):
-                self.counts["refused members"] += 1
-                continue
-            qos = QoS.LATEST if channel is None else QoS(channel.default_qos)
-            try:
-                self._transport.publish(f"{base}/{OUTGOING}/{metric}", payload, qos=qos)
-            except TransportError:  # no topic
-                self.counts["refused members"] += 1
-                continue
-            self.counts["streams"] += 1
+            may_pass = not is_reserved(metric) if channel is None else is_stream(channel)
+            if may_pass:
+                qos = QoS.LATEST if channel is None else QoS(channel.default_qos)
+                try:
+                    self._transport.publish(f"{base}/{OUTGOING}/{metric}", payload, qos=qos)
+                except TransportError:  # the metric makes no valid topic
+                    may_pass = False
+            self.counts["streams" if may_pass else "refused members"] += 1
         self.counts["groups"] += 1
 
     def _refuse(self, base: str, error: PayloadError) -> None:

@@ -51,18 +51,20 @@ def copy_of(member: groups.Member) -> bytes:
 
 def is_marked(raw: bytes) -> bool:
     """True if a command is marked as a copy, which only the bridge may send."""
-    if groups.MARK.encode() not in raw and b"\\" not in raw:
+    if groups.MARK.encode() not in raw and b"\\" not in raw:  # the mark may be written with escapes
         return False
     try:
         command = codec.plain(DRIVE, raw)
     except PayloadError:
         return False
-    bodies = (command, command.get("value")) if isinstance(command, dict) else ()
+    if not isinstance(command, dict):
+        return False
+    bodies = (command, command.get("value"))  # a command may be wrapped in `value`
     return any(isinstance(body, dict) and body.get(groups.MARK) is True for body in bodies)
 
 
 class _Part(NamedTuple):
-    """A member as a message of its own, with how it is forwarded, or why it is not."""
+    """A member of a group as a message of its own, with how it is forwarded, or why it is not."""
 
     member: groups.Member
     subject: Subject
@@ -73,10 +75,10 @@ class _Part(NamedTuple):
 class GroupGate:
     """A gate before a forwarder, for messages from outside. Messages that are no groups go on to :attr:`pass_on`.
 
-    A group passes if each member would: it is published whole, and then each member by itself. Motor owners and
-    described boards obey the whole, and of the copies, which are marked, only zeros. A group of which a member may not
-    pass is dropped, but for members that only end something. Marked copies from outside are refused: observers would
-    see motion that is not there.
+    A group passes if each member would: it is published whole, and then a copy of each member by itself, for programs
+    that know no groups. Motor owners and described boards obey the whole; their copies are marked, and they obey of
+    these only zeros. A group of which a member may not pass is dropped, except for members that only end something.
+    Marked copies from outside are refused: observers would see motion that is not there.
     """
 
     def __init__(self, forwarder: Forwarder, addresses: Addresses, note_drive: Callable[[bytes], None]) -> None:
@@ -98,14 +100,17 @@ class GroupGate:
     def _receive_group(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str
     ) -> Forward | Drop:
+        """Deliver a group and copies of its members; or, if a member may not pass, only members that end something."""
         try:
             members = groups.decode(message.payload)
         except PayloadError as error:
             _log.warning("group", "a group is not forwarded: %s", error)
             return Drop.REFUSED
         parts = [self._part(source, message, member, account) for member in members]
-        outcome: Forward | Drop = next((part.way for part in parts if isinstance(part.way, Drop)), forward)
+        drops = [part.way for part in parts if isinstance(part.way, Drop)]
+        outcome: Forward | Drop = drops[0] if drops else forward
         if isinstance(outcome, Forward):
+            # the checks may have changed the payloads
             parts = [part._replace(member=replace(part.member, payload=part.message.payload)) for part in parts]
             whole = replace(message, payload=encoded(part.member for part in parts))
             outcome = self._forwarder.deliver(source, subject, whole, forward)
@@ -120,23 +125,22 @@ class GroupGate:
         return outcome
 
     def _part(self, source: SideState, message: Message, member: groups.Member, account: str) -> _Part:
-        channel = member.channel
-        topic = (
-            f"{self._addresses.base}/{INCOMING}/{member.metric}"
-            if channel.is_pattern
-            else self._addresses[channel].topic
-        )
+        """Check a member of the group ``message`` as the forwarder checks a message of its own."""
+        if member.channel.is_pattern:
+            topic = f"{self._addresses.base}/{INCOMING}/{member.metric}"
+        else:
+            topic = self._addresses[member.channel].topic
         subject = self._subjects[topic]
         assert subject is not None  # noqa: S101 - its metric is that of a channel
         message = replace(message, topic=topic, payload=member.payload)
         admitted = self._forwarder.admit(source, subject, message, topic, True)
         way = Drop.STAYS if self._forwarder.stays(topic) else admitted
         if isinstance(way, Forward):
-            passing = self._forwarder.examine(source, subject, message, way, account)
-            if isinstance(passing, Drop):
-                way = passing
+            examined = self._forwarder.examine(source, subject, message, way, account)
+            if isinstance(examined, Drop):
+                way = examined
             else:
-                message = passing
+                message = examined
         return _Part(member, subject, message, way)
 
 
@@ -157,7 +161,7 @@ def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
     if not link.groups:
         return value
     lines = config.serial_instances().values()
-    has = {
+    is_offered = {
         DRIVE: value.drive and value.drive.available,
         LIGHTS_SOLID: value.lights and value.lights.solid,
         LIGHTS_FLASH: value.lights and value.lights.flash,
@@ -165,4 +169,4 @@ def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
         OUTLET_COMMAND: value.outlets and value.outlets.available,
         MCU_COMMAND: any(SERIAL_PROTOCOLS[line.protocol].describes_itself for line in lines),
     }
-    return replace(value, groups=[channel.metric for channel, offered in has.items() if offered])
+    return replace(value, groups=[channel.metric for channel, offered in is_offered.items() if offered])

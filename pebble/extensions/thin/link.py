@@ -4,6 +4,7 @@ Losses alone do not lower the level: a lost packet that is sent again delays an 
 """
 
 from collections import deque
+from math import inf
 
 from msgspec import Struct
 
@@ -38,9 +39,9 @@ class _Rule(Struct, frozen=True):
 
 
 _RULES: dict[LinkLevel, _Rule] = {
-    "wide": _Rule(0.15, float("inf")),
+    "wide": _Rule(0.15, inf),
     "narrow": _Rule(0.3, 20.0),
-    "thin": _Rule(float("inf"), 60.0),
+    "thin": _Rule(inf, 60.0),
 }
 
 
@@ -51,13 +52,13 @@ class ShortestTrip:
         self._parts: deque[tuple[float, float]] = deque()  # when each began, and the shortest in it
 
     def note(self, seconds: float, now: float) -> None:
-        parts = self._parts
-        if not parts or now - parts[-1][0] >= _PART_S:
-            parts.append((now, seconds))
+        began, shortest = self._parts[-1] if self._parts else (-inf, inf)
+        if now - began >= _PART_S:
+            self._parts.append((now, seconds))
         else:
-            parts[-1] = parts[-1][0], min(parts[-1][1], seconds)
-        while now - parts[0][0] >= _REMEMBERED_S + _PART_S:
-            parts.popleft()
+            self._parts[-1] = began, min(shortest, seconds)
+        while now - self._parts[0][0] >= _REMEMBERED_S + _PART_S:
+            self._parts.popleft()
 
     @property
     def seconds(self) -> float:
@@ -65,19 +66,20 @@ class ShortestTrip:
 
 
 class Crowd:
-    """Detects a standing queue. Operators and streams then send less until it has drained."""
+    """A detector of a standing queue. Operators and streams then send less until it has drained."""
 
     def __init__(self) -> None:
         self.stands = False
-        self._turns_since: float | None = None
+        self._contrary_since: float | None = None  # when measurements began to contradict ``stands``
 
     def note(self, queue_s: float, now: float) -> None:
-        if not (queue_s < _DRAINED_S if self.stands else queue_s > _STANDING_S):
-            self._turns_since = None
-        elif self._turns_since is None:
-            self._turns_since = now
-        elif now - self._turns_since >= (_DRAINED_FOR_S if self.stands else _STANDS_S):
-            self.stands, self._turns_since = not self.stands, None
+        contradicts = queue_s < _DRAINED_S if self.stands else queue_s > _STANDING_S
+        if not contradicts:
+            self._contrary_since = None
+        elif self._contrary_since is None:
+            self._contrary_since = now
+        elif now - self._contrary_since >= (_DRAINED_FOR_S if self.stands else _STANDS_S):
+            self.stands, self._contrary_since = not self.stands, None
 
 
 class LinkMeter:
@@ -93,12 +95,12 @@ class LinkMeter:
         self.level: LinkLevel = "thin" if thin else "wide"
         self.queue_s = 0.0
         self._fixed = thin or profile != "auto"
-        self._answers, self._answered_at = 0, float("-inf")  # of this connection, and when one counted last
+        self._answer_number, self._answered_at = 0, -inf  # of the newest answer, and when an answer last counted
         self._shortest = ShortestTrip()
-        self._newest: deque[float] = deque(maxlen=3)  # queues, at this level
-        self._rise_s = {level: rule.rise_s for level, rule in _RULES.items()}
-        self._rests_since: float | None = None
-        self._risen_at = float("-inf")
+        self._newest: deque[float] = deque(maxlen=3)  # queues that were measured at this level
+        self._rise_s = {level: rule.rise_s for level, rule in _RULES.items()}  # time without a queue before a rise
+        self._rests_since: float | None = None  # since when there is no queue
+        self._risen_at = -inf
         self._crowd = Crowd()
 
     @property
@@ -114,10 +116,11 @@ class LinkMeter:
         """Update the level by the newest answer: the same answer counts once, a missing one at every call."""
         if answer is None:
             self.lost()
-        elif answer.number != self._answers or (
-            answer.seconds > _UNANSWERED_S and now - self._answered_at >= _UNANSWERED_S
-        ):
-            self._answers, self._answered_at = answer.number, now
+            return
+        is_new = answer.number != self._answer_number
+        is_missing = answer.seconds > _UNANSWERED_S and now - self._answered_at >= _UNANSWERED_S
+        if is_new or is_missing:
+            self._answer_number, self._answered_at = answer.number, now
             self.answered(answer.seconds, now, answer.queue_s)
 
     def answered(self, seconds: float, now: float, tcp_queue_s: float | None = None) -> None:
@@ -132,15 +135,17 @@ class LinkMeter:
 
     def lost(self) -> None:
         """Note that the connection is lost; the next measurements belong to another connection."""
-        self._answers = 0
+        self._answer_number = 0
         self._crowd = Crowd()
         self._forget()
 
     def _forget(self) -> None:
+        """Forget the measurements of this level."""
         self._newest.clear()
         self._rests_since = None
 
     def _decide(self, now: float) -> None:
+        """Change the level, if the newest measurements call for it."""
         level = self.level
         if sum(queue_s > _RULES[level].worse_s for queue_s in self._newest) >= 2:
             self._fall(now)
@@ -155,8 +160,8 @@ class LinkMeter:
 
     def _fall(self, now: float) -> None:
         lower = _ORDER[_ORDER.index(self.level) + 1]
-        failed = now - self._risen_at < max(_PROVED_S, self._rise_s[lower])
-        self._rise_s[lower] = min(2 * self._rise_s[lower], _LONGEST_WAIT_S) if failed else _RULES[lower].rise_s
+        rise_failed = now - self._risen_at < max(_PROVED_S, self._rise_s[lower])
+        self._rise_s[lower] = min(2 * self._rise_s[lower], _LONGEST_WAIT_S) if rise_failed else _RULES[lower].rise_s
         self._change(lower)
 
     def _change(self, level: LinkLevel) -> None:
@@ -175,8 +180,8 @@ class Room:
         self._rate = None if kbit is None else _CARRIED * kbit * 125  # bytes/s
         self._bytes = float(_FIRST_BYTES if self._rate is None else _LEAST_BYTES)
         self._in_flight = InFlight(_SLACK_BYTES, _MOST)
-        self._waiting = 0
-        self._used = False  # a message found no room
+        self._waiting = 0  # bytes that are not confirmed
+        self._was_full = False  # since the last poll a message found no room
 
     def poll(self, waiting: int, round_trip_s: float, now: float) -> None:
         """Note how many bytes are not confirmed. The shortest round trip counts as the mere way there and back."""
@@ -186,18 +191,18 @@ class Room:
             self._bytes = max(_LEAST_BYTES, self._rate * (round_trip_s + _SOON_S))
         elif any(now - sent.at - round_trip_s > _SOON_S + _POLL_S for sent in confirmed):
             self._bytes = max(_LEAST_BYTES, 0.7 * self._bytes)
-        elif self._used:
+        elif self._was_full:
             self._bytes = min(_MOST_BYTES, self._bytes + sum(sent.size for sent in confirmed))
-        self._used = False
+        self._was_full = False
 
     def takes(self, rank: Rank, size: int, now: float) -> bool:
         """Return True if ``size`` bytes of this rank may be sent now, and note them.
 
-        A message may always be on its way. If it is larger than the room it takes all of it: the last ranks leave some
-        room for it.
+        One message may always be on its way. A message that is larger than the room takes all of it. Higher ranks may
+        use several times the room, so that they find some behind such a message.
         """
         fits = not self._waiting or self._waiting + min(size, self._bytes) <= self._bytes * rank
-        self._used = self._used or not fits
+        self._was_full = self._was_full or not fits
         if fits and size:
             self._in_flight.sent(size, now)
             self._waiting += size
@@ -215,7 +220,7 @@ class LateRun:
         self._since = self._newest_at = 0.0
 
     def note(self, late: bool, now: float) -> None:
-        """Count a ``late`` command that does not tell its age; a command in time restarts the count."""
+        """Count a ``late`` command whose sender does not tell its age; a command in time restarts the count."""
         if not late:
             self.count = 0
             return

@@ -21,7 +21,7 @@ OVERDUE_S = 10.0  # a message that has waited for so long gives way no more
 
 
 class Rank(IntEnum):
-    """Order in which messages wait: streams as soon as there is little room, heartbeats last."""
+    """The rank of a message. The number is how many times the room its messages may fill: streams wait first."""
 
     STREAM = 1
     STATE = 2
@@ -35,7 +35,7 @@ class Waiting(Struct, frozen=True):
     subject: Subject
     message: Message
     forward: Forward
-    since: float  # when the first of those began to wait that followed each other here
+    since: float  # when the first message of the topic began to wait, of which this one takes the place
 
 
 class Sieve:
@@ -51,22 +51,22 @@ class Sieve:
     def __init__(self, takes: Callable[[Rank, int], bool], counters: Counters, clock: Callable[[], float]) -> None:
         self.stream_s = 0.0
         self._takes, self._counters, self._clock = takes, counters, clock
-        self._waiting: dict[str, Waiting] = {}  # by topic, in the order of their last turns
-        self._sent_at: dict[str, float] = {}  # of streams, the oldest first
+        self._waiting: dict[str, Waiting] = {}  # by topic, in the order in which they began to wait
+        self._sent_at: dict[str, float] = {}  # by the topic of a stream, the oldest first
         self._short: set[Rank] = set()  # ranks with a message that waits for room
-        self._event_since = inf  # since when the next event waits
-        self._event_asked = False  # whether there is room, in vain
+        self._event_since = inf  # since when an event waits, in the buffer of its side
+        self._event_was_refused = False  # an event found no room, since states were last sent
 
     def __len__(self) -> int:
         return len(self._waiting)
 
     def takes_event(self, message: Message) -> bool:
-        """Return True if an event may be sent now; else note since when events wait, which is elsewhere."""
-        overdue = self._event_is_overdue
-        if (overdue or Rank.STATE not in self._short) and self._takes(Rank.STATE, _size(message)):
+        """Return True if an event may be sent now. False: it stays in its buffer, and its waiting time is noted."""
+        goes_before_states = self._event_is_overdue or Rank.STATE not in self._short
+        if goes_before_states and self._takes(Rank.STATE, _size(message)):
             self._event_since = inf
             return True
-        self._event_since, self._event_asked = min(self._event_since, self._clock()), True
+        self._event_since, self._event_was_refused = min(self._event_since, self._clock()), True
         return False
 
     def keeps(self, subject: Subject, message: Message, forward: Forward) -> bool:
@@ -74,38 +74,41 @@ class Sieve:
         rank, topic = rank_of(subject, message), message.topic
         if rank is None:
             return False
-        waits = topic in self._waiting
-        if not waits and self._is_turn(rank, topic) and self._passes(rank, message):
+        older = self._waiting.get(topic)
+        if older is not None:
+            self._counters.add("thinned" if self._takes(rank, 0) else "shed")  # it is replaced
+            self._waiting[topic] = Waiting(rank, subject, message, forward, older.since)
+            return True
+        if self._is_turn(rank, topic) and self._passes(rank, message):
             self._note(rank, topic)
             return False
-        if not waits and len(self._waiting) >= TOPICS:
-            if rank is Rank.STATE:
-                return False  # no state is lost
-            self._counters.add("shed")
+        if len(self._waiting) < TOPICS:
+            self._waiting[topic] = Waiting(rank, subject, message, forward, self._clock())
             return True
-        if waits:
-            self._counters.add("thinned" if self._takes(rank, 0) else "shed")  # the older one
-        since = self._waiting[topic].since if waits else self._clock()
-        self._waiting[topic] = Waiting(rank, subject, message, forward, since)
+        if rank is Rank.STATE:
+            return False  # no state is lost
+        self._counters.add("shed")
         return True
 
     def due(self, rank: Rank) -> Iterator[Waiting]:
         """Yield the waiting messages of this rank that may be sent now. States wait while an event is overdue."""
         if rank is Rank.STATE and self._event_is_overdue:
-            asked, self._event_asked = self._event_asked, False
-            if asked:  # since the last time: else it has gone
+            event_waits, self._event_was_refused = self._event_was_refused, False
+            if event_waits:
                 self._short.add(rank)
                 return
-            self._event_since = inf
+            self._event_since = inf  # the event has gone
         self._short.discard(rank)
-        overdue = self._clock() - OVERDUE_S
+        overdue_since = self._clock() - OVERDUE_S
         for topic, entry in list(self._waiting.items()):
-            if rank is (Rank.STATE if entry.since <= overdue else entry.rank) and self._is_turn(entry.rank, topic):
-                if not self._passes(rank, entry.message):
-                    return
-                self._note(entry.rank, topic)
-                del self._waiting[topic]
-                yield entry
+            present_rank = Rank.STATE if entry.since <= overdue_since else entry.rank
+            if present_rank is not rank or not self._is_turn(entry.rank, topic):
+                continue
+            if not self._passes(rank, entry.message):
+                return
+            self._note(entry.rank, topic)
+            del self._waiting[topic]
+            yield entry
 
     def empty(self) -> Iterator[Waiting]:
         """Yield all waiting messages, because from now on there is room for all."""

@@ -1,4 +1,4 @@
-"""Sends messages that leave a robot through a sieve, while the link to its remote side is thin."""
+"""Sends messages that leave a robot through a sieve, while the link to its remote side is not wide."""
 
 import threading
 from collections.abc import Iterable
@@ -52,6 +52,7 @@ class Sifter:
     def _sift(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str
     ) -> Forward | Drop:
+        """Pass a message on, or keep it for a group or in the sieve. The forwarder calls this in place of pass_now."""
         if source.side is not Side.LOCAL or subject.prompt:
             if self._groups is not None and subject.channel is EXPANDER:
                 self._groups.heard(message.payload)

@@ -47,27 +47,29 @@ class StreamGroups:
         self._below = f"{addresses.base}/{OUTGOING}/"
         self._topic, self._wire = addresses[STREAMS].topic, addresses[WIRE].topic
         self._short = f"{SHORT}{link.short}" if link.short else ""
-        self._is_heard, self._tries = False, 0  # of the short name
+        self._short_is_heard, self._tries = False, 0  # by an expander; to be heard there
         self._remote, self._counters, self._clock = remote, counters, clock
         self._hz, self._named = link.group_hz, config.security.named
         self._known_only = config.security.level != "open"  # brokers let an expander's account publish nothing else
         self._lock = threading.Lock()  # guards the messages that wait
         self._waiting: dict[str, bytes] = {}  # by metric
-        self._heard_at = self._sent_at = self._learned_at = -inf
-        self._since = inf  # the expander is heard
-        self._dict_id, self._dictionary = now_ms() % LAST_DICT + 1, b""
+        self._heard_at = self._sent_at = self._learned_at = -inf  # an expander; a group; the dictionary
+        self._heard_since = inf  # since when an expander is heard
+        self._dict_id, self._dictionary = now_ms() % LAST_DICT + 1, b""  # probably not the number before a restart
         self._known: frozenset[str] = frozenset()  # metrics in the dictionary
         self._is_announced = False
 
     def heard(self, raw: bytes) -> None:
-        """Note that an expander is there, and whether it hears the short name; if not, say something there."""
+        """Note an expander's announcement. If it does not hear the short name, publish an empty group there."""
         now = self._clock()
         if now - self._heard_at > HEARD_S:
-            self._since, self._tries = now, 0
+            self._heard_since, self._tries = now, 0
         self._heard_at = now
         with suppress(PayloadError, AttributeError):
-            self._is_heard = codec.plain(EXPANDER, raw).get("short") == self._short
-        self._tries = 0 if self._is_heard else self._tries + bool(self._short)
+            self._short_is_heard = codec.plain(EXPANDER, raw).get("short") == self._short
+        if not self._short:
+            return
+        self._tries = 0 if self._short_is_heard else self._tries + 1
         if 1 <= self._tries <= _TRIES:
             self._remote.publish(self._short, b"{}", qos=QoS.LATEST)
         elif self._tries == _TRIES + 1:
@@ -101,13 +103,14 @@ class StreamGroups:
             with self._lock:
                 self._waiting.clear()
             return
-        if not self._waiting or now - self._sent_at < (_CROWDED if crowded else 1) / self._hz - 0.01:
+        period_s = (_CROWDED if crowded else 1) / self._hz
+        if not self._waiting or now - self._sent_at < period_s - 0.01:
             return
         with self._lock:
             waiting = dict(self._waiting)
         text = joined(waiting)
         raw = packed(text, self._dict_id, self._dictionary)
-        topic = self._short if self._short and self._is_heard else self._topic
+        topic = self._short if self._short and self._short_is_heard else self._topic
         if not takes_room(len(raw) + len(topic)):
             return
         with self._lock:
@@ -120,7 +123,8 @@ class StreamGroups:
 
     def _learn(self, text: bytes, metrics: frozenset[str], now: float) -> None:
         """Make a group the dictionary of later groups, if it has streams that the present dictionary lacks."""
-        if now - max(self._since, self._learned_at + _LEARN_AGAIN_S - _LEARN_S) < _LEARN_S or metrics <= self._known:
+        due = max(self._heard_since + _LEARN_S, self._learned_at + _LEARN_AGAIN_S)
+        if now < due or metrics <= self._known:
             return
         self._dict_id, self._dictionary = self._dict_id % LAST_DICT + 1, text
         self._known, self._learned_at = metrics, now

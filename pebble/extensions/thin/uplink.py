@@ -32,8 +32,8 @@ _CHANGE_S = 0.05  # a queue that has changed by less is the same, and by less th
 _CROWDED_DRIVE, _CROWDED_STREAMS = 2 / 3, 1 / 4  # of what is sent at a level, while a queue stands
 _PAUSE = 25  # so much longer on a thin link what can wait is spread
 _HEARTBEAT_BYTES = 80  # about
-_LATE, _LATE_S = 8, 1.5  # commands, and since when all of them were late: the broker holds more of the kind
-_FLOODED_S = 60.0  # after what was done about it
+_LATE, _LATE_S = 8, 1.5  # as many late commands in a row, and for so long: more of them wait in the broker
+_FLOODED_S = 60.0  # how long the link counts as flooded after they were dropped
 _HELD = ("camera_publisher", "video_stream", "audio_publisher")
 _HOLD_S = 5.0  # after the newest command that moves something: each beginning costs 2 KB of states and logs
 RENEW_S = 30.0  # between two connections that are renewed for it, at least: who floods must not keep the robot away
@@ -61,13 +61,13 @@ class LinkReport:
 
     def publish(self, now: float) -> None:
         """Publish the state as a retained message. Without a connection it is sent on the next one."""
-        meter, earlier = self._meter, self._level
+        meter, earlier_level = self._meter, self._level
         self._level, self._crowded, self._queue_s, self._at = meter.level, meter.crowded, meter.queue_s, now
         trip_ms, queue_ms = round(1000 * meter.round_trip_s), round(1000 * meter.queue_s)
-        if earlier not in ("", meter.level):
+        if earlier_level not in ("", meter.level):
             log.info(
                 "the link to the remote broker is %s now (it was %s): a round trip of %d ms, and %d ms of queue",
-                meter.level, earlier, trip_ms, queue_ms
+                meter.level, earlier_level, trip_ms, queue_ms
             )  # fmt: skip
         drive_hz = round(LEVELS[meter.level].drive_hz * (_CROWDED_DRIVE if meter.crowded else 1), 2)
         state = LinkState(level=meter.level, drive_hz=drive_hz, rtt_ms=trip_ms, queue_ms=queue_ms, t=now_ms())
@@ -76,14 +76,14 @@ class LinkReport:
 
 
 class MediaHold:
-    """A pause of the programs with pictures or sound while a person drives over the same modem. The launcher keeps it.
+    """A pause of the programs with pictures or sound while a person drives over the same modem.
 
-    ``send_one`` returns False if the launcher is busy.
+    ``request(program, on)`` asks the launcher for it, and returns False if the launcher is busy.
     """
 
-    def __init__(self, programs: Collection[str], send_one: Callable[[str, bool], bool]) -> None:
-        self._sent = dict.fromkeys((name for name in _HELD if name in programs), False)
-        self._send_one = send_one
+    def __init__(self, programs: Collection[str], request: Callable[[str, bool], bool]) -> None:
+        self._requested = dict.fromkeys((name for name in _HELD if name in programs), False)  # by program
+        self._request = request
         self._driven_at = -inf
 
     def note_drive(self, now: float) -> None:
@@ -93,9 +93,9 @@ class MediaHold:
     def send(self, now: float) -> None:
         """Send the requests that have changed with time, and again those that the launcher has not accepted."""
         on = now - self._driven_at < _HOLD_S
-        for program, sent in self._sent.items():
-            if sent is not on and self._send_one(program, on):
-                self._sent[program] = on
+        for program, requested in self._requested.items():
+            if requested is not on and self._request(program, on):
+                self._requested[program] = on
 
 
 def make_uplink(
@@ -163,9 +163,9 @@ class ThinUplink(Uplink):
         return self.level.heartbeat_qos if self._saves_acks else None
 
     def heartbeat_due(self) -> bool:
-        now, level = self._clock(), self.level
-        if level.heartbeat_s:
-            if now - self._heartbeat_at < max(level.heartbeat_s, self._heartbeat_s) - POLL_S / 2:
+        now, level_s = self._clock(), self.level.heartbeat_s  # 0: the level sets no period
+        if level_s:
+            if now - self._heartbeat_at < max(level_s, self._heartbeat_s) - POLL_S / 2:
                 return False
             if not self._takes(Rank.HEARTBEAT, _HEARTBEAT_BYTES):
                 return False
@@ -207,8 +207,8 @@ class ThinUplink(Uplink):
         connection of their own.
         """
         late, now = self._late, self._clock()
-        since_s = now - self._flooded_at
-        if self._meter.level == "thin" and late.count >= _LATE and late.seconds(now) >= _LATE_S and since_s >= RENEW_S:
+        is_flood = self._meter.level == "thin" and late.count >= _LATE and late.seconds(now) >= _LATE_S
+        if is_flood and now - self._flooded_at >= RENEW_S:
             late.count = 0
             self._flooded_at = now
             self._remote.renew_connection("only late commands come over a thin link: those that wait there are dropped")

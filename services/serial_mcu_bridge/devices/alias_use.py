@@ -9,7 +9,7 @@ from pebble.transports import Subscription
 
 
 class AliasUse:
-    """The aliases in use. ``begin`` starts the use of one and returns its subscription, if any; ``end`` ends it."""
+    """The aliases in use. ``begin`` starts to use an alias and returns its subscription, if any; ``end`` ends that."""
 
     def __init__(
         self,
@@ -24,7 +24,7 @@ class AliasUse:
         self.permitted = False  # other devices have had time to object
         self._device: Device | None = None
         self.used: dict[str, tuple[Alias, Subscription | None]] = {}  # by claim
-        self._rivals: dict[str, list[str]] = {}  # by claim, as last logged
+        self._rivals: dict[str, list[str]] = {}  # other devices with the same claim, by claim, as last logged
 
     def __contains__(self, alias: Alias) -> bool:
         return alias.claim in self.used
@@ -40,7 +40,7 @@ class AliasUse:
             self.update()
 
     def update(self) -> None:
-        """Use the aliases that no other device claims, and release the others. If two claim one, neither uses it."""
+        """Use the aliases that no other device claims, and release the rest: of two devices neither uses it."""
         if self._device is None:
             return
         for route in self._device.routes.values():
@@ -56,9 +56,9 @@ class AliasUse:
 
     def _update(self, device: Device, route: Route, alias: Alias) -> None:
         owner = self._owners.get(alias.claim.partition("/")[2])
-        rivals = self._peers.claimants(alias.claim) if owner is None else [owner]
-        if owner == device.uid:
-            rivals = []
+        rivals = self._peers.claimants(alias.claim)
+        if owner is not None:
+            rivals = [] if owner == device.uid else [owner]
         self._log_conflict(device, alias.claim, rivals, owner)
         if rivals:
             self._release(alias.claim)

@@ -96,8 +96,6 @@ class DescribedBridge(SerialService):
     def stop(self) -> None:
         self._device_gone("the bridge ends")
 
-    # -- the line
-
     def on_line_state(self, state: LineState) -> None:
         now = self.clock()
         if state is LineState.READY:
@@ -134,7 +132,8 @@ class DescribedBridge(SerialService):
 
     def _arm(self) -> None:
         """Set the timer if the next event is earlier; a timer that is too early does no harm."""
-        due = min((due for due in (self._session.due, self._peers.due) if due is not None), default=None)
+        times = [due for due in (self._session.due, self._peers.due) if due is not None]
+        due = min(times, default=None)
         if due is None or (self._timer is not None and self._timer.due <= due):
             return
         if self._timer is not None:
@@ -165,9 +164,10 @@ class DescribedBridge(SerialService):
 
     def _report(self, reading: Reading) -> None:
         device, now_ms = self.device, _now_ms()
-        if device is None or not device.has_motion or reading.interface.profile == MOTION:
+        is_motion = reading.interface.profile == MOTION
+        if device is None or not device.has_motion or is_motion:
             self.watchdog.sample(self.clock())
-        if reading.interface.profile == MOTION:
+        if is_motion:
             self.sensors.take(measured(reading.values), self.clock())
         if reading.interface.kind is InterfaceKind.STATE:
             self._published_states[reading.interface.id] = reading, now_ms
@@ -199,6 +199,7 @@ class DescribedBridge(SerialService):
 
     @on(_UID_QUERY)
     def on_question(self, question: dict[str, Any], uid: str) -> None:
+        """Publish the manifest again for a process that asks; warn if that process has a device of this uid, too."""
         if self.device is None or uid != self.device.uid:
             return
         token = question.get("from")
@@ -210,9 +211,7 @@ class DescribedBridge(SerialService):
             self.log.warning(text, uid)
 
     def _publish_device(self, manifest: Manifest) -> None:
-        port = str(self.options.serial.port)
-        reports = ImuReports(device=port, protocol=self.options.protocol, instance=self.instance)
-        device = self.device = Device(manifest, self.addresses, reports)
+        device = self.device = Device(manifest, self.addresses, ImuReports(self.options, self.instance))
         hello = device.hello
         self.log.info("%s: %r, firmware %r, %d interfaces", device.uid, hello.model, hello.firmware_version,
                       len(device.routes))  # fmt: skip
@@ -221,16 +220,14 @@ class DescribedBridge(SerialService):
         if any(route.interface.profile.startswith(FAMILY) for route in device.routes.values()):
             self.watchdog.found_imu()
         self._peers.forget(device.uid)
-        subscriptions, self._generic = self._generic, []
-        for subscription in subscriptions:
+        for subscription in self._generic:
             subscription.close()
-        if device.has_motion:
-            self._generic.append(self.follow_driving())
+        self._generic = [self.follow_driving()] if device.has_motion else []
         self._listen_generic(device, private=False)  # a reader of the manifest may send commands at once
         self.publish(MCU_LOCAL_ONLY, device.local_only, uid=device.uid)
         self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)
-        self.publish(MCU_COMMAND, {"from": self._token}, uid=device.uid, name=RESERVED)
-        self._listen_generic(device, private=True)
+        self.publish(MCU_COMMAND, {"from": self._token}, uid=device.uid, name=RESERVED)  # see _UID_QUERY
+        self._listen_generic(device, private=True)  # not before: bridges must know that these stay on the robot
         self.aliases.announce(device)
         self.call_at(self.clock() + CLAIM_S, partial(self.aliases.permit, device))
 
@@ -256,8 +253,6 @@ class DescribedBridge(SerialService):
             if route.interface.direction is Direction.IN and route.interface.local_only is private
         ]
 
-    # -- commands
-
     def _receive_group(self, message: Message, _value: Any, _names: dict[str, str]) -> None:
         """Take the members of a group that are for this device, to be written at once, or not at all."""
         try:
@@ -271,13 +266,14 @@ class DescribedBridge(SerialService):
         if self.device is None:
             self._drop_command("a group of commands")
             return
-        interfaces = ((route.generic.metric, route.interface) for route in self.device.routes.values())
-        takes = {metric: interface for metric, interface in interfaces if interface.direction is Direction.IN}
-        mine = [member for member in members if member.metric.startswith(f"mcu/{self.device.uid}/")]
-        if unknown := [member.metric for member in mine if member.metric not in takes]:
+        routes = [route for route in self.device.routes.values() if route.interface.direction is Direction.IN]
+        interfaces = {route.generic.metric: route.interface for route in routes}
+        for_device = [member for member in members if member.metric.startswith(f"mcu/{self.device.uid}/")]
+        if unknown := [member.metric for member in for_device if member.metric not in interfaces]:
             self._refuse_command(f"{unknown[0]} is not there")
-        elif mine:
-            self._send_commands([(takes[one.metric], codec.plain(MCU_COMMAND, one.payload)) for one in mine])
+        elif for_device:
+            commands = [(interfaces[member.metric], codec.plain(MCU_COMMAND, member.payload)) for member in for_device]
+            self._send_commands(commands)
 
     def _command(self, device: Device, route: Route, values: dict[str, Any]) -> None:
         name = route.interface.name
@@ -305,8 +301,6 @@ class DescribedBridge(SerialService):
     def _refuse_command(self, why: str) -> None:
         self.counters.add("refused")
         self.log_limited.warning("command", "refused a command: %s", why)
-
-    # -- aliases
 
     def _begin_alias(self, device: Device, route: Route, alias: Alias) -> Subscription | None:
         self._features.names |= outlet_feature(alias.claim)
@@ -377,6 +371,6 @@ class _ProvidedFeatures:
 
     def report(self) -> None:
         """Report changes, also those for which the launcher was too busy before."""
-        for name in sorted(self._reported ^ self.names):
+        for name in sorted(self._reported ^ self.names):  # those that are in one of the two
             if self._notifier.feature(name, name in self.names):
                 self._reported ^= {name}

@@ -36,6 +36,8 @@ class Alias:
 
 @dataclass(frozen=True, slots=True)
 class Route:
+    """The channels of an interface: its generic one, and an alias if the robot lets it have one."""
+
     interface: Interface
     generic: c.Channel
     alias: Alias | None
@@ -103,11 +105,11 @@ class Device:
         channel = self._robots_channel(claim)
         if channel in (c.IMU_FAST, c.IMU):
             return Alias(claim, channel, interface.profile)
-        claimed = _channel(interface.channel, interface.kind, payload, retain=interface.retain)
+        new_channel = _channel(interface.channel, interface.kind, payload, retain=interface.retain)
         # a payload that must stay on the robot names its device, so that the MQTT bridge recognises it
-        profiled = interface.profile in (imu.MOTION, imu.SUMMARY) and not interface.local_only
-        fits = profiled and imu.fits(interface.profile, {field.name for field in interface.fields})
-        return Alias(claim, claimed, interface.profile if fits else "")
+        is_imu = interface.profile in (imu.MOTION, imu.SUMMARY) and not interface.local_only
+        has_fields = is_imu and imu.fits(interface.profile, {field.name for field in interface.fields})
+        return Alias(claim, new_channel, interface.profile if has_fields else "")
 
     def _renamed(self, interface: Interface) -> Interface:
         """Return ``interface`` with the channel name that the config sets, if it sets a valid one."""
@@ -120,12 +122,13 @@ class Device:
         return replace(interface, channel=self._addresses[channel].topic.removeprefix(family))
 
     def _robots_channel(self, suffix: str) -> c.Channel | None:
+        """Return the robot's channel at ``suffix``, by the config or else by the contract; None if there is none."""
         return self._addresses.channel(f"{self._addresses.base}/{suffix}") or c.channel_of(suffix)
 
 
 def _channel(metric: str, kind: InterfaceKind, payload: Any, *, retain: bool = False) -> c.Channel:
     """Return a channel made at run time. Only a state is retained: a retained sample would be stale."""
-    of_contract, qos = _KINDS[kind]
+    channel_kind, qos = _KINDS[kind]
     if kind is InterfaceKind.STATE and retain:
-        of_contract = c.Kind.STATE
-    return c.Channel(metric=metric, kind=of_contract, payload=payload, doc="", qos=qos)
+        channel_kind = c.Kind.STATE
+    return c.Channel(metric=metric, kind=channel_kind, payload=payload, doc="", qos=qos)

@@ -47,7 +47,10 @@ class LocalOnly(PrivateTopics):
             if message.topic.startswith(self._values) and message.topic.endswith(_LIST):
                 self._learn(message.topic.removeprefix(self._values).removesuffix(_LIST), message.payload)
                 waiting, self._waiting = self._waiting, {}
-                return [admitted for held in waiting.values() for admitted in self._judge(held)]
+                admitted: list[Message] = []
+                for held in waiting.values():  # those of other MCUs go on waiting
+                    admitted += self._judge(held)
+                return admitted
             return self._judge(message)
 
     def _learn(self, uid: str, payload: bytes) -> None:
@@ -58,12 +61,12 @@ class LocalOnly(PrivateTopics):
         except PayloadError:
             return
         if uid in self._private or len(self._private) < _DEVICES:
-            metrics = {topic: topic.partition("/")[2] for topic in listed.topics}
-            usable = (topic for topic, metric in metrics.items() if not is_reserved(metric))  # a stop must pass
+            usable = (topic for topic in listed.topics if not is_reserved(topic.partition("/")[2]))  # a stop must pass
             self._private[uid] = frozenset(f"{self.base}/{topic}" for topic in usable)
             self._listed.add(uid)
 
     def _judge(self, message: Message) -> list[Message]:
+        """Return ``message`` if it may pass. A retained value of an MCU without a list is kept until there is one."""
         if self.stays(message.topic):
             return []
         uid = self._uid_of(message)
@@ -79,7 +82,7 @@ class LocalOnly(PrivateTopics):
         if message.topic.startswith(self._values):
             uid = message.topic.removeprefix(self._values).partition("/")[0]
             return None if message.topic.endswith(_QUESTION) else uid
-        sample = _object(message.payload) if _MARK in message.payload else {}
+        sample = _object(message.payload) if _MARK in message.payload else {}  # under an alias
         sender = sample.get("device_uid")
         return sender if isinstance(sender, str) and isinstance(sample.get("interface"), str) else None
 

@@ -1,4 +1,4 @@
-"""Inertial sensors: the service of one with its own line of text, and the payloads of all kinds."""
+"""Inertial sensors: the service of a sensor on a line of text, and the payloads of all kinds of sensors."""
 
 from pebble.contract.serial_protocols import SerialProtocol
 from pebble.extension import Extension

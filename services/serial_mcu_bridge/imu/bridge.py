@@ -27,9 +27,7 @@ class ImuBridge(SerialService):
         super().__init__(*arguments, **options)
         self._watchdog = ImuWatchdog(self.options, self.instance)
         self._splitter = LineSplitter()
-        self._reports = ImuReports(
-            device=str(self.options.serial.port), protocol=self.options.protocol, instance=self.instance
-        )
+        self._reports = ImuReports(self.options, self.instance)
 
     def set_up(self) -> None:
         super().set_up()

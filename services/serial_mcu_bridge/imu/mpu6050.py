@@ -20,6 +20,7 @@ _MOTION |= {b"t": "temp_c", b"r": "roll_deg", b"p": "pitch_deg"}
 _SUMMARY = {b"an": "accel_norm_g", b"gbx": "gyro_bias_x_dps", b"gby": "gyro_bias_y_dps", b"gbz": "gyro_bias_z_dps"}
 _ATTITUDE = {b"r": "roll_deg", b"p": "pitch_deg", b"t": "temp_c"}  # a summary repeats them
 _COUNTS = {b"ok": "samples_ok", b"err": "samples_error", b"cal": "calibration_samples"}
+_HEAD = {b"n": "n", b"ms": "ms"}  # number of the line, and the sensor's clock
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +42,9 @@ Report: TypeAlias = Motion | Summary | DeviceLogLine
 
 def parse(line: bytes) -> Report | None:
     """Return the report of one line, None for a blank one. A malformed report is a warning. Never raises."""
-    kind, *rest = line.split() or [b""]
+    kind, *tokens = line.split() or [b""]
     if kind in (b"I", b"S"):
-        fields = dict(token.split(b"=", 1) for token in rest if b"=" in token)
+        fields = dict(token.split(b"=", 1) for token in tokens if b"=" in token)
         report = _motion(fields) if kind == b"I" else _summary(fields)
         return report or DeviceLogLine(logging.WARNING, printable(line))
     text = printable(line)
@@ -51,23 +52,20 @@ def parse(line: bytes) -> Report | None:
 
 
 def _motion(fields: dict[bytes, bytes]) -> Motion | None:
-    head, values = _integers(fields, {b"n": "n", b"ms": "ms"}), _decimals(fields, _MOTION)
+    head, values = _numbers(fields, _HEAD, int), _numbers(fields, _MOTION, float)
     return None if head is None or values is None else Motion(head["n"], head["ms"], values)
 
 
 def _summary(fields: dict[bytes, bytes]) -> Summary | None:
-    head, values = _integers(fields, {b"n": "n", b"ms": "ms"}), _decimals(fields, _SUMMARY | _ATTITUDE)
-    counts = _integers(fields, _COUNTS)
+    head, values = _numbers(fields, _HEAD, int), _numbers(fields, _SUMMARY | _ATTITUDE, float)
+    counts = _numbers(fields, _COUNTS, int)
     if head is None or values is None or counts is None:
         return None
     return Summary(head["n"], head["ms"], {**values, **counts})
 
 
-def _integers(fields: dict[bytes, bytes], names: dict[bytes, str]) -> dict[str, int] | None:
+def _numbers(fields: dict[bytes, bytes], names: dict[bytes, str], kind: type[Any]) -> dict[str, Any] | None:
+    """Return the numbers of a line by their names; None if one is missing, or is not written as this kind."""
+    form = _INTEGER if kind is int else _DECIMAL
     texts = {name: fields.get(key, b"") for key, name in names.items()}
-    return {name: int(raw) for name, raw in texts.items()} if all(map(_INTEGER.match, texts.values())) else None
-
-
-def _decimals(fields: dict[bytes, bytes], names: dict[bytes, str]) -> dict[str, float] | None:
-    texts = {name: fields.get(key, b"") for key, name in names.items()}
-    return {name: float(raw) for name, raw in texts.items()} if all(map(_DECIMAL.match, texts.values())) else None
+    return {name: kind(raw) for name, raw in texts.items()} if all(map(form.match, texts.values())) else None

@@ -3,6 +3,8 @@
 from collections.abc import Collection, Mapping
 from typing import Any, Final
 
+from msgspec.structs import asdict
+
 from pebble.config import SerialBridge
 from pebble.contract.payloads import Imu, ImuFast, ImuFastValues, ImuHealth, ImuValues, Orientation, Vector
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
@@ -15,14 +17,11 @@ FAMILY: Final = "imu."
 TIMEOUT_S = 5.0  # without a sample
 FIRST_S = 2.0  # more for the first sample: the board boots, and is asked for its manifest
 
+_ACCELERATION, _ROTATION = ("ax", "ay", "az"), ("gx", "gy", "gz")
+_BIAS = ("gyro_bias_x_dps", "gyro_bias_y_dps", "gyro_bias_z_dps")
 _FIELDS = {
-    MOTION: frozenset(("ax", "ay", "az", "gx", "gy", "gz", "temp_c", "roll_deg", "pitch_deg")),
-    SUMMARY: frozenset(
-        (
-            *("accel_norm_g", "gyro_bias_x_dps", "gyro_bias_y_dps", "gyro_bias_z_dps"),
-            *("samples_ok", "samples_error", "calibration_samples"),
-        )
-    ),
+    MOTION: frozenset((*_ACCELERATION, *_ROTATION, "temp_c", "roll_deg", "pitch_deg")),
+    SUMMARY: frozenset(("accel_norm_g", *_BIAS, "samples_ok", "samples_error", "calibration_samples")),
 }
 
 Values = Mapping[str, Any]
@@ -30,7 +29,7 @@ Values = Mapping[str, Any]
 
 def measured(values: Values) -> dict[str, tuple[Any, ...]]:
     """Return a sample's values by sensor. Because of noise, successive samples always differ."""
-    axes = {"acceleration": ("ax", "ay", "az"), "rotation": ("gx", "gy", "gz")}
+    axes = {"acceleration": _ACCELERATION, "rotation": _ROTATION}
     return {name: tuple(values[axis] for axis in names) for name, names in axes.items()}
 
 
@@ -42,15 +41,15 @@ def fits(profile: str, names: Collection[str]) -> bool:
 class ImuReports:
     """A maker of the payloads of one sensor; a summary repeats the newest sample."""
 
-    def __init__(self, *, device: str, protocol: str, instance: str) -> None:
-        self._device, self._protocol, self._instance = device, protocol, instance
+    def __init__(self, options: SerialBridge, instance: str) -> None:
+        self._device, self._protocol, self._instance = str(options.serial.port), options.protocol, instance
         self._newest: ImuFastValues | None = None
 
     def motion(self, t: int, seq: int, mcu_ms: int, values: Values) -> ImuFast:
         """Return a sample as a payload; ``values`` by the profile's fields: m/s², degrees per second, °C, degrees."""
         self._newest = ImuFastValues(
-            accel_mps2=_vector(values, "ax", "ay", "az"),
-            gyro_dps=_vector(values, "gx", "gy", "gz"),
+            accel_mps2=_vector(values, *_ACCELERATION),
+            gyro_dps=_vector(values, *_ROTATION),
             temp_c=round(values["temp_c"], 3),
             orientation_deg=Orientation(roll=round(values["roll_deg"], 3), pitch=round(values["pitch_deg"], 3)),
         )
@@ -58,16 +57,12 @@ class ImuReports:
 
     def summary(self, t: int, seq: int, mcu_ms: int, values: Values) -> Imu | None:
         """Return the summary; None before the first sample."""
-        newest = self._newest
-        if newest is None:
+        if self._newest is None:
             return None
         value = ImuValues(
-            accel_mps2=newest.accel_mps2,
-            gyro_dps=newest.gyro_dps,
-            temp_c=newest.temp_c,
-            orientation_deg=newest.orientation_deg,
+            **asdict(self._newest),
             accel_norm_g=round(values["accel_norm_g"], 4),
-            gyro_bias_dps=_vector(values, "gyro_bias_x_dps", "gyro_bias_y_dps", "gyro_bias_z_dps"),
+            gyro_bias_dps=_vector(values, *_BIAS),
             health=ImuHealth(
                 device=self._device,
                 protocol=self._protocol,

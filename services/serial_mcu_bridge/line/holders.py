@@ -1,4 +1,4 @@
-"""Finds other programs that use a serial device: each of two misses bytes that the other reads, and both send."""
+"""Finds other programs that use a serial device. Of two programs neither reads all bytes, and both send."""
 
 import os
 from contextlib import suppress
@@ -24,5 +24,6 @@ def holders(path: str) -> list[str]:
             with suppress(OSError):
                 name = (process / "comm").read_text(encoding="utf-8", errors="replace").strip()
                 unit = (process / "cgroup").read_text(encoding="utf-8").strip().rpartition("/")[2]
-                others.append(f"process {process.name} ({name})" + f" of {unit}" * unit.endswith(".service"))
+                of_unit = f" of {unit}" if unit.endswith(".service") else ""
+                others.append(f"process {process.name} ({name}){of_unit}")
     return others

@@ -166,7 +166,7 @@ class SerialLine:
                 try:
                     self._serve_opening(Port(self._opening.path, self._opening.baud))
                 except DeviceError as error:
-                    if self._state is LineState.READY:
+                    if self._state is LineState.READY:  # it was there, and may be back at once
                         retry_s = _FIRST_RETRY_S
                     self._set_state(LineState.ABSENT, str(error))
                     self._pause(retry_s)

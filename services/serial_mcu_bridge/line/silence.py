@@ -15,7 +15,7 @@ class Silence:
     """
 
     def __init__(self) -> None:
-        self._opened = 0
+        self._opened = 0  # at the last check, as the next
         self._received = 0
         self._received_at: float | None = None
         self._counted_at = 0.0
@@ -34,7 +34,8 @@ class Silence:
         if has_sent:
             self._received_at = now
         if self._unasked < _REGULAR and now - self._counted_at >= 0.9 * CHECK_S:
-            self._counted_at, self._unasked = now, self._unasked + 1 if has_sent and idle else 0
+            self._counted_at = now
+            self._unasked = self._unasked + 1 if has_sent and idle else 0
         if self._received_at is None or state is not LineState.READY:
             return state.value, None
         age_s = now - self._received_at

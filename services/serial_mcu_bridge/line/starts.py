@@ -13,7 +13,7 @@ class Starts:
     def __init__(self) -> None:
         self._starts: deque[float] = deque(maxlen=1000)
         self._opened = 0
-        self._clock: tuple[int, int] | None = None  # the opening, and the newest milliseconds of the board's clock
+        self._clock_opened = self._clock_ms = -1  # the newest reading of the board's clock, and in which opening
 
     def began(self, now: float) -> None:
         """Note that the board has started again."""
@@ -22,11 +22,10 @@ class Starts:
 
     def sent(self, opened: int, mcu_ms: int, now: float) -> None:
         """Note the board's clock, which begins at 0 with each start. A clock that goes back shows a start."""
-        earlier, self._clock = self._clock, (opened, mcu_ms)
-        if earlier is not None and earlier[0] == opened:
-            back_ms = (earlier[1] - mcu_ms) % (1 << _CLOCK_BITS)
-            if _LEAST_MS <= back_ms < 1 << (_CLOCK_BITS - 1):
-                self.began(now)
+        back_ms = (self._clock_ms - mcu_ms) % (1 << _CLOCK_BITS)  # a clock that goes on is "back" by more than half
+        if opened == self._clock_opened and _LEAST_MS <= back_ms < 1 << (_CLOCK_BITS - 1):
+            self.began(now)
+        self._clock_opened, self._clock_ms = opened, mcu_ms
 
     def within_a_minute(self, opened: int, now: float) -> int:
         """Return the number of starts in the last minute, including openings of the line except the first."""

@@ -126,5 +126,5 @@ def _full_blocks(part: bytes) -> bytes:
 
 def _block(part: bytes) -> bytes:
     """Return the last block of ``part``, shorter than a full one; after it comes a zero, or the end."""
-    rest = part[len(part) - len(part) % _BLOCK :]
-    return bytes((len(rest) + 1,)) + rest
+    last = part[len(part) - len(part) % _BLOCK :]
+    return bytes((len(last) + 1,)) + last

@@ -123,10 +123,10 @@ class Session:
         self._too_long = 0
         self._by_id: dict[int, Interface] = {}
         self.known: OrderedDict[Hello, Manifest] = OrderedDict()
-        self._commands: OrderedDict[int, _Command] = OrderedDict()
-        self._slots: dict[str, int] = {}  # of the newest command, by its interfaces
+        self._commands: OrderedDict[int, _Command] = OrderedDict()  # without an answer yet; the first is due first
+        self._slots: dict[str, int] = {}  # number of the newest command, below WAITING: by interface, or "group"
         self._sequence = 0
-        self._ask_at: float | None = None
+        self._ask_at: float | None = None  # when to ask for the manifest; None: it is known, or there is no line
         self._received_at = self._pinged_at = self._asked_at = float("-inf")
 
     @property
@@ -153,7 +153,9 @@ class Session:
 
     def feed(self, chunk: bytes, now: float) -> list[Event]:
         """Return the events of the frames that ``chunk`` completes. Never raises."""
-        events = [event for stuffed in self._splitter.feed(chunk) if stuffed for event in self._receive(stuffed, now)]
+        events: list[Event] = []
+        for stuffed in filter(None, self._splitter.feed(chunk)):
+            events += self._receive(stuffed, now)
         discarded = self._splitter.discarded_lines - self._too_long
         self._too_long += discarded
         return events + [RefusedInput("too long", f"a frame of more than {FRAME_LIMIT} bytes")] * discarded
@@ -191,8 +193,6 @@ class Session:
         kind = str(wanted[0][0].id) if len(wanted) == 1 else "group"
         slot = self._slots[kind] = (self._slots.get(kind, 0) + 1) % WAITING
         return Send(f"command {kind}/{slot}", data)
-
-    # -- received frames
 
     def _receive(self, stuffed: bytes, now: float) -> Iterator[Event]:
         try:

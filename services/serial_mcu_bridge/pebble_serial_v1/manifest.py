@@ -3,7 +3,7 @@
 import math
 import re
 import struct
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import IntEnum
 from typing import Any, Final
 
@@ -80,17 +80,8 @@ class Manifest:
 
     def payload(self) -> McuManifest:
         """Return the manifest in its published form, ``outgoing/mcu/{uid}/describe``, with the original's keys."""
-        hello = self.hello
-        return McuManifest(
-            protocol=PROTOCOL,
-            schema_version=hello.schema_version,
-            interface_count=hello.interface_count,
-            schema_hash=hello.schema_hash,
-            device_uid=hello.device_uid,
-            firmware_version=hello.firmware_version,
-            model=hello.model,
-            interfaces=[_plain_interface(interface) for interface in self.interfaces],
-        )
+        interfaces = [_plain_interface(interface) for interface in self.interfaces]
+        return McuManifest(protocol=PROTOCOL, **asdict(self.hello), interfaces=interfaces)
 
 
 def parse_hello(payload: bytes) -> Hello:
@@ -263,4 +254,6 @@ def _plain_field(field: Field) -> dict[str, Any]:
         plain["scale"] = field.scale
     if field.offset != 0.0:
         plain["offset"] = field.offset
-    return plain | ({"unit": field.unit} if field.unit else {})
+    if field.unit:
+        plain["unit"] = field.unit
+    return plain

@@ -56,9 +56,9 @@ def parse(line: bytes) -> list[Report]:
 
     Never raises. A ``T`` or ``C`` line without a valid field is reported as a warning.
     """
-    kind, *rest = line.split() or [b""]
+    kind, *tokens = line.split() or [b""]
     if kind in (b"T", b"C"):
-        fields = dict([token.split(b"=", 1) for token in rest if b"=" in token])
+        fields = dict([token.split(b"=", 1) for token in tokens if b"=" in token])
         reports = _touch(fields) if kind == b"T" else []
         reports += _charging(fields) + _level(fields)
         return reports or [DeviceLogLine(logging.WARNING, f"not understood: {printable(line)}")]

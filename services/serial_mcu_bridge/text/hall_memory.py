@@ -33,7 +33,7 @@ class HallMemory:
         self._path, self._slots = SHM / name.removeprefix("/"), slots
         self._size = _HEADER.size + slots * _SLOT.size
         self._number = 0
-        self._opened: tuple[int, mmap.mmap, memoryview] | None = None  # the last one is its words of eight bytes
+        self._opened: tuple[int, mmap.mmap, memoryview] | None = None  # descriptor, memory, and its words of 8 bytes
         self._check_at_ns = 0
         self._problem = ""
 
@@ -73,6 +73,7 @@ class HallMemory:
                 log.error("no hall samples for wheel-odometry: %s %s", self._path, text)
 
     def _in_place(self, descriptor: int) -> bool:
+        """True if the memory behind ``descriptor`` is still the one that readers find."""
         try:
             status = self._path.lstat()
         except OSError:

@@ -50,10 +50,7 @@ class MotorBridge(MotorOwner, SerialService):
     A bridge of another text protocol sets ``protocol`` and ``stop_line``.
     """
 
-    publishes = (
-        *MotorOwner.publishes,
-        *(c.MOTOR_POWER, c.TOUCH_SENSORS, c.CHARGING_STATUS, c.CHARGING_LEVEL),
-    )
+    publishes = (*MotorOwner.publishes, c.MOTOR_POWER, c.TOUCH_SENSORS, c.CHARGING_STATUS, c.CHARGING_LEVEL)
     company = (c.LIGHTS_SOLID, c.LIGHTS_FLASH)
     protocol: ClassVar[MotorProtocol] = goob_base
     stop_line = goob_base.STOP
@@ -63,7 +60,8 @@ class MotorBridge(MotorOwner, SerialService):
         self._publishes_touch = self.options.telemetry.publish_touch_sensors
         self._power, self._again_at = (0.0, 0.0), 0.0  # of the left and the right wheel, as published; and when again
         self._charging: ChargingStatus | None = None
-        self._hall = self._make_hall_memory()
+        memory = self.config.hall_memory(self.options)
+        self._hall = None if memory is None else HallMemory(memory)
         self._splitter = LineSplitter()
 
     @cached_property
@@ -74,16 +72,10 @@ class MotorBridge(MotorOwner, SerialService):
     def drive_timeout_s(self) -> float:
         return self.options.safety.drive_timeout_seconds
 
-    def _make_hall_memory(self) -> HallMemory | None:
-        name = self.config.hall_memory(self.options)
-        return None if name is None else HallMemory(name)
-
     def start(self) -> None:
         if self._hall is not None:
             self.on_stop(self._hall.close)
         super().start()
-
-    # -- motors
 
     def move(self, drive: Drive, valid_s: float) -> None:
         power = self.protocol.mix(drive.x, drive.z)
@@ -101,7 +93,7 @@ class MotorBridge(MotorOwner, SerialService):
         self.line.send(_LIGHTS, self._lights_line(company[0].value))
 
     def _note_power(self, left: float, right: float, valid_s: float) -> None:
-        self.sensors.drive(self.clock() + valid_s if left and right else 0.0)
+        self.sensors.drive(self.clock() + valid_s if left and right else 0.0)  # all must change only if both turn
         self._show_power(left, right)
 
     def halt(self) -> None:
@@ -116,8 +108,6 @@ class MotorBridge(MotorOwner, SerialService):
             self._power, self._again_at = (left, right), now + _AGAIN_S
             self.publish(c.MOTOR_POWER, MotorPower(left=left, right=right), owner=self.owner)
 
-    # -- lights
-
     @on(c.LIGHTS_SOLID)
     def lights_solid(self, colour: LightsSolid) -> None:
         if not self.is_copy(colour):
@@ -131,8 +121,6 @@ class MotorBridge(MotorOwner, SerialService):
         if isinstance(colour, LightsFlash):
             return self.protocol.flash_line(colour.b, colour.g, colour.r, colour.period)
         return self.protocol.lights_line(colour.b, colour.g, colour.r)
-
-    # -- reports
 
     def on_line_state(self, state: LineState) -> None:
         if state is LineState.BOOTING:

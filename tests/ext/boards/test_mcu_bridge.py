@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from pebble.runtime import notes
-from pebble.runtime.parent import NOTIFY_FD
+from pebble.runtime.parent import NOTIFY_FD, Notifier
 from pebble.services.serial_mcu_bridge.devices import peers
 from pebble.services.serial_mcu_bridge.imu import reports as imu
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import host
@@ -279,6 +279,18 @@ def test_a_stale_manifest_of_a_killed_bridge_is_cleared_by_the_next(
 
 
 # -- health
+
+
+@pytest.mark.parametrize("protocol", ["pebble_serial_v1", "imu_mpu6050_v1"])
+def test_noise_is_not_heard_from_a_board(memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch, protocol: str) -> None:
+    seen: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(Notifier, "mcu", lambda _notifier, *state: seen.append(state) or True)
+    mcu = memory_rig.mcu(LAMP, sends_hello=False)
+    mcu.silent = True
+    memory_rig.bridge(protocol=protocol)
+    noise = b"\xff\x00\x80\n>>> \nT a0=\n\0"
+    assert until(lambda: mcu.send(noise) or any("is not understood" in why for _, _, why, _ in seen), step=0.1)
+    assert {silent_ms for _, silent_ms, _, _ in seen} == {None}
 
 
 @pytest.mark.alone

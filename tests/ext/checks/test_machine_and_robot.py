@@ -28,13 +28,6 @@ MEGABYTE = 1024 * 1024
 
 
 @pytest.fixture(scope="module")
-def open_broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
-    broker = Broker(tmp_path_factory.mktemp("open"))
-    yield broker
-    broker.stop()
-
-
-@pytest.fixture(scope="module")
 def closed_broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
     """Requires the login of ann, whose password is geheim."""
     folder = tmp_path_factory.mktemp("closed")
@@ -155,8 +148,8 @@ def test_an_account_that_may_not_publish_is_found(
     assert level is State.OK or finding.fix == "allow it to write and read pebble/robots/goob/outgoing/# on the broker"
 
 
-def test_a_broker_that_hangs_up_on_what_is_published_is_found(open_broker: Broker) -> None:
-    with ForbiddingProxy(open_broker.port) as proxy:
+def test_a_broker_that_hangs_up_on_what_is_published_is_found(broker: Broker) -> None:
+    with ForbiddingProxy(broker.port) as proxy:
         proxy.forbidden = {"pebble/robots/goob/outgoing/bridge-probe"}
         finding = next(robot_account("b", MqttSettings(host="127.0.0.1", port=proxy.port), "pebble/robots/goob"))
     assert (finding.state, "hangs up" in finding.text) == (State.FAILED, True)
@@ -239,13 +232,13 @@ def test_the_operator_page_of_a_robot(web: dict[str, object], level: State, text
     assert (finding.state, text in finding.text) == (level, True)
 
 
-def test_a_whole_robot_is_examined(tmp_path: Path, open_broker: Broker) -> None:
+def test_a_whole_robot_is_examined(tmp_path: Path, broker: Broker) -> None:
     path = tmp_path / "fred.json"
     bridge = {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": free_port()}}
     serial = {"enabled": True, "serial": {"port": str(tmp_path / "ttyACM0")}}
     text = {
         "robot": {"id": "fred"},
-        "local_mqtt": {"port": open_broker.port},
+        "local_mqtt": {"port": broker.port},
         "services": {"mqtt_bridge": bridge, "serial_mcu_bridge": serial},
     }
     path.write_text(json.dumps(text))

@@ -230,6 +230,7 @@ def _pebble(broker: FleetBroker, *words: str) -> subprocess.CompletedProcess[str
         ("x", Account(roles=("page", "driver")), "page goes with no other role"),
         ("x", Account(roles=("robot",)), "has one base"),
         ("x", Account(roles=("driver",), bases=("a/b/c",)), "no other account has any"),
+        ("x", Account(roles=("viewer",), bases=("a/b/c", "a/b/d")), "no other account has any"),
         ("x", Account(roles=("driver",), plain=True), "only a robot can be plain"),
         ("x", Account(roles=("robot",), bases=("pebble/robots/goob",)), "belongs to goob"),
         ("x", Account(roles=("robot",), bases=("pebble/+/goob",)), "is no base"),

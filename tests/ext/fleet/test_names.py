@@ -8,7 +8,7 @@ import pytest
 
 from pebble.contract import CHANNELS, CONTROL, DRIVE, ESTOP, GROUP, INCOMING, Channel, codec, groups
 from pebble.extensions.fleet.names import CheckedNames
-from pebble.extensions.fleet.rights import WRITES, Right
+from pebble.extensions.fleet.roles import WRITES, Right
 from pebble.forwarding.names import Signed
 from pebble.forwarding.routing import Drop, Side
 from pebble.forwarding.subjects import Subjects

@@ -26,11 +26,6 @@ from tests.support import ROOT, Broker, until
 TOPIC = "homeassistant/device/pebble_pebble_robots_goob/config"
 
 
-@pytest.fixture(autouse=True)
-def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(s, "APART_S", 0.5)
-
-
 def config(folder: Path, port: int, **section: Any) -> Config:
     services = {
         "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": port}},

@@ -10,6 +10,7 @@ from functools import partial
 import pytest
 from playwright.sync_api import Browser
 
+from tests.commands.conftest import broker as broker
 from tests.ext.page.browser import chromium
 from tests.ext.page.canned import CannedServer, Show, serving, showing
 from tests.ext.page.served import Page, Served
@@ -17,13 +18,6 @@ from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker
 
 _NUMBERS = itertools.count(1)
-
-
-@pytest.fixture(scope="module")
-def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
-    running = Broker(tmp_path_factory.mktemp("broker"))
-    yield running
-    running.stop()
 
 
 @pytest.fixture(scope="module")

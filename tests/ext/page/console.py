@@ -34,7 +34,6 @@ QUIET_S = 0.4  # so long nothing may turn where nothing may turn: eight commands
 _READY_S = 20.0  # for picture, echoes and lease, on a busy machine
 _PRESSES = 6
 _MOVES_S = 0.7
-_PADS = "window.__pads = []; navigator.getGamepads = () => window.__pads;"
 
 
 @dataclass
@@ -174,23 +173,6 @@ class Console:
         self.page.wait_for_timeout(1000 * seconds)
         return not self.stage.wheels_turning(self.name, since_ns=began)
 
-    # -- gamepads
-
-    def pads(self, *pads: dict[str, Any] | None) -> None:
-        """What the browser shows of gamepads from now on."""
-        self.page.evaluate("(pads) => { window.__pads = pads }", list(pads))
-
-
-def pad(x: float = 0.0, z: float = 0.0, *buttons: int, stamp: float = 0.0, name: str = "Gamepad") -> dict[str, Any]:
-    """A gamepad as a browser shows it; ``buttons`` are pressed. ``stamp`` 0: newer than all before."""
-    return {
-        "id": name,
-        "axes": [x, -z],
-        "buttons": [{"pressed": index in buttons} for index in range(12)],
-        "timestamp": stamp or time.monotonic_ns() / 1e6,
-        "connected": True,
-    }
-
 
 @contextmanager
 def console(
@@ -209,7 +191,7 @@ def console(
     Without ``engineers`` none of its cards for them is open: drawing plots takes most of what a page needs.
     """
     address = f"{url or stage.url}r/{stage.ref(name)}"
-    with tab(browser, address, size, theme, script=_PADS + script, engineers=engineers) as opened:
+    with tab(browser, address, size, theme, script=script, engineers=engineers) as opened:
         yield Console(opened, stage, name)
 
 
@@ -224,7 +206,6 @@ def used(opened: Console, *, complaints: bool = True) -> Iterator[Console]:
     before = len(opened.tab.complaints())
     yield opened
     opened.let_go()
-    opened.pads()
     opened.page.mouse.up()
     assert opened.rests(), opened.speeds
     found = opened.tab.complaints()[before:]

@@ -87,7 +87,7 @@ def stop_s(page: Page) -> float:
 
 def test_neither_a_stop_nor_a_heartbeat_waits_behind_pictures(broker: Broker, robot: RecordingRobot) -> None:
     with (
-        SlowTcpProxy(broker.port, KBITS, back=True) as link,
+        SlowTcpProxy(broker.port, KBITS) as link,
         Served(link.port) as served,
         served.page() as page,
         filming(broker.port),

@@ -34,56 +34,31 @@ def op(tag: str, **fields: Any) -> Any:
     return _decoder.decode(json.dumps({"op": tag, "ref": BASE, **fields}))
 
 
-#: What a page sends, and what is published below the robot's ``incoming/``: metric, value, and whether it is retained.
-PUBLISHED: list[tuple[dict[str, Any], str, Any, bool]] = [
-    ({"tag": "lights", "r": 1, "g": 0.5}, "lights-solid", {"b": 0.0, "g": 0.5, "r": 1.0}, False),
-    ({"tag": "lights", "b": 1, "period": 0.5}, "lights-flash", {"b": 1.0, "g": 0.0, "r": 0.0, "period": 0.5}, False),
-    ({"tag": "lights"}, "lights-solid", {"b": 0.0, "g": 0.0, "r": 0.0}, False),
-    (
-        {"tag": "soundboard", "file": "a/horn.wav"},
-        "soundboard-command",
-        {"action": "play", "enabled": True, "file": "a/horn.wav"},
-        False,
-    ),
-    (
-        {"tag": "soundboard", "file": "horn.wav", "repeat": True},
-        "soundboard-command",
-        {"action": "play", "enabled": True, "file": "horn.wav", "repeat": True},
-        False,
-    ),
-    (
-        {"tag": "soundboard", "file": ""},
-        "soundboard-command",
-        {"action": "stop", "enabled": False, "file": None},
-        False,
-    ),
-    (
-        {"tag": "autonomy", "file": "no such script", "config": {"a": 1, "b": 0.5, "c": True, "d": "x", "e": None}},
-        "autonomy-command",
-        {"action": "start", "file": "no such script", "config": {"a": 1, "b": 0.5, "c": True, "d": "x", "e": None}},
-        False,
-    ),
-    (
-        {"tag": "autonomy", "file": "follow"},
-        "autonomy-command",
-        {"action": "start", "file": "follow", "config": {}},
-        False,
-    ),
-    ({"tag": "autonomy", "file": ""}, "autonomy-command", {"action": "stop"}, False),
-    ({"tag": "outlet", "outlet": "o1", "on": True}, "outlets/o1/power", {"on": True}, False),
-    (
-        {"tag": "mcu", "uid": "imu-1", "name": "led", "value": {"on": True, "level": 7}},
-        "mcu/imu-1/led",
-        {"on": True, "level": 7},
-        False,
-    ),
-    ({"tag": "action", "name": "reboot"}, "flags/reboot", {"value": True}, False),
-    ({"tag": "action", "name": "service-restart"}, "flags/service-restart", {"value": True}, False),
-    ({"tag": "action", "name": "git-pull"}, "flags/git-pull", {"value": True}, False),
-    ({"tag": "flag", "name": "remote-mirror", "on": True}, "flags/remote-mirror", {"value": True}, True),
-    ({"tag": "flag", "name": "mqtt-audio", "on": False}, "flags/mqtt-audio", {"value": False}, True),
-    ({"tag": "flag", "name": "mqtt-video", "on": True}, "flags/mqtt-video", {"value": True}, True),
+MANY = {"a": 1, "b": 0.5, "c": True, "d": "x", "e": None}
+_HORN = {"action": "play", "enabled": True}
+# fmt: off
+#: What a page sends, and what is published below the robot's ``incoming/``: metric, and value. Flags are retained.
+PUBLISHED: list[tuple[dict[str, Any], str, Any]] = [
+    ({"tag": "lights", "r": 1, "g": 0.5}, "lights-solid", {"b": 0.0, "g": 0.5, "r": 1.0}),
+    ({"tag": "lights", "b": 1, "period": 0.5}, "lights-flash", {"b": 1.0, "g": 0.0, "r": 0.0, "period": 0.5}),
+    ({"tag": "lights"}, "lights-solid", {"b": 0.0, "g": 0.0, "r": 0.0}),
+    ({"tag": "soundboard", "file": "a/horn.wav"}, "soundboard-command", {**_HORN, "file": "a/horn.wav"}),
+    ({"tag": "soundboard", "file": "horn.wav", "repeat": True}, "soundboard-command",
+     {**_HORN, "file": "horn.wav", "repeat": True}),
+    ({"tag": "soundboard", "file": ""}, "soundboard-command", {"action": "stop", "enabled": False, "file": None}),
+    ({"tag": "autonomy", "file": "no such script", "config": MANY}, "autonomy-command",
+     {"action": "start", "file": "no such script", "config": MANY}),
+    ({"tag": "autonomy", "file": "follow"}, "autonomy-command", {"action": "start", "file": "follow", "config": {}}),
+    ({"tag": "autonomy", "file": ""}, "autonomy-command", {"action": "stop"}),
+    ({"tag": "outlet", "outlet": "o1", "on": True}, "outlets/o1/power", {"on": True}),
+    ({"tag": "mcu", "uid": "imu-1", "name": "led", "value": {"on": True, "level": 7}}, "mcu/imu-1/led",
+     {"on": True, "level": 7}),
+    *(({"tag": "action", "name": name}, f"flags/{name}", {"value": True})
+      for name in ("reboot", "service-restart", "git-pull")),
+    *(({"tag": "flag", "name": name, "on": on}, f"flags/{name}", {"value": on})
+      for name, on in (("remote-mirror", True), ("mqtt-audio", False), ("mqtt-video", True))),
 ]
+# fmt: on
 #: Section and key of the capabilities that may name another topic for it.
 NAMED = {
     "lights-solid": ("lights", "solid_topic"),
@@ -112,33 +87,22 @@ def published(asked: Any, capabilities: dict[str, Any]) -> Message:
     return robot_commands.publication(asked, robots.capabilities(asked.ref))
 
 
-@pytest.mark.parametrize(("fields", "metric", "value", "retain"), PUBLISHED)
-def test_what_is_published(fields: dict[str, Any], metric: str, value: Any, retain: bool) -> None:
+@pytest.mark.parametrize(("fields", "metric", "value"), PUBLISHED)
+def test_what_is_published(fields: dict[str, Any], metric: str, value: Any) -> None:
     message = published(op(**fields), {})
     assert (message.topic, json.loads(message.payload)) == (f"{BASE}/incoming/{metric}", value)
-    assert (message.qos, message.retain) == (QoS.DELIVERED, retain)
+    assert (message.qos, message.retain) == (QoS.DELIVERED, fields["tag"] == "flag")
 
 
-@pytest.mark.parametrize(("fields", "metric"), [(fields, metric) for fields, metric, _, _ in PUBLISHED])
+@pytest.mark.parametrize(("fields", "metric"), [row[:2] for row in PUBLISHED])
 def test_capabilities_may_name_another_topic_of_the_same_robot(fields: dict[str, Any], metric: str) -> None:
     section, key = NAMED.get(metric, ("outlets", "command_topic"))
     own = f"{BASE}/incoming/other"
     usual = f"{BASE}/incoming/{metric}"
     assert published(op(**fields), nested(section, {key: own})).topic == (own if metric in NAMED else usual)
-    foreign = [
-        "pebble/robots/fred/incoming/x",
-        f"{BASE}/outgoing/x",
-        f"{BASE}/incoming/#",
-        f"{BASE}/incoming/a\x01b",
-        f"{BASE}/incoming/{'x' * 1100}",
-        f"{BASE}/incoming{'/x' * 250}",
-        f"{BASE}/incoming/drive-values",
-        f"{BASE}/incoming/estop",
-        f"{BASE}x/incoming/x",
-        7,
-        None,
-    ]
-    for topic in foreign:
+    below = ("#", "a\x01b", "x" * 1100, "/".join("x" * 250), "drive-values", "estop")
+    foreign = ["pebble/robots/fred/incoming/x", f"{BASE}/outgoing/x", f"{BASE}x/incoming/x", 7, None]
+    for topic in (*foreign, *(f"{BASE}/incoming/{one}" for one in below)):
         assert published(op(**fields), nested(section, {key: topic})).topic == usual
     for odd in ("text", ["list"], None, 1):
         assert published(op(**fields), {section.partition(".")[0]: odd}).topic == usual
@@ -159,7 +123,7 @@ def test_spellings_of_where_an_action_goes(section: dict[str, Any]) -> None:
     assert published(op("action", name="reboot"), section).topic == f"{BASE}/incoming/flags/reboot"
 
 
-@pytest.mark.parametrize("fields", [fields for fields, _, _, _ in PUBLISHED], ids=str)
+@pytest.mark.parametrize("fields", [row[0] for row in PUBLISHED], ids=str)
 def test_which_right_is_needed(fields: dict[str, Any]) -> None:
     right = robot_commands.right(op(**fields))
     assert right == ("system" if fields["tag"] == "action" or fields.get("name") == "remote-mirror" else "drive")
@@ -278,7 +242,7 @@ def test_every_command_reaches_the_robot_in_its_order_and_is_in_the_audit(
     for fields, *_ in PUBLISHED:
         ask(page, robot.base, **fields)
     assert until(lambda: len(asked_of(robot)) == len(PUBLISHED), 5), asked_of(robot)
-    assert asked_of(robot) == [(metric, value) for _, metric, value, _ in PUBLISHED]
+    assert asked_of(robot) == [row[1:] for row in PUBLISHED]
     assert page.refused == []
     retained: list[Message] = []
     with create("mqtt", "later", MqttSettings(host="127.0.0.1", port=broker.port)) as later:

@@ -7,7 +7,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from pebble.errors import PebbleError
-from pebble.extensions.recordings.library import FOREVER_NS
+from pebble.extensions.recordings.files.recorded import FOREVER_NS
 from pebble.extensions.recordings.period import parse_period
 
 BERLIN = ZoneInfo("Europe/Berlin")

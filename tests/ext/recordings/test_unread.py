@@ -223,7 +223,7 @@ class TestInterrupted:
         kill, before = "rewriting._check = lambda *_: os.kill(os.getpid(), signal.SIGKILL)", path.read_bytes()
         rest = [one for one in contents(path) if "/r0/" not in one[0]]
         code = (
-            f"import os, signal, sys; from pebble.recordings.files import rewrite as rewriting; {kill};"
+            f"import os, signal, sys; from pebble.extensions.recordings.files import rewrite as rewriting; {kill};"
             "from pebble.cli import main; sys.argv = ['pebble', *sys.argv[1:]]; main()"
         )
         arguments = ["recordings", "rm", str(path.parents[3]), "--robot", "r0", "--yes"]

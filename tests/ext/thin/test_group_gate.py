@@ -187,7 +187,7 @@ def test_capabilities_list_what_a_robot_takes_in_a_group(serial: dict[str, Any],
 
 
 def test_what_may_be_in_a_group_is_a_table() -> None:
-    """A member that is added must also be one that a driver may send by itself: pebble/extensions/fleet/rights.py."""
+    """A member that is added must also be one that a driver may send by itself: pebble/extensions/fleet/roles.py."""
     assert {channel.metric for channel in groups.MEMBERS} == {
         "drive-values", "lights-solid", "lights-flash", "soundboard-command", "outlets/{outlet}/power",
         "mcu/{uid}/{name}",

@@ -20,7 +20,7 @@ from pebble.contract import (
     codec,
 )
 from pebble.transports import Message, QoS
-from tests.robot.lockstep.commands import PERSON, Command, Commands
+from tests.robot.lockstep.commands import Commands
 from tests.robot.lockstep.network import Connection, Network
 from tests.robot.lockstep.processes import Process
 
@@ -83,10 +83,7 @@ class Driver(Process):
         """One command; with ``key``, under that one."""
         key = self.key if key is None else key
         sender = SCRIPT if "run" in fields else self.name if key else STRANGER
-        command = Command(
-            fields.get("run", PERSON), sender, self.scheduler.now, fields.get("valid_ms", 5000) / 1000, may_move=True
-        )
-        x, z = self._commands.add(command)
+        x, z = self._commands.add(sender)
         self._publish_drive({"x": x, "z": z} | ({"key": key} if key else {}) | fields)
 
     def steer(self, seconds: float, key: str | None = None, **fields: Any) -> None:
@@ -99,9 +96,6 @@ class Driver(Process):
             if key is not None or self.key:  # a page without control sends nothing
                 self.drive(key, **fields)
             self.scheduler.after(PERIOD_S, lambda: self._steer(gesture, until, key, fields))
-
-    def steer_by_old_key(self, seconds: float) -> None:
-        self.steer(seconds, self.old_keys[-1])
 
     def zero(self, *, final: bool = False) -> None:
         self._publish_drive({"x": 0, "z": 0} | ({"valid_ms": 0} if final else {}))

@@ -35,13 +35,11 @@ class Wheels:
         self._scheduler = scheduler
         self._line = _STOP
         self._at = scheduler.now
-        self.received = 0
         self.lights = b""  # that came with the newest drive line
         self.alone = 0  # lines of lights without one
         self.deadline = 0.0  # of the newest drive command that the line was given
 
     def receive(self, line: bytes) -> None:
-        self.received += 1
         drive, end, self.lights = line.partition(b"\n")
         self._line, self._at = drive + end, self._scheduler.now
 
@@ -52,11 +50,6 @@ class Wheels:
             return None
         _, left, right = self._line.split()
         return round(1000 * float(left)), round(1000 * float(right))
-
-    @property
-    def at(self) -> float:
-        """When the newest line was received."""
-        return self._at
 
 
 class RecordedLine:
@@ -156,7 +149,7 @@ class MemoryFile:
 
 
 class Owner(ServiceProcess):
-    """``before`` and ``after`` are called around each turn."""
+    """``after`` is called after each turn."""
 
     def __init__(
         self,
@@ -165,22 +158,16 @@ class Owner(ServiceProcess):
         disk: Disk,
         wheels: Wheels,
         *,
-        instance: str = "",
-        token_hex: Callable[[int], str] | None = None,
-        writes_s: float = 0.0,
+        instance: str,
+        token_hex: Callable[[int], str],
+        writes_s: float,
     ) -> None:
-        """``token_hex``: of each boot and key; without it they are the number of the life. ``writes_s``: to disk."""
+        """``token_hex``: of each boot and key. ``writes_s``: to disk."""
         super().__init__("owner" + instance, network.scheduler, lambda process: self._service(network, config, disk))
         self.wheels = wheels
         self._instance, self._writes_s = instance, writes_s
-        self._token_hex = token_hex or (lambda size: f"{self.lives:0{2 * size}x}")
-        self.before: Callable[[], None] = lambda: None
+        self._token_hex = token_hex
         self.after: Callable[[], None] = lambda: None
-
-    @property
-    def boot(self) -> str:
-        """The name of this life, as the latch has it."""
-        return f"{self.lives:08x}"
 
     def _service(self, network: Network, config: Config, disk: Disk) -> MotorBridge:
         def file(path: Path, *on_saved: Any) -> MemoryFile:
@@ -200,6 +187,5 @@ class Owner(ServiceProcess):
         return service
 
     def turn(self) -> None:
-        self.before()
         super().turn()
         self.after()

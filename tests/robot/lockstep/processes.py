@@ -20,8 +20,6 @@ class Process:
         self.alive = False
         self.frozen = False
         self.delay = 0.0  # of each message from or to it
-        self.latency = 0.0  # from an event to its turn
-        self.slack = 0.0  # the longest latency of turns that are due
         self.connection: Connection | None = None
         self.frozen_at = 0.0
         self._waiting: list[Callable[[], None]] = []
@@ -34,13 +32,9 @@ class Process:
         else:
             job()
 
-    def slow_down(self, latency: float) -> None:
-        self.latency, self.slack = latency, max(self.slack, latency)
-        self.wake()
-
     def wake(self) -> None:
         """There is something to do."""
-        self.turn_at(self.scheduler.now + self.latency)
+        self.turn_at(self.scheduler.now)
 
     def turn_at(self, due: float) -> None:
         """Have a turn then, if none is sooner."""
@@ -79,7 +73,6 @@ class Process:
         if due == self._turn_at and self.alive and not self.frozen:
             self._turn_at = None
             self.turn()
-            self.slack = self.latency
 
 
 class ServiceProcess(Process):
@@ -89,15 +82,11 @@ class ServiceProcess(Process):
         super().__init__(name, scheduler)
         self._make = make
         self.service: Service | None = None
-        self.lives = 0
-        self.started_at = scheduler.now
 
     def start(self) -> None:
         if self.alive:
             return
         self.alive = True
-        self.lives += 1
-        self.started_at = self.scheduler.now
         self.service = self._make(self)
         # Here all work waits for a turn of the process: a frozen one gets messages, and does nothing.
         self.service.run_if_idle = lambda _job: False  # type: ignore[method-assign]
@@ -121,4 +110,4 @@ class ServiceProcess(Process):
                 raise AssertionError(f"{self.name} ends by itself")
         wait = service.timers.wait(self.scheduler.now)
         if wait is not None:
-            self.turn_at(self.scheduler.now + wait + self.latency)
+            self.turn_at(self.scheduler.now + wait)

@@ -155,7 +155,7 @@ class StopRules:
             due = [at for at in (self._stopped[stop] for stop in self._first) if at > self._reset_sent[name]]
             state = self._published.get(name)
             if due and state is not None and not state.latched:
-                late = now - max(max(due), self._reached_from[name]) > _LATCHES_S + owner.slack
+                late = now - max(max(due), self._reached_from[name]) > _LATCHES_S
                 self._check(not late, "an owner is free after a stop that was passed on")
 
     @property

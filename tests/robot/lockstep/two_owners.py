@@ -5,6 +5,7 @@ Every step is possible at any time, and does nothing where it has no meaning, so
 * No two drivers move the two owners at once: persons with a key, and all commands without one as one more.
 * The first owner, by name, is moved only by who has control of it, or without a key while nobody has.
 * The second one is moved only by whom the first has named less than 1.5 s ago.
+* A script moves neither within 1.2 s after a person's command is over, that is, 2 s after it was sent.
 * In the end, when everything works, who takes control drives both.
 * Lights of a group shine with its drive command, in one write, or not at all; copies of its members have no effect.
 
@@ -31,7 +32,7 @@ from pebble.runtime.process import view_of
 from pebble.transports import Message, QoS
 from tests.kit.schedules import RandomSteps
 from tests.robot.lockstep.bridge import Bridge, Outside
-from tests.robot.lockstep.commands import Command, Commands
+from tests.robot.lockstep.commands import Commands
 from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Driver
 from tests.robot.lockstep.holders import Holders
 from tests.robot.lockstep.network import Network
@@ -42,6 +43,7 @@ from tests.robot.lockstep.stop_rules import StopRules
 
 FIRST, SECOND = "arm", "serial"  # in the config the second comes first
 FOLLOWS_S = 1.5
+_HELD_S = 1.2
 _MS = 0.0021
 _CHECK_S = 0.05
 
@@ -100,6 +102,7 @@ class TwoOwners:
         groups = config.services.mqtt_bridge.link.groups
         self.drivers = {name: Driver(name, net, self.commands, groups=groups) for name, net in networks.items()}
         self.moved: set[tuple[str, str]] = set()  # (owner, driver)
+        self._person_at: dict[str, float] = {}  # by owner: when a person moved it last
         self._granted: list[tuple[float, str]] = []  # when, and to whose id; what the first tells the second
         self._shown = (0.0, "")  # the same; what it tells everybody: both are lost while it has no connection
         self._recorded: list[Message] = []  # turns of the first
@@ -154,7 +157,7 @@ class TwoOwners:
             self.stops.learns(message)
 
     def _turned(self, owner: Owner) -> None:
-        late = self.scheduler.now > owner.wheels.deadline + owner.slack + _MS
+        late = self.scheduler.now > owner.wheels.deadline + _MS
         self.scheduler.check(not late or owner.wheels.speeds is None, "a wheel turns after its command's deadline")
         self._check_lights(owner.wheels)
         self.check()
@@ -179,22 +182,21 @@ class TwoOwners:
         return next((driver.name for driver in self.drivers.values() if driver.id == self._shown[1]), "")
 
     def driver_of(self, name: str) -> str:
-        """Who moves this owner; empty: it stands still."""
-        command = self._command(self.owners[name])
-        return "" if command is None else command.sender
-
-    def _command(self, owner: Owner) -> Command | None:
-        """By which an owner moves; not after its deadline, when only the board's own stops a frozen one."""
-        speeds = owner.wheels.speeds
-        if speeds is None or self.scheduler.now > owner.wheels.deadline:
-            return None
-        command = self.commands.of(speeds)
-        assert command is not None
-        return command
+        """Who moves this owner; empty: it stands still, or only the board's own deadline stops a frozen one."""
+        wheels = self.owners[name].wheels
+        if wheels.speeds is None or self.scheduler.now > wheels.deadline:
+            return ""
+        return self.commands.sender_of(wheels.speeds)
 
     def check(self) -> None:
         drivers = {name: self.driver_of(name) for name in self.owners}
         self.moved.update(drivers.items())
+        for name, driver in drivers.items():
+            if driver == SCRIPT:
+                held = self.scheduler.now - self._person_at.get(name, 0.0) < _HELD_S
+                self.scheduler.check(not held, "a script moves an owner soon after a person")
+            elif driver:
+                self._person_at[name] = self.scheduler.now
         persons = {driver for driver in drivers.values() if driver not in ("", SCRIPT)}
         self.scheduler.check(len(persons) < 2, "two drivers move the two owners")
         first, second = self.owners.values()
@@ -202,7 +204,7 @@ class TwoOwners:
         if drivers[FIRST] and first.alive and not first.frozen:
             self.scheduler.check(self._named(drivers[FIRST], newest), "the first obeys who has no control")
         if drivers[SECOND] and second.alive and not second.frozen:
-            since = self.scheduler.now - FOLLOWS_S - second.slack - _MS
+            since = self.scheduler.now - FOLLOWS_S - _MS
             recent = [granted for granted in self._granted if granted[0] >= since]
             self.scheduler.check(self._named(drivers[SECOND], recent), "the second obeys whom the first does not name")
 

@@ -41,7 +41,7 @@ def robot_account(
         with reached(settings, "") as trial:
             trial.patience_s = answer_s
             peer = trial.peer(protocol=settings.protocol)
-            granted = peer.subscribe(reads) if reads else b"\0"
+            granted = peer.subscribe(reads) if reads else b"\0"  # one code for each filter; none without an answer
             if not granted or granted[0] >= REFUSED:
                 why = "the broker refuses it" if granted else "the broker does not answer its subscription to"
                 text = f"a page with this account does not hear robots: {why} {reads}"
@@ -50,8 +50,8 @@ def robot_account(
             topic = BRIDGE_PROBE.topic(base)
             peer.subscribe(topic)
             is_back, refusal = _echo(trial, peer, topic)
-            tells = settings.protocol == "5" and not reads  # what it refuses
-            if refusal or not (is_back or tells):
+            tells_refusals = settings.protocol == "5"
+            if refusal or (not is_back and (reads or not tells_refusals)):
                 why = refusal or "it does not come back (or may this account not read it?)"
                 fix = f"allow it to write and read {topic.rpartition('/')[0]}/# on the broker"
                 yield failed(f"this account may not publish to {topic}: {why}", fix, what)
@@ -81,7 +81,8 @@ def _echo(trial: BrokerTrial, peer: Peer, topic: str) -> tuple[bool, str]:
             return f"the broker refuses it ({reasons.words(peer.acks[mid])})"
         return "the broker hangs up on it" if peer.closed else ""
 
-    is_back = trial.wait(lambda: payload in peer.payloads() or refusal()) and payload in peer.payloads()
+    trial.wait(lambda: payload in peer.payloads() or refusal())
+    is_back = payload in peer.payloads()
     trial.round_trip_s = time.monotonic() - began if is_back else 0.0
     return is_back, refusal()
 
@@ -92,7 +93,7 @@ def _rules(what: str, trial: BrokerTrial, peer: Peer, topic: str) -> CheckResult
     peer.subscribe(other)
     payload = new_probe(time.time_ns() // 1_000_000)
     mid = peer.publish(other, payload, qos=1)
-    is_back, _ = _echo(trial, peer, topic)  # what was let through has come before it
+    is_back, _ = _echo(trial, peer, topic)  # sent later: if the first one was let through, it came before this
     if payload in peer.payloads():
         fix = "start it with the files of `pebble fleet init`, see docs/ext/fleet.md"
         return failed("has no rules: with this account one can pose as any robot, and drive it", fix, what)

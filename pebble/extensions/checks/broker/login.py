@@ -63,10 +63,9 @@ def _anonymous_login(answer: LoginAttempt, level: SecurityLevel, *, is_here: boo
         return warn(f"{_UNKNOWN}: {answer.refusal}")
     if is_here:
         return ok("accepts anonymous logins: every program on this machine can drive the robot")
-    return (warn if level == "open" else failed)(
-        "accepts anonymous logins: every client that reaches it can drive the robot",
-        f"{MOSQUITTO}allow_anonymous false, password_file /etc/mosquitto/passwd",
-    )
+    text = "accepts anonymous logins: every client that reaches it can drive the robot"
+    fix = f"{MOSQUITTO}allow_anonymous false, password_file /etc/mosquitto/passwd"
+    return warn(text, fix) if level == "open" else failed(text, fix)
 
 
 def _encryption(settings: MqttSettings, answer: LoginAttempt, *, is_here: bool) -> CheckResult:
@@ -91,14 +90,16 @@ def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str])
     }
     what = f"{name} {settings.host}:{settings.port}"
     answering = {address: answer for address, answer in answers.items() if answer.code is not None}
-    if anonymous := [address for address, answer in answering.items() if answer.code == 0]:
+    anonymous = [address for address, answer in answering.items() if answer.code == 0]
+    unclear = [answer.refusal for answer in answering.values() if not answer.refuses_login]
+    if anonymous:
         yield warn(
             f"also answers at {', '.join(anonymous)} and accepts anonymous logins: the network can drive the robot",
             f"{MOSQUITTO}listener {settings.port} 127.0.0.1, or allow_anonymous false and a password_file",
             what,
         )
-    elif why := [answer.refusal for answer in answering.values() if not answer.refuses_login]:
-        yield warn(f"also answers at {', '.join(answering)}, but {_UNKNOWN}: {why[0]}", what=what)
+    elif unclear:
+        yield warn(f"also answers at {', '.join(answering)}, but {_UNKNOWN}: {unclear[0]}", what=what)
     elif answering:
         yield ok(f"also answers at {', '.join(answering)}, and refuses anonymous logins there", what=what)
     elif answers:

@@ -32,7 +32,9 @@ class LoginAttempt:
     @property
     def refusal(self) -> str:
         """Return why the login failed; empty if it was accepted."""
-        return self.problem if self.code is None else reasons.connection_refused(self.code) * bool(self.code)
+        if self.code == 0:
+            return ""
+        return self.problem if self.code is None else reasons.connection_refused(self.code)
 
     @property
     def refuses_login(self) -> bool:
@@ -54,14 +56,16 @@ def attempt(settings: MqttSettings, *, login: bool, timeout_s: float = TIMEOUT_S
         return LoginAttempt(problem=f"{settings.host} is no name of a host")
     except OSError as error:
         return LoginAttempt(problem=error.strerror or str(error))
-    answered, failures = LoginAttempt(), {}
+    answered = LoginAttempt()
+    failures: dict[str, str] = {}  # by address
     for address in addresses:
         began = time.monotonic()
         try:
             trial = BrokerTrial(settings, address, "", patience_s=timeout_s)
             expires = _expiry(trial.peer().sock)
         except TransportError as error:
-            if (code := getattr(error, "code", None)) is None:
+            code = getattr(error, "code", None)
+            if code is None:
                 failures[f"{address.text}:"] = str(error)
             else:
                 answered = LoginAttempt(code=code)

@@ -13,13 +13,13 @@ from pebble.forwarding.probes import new_probe
 from pebble.transports import Message, QoS
 
 _APART_S = 0.005  # between the two messages of a pair
-_HELD_S = 0.03  # by which Nagle's algorithm delays where the receiver's kernel confirms late
-_HELD = 0.75  # of a round trip: a thin link itself needs some of it for the second message
+_HELD_S = 0.03  # so much Nagle's algorithm delays a message at least, where the receiver's kernel confirms late
+_HELD = 0.75  # the same in round trips: a thin link itself needs some of one for the second message
 _PAIRS = 5
 _PING_TRIES = 3  # an answer that comes too early may by chance come last
 _PING_S = 2.0  # after which a robot gives a connection up
 _WILL_S = 1.0
-REFUSED = 0x80
+REFUSED = 0x80  # the least code of a refusal, in the answers to SUBSCRIBE and of MQTT 5
 
 #: What a name of a robot or of a channel may contain, below a topic of our own.
 _ODD_TOPICS = {
@@ -58,14 +58,15 @@ def rights(trial: BrokerTrial) -> CheckResult:
     elif why := _why_unread(trial, reader):
         return failed(why, fix)
     trial.qos = int(has_qos_1 and granted == b"\x01")
-    retained_message = _kept(trial)
+    retained_message = _retained(trial)
     trial.retains = retained_message is not None
     if retained_message is not None and not retained_message.retain:
         return failed("what it retains comes without the retain flag: a command of yesterday looks new", OTHER)
-    lacks = [
-        *([] if trial.qos else ["it has no QoS 1: events and answers may be lost on the way"]),
-        *([] if trial.retains else ["it retains nothing: who connects later sees no state until it changes"]),
-    ]
+    lacks = []
+    if not trial.qos:
+        lacks.append("it has no QoS 1: events and answers may be lost on the way")
+    if not trial.retains:
+        lacks.append("it retains nothing: who connects later sees no state until it changes")
     if lacks:
         return warn("; ".join(lacks), f"{MOSQUITTO}max_qos 2, retain_available true")
     took = f"a round trip takes {1000 * trial.round_trip_s:.1f} ms"
@@ -82,8 +83,8 @@ def _why_unread(trial: BrokerTrial, reader: Peer) -> str:
     return f"it hangs up on what this account publishes to {trial.base}/x" if writer.closed else ""
 
 
-def _kept(trial: BrokerTrial) -> Received | None:
-    """Return the retained message as a later subscriber gets it; None if there is none."""
+def _retained(trial: BrokerTrial) -> Received | None:
+    """Publish a message to be retained; return it as a later subscriber gets it, or None if it gets none."""
     writer, late = trial.peer(), trial.peer()
     writer.publish("retained", qos=trial.qos, retain=True)
     writer.ping()
@@ -95,7 +96,7 @@ def _kept(trial: BrokerTrial) -> Received | None:
 
 
 def _is_forbidden(trial: BrokerTrial) -> bool | None:
-    """True if the broker refuses a message; None if it cannot say so, as only MQTT 5 can."""
+    """True if the broker says that it refuses a message; None if it cannot say so, as only MQTT 5 can."""
     try:
         writer = trial.peer(protocol="5")
     except RefusedError:
@@ -149,11 +150,15 @@ def delay(trial: BrokerTrial) -> CheckResult:
 
 def held_back(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> CheckResult:
     """Check whether Nagle's algorithm delays a message until the receiver has acknowledged the previous one."""
-    pairs = [pair for _ in range(_PAIRS) if (pair := _pair(trial, reader, writer, topic)) is not None]
-    if len(pairs) < _PAIRS:
-        return failed("they are lost on an idle connection", OTHER)
-    round_trip_s, late_s = min(pair[0] for pair in pairs), median(pair[1] for pair in pairs) - _APART_S
-    if late_s < max(_HELD_S, _HELD * round_trip_s):
+    round_trips_s, gaps_s = [], []
+    for _ in range(_PAIRS):
+        pair = _pair(trial, reader, writer, topic)
+        if pair is None:
+            return failed("they are lost on an idle connection", OTHER)
+        round_trips_s.append(pair[0])
+        gaps_s.append(pair[1])
+    late_s = median(gaps_s) - _APART_S
+    if late_s < max(_HELD_S, _HELD * min(round_trips_s)):
         return ok("are passed on at once")
     text = f"it holds them back: a message that follows another one comes {1000 * late_s:.0f} ms late"
     return warn(text, f"{MOSQUITTO}set_tcp_nodelay true")
@@ -165,7 +170,7 @@ def _pair(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> tuple[f
     began, probes = time.monotonic(), [new_probe(number) for number in range(2)]
     for probe in probes:
         writer.publish(topic, probe)
-        trial.wait(lambda: False, _APART_S)
+        trial.wait(lambda: False, _APART_S)  # serves the peers meanwhile
     if not trial.wait(lambda: set(probes) <= set(reader.payloads())):
         return None
     trial.wait(lambda: False, 2 * _HELD_S + trial.round_trip_s)  # the pair is acknowledged then
@@ -210,19 +215,20 @@ def overlaps(trial: BrokerTrial) -> CheckResult:
 
 
 def as_published(trial: BrokerTrial) -> CheckResult:
+    """Check that a client can get messages as a bridge needs them: not its own ones, and with the retain flag."""
     lacks = {}
-    for words, protocol, bridge in (("bridge mode of 3.1.1", "3.1.1", True), ("MQTT 5", "5", False)):
+    for mode, protocol, bridge in (("bridge mode of 3.1.1", "3.1.1", True), ("MQTT 5", "5", False)):
         trial.begin()
         try:
             peer = trial.peer(protocol=protocol, bridge=bridge)
-            lacks[words] = _lacks_of_flags(trial, peer, modern=protocol == "5")
+            lacks[mode] = _lacks_of_flags(trial, peer, modern=protocol == "5")
         except RefusedError:
             continue
-    working = [words for words, lack in lacks.items() if not lack]
+    working = [mode for mode, lack in lacks.items() if not lack]
     if working:
-        told = "own messages do not come back, and tell whether they were to be retained"
-        return ok(f"{told}, with {' and '.join(working)}")
-    text = "; ".join(f"{words}: {lack}" for words, lack in lacks.items()) or "it has neither bridge mode nor MQTT 5"
+        what_works = "own messages do not come back, and tell whether they were to be retained"
+        return ok(f"{what_works}, with {' and '.join(working)}")
+    text = "; ".join(f"{mode}: {lack}" for mode, lack in lacks.items()) or "it has neither bridge mode nor MQTT 5"
     return warn(text, "a robot works without; mqtt_mirror needs a broker with it, as mosquitto")
 
 
@@ -237,7 +243,7 @@ def _lacks_of_flags(trial: BrokerTrial, peer: Peer, *, modern: bool) -> str:
         return "nothing comes"
     if peer.payloads("own"):
         return "own messages come back"
-    return "" if peer.received[-1].retain or not trial.retains else "the retain flag is lost"
+    return "the retain flag is lost" if trial.retains and not peer.received[-1].retain else ""
 
 
 # -- the end of a connection

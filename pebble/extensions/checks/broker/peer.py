@@ -23,7 +23,7 @@ from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.settings import MqttSettings
 
 ANSWER_S = 3.0  # within which a broker answers, and four round trips
-_QUIET_S = 0.3  # of silence, and four round trips: then nothing more comes
+_QUIET_S = 0.3  # of silence, and four round trips, after which nothing more comes
 _STEP_S = 0.001  # between two looks at what has come
 _KEEPALIVE_S = 60
 _AT_ONCE = 1000  # packets
@@ -57,9 +57,10 @@ class Peer(packets.Listener):
     """
 
     def __init__(self, trial: BrokerTrial, base: str, opening: Opening, *, bridge: bool) -> None:
+        """Start to connect. ``bridge``: in the bridge mode of MQTT 3.1.1."""
         self.received: list[Received] = []
-        self.acks: dict[int, int] = {}  # by message id: the code of MQTT 5
-        self.granted: dict[int, bytes] = {}
+        self.acks: dict[int, int] = {}  # acknowledged publications, by message id: the code of MQTT 5
+        self.granted: dict[int, bytes] = {}  # answered subscriptions, by message id: a code for each filter
         self.pongs: list[int] = []  # how many messages had been received at each answer to a ping
         self.code: int | None = None  # of CONNACK
         self.problem = ""
@@ -197,13 +198,15 @@ class BrokerTrial:
         restart: Callable[[], bool] | None = None,
         patience_s: float = ANSWER_S,
     ) -> None:
-        self.settings, self.restart = settings, restart  # which has the broker restarted
-        self.below, self.base = below, ""  # and that of the probe that is made now
+        self.settings = settings
+        self.restart = restart  # has a person restart the broker; returns False if it was not
+        self.below = below
+        self.base = ""  # the base topic of the present probe
         self.round_trip_s, self.patience_s = 0.0, patience_s
-        self.qos, self.retains, self.wildcards = 1, True, True  # as found out by the first probe
+        self.qos, self.retains, self.wildcards = 1, True, True  # what the broker supports; the first probes find out
         self._address = address
         self._peers: list[Peer] = []
-        self.left: dict[str, None] = {}  # topics that are retained, and not removed yet, in their order
+        self.left: dict[str, None] = {}  # topics with a retained message of ours, in the order of publishing
         self._credentials = Credentials(settings)
 
     def begin(self) -> None:
@@ -258,12 +261,12 @@ class BrokerTrial:
         """Serve all peers until no more messages arrive."""
         quiet_s, end = _QUIET_S + 4 * self.round_trip_s, time.monotonic() + self.answer_s
 
-        def seen() -> int:
+        def count() -> int:
             return sum(len(peer.received) for peer in peers)
 
         while time.monotonic() < end:
-            before = seen()
-            if not self.wait(lambda: seen() > before, quiet_s):  # noqa: B023
+            before = count()
+            if not self.wait(lambda: count() > before, quiet_s):  # noqa: B023
                 return
 
     def close(self) -> None:
@@ -275,6 +278,7 @@ class BrokerTrial:
         with suppress(TransportError):
             peer = self.peer()
             numbers = {peer.publish(topic, b"", qos=self.qos, retain=True) for topic in list(self.left)}
-            if self.wait(lambda: numbers <= peer.acks.keys()) if self.qos else peer.ping():
+            is_done = self.wait(lambda: numbers <= peer.acks.keys()) if self.qos else peer.ping()
+            if is_done:
                 self.left = {}
             peer.leave()

@@ -18,14 +18,14 @@ def _probe(
 ) -> Probe:
     """Return a check that runs with new connections and new topics."""
 
-    def tried(trial: BrokerTrial) -> CheckResult:
+    def begin_and_test(trial: BrokerTrial) -> CheckResult:
         trial.begin()
         try:
             return test(trial)
         except RefusedError as error:
             return failed(f"a connection was refused: {error}", "let an account have ten connections at once")
 
-    return Check(name, tried, needs, costs)
+    return Check(name, begin_and_test, needs, costs)
 
 
 PROBES = (
@@ -89,11 +89,9 @@ def assessment(states: Mapping[str, State]) -> list[str]:
     broken = [name for name, state in states.items() if state is State.FAILED]
     if broken:
         return [f"robots cannot use it with this account: {', '.join(broken)}"]
-    limits = [name for name, state in states.items() if state is State.WARN]
-    at_rest = {State.OK: "too", State.SKIPPED: "not at all"}
-    seen = at_rest.get(states.get(_WILDCARDS, State.SKIPPED), "after their next state, or by name")
-    return [
-        f"robots can use it{', with limits: ' + ', '.join(limits) if limits else ''}",
-        f"operators see robots at rest {seen}",
-        f"a mirror {'can' if states.get(_BRIDGE_MODE) is State.OK else 'cannot'} use it",
-    ]
+    limited = [name for name, state in states.items() if state is State.WARN]
+    limits = f", with limits: {', '.join(limited)}" if limited else ""
+    words_of_state = {State.OK: "too", State.SKIPPED: "not at all"}
+    at_rest = words_of_state.get(states.get(_WILDCARDS, State.SKIPPED), "after their next state, or by name")
+    mirror = "can" if states.get(_BRIDGE_MODE) is State.OK else "cannot"
+    return [f"robots can use it{limits}", f"operators see robots at rest {at_rest}", f"a mirror {mirror} use it"]

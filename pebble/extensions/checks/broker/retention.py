@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from itertools import count, pairwise
-
 from pebble.check_result import CheckResult, failed, ok, skipped, warn
 from pebble.extensions.checks.broker import MOSQUITTO, OTHER
-from pebble.extensions.checks.broker.peer import BrokerTrial, RefusedError
+from pebble.extensions.checks.broker.peer import BrokerTrial, Peer, RefusedError
 
 _STATES = 200  # retained ones; a robot has some twenty
-_TURNS = 6  # in which one asks for it after a restart
+_TRIES = 6  # to get the retained message after a restart
 _BY_NAME = 8  # filters in one SUBSCRIBE: AWS IoT closes the connection for more
 _PERSISTENT = f"{MOSQUITTO}persistence true, persistence_location /var/lib/mosquitto/, autosave_on_changes true"
 
@@ -48,9 +46,10 @@ def by_wildcard(trial: BrokerTrial) -> CheckResult:
 
 def before_pong(trial: BrokerTrial) -> CheckResult:
     names, reader = _retain_states(trial), trial.peer()
-    reader.subscribe(*(["#"] if trial.wildcards else names[:_BY_NAME]), qos=0)
-    reader.ping()
     expected = len(names) if trial.wildcards else _BY_NAME
+    filters = ["#"] if trial.wildcards else names[:expected]
+    reader.subscribe(*filters, qos=0)
+    reader.ping()
     trial.wait(lambda: len(reader.received) >= expected)
     received_before_pong = reader.pongs[0] if reader.pongs else 0
     late = len(reader.received) - received_before_pong
@@ -58,23 +57,28 @@ def before_pong(trial: BrokerTrial) -> CheckResult:
 
 
 def order(trial: BrokerTrial) -> CheckResult:
-    writer, readers, numbers = trial.peer(), [trial.peer() for _ in range(8)], count(1)
+    """Check the order in which readers get growing numbers, if they subscribe while these are published."""
+    writer, readers, newest = trial.peer(), [trial.peer() for _ in range(8)], 0
     for reader in readers:
         for _ in range(10):
-            writer.publish("state", b"%d" % next(numbers), qos=trial.qos, retain=True)
+            newest += 1
+            writer.publish("state", b"%d" % newest, qos=trial.qos, retain=True)
         reader.subscribe("state", qos=trial.qos)
     writer.ping()
     trial.wait_quiet(*readers)
-    received = [[int(payload) if payload.isdigit() else -1 for payload in reader.payloads()] for reader in readers]
-    newest = next(numbers) - 1
-    wrong = [reader for reader, values in zip(readers, received, strict=True) if values[-1:] != [newest]]
+    wrong = [reader for reader in readers if reader.payloads()[-1:] != [b"%d" % newest]]
     if any(not reader.received or not reader.received[-1].retain for reader in wrong):
         return failed("the last value that comes to a new subscription is not the newest", OTHER)
     if wrong:
         return warn("a retained value comes after a newer live one")
-    if any(after < before for values in received for before, after in pairwise(values)):
+    if any(map(_has_older_after_newer, readers)):
         return warn("an older value may come between, to who subscribes while others publish; the newest is last")
     return ok("no older value comes after a newer one")
+
+
+def _has_older_after_newer(reader: Peer) -> bool:
+    numbers = [int(payload) if payload.isdigit() else -1 for payload in reader.payloads()]
+    return numbers != sorted(numbers)
 
 
 def restarted(trial: BrokerTrial) -> CheckResult:
@@ -85,12 +89,12 @@ def restarted(trial: BrokerTrial) -> CheckResult:
         return skipped("it was not restarted")
     if writer.ping():
         return skipped("it was not restarted: a connection from before is still open")
-    for turn in range(_TURNS):  # NATS lets clients in some seconds before it has read what it retains
+    for attempt in range(_TRIES):  # NATS lets clients in some seconds before it has read what it retains
         try:
             late = trial.peer()
         except RefusedError as error:
             return failed(f"it takes no connection since: {error}", "see why in its log")
         late.subscribe("state", qos=trial.qos)
         if trial.wait(lambda: late.received, trial.answer_s / 3):  # noqa: B023
-            return ok("it is there again" + (", some seconds later" if turn else ""))
+            return ok("it is there again" + (", some seconds later" if attempt else ""))
     return warn("it is gone", _PERSISTENT)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -24,6 +24,9 @@ from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import check_connections, tls_settings
 from pebble.runtime.output import console
 from pebble.runtime.process import view_of
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 SCHEMA = "schema.json"  # in the folder of configs, so `configs/*.json` includes it
 _LAUNCHER = "launcher"
@@ -70,8 +73,8 @@ def _check(path: Path, *, as_json: bool, first: bool) -> bool:
         config = load(path)
         check_connections(config)
         _check_certificates(config)
-        speakers = [] if as_json else [extension for extension in config.installed if extension.facts]
-        added = [call(extension, "facts", Facts, config) for extension in speakers]
+        with_facts = [] if as_json else [extension for extension in config.installed if extension.facts]
+        extension_facts = [call(extension, "facts", Facts, config) for extension in with_facts]
     except ConfigError as error:
         for problem in error.problems:
             line = problem if f"{path.name}: " in problem else f"{path.name}: {problem}"
@@ -82,7 +85,7 @@ def _check(path: Path, *, as_json: bool, first: bool) -> bool:
         return True
     if not first:
         typer.echo()
-    _print(config, path, added)
+    _print(config, path, extension_facts)
     return True
 
 
@@ -104,7 +107,7 @@ def _check_certificates(config: Config) -> None:
         raise ConfigError(problems)
 
 
-def _print(config: Config, path: Path, added: list[Facts]) -> None:
+def _print(config: Config, path: Path, extension_facts: list[Facts]) -> None:
     from rich.padding import Padding
     from rich.table import Table
     from rich.text import Text
@@ -119,31 +122,40 @@ def _print(config: Config, path: Path, added: list[Facts]) -> None:
             output.print(Padding(grid, (above, 0, 0, 2), expand=False))
 
     output.print(Text.assemble((config.base, "bold"), f"  {path}"))
-    print_grid("dim", facts(config, added), above=0)
+    print_grid("dim", facts(config, extension_facts), above=0)
     if config.robot.platform == "linux":
-        table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 1, 0, 0))
-        for name in ("process", "", "topic"):
-            table.add_column(name, overflow="fold")
-        table.add_column("qos", justify="right")
-        table.add_column("retained")
-        for process, lines in topics_of(config):
-            for number, line in enumerate(lines):
-                table.add_row(
-                    "" if number else Text(process, style="bold"),
-                    "subscribes" if line.channel.direction == "incoming" else "publishes",
-                    Text(line.topic, style="yellow") if line.renamed else Text(line.channel.suffix),
-                    str(line.qos),
-                    "yes" if line.retained else "",
-                )
-        output.print(Padding(table, (1, 0, 0, 2), expand=False))
-    print_grid("dim", [tuple(map(shown, line)) for facts in added for line in facts.table])
+        output.print(Padding(_topics_table(config), (1, 0, 0, 2), expand=False))
+    print_grid("dim", [tuple(map(shown, row)) for added in extension_facts for row in added.table])
     print_grid("yellow", [("warning", warning) for warning in (*config.warnings, *_packages(config))])
+
+
+def _topics_table(config: Config) -> Table:
+    """Return a table of the topics of each process."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 1, 0, 0))
+    for name in ("process", "", "topic"):
+        table.add_column(name, overflow="fold")
+    table.add_column("qos", justify="right")
+    table.add_column("retained")
+    for process, lines in topics_of(config):
+        for number, line in enumerate(lines):
+            table.add_row(
+                "" if number else Text(process, style="bold"),
+                "subscribes" if line.channel.direction == "incoming" else "publishes",
+                Text(line.topic, style="yellow") if line.renamed else Text(line.channel.suffix),
+                str(line.qos),
+                "yes" if line.retained else "",
+            )
+    return table
 
 
 def _packages(config: Config) -> Iterator[str]:
     """Yield a line for each extension of this robot whose packages this Python lacks."""
     for extension in config.installed:
-        if missing := lacking_packages(extension) if programs_of([extension], config) else []:
+        missing = lacking_packages(extension)
+        if missing and programs_of([extension], config):
             install = f'pip install "{extension.package}[{extension.extra}]"'
             yield f"{extension.name} does not run without {' and '.join(missing)}: {install}"
 
@@ -158,7 +170,7 @@ class TopicLine(NamedTuple):
     renamed: bool
 
 
-def facts(config: Config, added: Iterable[Facts]) -> list[tuple[str, str]]:
+def facts(config: Config, extension_facts: Iterable[Facts]) -> list[tuple[str, str]]:
     """Return the transport, the connections and the processes, line by line, without secrets."""
     if config.robot.platform != "linux":
         firmware = f"runs on its own MCU ({config.robot.platform}), not with `pebble up`"
@@ -168,24 +180,29 @@ def facts(config: Config, added: Iterable[Facts]) -> list[tuple[str, str]]:
         lines.append(("mirror", _mqtt(config.transport.mqtt_mirror)))
     if config.services.mqtt_bridge.enabled:
         lines.append(("uplink", _uplink(config)))
-    lines += [line for facts in added for line in facts.lines]
+    for added in extension_facts:
+        lines += added.lines
     lines += _scripts(config)
     lines += [("serial", line) for line in _serial_lines(config)]
     memories = (config.hall_memory(line) for line in config.motor_lines().values())
     lines += [("for the original's scripts", f"hall samples in the shared memory {name}") for name in memories if name]
-    table = programs(config)
-    lines.append(("processes", ", ".join([_LAUNCHER, *(program.name for program in table if not program.on_demand)])))
-    on_request = ", ".join(program.name for program in table if program.on_demand)
-    off = ", ".join(_off(config))
-    return [*lines, *((name, line) for name, line in (("on request", on_request), ("off", off)) if line)]
+    names = [program.name for program in programs(config) if not program.on_demand]
+    lines.append(("processes", ", ".join([_LAUNCHER, *names])))
+    if on_request := [program.name for program in programs(config) if program.on_demand]:
+        lines.append(("on request", ", ".join(on_request)))
+    if off := list(_off(config)):
+        lines.append(("off", ", ".join(off)))
+    return lines
 
 
 def _off(config: Config) -> Iterator[str]:
     """Yield the services that have settings in the config but are not enabled."""
     bridge = config.services.serial_mcu_bridge
-    for name, line in {"": bridge, **bridge.instances}.items():
+    lines = {"serial_mcu_bridge": bridge}
+    lines |= {f"serial_mcu_bridge:{name}": line for name, line in bridge.instances.items()}
+    for name, line in lines.items():
         if not line.enabled and line.serial.port is not None:
-            yield f"serial_mcu_bridge{name and ':'}{name} (its section has a port)"
+            yield f"{name} (its section has a port)"
     for name in config.services.__struct_fields__:
         section = getattr(config.services, name)
         if name != "serial_mcu_bridge" and not getattr(section, "enabled", True) and section != type(section)():
@@ -202,15 +219,16 @@ def topics_of(config: Config) -> Iterator[tuple[str, list[TopicLine]]]:
 
 
 def _lines(config: Config, service: str) -> list[TopicLine]:
+    """Return the topics of a service's process."""
     addresses = Addresses(config)
     channels = [channel for channel in CHANNELS if _is_of(channel, service) or channel is _FIXED.get(service)]
     if service == "serial_mcu_bridge":
         channels = [channel for channel in channels if _is_of_serial_line(channel, config)]
-    return [
-        TopicLine(channel, topic, qos, retained, topic != channel.topic(config.base))
-        for channel in channels
-        for topic, qos, retained in [addresses[channel]]
-    ]
+    lines: list[TopicLine] = []
+    for channel in channels:
+        topic, qos, retained = addresses[channel]
+        lines.append(TopicLine(channel, topic, qos, retained, renamed=topic != channel.topic(config.base)))
+    return lines
 
 
 def _is_of(channel: Channel, service: str) -> bool:
@@ -225,7 +243,8 @@ def _is_of_serial_line(channel: Channel, config: Config) -> bool:
     line = config.services.serial_mcu_bridge
     if channel is TOUCH_SENSORS and not line.telemetry.publish_touch_sensors:
         return False
-    return channel.metric.startswith("sensors/") == (not SERIAL_PROTOCOLS[line.protocol].drives)
+    is_sensor, drives = channel.metric.startswith("sensors/"), SERIAL_PROTOCOLS[line.protocol].drives
+    return is_sensor != drives  # a board that drives has the other topics, any other board only these
 
 
 def _transport(config: Config) -> str:
@@ -250,9 +269,9 @@ def _scripts(config: Config) -> list[tuple[str, str]]:
     """Return a warning about scripts if other clients share the broker, where no bridge protects the motors."""
     bridge, shared = config.services.mqtt_bridge, config.transport.mqtt_mirror
     if config.transport.kind == "mqtt":
-        elsewhere = bridge.remote is not None and bridge.remote.kind != "mqtt"
-        apart = elsewhere or place_of(bridge.remote_mqtt) != place_of(config.local_mqtt)
-        shared = None if bridge.enabled and apart else config.local_mqtt
+        is_zenoh_uplink = bridge.remote is not None and bridge.remote.kind != "mqtt"
+        is_apart = is_zenoh_uplink or place_of(bridge.remote_mqtt) != place_of(config.local_mqtt)
+        shared = None if bridge.enabled and is_apart else config.local_mqtt
     if shared is None:
         return []
     return [("scripts", f"anybody at broker {shared.host}:{shared.port} may pose as one, or end one")]

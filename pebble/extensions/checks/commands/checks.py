@@ -37,9 +37,8 @@ class Printer:
 
     def take(self, result: CheckResult, why: str = "") -> None:
         """Print a result. Texts may come from the robot, so secrets and control characters are masked."""
-        text, fix = (
-            shown(without_secrets(words)) for words in (result.text, result.fix.replace("CONFIG", self._config))
-        )
+        text = shown(without_secrets(result.text))
+        fix = shown(without_secrets(result.fix.replace("CONFIG", self._config)))
         row = {"name": shown(result.what), "state": result.state.value, "text": text, "fix": fix}
         if why and result.state.value in _BAD:
             row["why"] = why

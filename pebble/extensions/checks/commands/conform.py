@@ -51,7 +51,8 @@ def conform(
                 printer.take(result, check.why)
             unasked = [] if may_move else [check.name for check in MOVING if check.binds(observer)]
     skips = printer.names("skipped")
-    unjudged = [*([", ".join(skips)] if skips else []), *([f"{len(unasked)} with --may-move"] if unasked else [])]
-    if unjudged and not as_json:
-        typer.echo(f"NOT JUDGED: {'; '.join(unjudged)}")
+    asked_for = f"{len(unasked)} with --may-move" if unasked else ""
+    not_judged = "; ".join(filter(None, (", ".join(skips), asked_for)))
+    if not_judged and not as_json:
+        typer.echo(f"NOT JUDGED: {not_judged}")
     return printer.end(robot=observer.base, not_judged=[*skips, *unasked])

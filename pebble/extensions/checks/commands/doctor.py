@@ -190,4 +190,4 @@ def _ask_to_restart() -> bool:
     typer.echo(
         "Restart the broker now (sudo systemctl restart mosquitto), then press Enter; q to go without: ", err=True
     )
-    return sys.stdin.readline().isspace()  # nothing at all: no person is there
+    return sys.stdin.readline().isspace()  # an empty text, without a line end: standard input has no person

@@ -1,1 +1,1 @@
-"""Judges a robot's conformance to the contract from outside, by its messages and its answers."""
+"""Checks of a robot's conformance to the contract, from outside: by its messages and its answers."""

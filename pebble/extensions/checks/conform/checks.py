@@ -58,8 +58,9 @@ def free(robot: Observer) -> str:
 
 def commanded(robot: Observer) -> str:
     """Return why the robot takes no commands from this account; empty if it takes them."""
-    named = robot.view.named and not robot.account
-    return "it takes commands only with a name: use an account, as in --url mqtts://ANN@BROKER" if named else ""
+    if robot.view.named and not robot.account:
+        return "it takes commands only with a name: use an account, as in --url mqtts://ANN@BROKER"
+    return ""
 
 
 def readable(robot: Observer) -> str:
@@ -76,7 +77,8 @@ def heartbeat(robot: Observer) -> CheckResult:
     beats = robot.of(c.ONLINE)
     if not beats:
         return failed("none arrived", 'publish {"t": <epoch ms>} on outgoing/online every 0.25 s to 1 s')
-    if wrong := [beat.wrong for beat in beats if beat.wrong]:
+    wrong = [beat.wrong for beat in beats if beat.wrong]
+    if wrong:
         return failed(wrong[0], 'its payload is {"t": <epoch milliseconds, an integer>}')
     gaps = [after.at - before.at for before, after in pairwise(beats)]
     interval = robot.view.liveness.interval_s
@@ -91,14 +93,16 @@ def heartbeat(robot: Observer) -> CheckResult:
 
 
 def clock(robot: Observer) -> CheckResult:
-    newest = robot.of(c.ONLINE)[-1:]
-    if not newest or newest[0].wrong:
+    heartbeats = robot.of(c.ONLINE)
+    if not heartbeats or heartbeats[-1].wrong:
         return skipped("there is no heartbeat")
-    off = newest[0].value.t / 1000 - time.time() + (time.monotonic() - newest[0].at)
-    if abs(off) > _CLOCK_S:
-        text = f"its clock is {abs(off):.0f} s {'ahead' if off > 0 else 'behind'}"
+    newest = heartbeats[-1]
+    received_s = time.time() - (time.monotonic() - newest.at)
+    ahead_s = newest.value.t / 1000 - received_s
+    if abs(ahead_s) > _CLOCK_S:
+        text = f"its clock is {abs(ahead_s):.0f} s {'ahead' if ahead_s > 0 else 'behind'}"
         return failed(text, "set it, by SNTP for example")
-    return ok(f"{1000 * off:+.0f} ms")
+    return ok(f"{1000 * ahead_s:+.0f} ms")
 
 
 # -- what it publishes
@@ -137,21 +141,26 @@ def sizes(robot: Observer) -> CheckResult:
 
 
 def retained(robot: Observer) -> CheckResult:
-    metrics = {record.metric for record in robot.retained()}
-    live = {record.metric: record.channel for record in robot.records if record.channel and record.payload}
-    must = {metric for metric, channel in live.items() if channel.default_retain and channel not in _REPEATED}
-    if lacks := must - metrics:
+    retained_metrics = {record.metric for record in robot.retained()}
+    lacking, stale = set(), set()
+    for record in robot.records:
+        channel, is_retained = record.channel, record.metric in retained_metrics
+        if channel is None or not record.payload:
+            continue
+        if channel.default_retain and channel not in _REPEATED and not is_retained:
+            lacking.add(record.metric)
+        if is_retained and not channel.default_retain and channel is not c.MCU_VALUE:  # that its manifest decides
+            stale.add(record.metric)
+    if lacking:
         fix = "publish it with the retain flag: who connects later lacks it"
-        return failed(f"not retained: {some_of(sorted(lacks))}", fix)
-    of_manifests = {metric for metric, channel in live.items() if channel is c.MCU_VALUE}  # which decide it
-    stale = {metric for metric in metrics & live.keys() if not live[metric].default_retain} - of_manifests
+        return failed(f"not retained: {some_of(sorted(lacking))}", fix)
     fix = "publish it without the retain flag: it is news only once"
-    return _none_of(stale, fix, f"{len(metrics)} states", "retained: ")
+    return _none_of(stale, fix, f"{len(retained_metrics)} states", "retained: ")
 
 
 def stale_commands(robot: Observer) -> CheckResult:
     parked = sorted(record.metric for record in robot.retained() if record.channel and record.channel.one_shot)
-    topic = f"{robot.base}/{''.join(parked[:1])}"
+    topic = f"{robot.base}/{next(iter(parked), '')}"
     return _none_of(parked, f"remove it: mosquitto_pub -r -n -t '{topic}'; and find who publishes it so", "none")
 
 
@@ -164,7 +173,7 @@ def capabilities(robot: Observer) -> CheckResult:
         return failed("it publishes none: pages offer nothing of it", "publish outgoing/capabilities, retained")
     try:
         msgspec.convert(published[-1].value.value, CapabilitiesValue)
-    except (msgspec.ValidationError, ValueError, AttributeError) as error:
+    except (msgspec.ValidationError, ValueError, AttributeError) as error:  # AttributeError: it could not be decoded
         return failed(str(published[-1].wrong or error), "CapabilitiesValue in `pebble topic contract --json-schema`")
     return ok(some_of(sorted(available(robot.view.capabilities)), 20) or "nothing is offered")
 
@@ -195,24 +204,27 @@ def _topics(value: object, path: str) -> Iterator[tuple[str, str]]:
 
 def identity(robot: Observer) -> CheckResult:
     section = section_of(robot.view.capabilities, "identity")
-    listed = "/".join(str(section.get(level)) for level in ("system", "type", "id"))
     if not section:
         return skipped("it lists no identity")
-    return ok(listed) if listed == robot.base else failed(f"it calls itself {listed}", "identity is that of its topics")
+    listed = "/".join(str(section.get(level)) for level in ("system", "type", "id"))
+    if listed != robot.base:
+        return failed(f"it calls itself {listed}", "identity is that of its topics")
+    return ok(listed)
 
 
 # -- what it does with what it cannot read
 
 
 def junk(robot: Observer) -> CheckResult:
+    """Check that the robot goes on with its heartbeats after messages that no program should send."""
     began = time.monotonic()
     for channel in (c.DRIVE, c.LIGHTS_SOLID, c.CONTROL, c.ESTOP_RESET, c.AUTONOMY_COMMAND):
         for payload in JUNK:
             robot.send(channel, payload)
     robot.send(c.DRIVE, _LARGE)
-    sent = robot.sent(ANSWER_S)
-    interval = robot.view.liveness.interval_s or ANSWER_S
-    if not robot.wait(lambda: len(robot.of(c.ONLINE, sent + 2 * interval)) >= 2, 6 * interval + ANSWER_S):
+    sent_at = robot.sent(ANSWER_S)
+    interval_s = robot.view.liveness.interval_s or ANSWER_S
+    if not robot.wait(lambda: len(robot.of(c.ONLINE, sent_at + 2 * interval_s)) >= 2, 6 * interval_s + ANSWER_S):
         return failed("its heartbeats ended", "drop what is no JSON of the contract, and go on")
     if any(beat.value and beat.value.online is False for beat in robot.of(c.ONLINE, began)):
         return failed("it went offline meanwhile", "drop what cannot be read")
@@ -229,6 +241,7 @@ def owners(robot: Observer) -> CheckResult:
 
 
 def stop(robot: Observer, name: str) -> bool:
+    """Send a stop; True if each motor owner confirms it in time."""
     robot.send(c.ESTOP, EstopCommand(stop=name, by=BY, why=_WHY))
 
     def latches() -> bool:
@@ -243,6 +256,7 @@ def _counts(robot: Observer) -> dict[str, int]:
 
 
 def reset(robot: Observer, *, boot: str = "", more: int = 0) -> None:
+    """Send a reset to each motor owner, with its ``boot`` or another one, and with its count or ``more``."""
     for state in robot.view.estop.states.values():
         robot.send(c.ESTOP_RESET, EstopReset(boot=boot or state.boot, count=state.count + more, by=BY))
 
@@ -276,8 +290,9 @@ def _confirmed(_robot: Observer, _name: str) -> CheckResult:
 
 
 def _after_long_ones(robot: Observer) -> CheckResult:
+    """Check that a stop still reaches the robot after messages that are too long for small boards."""
     stops_it = while_stopped(_confirmed)
-    if stops_it(robot).state is not State.OK:  # which also shows that all from before has been read
+    if stops_it(robot).state is not State.OK:  # if it is, the robot has read everything that was sent before
         return skipped("no stop reaches it without them, either")
     for _ in range(_BURSTS):
         for _ in range(_LONGS):

@@ -49,7 +49,9 @@ class Driver:
     def send(self, z: object = 0, *, key: str | None = None, wrapped: bool = False, **fields: object) -> float:
         """Send one command; return the time (monotonic). ``key`` replaces its own key; "" sends none."""
         key = self.key if key is None else key
-        command = {"x": 0, "z": z, **({"key": key} if key else {}), **fields}
+        command = {"x": 0, "z": z, **fields}
+        if key:
+            command["key"] = key
         return self._robot.send(c.DRIVE, msgspec.json.encode({"value": command} if wrapped else command))
 
     def drive(self, seconds: float = DRIVES_S, *, z: object = SPEED, **fields: Any) -> tuple[float, float]:
@@ -83,6 +85,8 @@ class Driver:
 
 
 def _with_control(test: Callable[[Observer, Driver], CheckResult]) -> Callable[[Observer], CheckResult]:
+    """Return a check that runs ``test`` with a driver that has control."""
+
     def run(robot: Observer) -> CheckResult:
         driver = Driver(robot)
         driver.asks()
@@ -100,7 +104,7 @@ def _first_keeps(robot: Observer, driver: Driver) -> CheckResult:
     by = "" if driver.state is None else driver.state.by
     if robot.view.named and by.partition("/")[0] != robot.account:
         return failed(f"its state tells that {by!r} has it", "at level named, by begins with the account in the topic")
-    driver.asks(for_ms=5 * _SHORTEST_MS)  # longer than one looks on, else the second gets what has ended
+    driver.asks(for_ms=5 * _SHORTEST_MS)  # longer than this test: the second must not get what has ended
     second = Driver(robot)
     second.asks()
     took = robot.happens(lambda: second.holds)
@@ -139,11 +143,13 @@ def _taken(robot: Observer, driver: Driver) -> CheckResult:
     key, second = driver.key, Driver(robot)
     second.takes()
     took = robot.answers(lambda: second.holds)
-    same = second.key == key
+    is_same_key = second.key == key
     second.leaves()
     if not took:
         return failed("the one who has it keeps it", "give control to who asks on incoming/control/take")
-    return failed("its key stays", "make a new key for each new holder") if same else ok("it passes on, with a new key")
+    if is_same_key:
+        return failed("its key stays", "make a new key for each new holder")
+    return ok("it passes on, with a new key")
 
 
 def _ends(robot: Observer, driver: Driver) -> CheckResult:

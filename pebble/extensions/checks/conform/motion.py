@@ -46,57 +46,62 @@ def moves_until(robot: Observer, since: float) -> float | None:
     None: the robot reports no motion. It may report ``wheels`` in its status (published on change), readings of hall
     sensors, or speeds of its odometry.
     """
-    reports = _shown(robot)
+    reports = _wheel_reports(robot)
     readings = [(record.at, record.value.value) for record in robot.of(c.TOUCH_SENSORS) if record.value]
-    travelled = _travelled(robot)
-    if not reports and not readings and not travelled:
+    odometry = _odometry_wheels(robot)
+    if not reports and not readings and not odometry:
         return None
-    ends = [*(at for at, _ in reports[1:]), inf]  # a report holds until the next one
-    turns = [end for (_, wheels), end in zip(reports, ends, strict=False) if any(wheels)]
-    moved = (at for at, wheels in travelled if any(wheels))
-    return max((at for at in (*turns, *_swings(readings), *moved) if at > since), default=0.0)
+    moved_at = [*_swings(readings), *(at for at, wheels in odometry if any(wheels))]
+    next_reports_at = [*(at for at, _ in reports[1:]), inf]
+    for (_, wheels), until in zip(reports, next_reports_at, strict=False):  # a report holds until the next one
+        if any(wheels):
+            moved_at.append(until)
+    return max((at for at in moved_at if at > since), default=0.0)
 
 
 def _swings(readings: list[tuple[float, Any]]) -> Iterator[float]:
     """Yield the times at which a hall sensor's value changed by more than noise since the previous such change."""
-    level: tuple[int, ...] = ()
+    reference: tuple[int, ...] | None = None  # the values at the last change
     for at, sensors in readings:
         values = msgspec.structs.astuple(sensors)
-        if any(abs(value - before) > _SWING for value, before in zip(values, level or values, strict=True)):
+        if reference is None:
+            reference = values
+        elif any(abs(value - before) > _SWING for value, before in zip(values, reference, strict=True)):
             yield at
-            level = values
-        level = level or values
+            reference = values
 
 
-def _shown(robot: Observer) -> list[tuple[float, list[float]]]:
-    """Return the reported wheel speeds, each with the time of its report."""
+def _wheel_reports(robot: Observer) -> list[tuple[float, list[float]]]:
+    """Return the wheel speeds that were seen from outside, or else reported, each with its time."""
     reports = [(report.at, report.value.value.get("wheels")) for report in robot.of(c.STATUS) if report.value]
     return robot.eyes() or [(at, wheels) for at, wheels in reports if _are_wheels(wheels)]
 
 
-def _travelled(robot: Observer) -> list[tuple[float, list[float]]]:
+def _odometry_wheels(robot: Observer) -> list[tuple[float, list[float]]]:
     """Return the odometry's speeds as those of a left and a right wheel (m/s), each with its time."""
     speeds = []
     for record in robot.of(c.WHEEL_ODOMETRY):
         value: dict[str, Any] = record.value.value if record.value else {}
-        ahead: Any = value.get("linear_speed_mps")
-        turn: Any = value.get("angular_speed_radps")
-        if _are_wheels([ahead, turn]):
-            metres, swing = round(float(ahead), 2), _HALF_TRACK_M * round(float(turn), 2)
-            speeds.append((record.at, [metres - swing, metres + swing]))
+        linear: Any = value.get("linear_speed_mps")
+        angular: Any = value.get("angular_speed_radps")
+        if _are_wheels([linear, angular]):
+            ahead_mps, turn_mps = round(float(linear), 2), _HALF_TRACK_M * round(float(angular), 2)
+            speeds.append((record.at, [ahead_mps - turn_mps, ahead_mps + turn_mps]))
     return speeds
 
 
-def _moves(robot: Observer, since: float) -> list[float] | None:
+def _moving_wheels(robot: Observer, since: float) -> list[float] | None:
     """Return the wheel speeds that the robot reports after ``since``: empty if it rests, None if it reports none."""
 
-    def moving() -> list[float]:
-        shown = _shown(robot) or _travelled(robot)
-        return next((wheels for at, wheels in reversed(shown) if at >= since and any(wheels)), [])
+    def reports() -> list[tuple[float, list[float]]]:
+        return _wheel_reports(robot) or _odometry_wheels(robot)
 
-    robot.wait(moving, ANSWER_S)
+    def newest_moving() -> list[float]:
+        return next((wheels for at, wheels in reversed(reports()) if at >= since and any(wheels)), [])
+
+    robot.wait(newest_moving, ANSWER_S)
     robot.look(LATE_S)
-    return moving() if _shown(robot) or _travelled(robot) else None
+    return newest_moving() if reports() else None
 
 
 def _are_wheels(value: Any) -> bool:
@@ -125,6 +130,8 @@ def at_the_wheel(robot: Observer, by: str = BY, answer_s: float = ANSWER_S) -> I
 
 
 def _driven(test: Callable[[Observer, Driver], CheckResult]) -> Callable[[Observer], CheckResult]:
+    """Return a check that runs ``test`` with a driver that may drive."""
+
     def run(robot: Observer) -> CheckResult:
         with at_the_wheel(robot) as driver:
             return test(robot, driver)
@@ -133,6 +140,7 @@ def _driven(test: Callable[[Observer, Driver], CheckResult]) -> Callable[[Observ
 
 
 def _rest(robot: Observer, began: float, last: float, limit_s: float, what: str = "the last command") -> CheckResult:
+    """Wait until the robot must rest and its reports have come; then check that, as :func:`rested` does."""
     robot.look(limit_s + LATE_S)
     return rested(robot, began, last, limit_s, what)
 
@@ -179,17 +187,21 @@ def _zero(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _steering(robot: Observer, driver: Driver) -> CheckResult:
+    """Check the signs of the left and the right wheel for three commands."""
     ways: tuple[tuple[dict[str, Any], tuple[int, int]], ...] = (
         ({"z": 0, "x": SPEED}, (1, -1)),
         ({"z": SPEED}, (1, 1)),
         ({"z": -SPEED, "wrapped": True}, (-1, -1)),
     )
     for fields, signs in ways:
-        wheels = _moves(robot, driver.drive(DRIVES_S / 2, **fields)[0])
+        began, _ = driver.drive(DRIVES_S / 2, **fields)
+        wheels = _moving_wheels(robot, began)
         if wheels is None:
             return _NOT_SHOWN
         if [speed * sign > 0 for speed, sign in zip(wheels, signs, strict=False)] != [True, True]:
-            sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}" + " within value" * ("wrapped" in fields)
+            sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}"
+            if "wrapped" in fields:
+                sent += " within value"
             return failed(f"at {sent} its wheels do {wheels}", "left is z + x, right is z - x, also within value")
     return ok("x to the right, z ahead")
 
@@ -197,12 +209,12 @@ def _steering(robot: Observer, driver: Driver) -> CheckResult:
 def _stop_moving(robot: Observer, driver: Driver) -> CheckResult:
     """Check that commands after a stop move nothing, also those after a pause."""
     began, _ = driver.drive()
-    at = time.monotonic()
+    stopped_at = time.monotonic()
     stop(robot, secrets.token_hex(8))
     driver.drive()
     driver.send()
     driver.drive(DRIVES_S / 2)
-    outcome = _rest(robot, began, at, 0.25, "the stop")
+    outcome = _rest(robot, began, stopped_at, 0.25, "the stop")
     return outcome if freed(robot) else failed("a reset does not end the stop", END_IT)
 
 
@@ -232,8 +244,9 @@ def _not_a_number(robot: Observer, _driver: Driver) -> CheckResult:
 
 
 def _clamped(robot: Observer, driver: Driver) -> CheckResult:
-    wheels = _moves(robot, driver.drive(DRIVES_S / 2, z=9, x=-9)[0])
-    if wheels is None or not _shown(robot):
+    began, _ = driver.drive(DRIVES_S / 2, z=9, x=-9)
+    wheels = _moving_wheels(robot, began)
+    if wheels is None or not _wheel_reports(robot):  # odometry shows no wheel that is too fast
         return _NOT_SHOWN
     if not wheels:
         return failed("x -9, z 9 does not move it", "clamp both axes to -1..1, and obey")
@@ -256,10 +269,10 @@ def _foreign_key(robot: Observer, driver: Driver) -> CheckResult:
 def _control_passes(robot: Observer, driver: Driver) -> CheckResult:
     began, _ = driver.drive()
     key, second = driver.key, Driver(robot)
-    at = second.takes()
+    taken_at = second.takes()
     robot.answers(lambda: second.holds)
     driver.drive(key=key)
-    outcome = _rest(robot, began, at, 0.25, "another took control")
+    outcome = _rest(robot, began, taken_at, 0.25, "another took control")
     second.leaves()
     return outcome
 
@@ -276,7 +289,9 @@ def _foreign_account(robot: Observer, driver: Driver) -> CheckResult:
     delivered = [robot.send_as(account, c.DRIVE, command) for account in (_OTHER_ACCOUNT, "")]
     fix = "a key counts with the account that asked for it"
     outcome = _moved(robot, began, "it moves by a key that another sends", fix)
-    return outcome if all(delivered) or outcome.state is State.FAILED else skipped(UNSEEN)
+    if outcome.state is not State.FAILED and not all(delivered):
+        return skipped(UNSEEN)
+    return outcome
 
 
 _MOVES = (drives, free, commanded)

@@ -85,6 +85,7 @@ def make(places: Places, file: Path | None = None) -> Report:
 
 
 def _here(places: Places, file: Path) -> Here:
+    """Read the config, with the state directory that systemd names for an installed robot."""
     env = {"STATE_DIRECTORY": str(places.state)} if file == places.config and places.state.exists() else {}
     try:
         return Here(places, file, load(file, {**os.environ, **env}))
@@ -109,7 +110,10 @@ def _config(here: Here) -> str:
     """Return the config file and the config with its defaults, with secrets masked."""
     written = masked(plain(decode(read_text(here.file), here.file.name), Notes()))
     config: dict[str, Any] = {"file": str(here.file), "written": written}
-    config |= {"problems": here.problem.splitlines()} if here.config is None else {"resolved": resolved(here.config)}
+    if here.config is None:
+        config["problems"] = here.problem.splitlines()
+    else:
+        config["resolved"] = resolved(here.config)
     return json.dumps(config, indent=1, ensure_ascii=False)
 
 
@@ -127,13 +131,13 @@ def _status(here: Here) -> str:
     if here.config is None:
         raise PebbleError("the config cannot be read")
     user, file = user_of(here.config.run_dir()), str(here.file.absolute())
-    who: dict[str, Any] = {}
-    if user is not None:  # who sees the variables of such a process
+    options: dict[str, Any] = {}
+    if user is not None:  # this user sees the variables of the process: it gets only these
         env = {name: os.environ[name] for name in (*_VARIABLES, *here.config.password_variables) if name in os.environ}
-        who = {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": [], "env": env}
+        options = {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": [], "env": env}
     topics = f"{here.config.base}/{OUTGOING}/#"
     echo = ("-Pm", "pebble.cli", "topic", "echo", topics, "--seconds", str(_STATES_S), "--config", file)
-    return output_of(sys.executable, *echo, seconds=_PROGRAM_S, **who)
+    return output_of(sys.executable, *echo, seconds=_PROGRAM_S, **options)
 
 
 def _journal(here: Here) -> str:
@@ -146,7 +150,8 @@ def _journal(here: Here) -> str:
 def _versions(here: Here) -> str:
     lines = [f"pebble {__version__}", f"python {sys.version}", f"{sys.executable}", " ".join(platform.uname())]
     release = here.places.root / "etc/os-release"
-    lines += release.read_text(encoding="utf-8", errors="replace").splitlines() if release.is_file() else []
+    if release.is_file():
+        lines += release.read_text(encoding="utf-8", errors="replace").splitlines()
     installed = {package.name: package.version for package in metadata.distributions()}
     return "\n".join([*lines, *(f"{name} {version}" for name, version in sorted(installed.items()))]) + "\n"
 

@@ -62,7 +62,7 @@ class Secrets(NamedTuple):
 def secrets_of(places: Places, config: Config | None, more: Collection[Path] = ()) -> Secrets:
     """Find the secrets on this machine. ``more``: further files and folders to search."""
     folders = [path for pattern in _PLACES for path in sorted(places.root.glob(pattern))]
-    values: list[tuple[str, str]] = []  # and where each is written
+    values: list[tuple[str, str]] = []  # the secrets, each with the place where it is written
     if config is not None:
         folders += [config.folder, config.state_dir(), *filter(Path.is_file, values_of(config, Path))]
         values += [(str(secret), "the config") for secret in values_of(config, Secret)]
@@ -84,8 +84,8 @@ def values_in(name: str, raw: bytes) -> Iterator[str]:
     """Yield the secrets in a file, found by the file's name and by its keys."""
     text = raw.decode(errors="replace")
     yield from _logins(text)
-    keys = _keys(text)
-    yield from (line.strip() for key in keys for line in key.splitlines() if len(line.strip()) >= 4 * _SHORTEST)
+    for key in _keys(text):
+        yield from _long_ones(key.splitlines())
     if name.endswith(_PROGRAMS):
         return
     for match in _settings(text):
@@ -95,7 +95,15 @@ def values_in(name: str, raw: bytes) -> Iterator[str]:
     if _names_secrets(name) and "-----BEGIN" not in text and not text.lstrip().startswith("{"):
         for line in filter(None, map(str.strip, text.splitlines())):
             _, colon, hashed = line.partition(":$")
-            yield from (part for part in hashed.split("$") if len(part) >= 4 * _SHORTEST) if colon else (line,)
+            if colon:  # USER:$7$ITERATIONS$SALT$HASH, of mosquitto
+                yield from _long_ones(hashed.split("$"))
+            else:
+                yield line
+
+
+def _long_ones(parts: Iterable[str]) -> Iterator[str]:
+    """Yield the parts of a key or hash that are so long that no other text contains them."""
+    return (part.strip() for part in parts if len(part.strip()) >= 4 * _SHORTEST)
 
 
 def _decoded(value: str) -> str:

@@ -21,7 +21,7 @@ from pebble.runtime.notes import OFTEN
 
 _IN_A_ROW = 10  # heartbeats in a row
 _LONGEST_GAP = 2.5  # times the interval that its config has
-_JUDGED_S = 6.0  # motor owners repeat every 5 s what the others must receive of them
+_JUDGED_S = 6.0  # for the judgement whether motors obey: motor owners repeat every 5 s what it is based on
 _VOLTS_S = 6.0  # boards report it every five seconds
 _LOW_S = 2 * _VOLTS_S  # one reading is no empty battery
 _LEAST_CELL_V = 3.4  # of a lithium cell: below, a robot has minutes
@@ -65,13 +65,15 @@ def processes(robot: RobotUnderTest) -> CheckResult:
     if not robot.wait(lambda: _unready(robot) == [], robot.patience_s):
         return failed(", ".join(_unready(robot)), _LOG)
     services = section_of(robot.own_side.status, "services")
-    if often := [name for name in services if _often(section_of(services, name), "restarts")]:
-        return failed(f"{', '.join(often)} ended {OFTEN} times within a minute, or more often", _LOG)
+    restarting = [name for name in services if _is_often(section_of(services, name), "restarts")]
+    if restarting:
+        return failed(f"{', '.join(restarting)} ended {OFTEN} times within a minute, or more often", _LOG)
     return ok(f"{len(_states(robot))} are ready")
 
 
-def _often(section: dict[str, object], what: str) -> bool:
-    count = section.get(f"{what}_per_minute")
+def _is_often(section: dict[str, object], event: str) -> bool:
+    """True if a section of the status counts more events a minute than are normal."""
+    count = section.get(f"{event}_per_minute")
     return isinstance(count, int) and count >= OFTEN
 
 
@@ -154,12 +156,14 @@ def boards(robot: RobotUnderTest) -> CheckResult:
         why = mcu.get("why") or _MCU_STATES.get(str(mcu.get("state")), "its state is not known")
         return failed(f"{names[0]} ({lines[names[0]]}): {why}", f"plug it in, then: ls -l /dev/serial/by-id/; {_LOG}")
     robot.wait(lambda: robot.view.driveable is None or robot.view.driveable.state != "unknown", _JUDGED_S)
-    if often := [f"{name}: {mcu.get('why')}" for name in lines if _often(mcu := _mcu(robot, name), "starts")]:
-        return failed(", ".join(often), "look at its supply while motors start, and at its cable")
+    mcus = {name: _mcu(robot, name) for name in lines}
+    restarting = [f"{name}: {mcu.get('why')}" for name, mcu in mcus.items() if _is_often(mcu, "starts")]
+    if restarting:
+        return failed(", ".join(restarting), "look at its supply while motors start, and at its cable")
     drives = robot.view.driveable
     if drives is not None and drives.state == "no":
         return failed(f"its motors are not reached: {drives.why}", _LOG)
-    ages_ms = {name: _mcu(robot, name).get("heard_ms") for name in lines}
+    ages_ms = {name: mcu.get("heard_ms") for name, mcu in mcus.items()}
     unheard = [name for name, age_ms in ages_ms.items() if not isinstance(age_ms, int) or age_ms >= 10_000]
     if unheard:
         return skipped(f"{', '.join(unheard)} sends nothing at rest, as some boards do")
@@ -172,6 +176,7 @@ _MCU_STATES = {"silent": "its board has stopped sending", "absent": "there is no
 
 
 def _mcu(robot: RobotUnderTest, name: str) -> dict[str, object]:
+    """Return the part of the newest status about the board of a serial line."""
     return section_of(section_of(robot.own_side.status, "mcu"), name)
 
 
@@ -181,8 +186,13 @@ def battery(robot: RobotUnderTest) -> CheckResult:
     volts, cells = robot.view.volts, robot.config.robot.battery_cells
     if volts is None:
         return skipped("it reports no voltage")
+    least = (cells or 0) * _LEAST_CELL_V
+
+    def is_enough() -> bool:
+        return (robot.view.volts or 0.0) >= least
+
     charging = ", on the charger" if robot.view.charging else ""
-    if cells and not charging and not robot.wait(lambda: (robot.view.volts or 0.0) >= cells * _LEAST_CELL_V, _LOW_S):
+    if cells and not charging and not robot.wait(is_enough, _LOW_S):
         volts = robot.view.volts or 0.0
         return failed(f"{volts:.2f} V, {volts / cells:.2f} V a cell: it is nearly empty", "charge it")
     return ok(f"{robot.view.volts:.2f} V{charging}")

@@ -39,7 +39,11 @@ def unit(robot: RobotUnderTest) -> CheckResult:
     shown = this_machine.printed("systemctl", "show", UNIT, *(f"--property={name}" for name in _PROPERTIES))
     if not shown:
         return failed("systemd does not answer", "systemctl status")
-    return unit_of(dict(line.partition("=")[::2] for line in shown.splitlines()))
+    properties = {}
+    for line in shown.splitlines():
+        name, _, value = line.partition("=")
+        properties[name] = value
+    return unit_of(properties)
 
 
 def unit_of(properties: Mapping[str, str]) -> CheckResult:
@@ -48,9 +52,10 @@ def unit_of(properties: Mapping[str, str]) -> CheckResult:
         return skipped(f"{UNIT} is not installed")
     state, sub, restarts = (properties.get(name, "?") for name in ("ActiveState", "SubState", "NRestarts"))
     if state != "active":
-        why = properties.get("Result", "")
-        text = f"{UNIT} is {state} ({sub}{', ' + why if why not in ('', 'success') else ''})"
-        return failed(text, "sudo systemctl restart pebble; journalctl -u pebble -n 50")
+        result = properties.get("Result", "")
+        why = "" if result in ("", "success") else f", {result}"
+        fix = "sudo systemctl restart pebble; journalctl -u pebble -n 50"
+        return failed(f"{UNIT} is {state} ({sub}{why})", fix)
     if (enabled := properties.get("UnitFileState", "")) not in ("enabled", "static"):
         return failed(f"{UNIT} runs, but does not start with the machine: {enabled}", "sudo systemctl enable pebble")
     return ok(f"{UNIT} runs" + (f"; restarted {restarts} times" if restarts not in ("0", "?") else ""))

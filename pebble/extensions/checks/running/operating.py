@@ -21,7 +21,7 @@ _LOG = "pebble doctor CONFIG; journalctl -u pebble -n 50"
 _PROGRAMS: dict[Medium, str] = {"video": "camera_publisher", "audio": "audio_publisher"}
 _CONFIRMED_S = 5.0  # a stop is repeated every half second
 _WHY = "selftest"
-_NO_BOOT, _NO_COUNT = "selftest", 1_000_000  # of no start of a motor owner, and of no stop
+_NO_BOOT, _NO_COUNT = "selftest", 1_000_000  # no motor owner has had this boot id, or so many stops
 _SPEED, _DRIVES_S = 0.2, 0.3
 _CONTROL_S = 3.0
 _WHEEL_FIXES = {
@@ -54,7 +54,10 @@ def received(robot: RobotUnderTest, medium: Medium, device: str) -> CheckResult:
         return failed(str(error), _LOG)
     finally:
         receiver.close()
-    size = "" if receiver.newest is None else "{1}×{0}, ".format(*receiver.newest.picture.shape[:2])
+    size = ""
+    if receiver.newest is not None:
+        height, width = receiver.newest.picture.shape[:2]
+        size = f"{width}×{height}, "
     return ok(f"{size}{receiver.encoding[medium]}, after {took_s:.1f} s")
 
 
@@ -77,7 +80,7 @@ def stop(robot: RobotUnderTest) -> CheckResult:
     try:
         robot.wait(confirmed, _CONFIRMED_S)
         took_s, why = stopped.confirmed_s, stopped.why
-    finally:  # also when this is interrupted: what it has stopped, it ends
+    finally:  # also if this is interrupted: the robot must not stay stopped by a test
         why_stopped = _end(robot, name, before)
     if why_stopped:
         return failed(why_stopped, "pebble estop reset CONFIG")
@@ -89,7 +92,7 @@ def stop(robot: RobotUnderTest) -> CheckResult:
 
 
 def _end(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> str:
-    """End this stop; return why the robot stays stopped, or an empty text."""
+    """End this stop, unless another one was sent since the names in ``before``; return why the robot stays stopped."""
     view = robot.view
     robot.wait(lambda: all(name in state.recent for state in view.estop.states.values()), 1.0)
     if not view.latched:
@@ -129,7 +132,8 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
         beside.publish(topic, payload, qos=QoS.DELIVERED, retain=True, remember=False)
         robot.wait(lambda: beside.outgoing.waiting == 0, robot.patience_s)
 
-    with operators.beside("selftest") as (beside, _):  # it puts no name into the topic: nothing with one is retained
+    # This connection puts no account into the topic, as nothing is retained on a topic with one.
+    with operators.beside("selftest") as (beside, _):
         try:
             leave(codec.encode(ESTOP_RESET, EstopReset(boot=_NO_BOOT, count=0, by=_WHY)))
             operators.send(ESTOP_RESET, EstopReset(boot=state.boot, count=state.count + _NO_COUNT, by=_WHY))

@@ -121,12 +121,7 @@ class RobotUnderTest:
 
     def wait(self, condition: Callable[[], object], seconds: float) -> bool:
         """Read messages of both sides until ``condition`` holds; return False if it does not within ``seconds``."""
-
-        def holds() -> object:
-            self.read()
-            return condition()
-
-        return wait_for(holds, seconds)
+        return wait_for(condition, seconds, self.read)
 
 
 def user_of(folder: Path) -> pwd.struct_passwd | None:

@@ -31,10 +31,11 @@ def audit(
     newer, older = files(load(config))
     try:
         with as_owner(newer.parent):
-            lines = [line for file in (older, newer) if file.exists() for line in read_plain(file).splitlines() if line]
+            content = b"\n".join(read_plain(file) for file in (older, newer) if file.exists())
     except OSError as error:
         raise PebbleError(f"{error.filename}: {error.strerror}; run it as the robot's user") from None
-    rows = [row for line in lines[-limit:] if (row := _row(line))]
+    lines = [line for line in content.splitlines() if line]
+    rows = [row for row in map(_row, lines[-limit:]) if row]
     print_table(("time", "what", "who", "from", ""), rows)
     typer.echo(f"{newer}: {len(lines):,} rows" if lines else "nothing yet: the bridge of this robot writes it")
     if unread := min(limit, len(lines)) - len(rows):

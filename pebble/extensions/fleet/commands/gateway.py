@@ -13,10 +13,10 @@ from pebble.runtime.signals import EndSignal
 
 log = logging.getLogger(__name__)
 
-FileArgument = Annotated[Path, typer.Argument(help="The gateway's file, in JSON.", metavar="FILE", show_default=False)]
 
-
-def gateway(file: FileArgument) -> int:
+def gateway(
+    file: Annotated[Path, typer.Argument(help="The gateway's file, in JSON.", metavar="FILE", show_default=False)],
+) -> int:
     """Carry robots of a Zenoh hub, or of a LAN's broker, to an MQTT broker and back; Ctrl-C ends it.
 
     Operators at the broker see, drive and stop them as if they were there. There

@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 from msgspec.structs import replace
@@ -21,6 +21,7 @@ from pebble.extensions.fleet.roles import Account, ProgramRole, Role
 from pebble.extensions.operator.client.page_packages import require_packages
 from pebble.extensions.operator.commands.options import host_of, split_names
 from pebble.runtime.as_owner import as_before, as_owner
+from pebble.transports.hosts import HostPort
 
 _HELP = """The accounts of a broker: robots, people and page servers, and what each may do.
 
@@ -128,7 +129,8 @@ def add(
         pebble fleet add goob-lan --role neighbour --base pebble/robots/goob
     """
     role_names = tuple(dict.fromkeys(split_names(roles)))
-    bases = tuple(base or ((f"pebble/robots/{name}",) if role_names == (ProgramRole.ROBOT,) else ()))
+    usual_bases = (f"pebble/robots/{name}",) if role_names == (ProgramRole.ROBOT,) else ()
+    bases = tuple(base) if base else usual_bases
     database = "" if people is None else str(people.absolute())
     account = Account(roles=role_names, bases=bases, plain=plain, people=database)
     with _changing(folder_) as (place, fleet):
@@ -182,7 +184,8 @@ def remove(name: _Name, folder_: _Folder = None) -> int:
     with _changing(folder_) as (place, fleet):
         account = _account(place, fleet, name)
         after = fleet.without(name)
-        unfinished = list(_remove_from_pages(fleet, name)) if not set(account.roles) & set(ProgramRole) else []
+        is_person = not set(account.roles) & set(ProgramRole)
+        unfinished = list(_remove_from_pages(fleet, name)) if is_person else []
         unfinished += applying.copies(Path(_shown(place)), after)
         try:
             how = applying.apply(place, after)
@@ -238,9 +241,11 @@ def certificate(
         is_hub = ProgramRole.HUB in account.roles
         if is_hub and not hosts:
             raise FleetError(f"{name} is a hub: name where others reach it, `pebble fleet certificate {name} HOST`")
-        of_brokers = certificates.hosts_of(host for server in fleet.brokers for host in applying.names_of(server))
+        taken = set(fleet.accounts)
+        if not is_hub:  # it may run on a broker's machine
+            taken.update(certificates.hosts_of(host for server in fleet.brokers for host in applying.names_of(server)))
         host_names = set(certificates.hosts_of(hosts)) if hosts else set[str]()
-        if conflicts := host_names & {*fleet.accounts, *(() if is_hub else of_brokers)} - {name}:
+        if conflicts := host_names & (taken - {name}):
             raise FleetError(f"{name} cannot be {min(conflicts)}: that is a broker of this fleet, or another account")
         files = certificates.of_account(place, name, hosts or ())
         _print_certificate(place, fleet, name, files)
@@ -252,9 +257,8 @@ def list_(folder_: _Folder = None) -> int:
     place = _place(folder_)
     with as_owner(place):
         fleet = folder.load(place)
-    typer.echo(
-        f"{_shown(place)}: level {fleet.level}, broker " + ", ".join(f"{s.host}:{s.port}" for s in fleet.brokers)
-    )
+    brokers = ", ".join(f"{server.host}:{server.port}" for server in fleet.brokers)
+    typer.echo(f"{_shown(place)}: level {fleet.level}, broker {brokers}")
     for name, account in fleet.accounts.items():
         what = [", ".join(account.roles), *account.bases, *(["plain"] if account.plain or fleet.plain else [])]
         typer.echo(f"{name:<32}  {'  '.join(what)}")
@@ -301,18 +305,8 @@ def check_(folder_: _Folder = None) -> int:
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(help=_HELP, rich_markup_mode=None)
-    commands: dict[str, Any] = {"init": init, "add": add, "role": role_, "password": password, "remove": remove}
-    commands |= {
-        "list": list_,
-        "apply": apply_,
-        "check": check_,
-        "zenoh": zenoh,
-        "certificate": certificate,
-        "lan": lan.lan,
-        "up": lan.up,
-    }
-    for name, command in commands.items():
-        group.command(name)(command)
+    for command in (init, add, role_, password, remove, list_, apply_, check_, zenoh, certificate, lan.lan, lan.up):
+        group.command(command.__name__.rstrip("_"))(command)
     app.add_typer(group, name="fleet")
 
 
@@ -385,7 +379,7 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
         typer.echo(f"For its config, which no other user may read, with a copy of {ca} beside it:")
         typer.echo(json.dumps(pieces.of_broker(fleet, name, secret, board=board), indent=2))
         return
-    url = f"mqtts://{name}@{pieces.host_and_port(fleet.brokers[0])}"
+    url = f"mqtts://{name}@{HostPort(fleet.brokers[0].host, fleet.brokers[0].port)}"
     if ProgramRole.PAGE in account.roles:
         typer.echo(f"    pebble web --url {url} --ca-cert {ca} --password-file FILE")
     elif ProgramRole.HUB in account.roles:

@@ -5,10 +5,10 @@ from typing import Annotated
 
 import typer
 
-FileArgument = Annotated[Path, typer.Argument(help="The hub's file, in JSON.", metavar="FILE", show_default=False)]
 
-
-def hub(file: FileArgument) -> int:
+def hub(
+    file: Annotated[Path, typer.Argument(help="The hub's file, in JSON.", metavar="FILE", show_default=False)],
+) -> int:
     """Run a Zenoh hub, to which robots connect; Ctrl-C ends it.
 
     FILE says where it listens. An example:
@@ -22,13 +22,13 @@ def hub(file: FileArgument) -> int:
     \b
         pebble fleet hub hub1.json
     """
-    from pebble.extensions.fleet.hub_file import load_hub, settings_of
+    from pebble.extensions.fleet.hub_file import load_hub
     from pebble.runtime.as_owner import require_own
     from pebble.runtime.hub import run_hub  # of Linux only
     from pebble.runtime.parent import set_up_logging
     from pebble.runtime.signals import EndSignal
 
-    settings = settings_of(*load_hub(file))
+    settings = load_hub(file)
     if settings.journal is not None:
         require_own(settings.journal.parent)
     set_up_logging("INFO")

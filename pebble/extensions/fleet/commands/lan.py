@@ -101,7 +101,7 @@ def up(folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the fl
     require_own(place)
     if not (place / HUB_FILE).is_file():
         raise FleetError(f"{folder_ / HUB_FILE} is missing: name a folder that `pebble fleet lan` has made")
-    commands = {name: command for name, command in _commands(place).items() if command}
+    commands = _commands(place)
     if (lock := FileLock.take(place / _LOCK)) is None:
         raise FleetError(f"{folder_} runs already: another `pebble fleet up` holds {folder_ / _LOCK}")
     ends = EndSignal()
@@ -120,15 +120,15 @@ def up(folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the fl
 
 def _commands(place: Path) -> dict[str, list[str]]:
     """Return the programs to run for this LAN, by name. Raises PebbleError."""
-    pebble = [sys.executable, "-Pm", "pebble"]  # nothing of the folder that we are in
+    pebble = [sys.executable, "-Pm", "pebble"]  # -P: imports nothing from the current folder
     hub = {"hub": [*pebble, "fleet", "hub", str(place / HUB_FILE)]}
     if not (place / GATEWAY_FILE).exists():
         return hub
     mosquitto = mosquitto_path()
     if mosquitto is None:
         raise PebbleError("mosquitto is not installed: sudo apt install mosquitto")
-    broker = [] if applying.pid_of(place) else [mosquitto, "-c", str(place / CONF)]
-    return {"broker": broker, **hub, "gateway": [*pebble, "fleet", "gateway", str(place / GATEWAY_FILE)]}
+    broker = {} if applying.pid_of(place) else {"broker": [mosquitto, "-c", str(place / CONF)]}
+    return broker | hub | {"gateway": [*pebble, "fleet", "gateway", str(place / GATEWAY_FILE)]}
 
 
 @contextmanager
@@ -155,9 +155,10 @@ def _accounts(fleet: Fleet, robots: list[str], boards: list[str]) -> Fleet:
             raise FleetError(f"{name} is named {times} times")
     wanted = [(_neighbour(name), ProgramRole.NEIGHBOUR, [base]) for name, base in bases.items()]
     wanted += [(name, ProgramRole.ROBOT, [bases[name]]) for name in boards]
-    wanted += [(GATEWAY, ProgramRole.BOARDS, [bases[name] for name in boards])] if boards else []
-    for name, role, of_it in wanted:
-        account = Account(roles=(role,), bases=tuple(of_it))
+    if boards:
+        wanted.append((GATEWAY, ProgramRole.BOARDS, [bases[name] for name in boards]))
+    for name, role, account_bases in wanted:
+        account = Account(roles=(role,), bases=tuple(account_bases))
         if why := folder.refused(fleet, name, account):
             raise FleetError(why)
         fleet = fleet.with_account(name, account)
@@ -165,6 +166,7 @@ def _accounts(fleet: Fleet, robots: list[str], boards: list[str]) -> Fleet:
 
 
 def _write_boards(place: Path, fleet: Fleet, boards: list[str], passwords: dict[str, str]) -> None:
+    """Write the boards' configs, and the file and password of their gateway."""
     for name in boards:
         piece = pieces.of_broker(fleet, name, passwords[name], board=True)
         piece["robot"]["platform"] = "esp32"
@@ -177,14 +179,13 @@ def _write_boards(place: Path, fleet: Fleet, boards: list[str], passwords: dict[
 
 
 def _write_robot(place: Path, fleet: Fleet, name: str, others: list[str]) -> None:
+    """Write a robot's folder: its config, in which it listens to the ``others``, and its certificate."""
     piece = pieces.of_certificate(fleet, _neighbour(name))
     section = piece["services"]["neighbours"]
     section |= {"shares": list(_SHARED), "listens": {other: list(_SHARED) for other in others}}
     robot_folder = _folder_of(place, name)
-    _write(
-        robot_folder / f"{name}.json",
-        {"robot": piece["robot"], "transport": {"kind": "zenoh"}, "services": piece["services"]},
-    )
+    config = {"robot": piece["robot"], "transport": {"kind": "zenoh"}, "services": piece["services"]}
+    _write(robot_folder / f"{name}.json", config)
     for suffix, mode in ((".pem", 0o644), (".key", 0o600)):
         file = place / certificates.ACCOUNTS / f"{_neighbour(name)}{suffix}"
         write(robot_folder / file.name, read_plain(file), mode, FleetError)

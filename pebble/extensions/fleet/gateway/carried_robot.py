@@ -7,19 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import islice
 
-from pebble.contract import (
-    AUDIO,
-    AUDIO_CONTROL,
-    CAMERA,
-    INCOMING,
-    MQTT_AUDIO,
-    MQTT_VIDEO,
-    OUTGOING,
-    VIDEO_CONTROL,
-    Channel,
-    Kind,
-    codec,
-)
+from pebble import contract as c
+from pebble.contract import INCOMING, OUTGOING, Channel, Kind, codec
 from pebble.contract.names import BY, stop_topic, without_name
 from pebble.errors import PayloadError
 from pebble.forwarding.cycles import PROBE_PERIOD_S
@@ -39,8 +28,8 @@ GATEWAY = Rules(
     media=True,
     stored=False,
 )
-#: What the robot sends of each medium, by what allows and what requests it.
-_MEDIA = ((CAMERA, MQTT_VIDEO, VIDEO_CONTROL), (AUDIO, MQTT_AUDIO, AUDIO_CONTROL))
+#: Of pictures and of sound: their channel, the flag that allows them, and what requests them.
+_MEDIA = ((c.CAMERA, c.MQTT_VIDEO, c.VIDEO_CONTROL), (c.AUDIO, c.MQTT_AUDIO, c.AUDIO_CONTROL))
 LARGEST = 1024 * 1024  # bytes of a message; the brokers of `pebble fleet` take no more
 
 
@@ -48,6 +37,7 @@ class NamedSubjects(Subjects):
     """A robot's subjects without renamed topics. Topics with an account's name are forwarded unchanged."""
 
     def _find(self, topic: str) -> Subject | None:
+        """Return the subject of a topic; behind an account's name it is the one of the same topic without a name."""
         if not topic.startswith(f"{self._base}/{INCOMING}/{BY}/"):
             return super()._find(topic)
         named = without_name(topic)
@@ -64,11 +54,12 @@ class Beginning:
     All robots share a connection that is almost never idle, so pings cannot tell the age of a command.
     """
 
-    LONG_S, REST_S = 0.5, 0.25  # what moves may wait so long; so long after it what had waited is still being read
+    LONG_S = 0.5  # what moves a robot may wait so long
+    REST_S = 0.25  # after the start, what had waited is still being read for so long
 
     def __init__(self) -> None:
-        self._began: float | None = None  # None: none begins
-        self._slow, self._until = 0.0, float("-inf")  # the newest one that took long: since, until
+        self._began: float | None = None  # None: no forwarding is being started
+        self._slow_since, self._slow_until = 0.0, float("-inf")  # the newest start that took long
 
     def __enter__(self) -> None:
         self._began = clock.since_boot()
@@ -76,20 +67,20 @@ class Beginning:
     def __exit__(self, *_: object) -> None:
         now, began = clock.since_boot(), self._began
         if began is not None and now - began > self.LONG_S:
-            self._slow, self._until = began, now + self.REST_S
+            self._slow_since, self._slow_until = began, now + self.REST_S
         self._began = None
 
     def aged(self, message: Message) -> Message:
         """Return ``message`` with the time since which it may have waited at the broker. Called for each message."""
         began = self._began
-        if began is None and self._until == float("-inf"):
+        if began is None and self._slow_until == float("-inf"):
             return message
-        now, since = clock.since_boot(), None
+        now = clock.since_boot()
         if began is not None and now - began > self.LONG_S:
             since = began
-        elif now <= self._until:
-            since = self._slow
-        if since is None:
+        elif now <= self._slow_until:
+            since = self._slow_since
+        else:
             return message
         return Message(message.topic, message.payload, message.qos, message.retain, message.retain_requested, since)
 
@@ -106,6 +97,7 @@ def begin(robots: Sequence["CarriedRobot"], hub: Transport, broker: Transport) -
 
 
 def _subscribe(robots: Sequence["CarriedRobot"], side: Side, transport: Transport, *below: str) -> None:
+    """Subscribe on one side to filters ``below`` the base of each robot, and wait for the retained messages."""
     handlers: dict[str, Handler] = {}
     for robot in robots:
         handlers |= robot.subscribing(side, *below)
@@ -113,7 +105,7 @@ def _subscribe(robots: Sequence["CarriedRobot"], side: Side, transport: Transpor
     if side is Side.REMOTE:
         transport.ask([flag for robot in robots for flag in robot.subjects.flags])
     for robot in robots:
-        robot.subscribed(side, islice(subscriptions, len(below)))
+        robot.subscribed(side, islice(subscriptions, len(below)))  # the next ones, as in ``handlers``
 
 
 class CarriedRobot:
@@ -179,6 +171,7 @@ class CarriedRobot:
     # -- the transports' threads
 
     def receive(self, side: Side, message: Message) -> None:
+        """Forward a message, unless it is too large, a medium that is not wanted, or a stop that comes another way."""
         subject = self.subjects[message.topic]
         if subject is None:
             return

@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.1
 MAX_ROBOTS = 1000  # that one gateway carries; further ones with a warning
-SILENT_S = 30.0  # without a heartbeat a robot is carried so long: three of the slowest pace
+SILENT_S = 30.0  # without a heartbeat a robot is carried so long: three periods of the slowest heartbeats
 #: Robots that begin in one turn: they wait together for hub and broker. What moves is taken for old while a turn lasts
 #: longer than Beginning.LONG_S.
 TOGETHER = 8
@@ -77,9 +77,9 @@ class Gateway:
         self._hub, self._broker, self._presence, self._stops = hub, broker, presence, stops
         self._others = OtherGateways(secrets.token_hex(4))
         self._listens_since = float("inf")  # for other gateways
-        self._told_at = float("-inf")  # the newest heartbeat
-        self._heard: dict[str, float] = {}  # robots, and when
-        self._first: dict[str, bytes] = {}  # heartbeat of a robot that may be retained
+        self._published_at = float("-inf")  # the newest heartbeat of this gateway
+        self._heard: dict[str, float] = {}  # by robot: when its newest heartbeat came
+        self._first: dict[str, bytes] = {}  # by robot: its first heartbeat, which may be a retained one
         self._carried: dict[str, CarriedRobot] = {}
         self._has_begun = False
         self._beginning = Beginning()
@@ -143,22 +143,20 @@ class Gateway:
             self._lost.clear()
             self._end(self.carries)
         now = self._clock()
-        for base in [base for base, at in list(self._heard.items()) if now - at > SILENT_S]:
-            self._heard.pop(base, None)
+        for base, heard_at in list(self._heard.items()):
+            if now - heard_at > SILENT_S:
+                self._heard.pop(base, None)
         self._end(self.carries - self._heard.keys())
         if self._is_connected and now - self._listens_since >= FRESH_S:
             self._leave_to_others(now)
             self._begin(now)
         for robot in self._carried.values():
             robot.tick(now)
-        if now - self._told_at >= HEARTBEAT_S and self._presence.state is State.CONNECTED:
-            self._told_at = now
-            heartbeat = GatewayHeartbeat(
-                t=int(time.time() * 1000), run=self._others.run, robots=tuple(sorted(self._carried))
-            )
-            self._presence.publish(
-                will(self._name).topic, _encode(heartbeat), qos=QoS.DELIVERED, retain=True, remember=False
-            )
+        if now - self._published_at >= HEARTBEAT_S and self._presence.state is State.CONNECTED:
+            self._published_at = now
+            topic, robots = will(self._name).topic, tuple(sorted(self._carried))
+            heartbeat = GatewayHeartbeat(t=int(time.time() * 1000), run=self._others.run, robots=robots)
+            self._presence.publish(topic, _encode(heartbeat), qos=QoS.DELIVERED, retain=True, remember=False)
 
     @property
     def _is_connected(self) -> bool:
@@ -166,6 +164,7 @@ class Gateway:
         return all(transport.state is State.CONNECTED for transport in (self._hub, self._broker, self._presence))
 
     def _leave_to_others(self, now: float) -> None:
+        """End the robots that another gateway carries; at the start, raise SecondGatewayError if there is one."""
         for base in list(self._heard):
             other = self._others.carrier(base, now, carried=base in self._carried)
             if not other:
@@ -179,6 +178,7 @@ class Gateway:
             self._end(self.carries & {base})
 
     def _begin(self, now: float) -> None:
+        """Begin to carry robots that were heard and that no gateway carries, at most TOGETHER of them."""
         waiting = [
             base
             for base in list(self._heard)
@@ -206,7 +206,7 @@ class Gateway:
             self._carried.pop(base).end()
             log.info("carries %s no more", base)
 
-    # -- the transports' threads
+    # -- on the transports' threads; the last two are rules of pebble.transports.base.TopicPolicy
 
     def _on_state(self, state: State) -> None:
         if state is not State.CONNECTED:
@@ -230,7 +230,7 @@ class Gateway:
             self._quiet_log.warning("many", "the hub has more than %d robots: give it accounts", MAX_ROBOTS)
 
     def _differs(self, base: str, heartbeat: bytes) -> bool:
-        """True if the robot's last heartbeat was a different one.
+        """True if the robot's first heartbeat was a different one, so that this one is live.
 
         Needed where a transport cannot tell live messages from retained ones.
         """
@@ -266,16 +266,16 @@ class Gateway:
         """True if stops arrive on their own connection."""
         return self._stops.state is State.CONNECTED and not self._stops.not_received
 
-    def _of(self, topic: str) -> CarriedRobot | None:
+    def _robot_of(self, topic: str) -> CarriedRobot | None:
         address = parse_topic(topic)
         return None if address is None else self._carried.get(address.identity.base)
 
     def _is_invented(self, topic: str) -> bool:
-        robot = self._of(topic)
+        robot = self._robot_of(topic)
         return robot is None or robot.subjects.invented(topic.encode()) is not None
 
     def _skips_retained(self, topic: bytes) -> bool:
-        robot = self._of(topic.decode(errors="replace"))
+        robot = self._robot_of(topic.decode(errors="replace"))
         return (
             robot is not None
             and not topic.endswith(_STOP_END.encode())

@@ -61,7 +61,9 @@ def load_gateway(path: Path) -> tuple[GatewayFile, str, Path]:
     problem = reader.notes.problem
     gateway = reader.section(GatewayFile, plain(decode(read_text(path), path.name), reader.notes))
     operators = gateway.operators
-    name = gateway.id or (operators.username if operators is not None else "") or ""
+    name = gateway.id
+    if not name and operators is not None:
+        name = operators.username or ""
     if not name:
         problem(("id",), "is missing: write what this gateway is called, such as gate-1")
     if not gateway.robots:

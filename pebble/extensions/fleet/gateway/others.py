@@ -9,7 +9,7 @@ MAX_GATEWAYS = 16  # that are known beside this one
 
 @dataclass(frozen=True, slots=True)
 class _Other:
-    at: float
+    heard_at: float
     run: str
     robots: frozenset[str]
 
@@ -37,14 +37,16 @@ class OtherGateways:
         """Note a live heartbeat of any gateway."""
         if run == self.run:
             return
-        others = self._others
+        others = self._others.copy()  # another thread may change the table
         if name not in others and len(others) >= MAX_GATEWAYS:
-            others.pop(min(others.copy().items(), key=lambda item: item[1].at)[0], None)
-        others[name] = _Other(now, run, frozenset(robots))
+            oldest = min(others, key=lambda other: others[other].heard_at)
+            self._others.pop(oldest, None)
+        self._others[name] = _Other(now, run, frozenset(robots))
 
     def carrier(self, robot: str, now: float, *, carried: bool) -> str:
         """Return the other gateway that carries ``robot``; empty if none does. ``carried``: this one carries it too."""
         for name, other in list(self._others.items()):
-            if now - other.at <= FRESH_S and robot in other.robots and (not carried or other.run > self.run):
+            is_carrier = now - other.heard_at <= FRESH_S and robot in other.robots
+            if is_carrier and (not carried or other.run > self.run):
                 return name
         return ""

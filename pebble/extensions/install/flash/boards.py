@@ -60,7 +60,7 @@ class Firmware:
     name: str
     board: Board
     baud: int = 115200  # of the serial line to the host
-    #: Whether bytes received from the serial line contain one of its reports; None: the robot connects to a broker.
+    #: True if bytes from the serial line contain one of its reports. None: the robot connects to a broker instead.
     is_report: Callable[[bytes], bool] | None = None
     #: Serial port used instead of USB on an image without ``sys.stdin.buffer``, such as the official SAMD21 one.
     fallback_port: str = ""

@@ -93,6 +93,7 @@ def _reset(port: str) -> None:
 
 
 def _answers(port: str, *, until: float) -> bool:
+    """True if MicroPython's prompt comes in time, after Ctrl-C was sent again and again."""
     with serial.Serial(port, 115200, timeout=0.1, write_timeout=0.5) as line:
         received = b""
         while time.monotonic() < until:

@@ -1,6 +1,5 @@
 """Makes private_config.json, a board's identity, Wi-Fi and broker, from the robot's config. The firmware reads it."""
 
-import ipaddress
 import json
 import ssl
 from dataclasses import dataclass, field
@@ -8,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.config import Config, Mqtt, Secret
+from pebble.config.hosts import is_loopback
 from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.install.flash.boards import ESP8266, Firmware
 
@@ -44,27 +44,19 @@ def private_files(config: Config, firmware: Firmware, *, ssid: str, wifi_passwor
         if '"' in name or "\\" in name:  # the firmware does not escape JSON: firmware/common/settings.py
             raise ConfigError(f'robot.{key}: " and \\ are not allowed on a board')
     broker = config.local_mqtt
-    tls, ca = _tls(broker, firmware)
-    return PrivateFiles(
-        settings={
-            "robot": {
-                "system": config.robot.system,
-                "type": config.robot.type,
-                "id": config.robot.id,
-                **({"name": config.robot.name} if config.robot.name is not None else {}),
-            },
-            "wifi": {"ssid": ssid, "password": Secret(wifi_password)},
-            "mqtt": {
-                "host": broker.host,
-                "port": broker.port,
-                **({"username": broker.username} if broker.username is not None else {}),
-                **({"password": Secret(broker.password)} if broker.password is not None else {}),
-                "tls": tls,
-            },
-            **({"security": security} if (security := config.security.on_board()) else {}),
-        },
-        ca=ca,
-    )
+    robot = {"system": config.robot.system, "type": config.robot.type, "id": config.robot.id}
+    if config.robot.name is not None:
+        robot["name"] = config.robot.name
+    mqtt: dict[str, Any] = {"host": broker.host, "port": broker.port}
+    if broker.username is not None:
+        mqtt["username"] = broker.username
+    if broker.password is not None:
+        mqtt["password"] = Secret(broker.password)
+    mqtt["tls"], ca = _tls(broker, firmware)
+    settings = {"robot": robot, "wifi": {"ssid": ssid, "password": Secret(wifi_password)}, "mqtt": mqtt}
+    if security := config.security.on_board():
+        settings["security"] = security
+    return PrivateFiles(settings=settings, ca=ca)
 
 
 def check_broker(config: Config) -> None:
@@ -73,19 +65,12 @@ def check_broker(config: Config) -> None:
     if host == "example" or host.endswith(_NO_BROKER):
         where = config.path or "the config"
         raise ConfigError(f"local_mqtt.host: {host} is only an example; set your broker's address in a copy of {where}")
-    if host == "localhost" or _is_loopback(host):
+    if is_loopback(host) or host in ("0.0.0.0", "::"):  # noqa: S104 - the unspecified addresses
         raise ConfigError(f"local_mqtt.host: on a board, {host} is the board itself; set the broker's network address")
 
 
-def _is_loopback(host: str) -> bool:
-    try:
-        address = ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return address.is_loopback or address.is_unspecified
-
-
 def _tls(broker: Mqtt, firmware: Firmware) -> tuple[Any, bytes | None]:
+    """Return the board's setting ``tls``, and the authority's certificate as DER if there is one."""
     tls = broker.tls
     if not tls.enabled:
         return False, None

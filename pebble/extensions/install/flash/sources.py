@@ -39,6 +39,7 @@ def modules(firmware: Firmware, root: Path | None = None) -> list[Path]:
 
 
 def _imported(file: Path, root: Path) -> Iterator[Path]:
+    """Yield the files of firmware/ that a file imports, relative to ``root``."""
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"), file.name)):
         names = []
         if isinstance(node, ast.Import):

@@ -47,8 +47,9 @@ class Step:
 def execute(options: FlashOptions, tools: Tools, report: Report) -> None:
     """Perform all steps; passwords are only in a private temporary folder, which is removed in every case."""
     with tempfile.TemporaryDirectory(prefix="pebble-flash-") as folder:
-        for number, step in enumerate(todo := Steps(options, tools, Path(folder), report).all(), 1):
-            report(f"[{number}/{len(todo)}] {step.title}")
+        steps = Steps(options, tools, Path(folder), report).all()
+        for number, step in enumerate(steps, 1):
+            report(f"[{number}/{len(steps)}] {step.title}")
             if remark := step.act():
                 report(f"      {remark}")
 
@@ -56,8 +57,9 @@ def execute(options: FlashOptions, tools: Tools, report: Report) -> None:
 def show_steps(options: FlashOptions, tools: Tools, report: Report) -> None:
     """Show every step with its exact commands, without performing it."""
     folder = Path(tempfile.gettempdir(), "pebble-flash")
-    for number, step in enumerate(todo := Steps(options, tools, folder, report).all(), 1):
-        report(f"[{number}/{len(todo)}] {step.title}")
+    steps = Steps(options, tools, folder, report).all()
+    for number, step in enumerate(steps, 1):
+        report(f"[{number}/{len(steps)}] {step.title}")
         for line in step.lines:
             report(f"      {line}")
 
@@ -69,7 +71,7 @@ class Steps:
         self._options, self._tools, self._work, self._report = options, tools, work, report
         self._board = options.firmware.board
         self._code = work / "code"
-        self._info = on_board.BoardInfo("", binary=True, rom=0)
+        self._info = on_board.BoardInfo("", binary=True, rom=0)  # until the board has answered
 
     def all(self) -> list[Step]:
         return [
@@ -100,7 +102,8 @@ class Steps:
             title=f"check: {image.name} is MicroPython for {self._board.title}",
             act=lambda: images.check_image(image, self._board),
         )
-        return [check, *(self._by_esptool(image) if self._board.chip else self._by_drive(image)), self._wait_for_port()]
+        installing = self._by_esptool(image) if self._board.chip else self._by_drive(image)
+        return [check, *installing, self._wait_for_port()]
 
     def _by_esptool(self, image: Path) -> list[Step]:
         start = ("--chip", str(self._board.chip), "--port", self._options.port, "--baud", str(self._board.baud))
@@ -132,6 +135,7 @@ class Steps:
     # -- the firmware
 
     def _check_board(self) -> list[Step]:
+        """Return the steps that stop the board's program, and ask its MicroPython what it is."""
         pulse = self._board.chip is not None
         how = "reset the board by RTS, then Ctrl-C" if pulse else "Ctrl-C; if the board ignores it, press reset"
 

@@ -1,6 +1,5 @@
 """Verifies a flashed robot: waits for its first heartbeat at the broker, or its first report on the serial line."""
 
-import json
 import queue
 import time
 from contextlib import closing, suppress
@@ -8,8 +7,8 @@ from contextlib import closing, suppress
 import serial
 
 from pebble.config import Config
-from pebble.contract import ONLINE
-from pebble.errors import DeviceError
+from pebble.contract import ONLINE, codec
+from pebble.errors import DeviceError, PayloadError
 from pebble.extensions.install.flash.boards import Firmware
 from pebble.runtime.connections import LOCAL_RECONNECT_S, mqtt_settings
 from pebble.transports import Message, QoS, State, create
@@ -35,7 +34,7 @@ def at_broker(config: Config, timeout_s: float = HEARTBEAT_S) -> str:
         while (remaining_s := end - time.monotonic()) > 0:
             with suppress(queue.Empty):
                 message = received.get(timeout=remaining_s)
-                if not message.retain and _alive(message.payload):
+                if not message.retain and _is_heartbeat(message.payload):
                     return "the robot is online"
     raise DeviceError(
         f"no heartbeat from {config.base} within {timeout_s:g} s: check that the Wi-Fi's name and password are right, "
@@ -43,12 +42,11 @@ def at_broker(config: Config, timeout_s: float = HEARTBEAT_S) -> str:
     )
 
 
-def _alive(payload: bytes) -> bool:
-    try:
-        body = json.loads(payload)
-    except ValueError:
-        return False
-    return isinstance(body, dict) and body.get("online") is not False
+def _is_heartbeat(payload: bytes) -> bool:
+    """True if this is a heartbeat, not the will of an earlier connection."""
+    with suppress(PayloadError):
+        return codec.decode(ONLINE, payload).online is not False
+    return False
 
 
 def on_serial_port(port: str, firmware: Firmware, timeout_s: float = REPORT_S) -> str:

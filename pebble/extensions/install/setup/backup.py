@@ -96,9 +96,10 @@ def make(places: Places) -> Backup:
     files = dict.fromkeys(_files(places, config))
     plain = {file.resolve() for file in files if not file.is_symlink()}
     for file in files:
-        if not (file.is_symlink() and file.resolve() in plain):  # setup makes such a link again
-            with as_owner(file.parent):
-                _add(backup, places.root, file)
+        if file.is_symlink() and file.resolve() in plain:
+            continue  # setup makes such a link again
+        with as_owner(file.parent):
+            _add(backup, places.root, file)
     for what, folder in _left_out(config):
         if (place := _here(places, folder)).exists():
             backup.left_out[str(place)] = what
@@ -131,6 +132,7 @@ def _here(places: Places, path: Path) -> Path:
 
 
 def _left_out(config: Config) -> Iterator[tuple[str, Path]]:
+    """Yield the folders that no backup has, each after a word for its content."""
     yield "recordings", config.section(Recorder).place
     scripts = config.folder / config.section(AutonomyManager).autonomy_root
     if not scripts.is_relative_to(config.folder):
@@ -140,6 +142,7 @@ def _left_out(config: Config) -> Iterator[tuple[str, Path]]:
 
 
 def _below(place: Path, without: Iterable[Path]) -> Iterator[Path]:
+    """Yield the files below a folder, except for those in the folders ``without``."""
     for path in sorted(place.rglob("*")):
         if path.is_file() and not any(path.is_relative_to(folder) for folder in without):
             yield path
@@ -258,9 +261,7 @@ def _content(tar: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
     """Return the content of a member. Raises EOFError if it is cut off or has changed."""
     opened = tar.extractfile(member)
     content = b"" if opened is None else opened.read()
-    if len(content) != member.size or member.pax_headers.get(_SHA256) not in (
-        None,
-        hashlib.sha256(content).hexdigest(),
-    ):
+    digest = hashlib.sha256(content).hexdigest()
+    if len(content) != member.size or member.pax_headers.get(_SHA256, digest) != digest:  # the first file has none
         raise EOFError(f"{member.name} is not what it was")
     return content

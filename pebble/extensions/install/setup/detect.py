@@ -76,7 +76,7 @@ def _received(port: str, baud: int, seconds: float) -> bytes:
     line = serial.Serial(None, baud, timeout=0.05, exclusive=True)
     line.port, line.dtr, line.rts = port, False, False  # some boards start anew at each of them
     received, end = b"", time.monotonic() + seconds
-    with line:
+    with line:  # opens it
         while time.monotonic() < end and len(received) < _MOST:
             received += line.read(4096)
     return received

@@ -36,13 +36,16 @@ def say(text: str, indent: int = 0) -> None:
 
 def asked(job: Job) -> Job:
     """Return the job with the answers from the terminal. A wrong answer is asked for again."""
-    first = [] if job.config is not None else [_ask_name]
-    for number, ask in enumerate([*first, _ask_board, _ask_camera, _ask_broker, _ask_page], start=1):
+    questions: list[Callable[[Job, str], _Given]] = [_ask_board, _ask_camera, _ask_broker, _ask_page]
+    if job.config is None:
+        questions.insert(0, _ask_name)
+    for number, ask in enumerate(questions, start=1):
         job = _answered(job, number, ask)
     return _with_passwords(job)
 
 
 def _answered(job: Job, number: int, ask: Callable[[Job, str], _Given]) -> Job:
+    """Return the job with the answer to one question, which is asked until its answer is right."""
     while True:
         try:
             return job.with_answers(ask(job, f"{number}."))
@@ -62,7 +65,9 @@ def _choose(question: str, choices: Sequence[tuple[str, str]], default: str, oth
     for place, (value, label) in enumerate(choices, start=1):
         say(f"{place}  {value}{f'  ({label})' if label else ''}", 5)
     answer = str(typer.prompt(f"   Number, or {other}", default=default))
-    return choices[int(answer) - 1][0] if answer.isdecimal() and 0 < int(answer) <= len(choices) else answer
+    if answer.isdecimal() and 0 < int(answer) <= len(choices):
+        return choices[int(answer) - 1][0]
+    return answer
 
 
 def _ask_name(_job: Job, number: str) -> _Given:
@@ -75,8 +80,9 @@ def _ask_board(job: Job, number: str) -> _Given:
     typer.echo("\n   Listening to serial ports…")
     boards = {board.port: board for board in detect.boards(detect.SERIAL_PORTS)}
     choices = [*((board.port, board.text) for board in boards.values()), (NONE, "no board now")]
-    heard_port = next((board.port for board in boards.values() if board.baud), NONE)
-    port = _choose(f"{number} Which board drives the motors?", choices, job.answers.port or heard_port)
+    ports_that_send = [board.port for board in boards.values() if board.baud]
+    default = job.answers.port or (ports_that_send[0] if ports_that_send else NONE)
+    port = _choose(f"{number} Which board drives the motors?", choices, default)
     if port == NONE:
         return {"port": NONE}
     board = boards.get(port)
@@ -84,7 +90,10 @@ def _ask_board(job: Job, number: str) -> _Given:
         return {"port": port, "protocol": board.protocol, "baud": board.baud}
     usual = job.answers.protocol or next(iter(SERIAL_PROTOCOLS))
     protocol = _choose("What does it speak?", [(name, "") for name in SERIAL_PROTOCOLS], usual)
-    return {"port": port, "protocol": protocol} | ({"baud": board.baud} if board is not None and board.baud else {})
+    given: _Given = {"port": port, "protocol": protocol}
+    if board is not None and board.baud:
+        given["baud"] = board.baud
+    return given
 
 
 def _ask_camera(job: Job, number: str) -> _Given:
@@ -113,7 +122,8 @@ def _ask_page(job: Job, number: str) -> _Given:
     if job.answers.broker == NONE:
         return {"page": False}
     _ask(f"{number} May phones and computers in this network open the robot's page?")
-    if not typer.confirm("   Page", default=job.answers.page is not False):
+    is_usual = job.answers.page is not False  # also if it is not answered yet
+    if not typer.confirm("   Page", default=is_usual):
         return {"page": False}
     if has_user(job.people):
         return {"page": True}

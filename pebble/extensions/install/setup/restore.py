@@ -43,10 +43,10 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
     """
     backup, places = backups.read(file), system.places
     config = str(places.config.relative_to(places.root))
-    files = {name: saved for name, saved in _allowed(backup.files, places).items() if name != config}
+    files = _allowed(backup.files, places)
     if config not in backup.files:
         raise SetupError(f"{file}: has no {config}: it is no backup of a robot that is installed")
-    files[config] = backup.files[config]
+    files[config] = files.pop(config)  # the last one to be written
     for name in reversed(files):
         if not _place(name):
             raise SetupError(f"the backup would write {name!r}, which is no file of a robot")
@@ -61,14 +61,15 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
     for place in {_place(name) for name in files}:
         system.owner(_PLACES[place][0])  # without mosquitto the robot's broker has no owner
     for name, saved in files.items():
-        target, owner = places.root / name, _PLACES[_place(name)][0]
+        target = places.root / name
         for folder in reversed(target.parents):
             if not folder.exists():
-                owner_there, mode = _PLACES.get(_place(f"{folder.relative_to(places.root)}/"), _PLACES["etc/mosquitto"])
-                system.make_folder(folder, mode, owner_there)
+                owner, mode = _PLACES.get(_place(f"{folder.relative_to(places.root)}/"), _PLACES["etc/mosquitto"])
+                system.make_folder(folder, mode, owner)
         if not places.unfinished.exists() and places.etc.is_dir():
             system.write(places.unfinished, b"")
         if not target.exists():
+            owner, _ = _PLACES[_place(name)]
             system.write(target, saved.content, saved.mode & 0o755, owner)
     if (places.broker_folder / FLEET).is_file():
         with as_owner(places.broker_folder):  # its rules follow from its table, and from nothing else
@@ -106,7 +107,9 @@ def _beyond(value: Any, *keys: str) -> Iterator[str]:
     """Yield the programs in a config that setup does not write, and files outside of the robot's, each with its key."""
     key = keys[-1] if keys else ""
     is_run = key in _RUNS or key.endswith(("_command", "_env"))
-    if (value and value not in COMMANDS) if is_run else (isinstance(value, str) and _is_beyond(value)):
+    is_other_program = is_run and value and value not in COMMANDS
+    is_other_file = not is_run and isinstance(value, str) and _is_beyond(value)
+    if is_other_program or is_other_file:
         yield f"{'.'.join(keys)}: {' '.join(map(str, value)) if isinstance(value, list | dict) else value}"
     if isinstance(value, dict):
         for name, item in value.items():
@@ -125,4 +128,5 @@ def _is_beyond(text: str) -> bool:
 
 
 def _place(name: str) -> str:
+    """Return the key of ``_PLACES`` below which this file belongs; empty if there is none."""
     return next((place for place in _PLACES if name.startswith(f"{place}/")), "")

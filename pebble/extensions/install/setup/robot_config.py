@@ -52,10 +52,13 @@ def answers_of(config: Config, places: Places) -> Answers:
 
 
 def changed(current: dict[str, Any], before: dict[str, Any], after: dict[str, Any]) -> dict[str, Any]:
-    """Return the present config with the changes that the answers ask for; other hand-written keys stay."""
+    """Return the present config with the changes that the answers ask for; other hand-written keys stay.
+
+    ``before`` and ``after``: the configs that setup writes for the earlier answers, and for those of now.
+    """
     result = dict(current)
     for key in {**before, **after}:
-        present, old, new = (config.get(key) for config in (current, before, after))
+        present, old, new = current.get(key), before.get(key), after.get(key)
         if old == new:
             continue
         if isinstance(present, dict) and (isinstance(old, dict) or isinstance(new, dict)):
@@ -111,6 +114,7 @@ def _video(camera: str) -> dict[str, Any]:
 
 
 def _broker(answers: Answers) -> dict[str, Any]:
+    """Return the section of the broker for operators."""
     if answers.broker == HERE:
         return _own_login(answers.account, BROKER_PASSWORD)
     host, port = answers.remote or ("", 0)

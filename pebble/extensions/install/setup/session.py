@@ -100,6 +100,7 @@ def _has_page(job: Job) -> bool:
 
 
 def _next(job: Job) -> Iterator[str]:
+    """Yield what the person may do next."""
     answers, places = job.answers, job.places
     if _has_page(job):
         url = _url(places)

@@ -90,8 +90,10 @@ class Job:
 
     @property
     def page(self) -> Config | None:
-        """Return the config if the robot already serves a page."""
-        return self.config if self.config is not None and self.config.section(WebHandler).enabled else None
+        """The config, if the robot already serves a page."""
+        if self.config is None or not self.config.section(WebHandler).enabled:
+            return None
+        return self.config
 
     @property
     def people(self) -> Path:
@@ -141,6 +143,7 @@ class Job:
         return steps
 
     def _passwords(self) -> Iterator[Step]:
+        """Yield the steps that write the passwords of the robot and of its page at the broker."""
         file, page = self.places.etc / BROKER_PASSWORD, self.places.etc / PAGE_PASSWORD
         typed = self.secrets.broker_password
         if typed is not None and self.answers.broker != HERE:
@@ -152,7 +155,7 @@ class Job:
                 yield self._new_password("password of the page at the robot's broker", page)
 
     def _new_password(self, what: str, file: Path, *, known: bool = True) -> Step:
-        """Return the step that writes a new password. ``known``: the one in the file is of this broker, so it stays."""
+        """Return the step that writes a new password. ``known``: one in the file is of this broker, and stays."""
         write = partial(self.system.write, file)
         return Step(what, lambda: known and file.exists(), lambda: write(f"{new_password()}\n".encode()))
 
@@ -161,6 +164,7 @@ class Job:
         return Step(what, lambda: file.exists() and file.read_bytes() == content, write)
 
     def _own_broker(self) -> Iterator[Step]:
+        """Yield the steps that make mosquitto on this machine the robot's broker."""
         places, folder = self.places, self.places.broker_folder
         base = str(Identity("pebble", "robots", str(self.answers.id))) if self.config is None else self.config.base
         wanted = own_broker.fleet_of(self.answers.account, base, Path(places.named(places.people)))
@@ -191,6 +195,7 @@ class Job:
         )._replace(restarts=(BROKER_SERVICE,))
 
     def _other_broker(self) -> Iterator[Step]:
+        """Yield the steps that end the robot's own broker, and write the authority of another one."""
         broker_conf = self.places.broker
         if broker_conf.exists():
             yield Step("the robot's own broker ends", lambda: False, broker_conf.unlink, (BROKER_SERVICE,))
@@ -228,6 +233,7 @@ class Job:
         yield Step(f"{name} may log in at the page, as admin", lambda: has_user(file, str(name)), add, ())
 
     def _config(self) -> Step:
+        """Return the step that writes the config, with a copy of the earlier one beside it."""
         file, wanted = self.places.config, config_of(self.answers, self.places)
         current = json.loads(file.read_bytes()) if self.config is not None else {}
         before = config_of(self.earlier, self.places) if self.config is not None else {}

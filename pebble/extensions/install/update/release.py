@@ -74,28 +74,29 @@ def check_signature(data: bytes, signature: bytes, keys: Iterable[str], *, test_
     """
     try:
         untrusted, first, comment, second, end = signature.decode().split("\n")
-        signed, whole = _bytes(first), _bytes(second)
+        signed, comment_signature = _bytes(first), _bytes(second)
     except ValueError as error:
         raise ReleaseError(f"{SIGNATURE} is no signature by minisign") from error
     if not untrusted.startswith(_UNTRUSTED) or not comment.startswith(_TRUSTED) or end or len(signed) != _SIGNATURE:
         raise ReleaseError(f"{SIGNATURE} is no signature by minisign")
-    by = signed[2:_ID]
-    key = next((key for key in map(_key, keys) if key[2:_ID] == by), None)
+    key_id = signed[2:_ID]
+    key = next((key for key in map(_key, keys) if key[2:_ID] == key_id), None)
     if key is None or signed[:2] != b"ED":
-        raise ReleaseError(f"{SIGNATURE} is by key {_name(by)}, which is none of this robot's")
-    if by == TEST_ID and not test_key:
+        raise ReleaseError(f"{SIGNATURE} is by key {_name(key_id)}, which is none of this robot's")
+    if key_id == TEST_ID and not test_key:
         raise ReleaseError(f"{SIGNATURE} is by a test key, with which everybody can sign")
     public = Ed25519PublicKey.from_public_bytes(key[_ID:])
     trusted = comment.removeprefix(_TRUSTED)
     try:
         public.verify(signed[_ID:], hashlib.blake2b(data).digest())
-        public.verify(whole, signed[_ID:] + trusted.encode())
+        public.verify(comment_signature, signed[_ID:] + trusted.encode())
     except InvalidSignature:
-        raise ReleaseError(f"{MANIFEST} or {SIGNATURE} was changed after key {_name(by)} had signed it") from None
+        raise ReleaseError(f"{MANIFEST} or {SIGNATURE} was changed after key {_name(key_id)} had signed it") from None
     return trusted
 
 
 def _check_files(folder: Path, release: Release) -> None:
+    """Raise ReleaseError unless the folder has exactly the files of the release, unchanged."""
     wheels = [name for name in release.files if _WHEEL.fullmatch(name)]
     if len(wheels) != 1 or set(release.files) != {*wheels, "robot.txt"}:
         raise ReleaseError(f"{MANIFEST} names {', '.join(release.files) or 'no file'}: not a wheel and robot.txt")
@@ -127,6 +128,7 @@ def _bytes(text: str) -> bytes:
 
 
 def _key(text: str) -> bytes:
+    """Return a public key in minisign's form: its kind, its id, its 32 bytes. Raises ReleaseError."""
     try:
         key = _bytes(text)
     except ValueError:

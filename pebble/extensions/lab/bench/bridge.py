@@ -24,13 +24,13 @@ from rich.table import Table
 
 from pebble.errors import PebbleError
 from pebble.extensions.lab.bench import plots
-from pebble.extensions.lab.bench.bridge_operator import ALL, Arrived, DrivenRobot, Turn, compiled, driven_robot
+from pebble.extensions.lab.bench.bridge_operator import Arrived, DrivenRobot, Turn, compiled, driven_robot
 from pebble.extensions.lab.bench.results import FLOOR, STAND_IN, Cell, Results, begin, grouped, round_cell
 from pebble.extensions.lab.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.extensions.lab.bench.show import RATIOS, Picture, Shown, compared, percentiles, plain_table, spread
 from pebble.extensions.lab.rig.robot import KINDS
 
-UNLOADED, COMMANDS = "none", "commands"  # unloaded: 20 commands and 50 reports a second
+REPORTS, COMMANDS = "none", "commands"  # loads: the first is a robot's usual one, 20 commands and 50 reports a second
 VARIANTS = (STAND_IN, FLOOR, *KINDS)
 DOWN, UP, CPU = MEASURES = ("down", "up", "CPU per message")
 STARTUP_S = 1.0  # for start-up work to finish
@@ -60,7 +60,8 @@ def run(settings: Settings, console: Console) -> Shown:
         settings = replace(settings, variants=[name for name in settings.variants if name != FLOOR])
     measure_rounds(results, settings.rounds, lambda number, progress: measure(settings, number, progress), console)
     results.cells.sort(key=lambda cell: MEASURES.index(cell.measure))
-    latencies, cpu = ([cell for cell in results.cells if (cell.measure == CPU) == is_cpu] for is_cpu in (False, True))
+    cpu = [cell for cell in results.cells if cell.measure == CPU]
+    latencies = [cell for cell in results.cells if cell.measure != CPU]
     pictures = list[Picture]()
     for way in (DOWN, UP):
         cells = [cell for cell in latencies if cell.measure == way]
@@ -82,42 +83,42 @@ def running(variants: Sequence[str], *, reports: bool) -> Iterator[dict[str, Dri
 def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cell]:
     """Yield the results of fresh robots with and without reports of their MCUs, each measured in turns of a second."""
     passes = max(1, round(settings.seconds))
-    for load in in_turn((UNLOADED, COMMANDS), number):
-        reports, turns = load == UNLOADED, list[tuple[str, Turn]]()
+    for load in in_turn((REPORTS, COMMANDS), number):
+        variants = [name for name in settings.variants if name != FLOOR or load == COMMANDS]  # it has no reports
+        turns: dict[str, list[Turn]] = {variant: [] for variant in variants}
         progress("starting the robots")
-        with running([name for name in settings.variants if name != FLOOR or not reports], reports=reports) as driven:
+        with running(variants, reports=load == REPORTS) as driven:
             for pass_ in range(passes):
-                for variant in in_turn(list(driven), number + pass_):
+                for variant in in_turn(variants, number + pass_):
                     progress(f"{variant}, {load}")
-                    turns.append((variant, driven[variant].drive(settings.seconds / passes)))
-            for variant, of_variant in grouped(turns, lambda turn: turn[0]).items():
-                arrived = driven[variant].arrived([turn for _, turn in of_variant])
-                for _, turn in of_variant:
+                    turns[variant].append(driven[variant].drive(settings.seconds / passes))
+            for variant, turns_of_variant in turns.items():
+                arrived = driven[variant].arrived(turns_of_variant)
+                for turn in turns_of_variant:
                     yield from cells_of(variant, load, turn, arrived)
 
 
 def cells_of(variant: str, load: str, turn: Turn, arrived: Arrived) -> Iterator[Cell]:
-    params, took_s = {"load": load}, (turn.ended - turn.began) / 1e9
-    figures = {"cpu_percent": 100 * turn.cpu_s[ALL] / took_s} if ALL in turn.cpu_s else {}
+    """Yield the latencies of a turn, and the CPU time for each message. ``arrived``: what came in all turns."""
+    params = {"load": load}
     down = [(arrived.commands[wheels] - ns) / 1e6 for wheels, ns in turn.sent.items() if wheels in arrived.commands]
-    yield round_cell(variant, DOWN, "ms", down, params, sent=len(turn.sent), **figures)
-    if load != COMMANDS:
-        reports = [(sent, ns) for sent, ns in arrived.reports if turn.began <= sent <= turn.ended]
-        yield round_cell(
-            variant, UP, "ms", [(ns - sent) / 1e6 for sent, ns in reports if ns is not None], params, sent=len(reports)
-        )
-    forwarded = len(down) + sum(turn.began <= ns <= turn.ended for ns, _ in arrived.received)
+    yield round_cell(variant, DOWN, "ms", down, params, sent=len(turn.sent))
+    if load == REPORTS:
+        reports = [report for report in arrived.reports if turn.began <= report.sent_ns <= turn.ended]
+        up = [(report.received_ns - report.sent_ns) / 1e6 for report in reports if report.received_ns is not None]
+        yield round_cell(variant, UP, "ms", up, params, sent=len(reports))
+    received = [ns for ns, _ in arrived.received if turn.began <= ns <= turn.ended]
+    forwarded = len(down) + len(received)
     for process, cpu_s in turn.cpu_s.items():
-        if process != ALL:
-            cost = [1e6 * cpu_s / forwarded] if forwarded else []
-            yield round_cell(variant, CPU, "us", cost, {**params, "process": process})
+        cost = [1e6 * cpu_s / forwarded] if forwarded else []
+        yield round_cell(variant, CPU, "us", cost, {**params, "process": process})
 
 
 def latency_table(results: Results, cells: Sequence[Cell]) -> Table:
-    """Return latencies of commands and reports, and the CPU of the whole robot."""
+    """Return the latencies of commands and reports."""
     grid = plain_table(
-        "Commands down, reports up, ms; CPU of the whole robot, % of a core",
-        ["way", "load", "variant", "p50", "p95", "p99", "max", "n", "lost", "CPU",
+        "Commands down, reports up, ms",
+        ["way", "load", "variant", "p50", "p95", "p99", "max", "n", "lost",
          *(f"p{percent} to {base}" for base in (STAND_IN, FLOOR) for percent in (50, 99))],
         left=3, caption=f"{STAND_IN}: plain paho in place of the original. {RATIOS}",
     )  # fmt: skip
@@ -125,17 +126,10 @@ def latency_table(results: Results, cells: Sequence[Cell]) -> Table:
         grid.add_section()
         for ours in group:
             bases = [results.find(name, way, load=load) for name in (STAND_IN, FLOOR)]
-            cpu = f"{ours.middle('cpu_percent'):.1f}" if way == DOWN else ""
             place = (way, load) if ours is group[0] else ("", "")
             counts = (str(len(ours.samples)), str(ours.lost))
-            grid.add_row(
-                *place,
-                ours.variant,
-                *percentiles(ours, 50, 95, 99, 100),
-                *counts,
-                cpu,
-                *(compared(ours, base, percent) for base in bases for percent in (50, 99)),
-            )
+            ratios = [compared(ours, base, percent) for base in bases for percent in (50, 99)]
+            grid.add_row(*place, ours.variant, *percentiles(ours, 50, 95, 99, 100), *counts, *ratios)
     return grid
 
 

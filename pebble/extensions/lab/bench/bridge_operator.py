@@ -25,8 +25,7 @@ from pebble.extensions.lab.rig.scripted_operator import paced
 from pebble.extensions.lab.simulation.trace import Entry
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch, parse
 
-ALL = "all"  # processes of a robot; and those that forward, by the names of their services
-SERVICES = {"bridge": "mqtt_bridge", "serial bridge": "serial_mcu_bridge"}
+SERVICES = {"bridge": "mqtt_bridge", "serial bridge": "serial_mcu_bridge"}  # the processes that forward
 _STEPS = 800  # wheel values 0.100 … 0.899
 _UP_S = 30.0
 _ARRIVE_S = 1.0  # commands and reports that take longer count as lost
@@ -40,15 +39,22 @@ class Turn(NamedTuple):
     began: int
     ended: int
     sent: Mapping[Wheels, int]  # when each command was, by its wheel speeds
-    cpu_s: Mapping[str, float]  # of the robot's processes: of all, and of its bridges
+    cpu_s: Mapping[str, float]  # of the robot's two bridges
+
+
+class Report(NamedTuple):
+    """The times of a report of the MCU: when it was sent, and received; None: it was not. CLOCK_MONOTONIC, ns."""
+
+    sent_ns: int
+    received_ns: int | None
 
 
 class Arrived(NamedTuple):
     """The messages of several turns that arrived."""
 
     commands: Mapping[Wheels, int]  # when each reached the MCU
-    reports: Sequence[tuple[int, int | None]]  # of the MCU: when each was sent, and received; None: it was not
-    received: Sequence[tuple[int, Touch]]  # all reports, also those of equal values
+    reports: Sequence[Report]  # those whose values were sent once
+    received: Sequence[tuple[int, Touch]]  # when each report was received, and its values: all reports
 
 
 def wheels(number: int) -> Wheels:
@@ -61,18 +67,26 @@ def arrivals(entries: Sequence[Entry]) -> dict[Wheels, int]:
     return {line.drive: line.ns for line in reversed(entries) if line.drive is not None}
 
 
-def matched(entries: Sequence[Entry], received: Sequence[tuple[int, Touch]]) -> list[tuple[int, int | None]]:
-    """Return, for each report, the time when it was sent and the time when it was received (None: it was not).
+def matched(entries: Sequence[Entry], received: Sequence[tuple[int, Touch]]) -> list[Report]:
+    """Return the reports that the MCU sent, each with the time of its first arrival after that.
 
     A report is identified by its values: while the wheels turn, the sensors never report the same values for long.
     Values that were sent more than once do not count.
     """
-    lines = [(entry.ns, entry.line.encode()) for entry in entries if entry.event == "said"]
-    published = [(ns, touch) for ns, line in lines for touch in parse(line) if isinstance(touch, Touch)]
-    times = Counter(touch for _, touch in published)
-    wanted = {touch: ns for ns, touch in published if times[touch] == 1}
-    first = {touch: ns for ns, touch in reversed(received) if touch in wanted and ns >= wanted[touch]}
-    return [(ns, first.get(touch)) for touch, ns in wanted.items()]
+    sent = [
+        (entry.ns, touch)
+        for entry in entries
+        if entry.event == "said"
+        for touch in parse(entry.line.encode())
+        if isinstance(touch, Touch)
+    ]
+    counts = Counter(touch for _, touch in sent)
+    sent_ns = {touch: ns for ns, touch in sent if counts[touch] == 1}
+    received_ns: dict[Touch, int] = {}
+    for ns, touch in received:
+        if touch in sent_ns and ns >= sent_ns[touch]:
+            received_ns.setdefault(touch, ns)
+    return [Report(ns, received_ns.get(touch)) for touch, ns in sent_ns.items()]
 
 
 class DrivenRobot(StockClient):
@@ -90,7 +104,7 @@ class DrivenRobot(StockClient):
         self._driver = self.driver(BASE)
         self._number = 0  # of the last command
         self._received: list[tuple[int, bytes]] = []  # reports
-        self._parts: dict[str, list[int]] = {}  # the processes that forward
+        self._pids: dict[str, int] = {}  # of the processes that forward, by the keys of SERVICES
         self.open(robot.remote_port)
 
     def wait_until_ready(self) -> None:
@@ -101,14 +115,13 @@ class DrivenRobot(StockClient):
                 lambda: None not in (subscriber.ready_ns, subscriber.first_heartbeat_ns), "it is not ready", _UP_S
             )
         running = robot.processes()
-        self._parts = {part: [running[name]] for part, name in SERVICES.items() if name in running}
-        if len(self._parts) < len(SERVICES):
+        self._pids = {part: running[name] for part, name in SERVICES.items() if name in running}
+        if len(self._pids) < len(SERVICES):
             raise PebbleError(f"{robot.kind}: a bridge is not running\n{robot.log()}")
 
     def drive(self, seconds: float) -> Turn:
         """Drive at a steady rate. Raises PebbleError if one of the two bridges has ended."""
-        groups = {ALL: [*self.robot.processes().values()], **self._parts}
-        before = {name: cpu_s(pids) for name, pids in groups.items()}
+        before = {part: cpu_s([pid]) for part, pid in self._pids.items()}
         sent: dict[Wheels, int] = {}
         began = time.monotonic_ns()
         for _ in paced(seconds):
@@ -116,8 +129,8 @@ class DrivenRobot(StockClient):
             speeds = wheels(self._number)
             sent[speeds] = round(1e9 * self._driver.command(drive_of(*speeds)))
         ended = time.monotonic_ns()
-        used = {name: cpu_s(pids) - before[name] for name, pids in groups.items()}
-        if min(used.values()) <= 0:
+        used = {part: cpu_s([pid]) - before[part] for part, pid in self._pids.items()}
+        if min(used.values()) <= 0:  # the CPU time of a process that has ended is 0
             raise PebbleError(f"{self.robot.kind}: a process ended while it was driven\n{self.robot.log()}")
         return Turn(began, ended, sent, used)
 
@@ -145,7 +158,8 @@ class StandIn(Robot):
     """A robot as a user would build it without us."""
 
     def launch(self) -> None:
-        arguments = (*self.broker_ports[::-1], self.base, self.port, *(["--reports"] if self.reports else []))
+        reports = ["--reports"] if self.reports else []
+        arguments = (self.local_port, self.remote_port, self.base, self.port, *reports)
         for part in ("bridge", "serial"):
             self.start(f"the {self.name}'s {part}", [*self.command(), part, *map(str, arguments)])
 
@@ -154,8 +168,8 @@ class StandIn(Robot):
 
     def processes(self) -> dict[str, int]:
         """Return the two programs, under the names of the services that they replace, and the robot's broker."""
-        running = [*self._started, *([self.local_broker] if self.local_broker else [])]
-        return {name: program.pid for name, program in zip((*SERVICES.values(), "mosquitto"), running, strict=False)}
+        pids = {service: program.pid for service, program in zip(SERVICES.values(), self._started, strict=True)}
+        return pids if self.local_broker is None else pids | {"mosquitto": self.local_broker.pid}
 
 
 class CFloor(StandIn):

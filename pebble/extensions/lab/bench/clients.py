@@ -8,7 +8,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from typing import Any, Final, Self
 
 from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
@@ -16,17 +16,14 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble import contract
 from pebble.contract.payloads import Drive
-from pebble.errors import PayloadError, PebbleError
+from pebble.errors import PebbleError
 from pebble.extensions.lab.rig.scripted_operator import ScriptedOperator
-from pebble.extensions.media.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.transports import Message
 
-_AHEAD: Final = 0.5
+_THROTTLE: Final = 0.5  # of robots that `driving` drives straight ahead
 _ANSWER_S = 10.0
 UP_S: Final = 20.0  # for a robot to start
-#: Flag and request, of pictures and of sound.
-_MEDIA_CHANNELS = (contract.MQTT_VIDEO, contract.VIDEO_CONTROL), (contract.MQTT_AUDIO, contract.AUDIO_CONTROL)
 
 
 def drive_of(left: float, right: float) -> Drive:
@@ -82,16 +79,19 @@ class StockClient:
         """Publish ``body`` as JSON, with the QoS and the retain flag of the channel."""
         return self.paho.publish(channel.topic(base), json.dumps(body), channel.default_qos, channel.default_retain)
 
-    def publish(self, message: Message) -> None:
+    def publish(self, message: Message | MQTTMessage) -> None:
         self.paho.publish(message.topic, message.payload, message.qos, message.retain)
 
     def driver(self, base: str, wait: Callable[[float], object] = time.sleep) -> ScriptedOperator:
         """Return an operator that, like the original page, knows nothing of its robot and drives without control."""
         return ScriptedOperator(RobotView(base), self.publish, by="bench", wait=wait)
 
-    def request_media(self, base: str, *encodings: str) -> None:
-        """Permit and request a robot's pictures and sound."""
-        for (flag, request), encoding in zip(_MEDIA_CHANNELS, encodings, strict=True):
+    def request_media(self, base: str) -> None:
+        """Permit and request a robot's pictures as H.264, and its sound as Opus."""
+        for flag, request, encoding in (
+            (contract.MQTT_VIDEO, contract.VIDEO_CONTROL, "h264"),
+            (contract.MQTT_AUDIO, contract.AUDIO_CONTROL, "opus"),
+        ):
             self.send(flag, base, True)
             self.send(request, base, {"enabled": True, "encoding": encoding})
 
@@ -112,9 +112,9 @@ def driving(port: int, *bases: str) -> Iterator[None]:
     ended = threading.Event()
     with closing(StockClient().open(port)) as client:
         drivers = [client.driver(base, ended.wait) for base in bases]
-        threads = [threading.Thread(target=driver.drive, args=(0.0, _AHEAD), daemon=True) for driver in drivers]
+        threads = [threading.Thread(target=driver.drive, args=(0.0, _THROTTLE), daemon=True) for driver in drivers]
         for driver, thread in zip(drivers, threads, strict=True):
-            driver.command(Drive())
+            driver.command(Drive())  # begins at rest, as a person does
             thread.start()
         try:
             yield
@@ -131,31 +131,19 @@ class RobotSubscriber(StockClient):
         self._base = base
         self.first_heartbeat_ns: int | None = None
         self.ready_ns: int | None = None  # every service is ready
-        self.arrived: Counter[str] = Counter()  # pictures and sound packets, by encoding: "json", "h264", "pcm", "opus"
+        self.arrived: Counter[str] = Counter()  # pictures and sound packets, by topic below the base
         super().__init__(self._on_message, [(f"{base}/#", 1)])
         self.open(port)
 
     def _on_message(self, message: MQTTMessage) -> None:
         now, topic = time.monotonic_ns(), message.topic.removeprefix(f"{self._base}/")
         if topic in (contract.CAMERA.suffix, contract.AUDIO.suffix):
-            self.arrived[encoding_of(bytes(message.payload))] += 1
+            self.arrived[topic] += 1
         elif topic == contract.ONLINE.suffix and self.first_heartbeat_ns is None:
-            self.first_heartbeat_ns = now if json.loads(message.payload).get("online", True) else None
-        elif (
-            topic == contract.STATUS.suffix
-            and self.ready_ns is None
-            and all_ready(json.loads(message.payload)["value"])
-        ):
-            self.ready_ns = now
-
-
-def encoding_of(raw: bytes) -> str:
-    """Return the encoding of a picture or a sound packet; ``json`` if it has no binary header."""
-    with suppress(PayloadError):
-        return "h264" if Picture.unpack(raw).kind == PictureKind.H264 else "pbvd"
-    with suppress(PayloadError):
-        return "opus" if Sound.unpack(raw).codec == Codec.OPUS else "pcm"
-    return "json"
+            if json.loads(message.payload).get("online", True):  # else it is the will of an earlier connection
+                self.first_heartbeat_ns = now
+        elif topic == contract.STATUS.suffix and all_ready(json.loads(message.payload)["value"]):
+            self.ready_ns = self.ready_ns or now
 
 
 def all_ready(status: Mapping[str, Any]) -> bool:

@@ -1,19 +1,18 @@
-"""Measures the latency of messages between two services, one-way and round trip, on MQTT and Zenoh in turn.
+"""Measures the latency of messages between two services, on MQTT and Zenoh in turn.
 
 One process sends periodically, another returns each message at once; both work as services do with drive commands, and
-use their QoS. One-way is from just before the publish call until the receiver's handler runs, a round trip until the
-sender's. Every round starts new processes, and a broker or hub for each variant; a slice of each variant under the same
-condition runs directly after the other, in either order. Messages of the first 0.1 s do not count, those that do not
-return within a second of the last one are lost. ``media``: pictures of 640x480 flow at 30 Hz through the same broker or
-shared memory.
+use their QoS. The latency is from just before the publish call until the other's handler runs. Every round starts new
+processes, and a broker or hub for each variant; a slice of each variant under the same condition runs directly after
+the other, in either order. Messages of the first 0.1 s do not count, those that do not return within a second of the
+last one are lost. ``media``: pictures of 640x480 flow at 30 Hz through the same broker or shared memory.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 from rich.console import Console
@@ -29,29 +28,14 @@ from pebble.extensions.lab.rig.processes import BROKERS, Processes, Program, Wor
 from pebble.transports import MqttSettings, ZenohSettings
 
 NONE, MEDIA = "none", "media"  # loads
-ONE_WAY, ROUND_TRIP = "one-way", "round trip"
+ONE_WAY = "one-way"
 BASELINE: Final = "mqtt"
 _READY_S = 40.0
 _ANSWER_S = 30.0  # in addition to the slice itself
 
 
-class Variant(NamedTuple):
-    """A transport between two services."""
-
-    kind: str  # a transport, or the stand-in
-    settings: Mapping[str, Any] = {}
-    broker: Sequence[str] = ()  # lines of mosquitto's configuration
-
-
-_NODELAY = ("set_tcp_nodelay true",)
-VARIANTS: Final = {
-    STAND_IN: Variant(STAND_IN),  # stock paho at both ends
-    "mqtt": Variant("mqtt"),
-    "mqtt-nodelay": Variant("mqtt", broker=_NODELAY),
-    "mqtt5": Variant("mqtt", {"protocol": "5"}, _NODELAY),
-    "zenoh-p2p": Variant("zenoh"),
-    "zenoh-hub": Variant("zenoh", {"client": True}),  # everything goes through the hub
-}
+#: By variant: the transport between the two services, or the stand-in, which is stock paho at both ends.
+VARIANTS: Final = {STAND_IN: STAND_IN, "mqtt": "mqtt", "zenoh-p2p": "zenoh"}
 
 
 class Case(NamedTuple):
@@ -84,8 +68,8 @@ def run(settings: Settings, console: Console) -> Shown:
     """Measure all variants. Raises PebbleError."""
     results = begin("control", settings)
     measure_rounds(results, settings.rounds, lambda number, progress: measure(settings, number, progress), console)
-    one_way = [cell for cell in results.cells if cell.measure == ONE_WAY]
-    return Shown(results, [table(results)], plots.curves("control-one-way", "Service to service, one way", one_way))
+    charts = plots.curves("control-one-way", "Service to service, one way", results.cells)
+    return Shown(results, [table(results)], charts)
 
 
 def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cell]:
@@ -95,34 +79,24 @@ def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cel
             for case in in_turn(settings.cases, number + pass_):
                 for variant in in_turn(settings.variants, number + pass_):
                     progress(f"{variant}, {', '.join(map(str, case.params().values()))}")
-                    done, pictures_hz = participants.run(variant, case, settings.seconds)
-                    figures = {"sent": done.sent, "late": done.late, "pictures_hz": pictures_hz}
-                    one_way = [(exchange.echoed_ns - exchange.sent_ns) / 1000 for exchange in done.exchanges]
-                    round_trip = [(exchange.received_ns - exchange.sent_ns) / 1000 for exchange in done.exchanges]
-                    yield round_cell(variant, ONE_WAY, "us", one_way, case.params(), **figures)
-                    yield round_cell(variant, ROUND_TRIP, "us", round_trip, case.params(), **figures)
+                    done = participants.run(variant, case, settings.seconds)
+                    yield round_cell(variant, ONE_WAY, "us", done.latencies_us, case.params(), sent=done.sent)
 
 
 def table(results: Results) -> Table:
     """Return the latencies of each variant under each condition."""
     grid = plain_table(
-        "Latency, µs; the ratio is that of one-way medians",
-        ["size", "rate", "load", "variant", "one way\np50", "p99", "round trip\np50", "p99", "lost", "late", "media Hz",
-         f"to {BASELINE}"],
+        "Latency one way, µs; the ratio is that of medians",
+        ["size", "rate", "load", "variant", "p50", "p99", "lost", f"to {BASELINE}"],
         left=4, caption=f"{STAND_IN}: stock paho at both ends. {RATIOS}",
     )  # fmt: skip
     for cells in grouped(results.cells, lambda cell: tuple(cell.params.values())).values():
         grid.add_section()
-        one_way = [cell for cell in cells if cell.measure == ONE_WAY]
-        for at, ours in enumerate(sorted(one_way, key=lambda cell: list(VARIANTS).index(cell.variant))):
-            place = ours.params.values() if at == 0 else ("", "", "")
-            back = results.find(ours.variant, ROUND_TRIP, **ours.params) or ours
+        for number, ours in enumerate(sorted(cells, key=lambda cell: list(VARIANTS).index(cell.variant))):
+            condition = ("", "", "") if number else ours.params.values()
             base = results.find(BASELINE, ONE_WAY, **ours.params)
-            pictures = f"{ours.middle('pictures_hz'):.1f}" if ours.params["load"] == MEDIA else ""
-            grid.add_row(
-                *map(str, place), ours.variant, *percentiles(ours, 50, 99), *percentiles(back, 50, 99), str(ours.lost),
-                str(ours.total("late")), pictures, compared(ours, base),
-            )  # fmt: skip
+            figures = (*percentiles(ours, 50, 99), str(ours.lost), compared(ours, base))
+            grid.add_row(*map(str, condition), ours.variant, *figures)
     return grid
 
 
@@ -132,59 +106,54 @@ class Participants(Processes):
     def __init__(self, variants: Sequence[str]) -> None:
         super().__init__()
         self._variants = variants
-        #: By variant: how frames_worker names where pictures flow, and the sender.
-        self._parts: dict[str, tuple[tuple[str, object], Worker]] = {}
+        self._senders: dict[str, Worker] = {}  # by variant
+        self._where: dict[str, object] = {}  # by variant: the folder for sockets, or the broker's port
 
     def start(self) -> None:
         for number, variant in enumerate(self._variants):
-            folder, (kind, settings, lines) = self.folder / str(number), VARIANTS[variant]
+            folder, kind = self.folder / str(number), VARIANTS[variant]
             folder.mkdir()
+            settings: MqttSettings | ZenohSettings
             if kind == "zenoh":
-                where: Any = ZenohSettings(run_dir=folder / "z", **settings)  # short: paths of Unix sockets
-                hub_settings = _json(ZenohSettings(run_dir=where.run_dir))
-                hub = self.add(
-                    Program("hub", python("pebble.extensions.lab.rig.hub", hub_settings), folder / "hub.log"), BROKERS
-                )
-                hub.wait_until((where.run_dir / "hub.sock").exists, _READY_S)
-                stream: tuple[str, object] = ("zenoh-shm", where.run_dir)
+                settings = ZenohSettings(run_dir=folder / "z")  # short: paths of Unix sockets
+                command = python("pebble.extensions.lab.rig.hub", _json(settings))
+                hub = self.add(Program("hub", command, folder / "hub.log"), BROKERS)
+                hub.wait_until((settings.run_dir / "hub.sock").exists, _READY_S)
+                self._where[variant] = settings.run_dir
             else:
-                broker = self.broker(extra=lines, folder=folder)
+                broker = self.broker(folder=folder)
                 broker.wait()
-                where = MqttSettings(host="127.0.0.1", port=broker.port, **settings)
-                stream = ("mqtt", broker.port)
-            sender, _ = (
-                self.worker(f"{variant}: {name}", "pebble.extensions.lab.bench.control_ends", name, kind, _json(where))
-                for name in ("sender", "echo")
-            )
-            self._parts[variant] = stream, sender
+                settings = MqttSettings(host="127.0.0.1", port=broker.port)
+                self._where[variant] = broker.port
+            for role in ("sender", "echo"):
+                options = (role, kind, _json(settings))
+                worker = self.worker(f"{variant}: {role}", "pebble.extensions.lab.bench.control_ends", *options)
+                if role == "sender":
+                    self._senders[variant] = worker
         for worker in self.workers:
             worker.answer(_READY_S)
 
-    def run(self, variant: str, case: Case, seconds: float) -> tuple[Slice, float]:
-        """Run one slice; return its results, and the pictures per second during it.
-
-        Raises PebbleError if a process ended, or no pictures flow.
-        """
-        stream, sender = self._parts[variant]
-        ends = [
-            self.worker(name, "pebble.extensions.lab.bench.frames_worker", stream[0], name, stream[1], "640x480")
-            for name in (("reader", "writer") if case.load == MEDIA else ())
-        ]
-        for end in ends:
+    def run(self, variant: str, case: Case, seconds: float) -> Slice:
+        """Run one slice; return its results. Raises PebbleError if a process ended, or no pictures flow."""
+        picture_variant = "zenoh-shm" if VARIANTS[variant] == "zenoh" else "mqtt"
+        picture_ends: dict[str, Worker] = {}
+        for role in ("reader", "writer") if case.load == MEDIA else ():
+            options = (picture_variant, role, self._where[variant], "640x480")
+            picture_ends[role] = self.worker(role, "pebble.extensions.lab.bench.frames_worker", *options)
+        for end in picture_ends.values():
             end.answer(_READY_S)
-        began_ns, pictures_hz = time.monotonic_ns(), 0.0
+        began_ns = time.monotonic_ns()
         spec = _json(SliceSpec(case.size, case.rate, seconds))
-        done = msgspec.convert(sender.ask(spec, seconds + _ANSWER_S), Slice)
-        for reader in ends[:1]:
-            pictures = sum(ns > began_ns for _, ns in reader.ask("", _ANSWER_S)["arrived"])
-            pictures_hz = 1e9 * pictures / (time.monotonic_ns() - began_ns)
-            if not pictures:
+        done = msgspec.convert(self._senders[variant].ask(spec, seconds + _ANSWER_S), Slice)
+        if case.load == MEDIA:
+            pictures = picture_ends["reader"].ask("", _ANSWER_S)["arrived"]
+            if not any(arrived_ns > began_ns for _, arrived_ns in pictures):
                 raise PebbleError(f"{variant}: no pictures flow")
         if problems := self.unexpected_exits():
             raise PebbleError(f"{variant}: {'; '.join(problems)}")
-        for end in ends:
+        for end in picture_ends.values():
             self.end(end)
-        return done, pictures_hz
+        return done
 
 
 def _json(settings: MqttSettings | ZenohSettings | SliceSpec) -> str:

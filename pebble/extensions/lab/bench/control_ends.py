@@ -35,9 +35,9 @@ _POLL_S = 0.01
 _CONNECT_S = 10.0
 _WARM_UP, _WARM_UP_S = 20, 15.0  # messages
 
-#: Of a message: its number, when it was sent (ns), and when it was echoed; padding follows.
+#: A message: its number, when it was sent (ns), and when it was echoed (ns); padding follows.
 _FORM = struct.Struct("<Qqq")
-_ECHOED, _ECHOED_AT = struct.Struct("<q"), 16
+_ECHOED, _ECHOED_AT = struct.Struct("<q"), 16  # the third value, and its place in bytes
 SMALLEST = _FORM.size
 
 Handler = Callable[[bytes], None]
@@ -51,20 +51,11 @@ class SliceSpec(msgspec.Struct, frozen=True):
     seconds: float
 
 
-class Exchange(NamedTuple):
-    """The times at which a message was sent, echoed, and received again: CLOCK_MONOTONIC, ns."""
-
-    sent_ns: int
-    echoed_ns: int
-    received_ns: int
-
-
-class Slice(msgspec.Struct, frozen=True, kw_only=True):
+class Slice(msgspec.Struct, frozen=True):
     """The results of a slice."""
 
     sent: int  # counted messages
-    late: int  # of these, by more than half of the period
-    exchanges: list[Exchange]
+    latencies_us: list[float]  # of those that were echoed
 
 
 # -- connections, and the two ends
@@ -123,7 +114,7 @@ class Sender:
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self._first = 0  # the number of the first message
-        self._received: list[Exchange | None] = []
+        self._received: list[float | None] = []  # by message: its latency in µs
         connection.subscribe(REPLIES, self._on_message)
 
     def warm_up(self, count: int, timeout: float) -> bool:
@@ -132,48 +123,51 @@ class Sender:
         while returned < count and time.monotonic() < end:
             self._expect(1)
             self._send(self._first, SMALLEST)
-            self._collect(0.1)
-            returned += None not in self._received
+            if self._collect(0.1):
+                returned += 1
         return returned >= count
 
     def run(self, spec: SliceSpec) -> Slice:
+        """Send the messages of a slice at their times; return its results once all replies are there, or are lost."""
         lead, period = max(1, math.ceil(_LEAD_S * spec.rate)), 1 / spec.rate
-        counting = max(1, round(spec.seconds * spec.rate))
-        self._expect(lead + counting)
-        late, due = 0, time.monotonic() + period
-        for number in range(lead + counting):
+        counted = max(1, round(spec.seconds * spec.rate))
+        self._expect(lead + counted)
+        due = time.monotonic() + period
+        for number in range(lead + counted):
             time.sleep(max(0.0, due - time.monotonic()))
-            late += number >= lead and time.monotonic() - due > period / 2
             self._send(self._first + number, spec.size)
             due += period
         self._collect(_LAST_S)
-        exchanges = [exchange for exchange in self._received[lead:] if exchange is not None]
-        return Slice(sent=counting, late=late, exchanges=exchanges)
+        return Slice(counted, [latency_us for latency_us in self._received[lead:] if latency_us is not None])
 
     def _expect(self, count: int) -> None:
+        """Make entries for the next ``count`` messages, whose numbers continue those of earlier messages."""
         self._first += len(self._received)
         self._received = [None] * count
 
     def _send(self, number: int, size: int) -> None:
         self._connection.publish(REQUESTS, _FORM.pack(number, time.monotonic_ns(), 0).ljust(size, b"\0"))
 
-    def _collect(self, timeout: float) -> None:
+    def _collect(self, timeout: float) -> bool:
+        """Wait for the replies, at most ``timeout`` seconds; return True if all are there."""
         end = time.monotonic() + timeout
         while None in self._received and time.monotonic() < end:
             time.sleep(_POLL_S)
+        return None not in self._received
 
     def _on_message(self, payload: bytes) -> None:
-        received = time.monotonic_ns()
-        number, sent, echoed = _FORM.unpack_from(payload)
+        number, sent_ns, echoed_ns = _FORM.unpack_from(payload)
         index = number - self._first
         if 0 <= index < len(self._received) and self._received[index] is None:  # QoS 1 may deliver twice
-            self._received[index] = Exchange(sent, echoed, received)
+            self._received[index] = (echoed_ns - sent_ns) / 1000
 
 
 def run_end(role: str, kind: str, settings: str) -> None:
+    """Run one end until standard input closes. The arguments are those of the command line."""
     form = ZenohSettings if kind == "zenoh" else MqttSettings
     where: Any = msgspec.json.decode(settings, type=form, dec_hook=lambda _kind, text: Path(text))
-    with closing(stock(where.port) if kind == STAND_IN else opened(create(kind, role, where))) as connection:
+    connection = stock(where.port) if kind == STAND_IN else opened(create(kind, role, where))
+    with closing(connection):
         if role == "echo":
             echo(connection)
             answer({"ready": True})

@@ -1,4 +1,4 @@
-"""Measures memory, CPU and threads of each process of a robot, idle and active, on MQTT and on Zenoh.
+"""Measures memory and CPU of each process of a robot, idle and active, on MQTT and on Zenoh.
 
 Whole robots with a synthetic camera and microphone, stock mosquitto, a simulated MCU. The phases have a fixed order;
 each starts with the memory that the one before left allocated. Memory is PSS, in which shared pages are divided among
@@ -9,30 +9,28 @@ not the remote broker, the operator and the MCU. Nothing large is imported here,
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from importlib.util import find_spec
 from typing import Final
 
 from rich.console import Console
 from rich.table import Table
 
+from pebble.contract import AUDIO, CAMERA
 from pebble.errors import PebbleError
 from pebble.extensions.lab.bench.clients import UP_S, RobotSubscriber, driving
 from pebble.extensions.lab.bench.results import Cell, Results, begin, grouped, round_cell
 from pebble.extensions.lab.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.extensions.lab.bench.show import RATIOS, Shown, compared, middle, plain_table
-from pebble.extensions.lab.bench.usage import cpu_s, pss_mb, threads
+from pebble.extensions.lab.bench.usage import cpu_s, pss_mb
 from pebble.extensions.lab.rig.robot import BASE, KINDS, MEDIA, Robot, one_robot
 
 ALL: Final = "all"  # the processes of a robot together
-MEMORY, CPU, THREADS = "PSS", "CPU", "threads"
-IDLE, DRIVING = "idle", "driving"
-_UNITS = {MEMORY: "MB", CPU: "%", THREADS: ""}
-#: The encodings requested in each media phase, by the name of the phase.
-STREAMS: Final = {"json+pcm": ("json", "pcm"), "h264+opus": ("h264", "opus")}
+MEMORY, CPU = "PSS", "CPU"
+IDLE, DRIVING, STREAMING = "idle", "driving", "h264+opus"
+_UNITS = {MEMORY: "MB", CPU: "%"}
 _FLOW_S = 20.0
 _STARTUP_S = 0.5  # for start-up work, or a change of the streams, to finish
 _FIRST = 5  # pictures and sound packets until a stream counts as flowing
@@ -74,16 +72,15 @@ def measure(variant: str, seconds: float) -> Iterator[Cell]:
         yield from _phase(robot, IDLE, seconds)
         with driving(robot.remote_port, BASE):
             yield from _phase(robot, DRIVING, seconds)
-        for name, forms in STREAMS.items():
-            if "h264" in forms and find_spec("av") is None:
-                continue
-            subscriber.request_media(BASE, *forms)
-            robot.expect(partial(_flow, robot, subscriber, forms), f"{name} does not flow", _FLOW_S)
-            yield from _phase(robot, name, seconds)
+        if find_spec("av") is not None:
+            subscriber.request_media(BASE)
+            robot.expect(lambda: _media_flow(robot, subscriber), "pictures or sound do not flow", _FLOW_S)
+            yield from _phase(robot, STREAMING, seconds)
 
 
-def _flow(robot: Robot, subscriber: RobotSubscriber, forms: Sequence[str]) -> bool:
-    return all(subscriber.arrived[form] >= _FIRST for form in forms) and robot.complete()
+def _media_flow(robot: Robot, subscriber: RobotSubscriber) -> bool:
+    arrived = (subscriber.arrived[channel.suffix] for channel in (CAMERA, AUDIO))
+    return min(arrived) >= _FIRST and robot.complete()
 
 
 def _phase(robot: Robot, phase: str, seconds: float) -> Iterator[Cell]:
@@ -97,33 +94,27 @@ def _phase(robot: Robot, phase: str, seconds: float) -> Iterator[Cell]:
     if robot.processes() != processes:
         raise PebbleError(f"{phase}: processes of the robot ended or started meanwhile\n{robot.log()}")
     memory = {name: pss_mb(pid) for name, pid in processes.items()}
-    running = {name: threads(pid) for name, pid in processes.items()}
-    yield from cells_of(robot.kind, phase, {MEMORY: memory, CPU: cpu, THREADS: running})
-
-
-def cells_of(variant: str, phase: str, used: Mapping[str, Mapping[str, float]]) -> Iterator[Cell]:
-    """Yield the ``used`` resources by measure and process, and for the whole robot."""
-    for name, values in used.items():
-        for process, value in (*values.items(), (ALL, sum(values.values()))):
-            yield round_cell(variant, name, _UNITS[name], [value], {"phase": phase, "process": process})
+    for measure_, by_process in ((MEMORY, memory), (CPU, cpu)):
+        for process, value in (*by_process.items(), (ALL, sum(by_process.values()))):
+            params = {"phase": phase, "process": process}
+            yield round_cell(robot.kind, measure_, _UNITS[measure_], [value], params)
 
 
 def table(results: Results) -> Table:
     """Return the usage of each process by phase, and the ratios; the whole robot last, in bold."""
-    heads = [f"{variant} {unit}" for variant in KINDS for unit in ("MB", "%", "thr.")]
-    ratios = [f"{measure_}, zenoh / mqtt" for measure_ in (MEMORY, CPU)]
-    grid = plain_table("Memory (PSS), CPU (of one core), threads; medians", ["phase", "process", *heads, *ratios],
-                        left=2, caption=RATIOS)  # fmt: skip
+    heads = [f"{variant} {unit}" for variant in KINDS for unit in _UNITS.values()]
+    ratios = [f"{measure_}, zenoh / mqtt" for measure_ in _UNITS]
+    grid = plain_table("Memory (PSS), CPU (of one core); medians", ["phase", "process", *heads, *ratios], left=2,
+                        caption=RATIOS)  # fmt: skip
     for phase, cells in grouped(results.cells, lambda cell: cell.params["phase"]).items():
         grid.add_section()
         processes = sorted({str(cell.params["process"]) for cell in cells}, key=lambda name: (name == ALL, name))
         for number, process in enumerate(processes):
-            used = {
-                (variant, measure_): results.find(variant, measure_, phase=phase, process=process)
+            mqtt, zenoh = (
+                [results.find(variant, measure_, phase=phase, process=process) for measure_ in _UNITS]
                 for variant in KINDS
-                for measure_ in (MEMORY, CPU, THREADS)
-            }
-            comparisons = [compared(used["zenoh", measure_], used["mqtt", measure_]) for measure_ in (MEMORY, CPU)]
-            place, style = "" if number else str(phase), "bold" if process == ALL else None
-            grid.add_row(place, process, *map(middle, used.values()), *comparisons, style=style)
+            )
+            comparisons = map(compared, zenoh, mqtt)
+            shown_phase, style = "" if number else str(phase), "bold" if process == ALL else None
+            grid.add_row(shown_phase, process, *map(middle, (*mqtt, *zenoh)), *comparisons, style=style)
     return grid

@@ -36,9 +36,9 @@ def open_zenoh(socket: str) -> Any:
 
 
 def main(place: str, remote_port: str, online: str, status: str) -> None:
-    local = connected(int(place)) if place.isdigit() else open_zenoh(place)  # kept open
+    _local = connected(int(place)) if place.isdigit() else open_zenoh(place)  # open as long as this runs
     remote = connected(int(remote_port))
-    while local is not None:
+    while True:
         remote.publish(online, json.dumps({"t": round(1000 * time.time())}), 1, retain=True)
         services = {"floor": {"state": "ready"}}
         remote.publish(status, json.dumps({"value": {"services": services}}), 1, retain=True)

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pebble.extensions.lab.bench.results import FLOOR, STAND_IN, Cell, grouped, named, percentile
+from pebble.extensions.lab.bench.results import FLOOR, STAND_IN, Cell, grouped, naming_in_errors, percentile
 from pebble.extensions.lab.bench.show import Picture, digits
 
 if TYPE_CHECKING:
@@ -38,17 +38,17 @@ def curves(name: str, caption: str, cells: Sequence[Cell]) -> list[Picture]:
 
 def _curves(cells: Sequence[Cell], title: str) -> Figure:
     """Return the figure. A curve ends below 100 % by the share of lost messages; the slowest few are cut off."""
-    by_place, style_of = grouped(cells, Cell.conditions), styles([cell.variant for cell in cells])
-    figure, every = panels(len(by_place), 3, (3.9, 2.7), title)
-    ends = around([percentile(cell.samples, percent) for cell in cells for percent in (0.1, 99.8)])
-    for axes, (place, group) in zip(every, by_place.items(), strict=True):
+    by_condition, style_of = grouped(cells, Cell.conditions), styles([cell.variant for cell in cells])
+    figure, all_axes = panels(len(by_condition), 3, (3.9, 2.7), title)
+    ends = log_limits([percentile(cell.samples, percent) for cell in cells for percent in (0.1, 99.8)])
+    for axes, (condition, group) in zip(all_axes, by_condition.items(), strict=True):
         for cell in group:
             times, style = sorted(cell.samples), style_of[cell.variant]
             step = 100 / (len(times) + (cell.lost or 0))
             shares = [step * count for count in range(1, len(times) + 1)]
             axes.plot(times, shares, **{**style, "marker": ""})
         log_axis(axes, "x", f"latency, {_unit(cells[0])}", *ends)
-        axes.set(ylim=(0, 101), title=place)
+        axes.set(ylim=(0, 101), title=condition)
         for percent in (50, 99):
             guide(axes, percent, f"p{percent}")
     legend(figure, style_of)
@@ -63,14 +63,15 @@ def lines(name: str, caption: str, cells: Sequence[Cell], *, over: str) -> list[
 
 def _lines(cells: Sequence[Cell], title: str, over: str) -> Figure:
     by_measure, style_of = grouped(cells, lambda cell: cell.measure), styles([cell.variant for cell in cells])
-    figure, every = panels(len(by_measure), 3, (3.9, 3.0), title)
-    for axes, (measure, group) in zip(every, by_measure.items(), strict=True):
-        for variant, points in grouped(group, lambda cell: cell.variant).items():
-            along = sorted((float(str(cell.params[over])), cell.percentile(50)) for cell in points)
-            axes.plot(*zip(*along, strict=True), **style_of[variant])
-            axes.annotate(f"  {digits(along[-1][1])}", along[-1], fontsize=8, va="center", annotation_clip=False)
-        at = [float(str(cell.params[over])) for cell in group]
-        log_axis(axes, "x", over, 0.8 * min(at), 2.5 * max(at))
+    figure, all_axes = panels(len(by_measure), 3, (3.9, 3.0), title)
+    for axes, (measure, group) in zip(all_axes, by_measure.items(), strict=True):
+        for variant, cells_of_variant in grouped(group, lambda cell: cell.variant).items():
+            points = sorted((float(str(cell.params[over])), cell.percentile(50)) for cell in cells_of_variant)
+            axes.plot(*zip(*points, strict=True), **style_of[variant])
+            last_median = points[-1][1]
+            axes.annotate(f"  {digits(last_median)}", points[-1], fontsize=8, va="center", annotation_clip=False)
+        positions = [float(str(cell.params[over])) for cell in group]
+        log_axis(axes, "x", over, 0.8 * min(positions), 2.5 * max(positions))  # space for the last number
         top = 1.15 * max(cell.percentile(50) for cell in group) or 1.0
         axes.set(ylim=(0, top), ylabel=f"{measure}, {_unit(group[0])}")
     legend(figure, style_of)
@@ -88,8 +89,8 @@ Style = dict[str, Any]  # keywords of a line
 #: Blue is Zenoh, red MQTT, brown the stand-in.
 _COLOURS: dict[str, str] = {
     "zenoh": "#0072B2", "zenoh-p2p": "#0072B2", "zenoh-shm": "#0072B2", "zenoh h264 opus": "#0072B2",
-    "zenoh-hub": "#2AA198", "zenoh original": "#56B4E9", "mqtt": "#D55E00", "mqtt h264 opus": "#D55E00",
-    "mqtt-nodelay": "#E69F00", "mqtt original": "#E69F00", "mqtt5": "#A4133C", STAND_IN: "#8C510A", FLOOR: "#000000",
+    "zenoh original": "#56B4E9", "mqtt": "#D55E00", "mqtt h264 opus": "#D55E00", "mqtt original": "#E69F00",
+    STAND_IN: "#8C510A", FLOOR: "#000000",
     "gstreamer-shm": "#8A8A8A", "page": "#8A8A8A", "each by itself": "#D55E00", "groups": "#E69F00",
     "groups, deflate": "#56B4E9", "groups, deflate, short name": "#0072B2",
 }  # fmt: skip
@@ -98,9 +99,9 @@ _COLOURS: dict[str, str] = {
 def styles(variants: Sequence[str]) -> dict[str, Style]:
     """Return the style of each variant. Dash and marker differ as well, for colour-blind readers."""
     return {
-        name: {"color": _COLOURS[name], "linestyle": ("-", "--", "-.", ":")[at % 4], "marker": "os^DvP"[at % 6],
+        name: {"color": _COLOURS[name], "linestyle": ("-", "--", "-.", ":")[number % 4], "marker": "os^DvP"[number % 6],
                "markersize": 5, "markerfacecolor": "white" if "original" in name else _COLOURS[name]}
-        for at, name in enumerate(dict.fromkeys(variants))
+        for number, name in enumerate(dict.fromkeys(variants))
     }  # fmt: skip
 
 
@@ -130,7 +131,7 @@ def save(picture: Picture, folder: Path, *, quick: bool) -> Path:
     import matplotlib as mpl
 
     path = folder / f"{picture.name}.png"
-    with mpl.rc_context(_SETTINGS), named(path):
+    with mpl.rc_context(_SETTINGS), naming_in_errors(path):
         figure = picture.make()
         if quick:
             figure.text(0.995, 0.993, "quick run", ha="right", va="top", color="#A4133C", weight="bold")
@@ -140,12 +141,12 @@ def save(picture: Picture, folder: Path, *, quick: bool) -> Path:
 
 def log_axis(axes: Axes, which: str, label: str, low: float, high: float) -> None:
     """Set a logarithmic axis from ``low`` to ``high``, with written-out numbers."""
-    limits: dict[str, Any] = {f"{which}scale": "log", f"{which}lim": (low, high), f"{which}label": label}
-    axes.set(**limits)
+    settings: dict[str, Any] = {f"{which}scale": "log", f"{which}lim": (low, high), f"{which}label": label}
+    axes.set(**settings)
     (axes.xaxis if which == "x" else axes.yaxis).set_major_formatter("{x:,.12g}")
 
 
-def around(values: Sequence[float]) -> tuple[float, float]:
+def log_limits(values: Sequence[float]) -> tuple[float, float]:
     """Return the ends of a logarithmic axis that holds all positive values with some margin."""
     positive = [value for value in values if 0 < value < math.inf] or [1.0]
     return 0.75 * min(positive), 1.4 * max(positive)

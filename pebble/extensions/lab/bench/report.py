@@ -14,7 +14,7 @@ from typing import Final
 from rich.console import Console
 
 from pebble.errors import PebbleError
-from pebble.extensions.lab.bench.results import STAND_IN, Results, Value, check_folder, load, named
+from pebble.extensions.lab.bench.results import STAND_IN, Results, Value, check_folder, load, naming_in_errors
 from pebble.extensions.lab.bench.show import RATIOS, compared, middle
 from pebble.extensions.lab.rig.processes import Program, end_all, python
 from pebble.extensions.operator.signals import interrupted_by_signals
@@ -46,11 +46,11 @@ class Section:
 
 
 SECTIONS: Final = (
-    Section("control", "Service to service", 500, 40),
+    Section("control", "Service to service", 250, 25),
     Section("bridge", "Operator to wheels, and back", 2200, 30),
     Section("startup", "Start-up", 240, 60),
     Section("cost", "Memory and CPU", 180, 20),
-    Section("frames", "Camera frames inside the robot", 200, 12),
+    Section("frames", "Camera frames inside the robot", 240, 15),
     Section("scale", "Many boards", 150, 25),
     Section("traffic", "Traffic of robots, as in the paper", 140, 19),
     Section("impair", "On an impaired network", 900, 150, needs_root=True),
@@ -68,11 +68,11 @@ class Headline:
     variants: Sequence[str] = (STAND_IN, "mqtt", "zenoh")
 
 
-_SLICE: Final = {"size": "40 B", "rate": "200 Hz"}
+_MESSAGES: Final = {"size": "40 B", "rate": "200 Hz"}  # the condition of `control` that stands in the table
 _P2P: Final = (STAND_IN, "mqtt", "zenoh-p2p")
 HEADLINES: Final = (
-    Headline("message between two services", "control", "one-way", {**_SLICE, "load": "none"}, _P2P),
-    Headline("the same, beside pictures", "control", "one-way", {**_SLICE, "load": "media"}, _P2P),
+    Headline("message between two services", "control", "one-way", {**_MESSAGES, "load": "none"}, _P2P),
+    Headline("the same, beside pictures", "control", "one-way", {**_MESSAGES, "load": "media"}, _P2P),
     Headline("command to the wheels, commands only", "bridge", "down", {"load": "commands"}),
     Headline("the same, with reports", "bridge", "down", {"load": "none"}),
     Headline("report to the operator", "bridge", "up", {"load": "none"}),
@@ -95,7 +95,7 @@ def run(names: Sequence[str], folder: Path, *, quick: bool, console: Console) ->
 
     Without names it runs all that this user may run. Raises PebbleError if the folder cannot be written.
     """
-    path, sections, failed = _checked(folder), _chosen(names), 0
+    path, sections, failed = _report_path(folder), _chosen(names), 0
     console.print(f"{len(sections)} comparisons: about {_span(sum(section.expected_s(quick) for section in sections))}")
     try:
         with interrupted_by_signals():
@@ -107,14 +107,14 @@ def run(names: Sequence[str], folder: Path, *, quick: bool, console: Console) ->
                 console.print(f"{line}, {_span(time.monotonic() - began)}", soft_wrap=True)
                 failed += bool(problem)
     finally:  # also after Ctrl-C
-        with named(path):
+        with naming_in_errors(path):
             path.write_text(text(folder))
         console.print(f"Written: {path}", soft_wrap=True)
     return 1 if failed else 0
 
 
-def _checked(folder: Path) -> Path:
-    """Return the report's path. PebbleError, before an hour of measuring, if it cannot or must not be written."""
+def _report_path(folder: Path) -> Path:
+    """Return the report's path. Raises PebbleError if it cannot or must not be written: before an hour of measuring."""
     if find_spec("matplotlib") is None:
         raise PebbleError("a report needs matplotlib, which is not installed: pip install 'pebble-robot[bench]'")
     check_folder(folder)
@@ -175,6 +175,7 @@ def text(folder: Path) -> str:
 
 
 def _about(section: Section, results: Results | None) -> Iterator[str]:
+    """Yield paragraphs that tell how the section was measured; ``results``: None if it left no file."""
     if results is None:
         yield "**It failed, and left no results.**"
         return

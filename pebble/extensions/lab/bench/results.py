@@ -116,19 +116,21 @@ class Results(msgspec.Struct, kw_only=True):
         for cell in self.cells:
             rounds = [[round(sample, _DIGITS) for sample in samples] for samples in cell.rounds]
             cells.append(msgspec.structs.replace(cell, rounds=rounds))
-        with named(path):
+        with naming_in_errors(path):
             path.write_bytes(msgspec.json.encode(msgspec.structs.replace(self, cells=cells)) + b"\n")
 
     def find(self, variant: str, measure: str, **params: Value) -> Cell | None:
-        """Return the first cell with these ``params``, which may have more; None if there is none."""
-        same = (cell for cell in self.cells if (cell.variant, cell.measure) == (variant, measure))
-        return next((cell for cell in same if params.items() <= cell.params.items()), None)
+        """Return the first cell whose ``params`` include these; None if there is none."""
+        for cell in self.cells:
+            if (cell.variant, cell.measure) == (variant, measure) and params.items() <= cell.params.items():
+                return cell
+        return None
 
 
 def load(path: Path) -> Results:
     """Read results. Raises PebbleError if the file holds none."""
     try:
-        with named(path):
+        with naming_in_errors(path):
             return msgspec.json.decode(path.read_bytes(), type=Results)
     except msgspec.DecodeError as error:
         raise PebbleError(f"{path} holds no results of pebble bench: {error}") from None
@@ -141,8 +143,8 @@ def begin(bench: str, settings: DataclassInstance) -> Results:
 
 
 @contextmanager
-def named(path: Path) -> Iterator[None]:
-    """Raise PebbleError that names the path, in place of an OSError."""
+def naming_in_errors(path: Path) -> Iterator[None]:
+    """Raise PebbleError that names the path, in place of an OSError of the ``with`` block."""
     try:
         yield
     except OSError as error:
@@ -151,7 +153,7 @@ def named(path: Path) -> Iterator[None]:
 
 def check_folder(folder: Path) -> None:
     """Raise PebbleError if the folder cannot be written: before an hour of measuring, not after it."""
-    with named(folder):
+    with naming_in_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
 
@@ -161,16 +163,17 @@ def machine() -> dict[str, Value]:
     from pebble.extensions.operator.places import mosquitto_path  # not for the processes that only measure
 
     model = re.search(r"^(?:model name|Model).*?: *(.*?) *$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    broker = ""
+    broker_version = ""
     if (path := mosquitto_path()) is not None:
-        broker = subprocess.run([path, "-h"], capture_output=True, text=True, check=False).stdout.partition("\n")[0]
+        help_text = subprocess.run([path, "-h"], capture_output=True, text=True, check=False).stdout
+        broker_version = help_text.partition("\n")[0].removeprefix("mosquitto version ")
     return {
         "cpu": model[1] if model else platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
         "kernel": platform.release(),
         "system": platform.freedesktop_os_release()["PRETTY_NAME"],
         "python": platform.python_version(),
-        "mosquitto": broker.removeprefix("mosquitto version ") or None,
+        "mosquitto": broker_version or None,
         **{name: package.version for name in _PACKAGES for package in distributions(name=name)},
     }
 
@@ -183,8 +186,9 @@ def grouped(things: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
     return groups
 
 
-def percentile(figures: Sequence[float], percent: float) -> float:
+def percentile(values: Sequence[float], percent: float) -> float:
     """Return the smallest value that at least ``percent`` per cent of the values do not exceed; NaN without values."""
-    if not figures:
+    if not values:
         return math.nan
-    return sorted(figures)[max(0, math.ceil(len(figures) * percent / 100) - 1)]
+    count = math.ceil(len(values) * percent / 100)  # of the values up to the percentile
+    return sorted(values)[max(0, count - 1)]

@@ -1,4 +1,4 @@
-"""Compares variants in rounds, from which the confidence interval of a ratio comes.
+"""Runs comparisons in rounds, in which all variants take turns, and computes confidence intervals of ratios.
 
 Samples of one round are not independent: they share processes, a memory layout and a moment of the machine. So each
 round counts as one observation, and the variation is estimated by resampling the rounds (decision 0010).
@@ -10,12 +10,14 @@ import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from statistics import NormalDist, fmean
 from typing import Final, TypeVar
 
 import msgspec
 from rich.console import Console
 from rich.markup import escape
+from rich.status import Status
 
 from pebble.errors import PebbleError
 from pebble.extensions.lab.bench.results import Cell, Results, grouped, percentile
@@ -50,15 +52,13 @@ def measure_rounds(
     began, failed = time.monotonic(), list[str]()
     with console.status("", refresh_per_second=4) as status:
         for number in range(rounds):
-
-            def progress(what: str, before: str = f"round {number + 1} of {rounds}: ") -> None:
-                status.update(escape(before + what))
-
+            title = f"round {number + 1} of {rounds}"
             try:
-                add_round(results, measure(number, progress))
+                add_round(results, measure(number, partial(_show_progress, status, title)))
             except (PebbleError, OSError) as error:
                 failed.append(f"round {number + 1}: {error}")
-                if len(failed) == number + 1 == min(_GIVEN_UP, rounds):
+                none_succeeded = len(failed) == number + 1
+                if none_succeeded and len(failed) == min(_GIVEN_UP, rounds):
                     raise
                 console.print(failed[-1], style="red", highlight=False, markup=False)
     results.took_s = round(time.monotonic() - began, 1)
@@ -68,10 +68,14 @@ def measure_rounds(
     results.complete = enough and all(cell.samples for cell in results.cells)
 
 
-def add_round(results: Results, measured: Iterable[Cell]) -> None:
-    """Add the cells of a round to those of earlier rounds; equal cases are joined.
+def _show_progress(status: Status, title: str, what: str) -> None:
+    status.update(escape(f"{title}: {what}"))
 
-    Their figures that are whole numbers are counts, which add up; others are averaged.
+
+def add_round(results: Results, measured: Iterable[Cell]) -> None:
+    """Add the cells of a round to those of earlier rounds. Cells of one variant, measure and condition become one.
+
+    Of such cells, figures that are whole numbers are counts, which are added up; other figures are averaged.
     """
     by_key = {_key(cell): cell for cell in results.cells}
     for key, parts in grouped(list(measured), _key).items():
@@ -108,18 +112,21 @@ class Interval:
 
 
 def ratio(ours: Cell, theirs: Cell, percent: float = 50) -> Interval:
-    """Return the ratio of the percentiles of two cells that took turns; lost messages are infinitely late."""
+    """Return the ratio of the percentiles of two cells, measured in turns; lost messages are infinitely late."""
     return paired(ours.with_lost(), theirs.with_lost(), percent)
 
 
 def paired(ours: Samples, theirs: Samples, percent: float = 50) -> Interval:
     """Return the median over the rounds of the ratio of their percentiles; rounds with two infinite ones are left out.
 
-    The ends of the interval are those of the medians of many samples of as many rounds, drawn with replacement, and
-    wider by Student's t.
+    For the interval, as many rounds as there are are drawn with replacement, many times: its ends are quantiles of the
+    medians of these draws, moved outwards by Student's t because there are few rounds.
     """
-    pairs = [(percentile(a, percent), percentile(b, percent)) for a, b in zip(ours, theirs, strict=False) if a and b]
-    ratios = [min(a, _INFINITE) / min(b, _INFINITE) for a, b in pairs if b > 0 and min(a, b) < math.inf]
+    ratios = []
+    for our_samples, their_samples in zip(ours, theirs, strict=False):
+        our_value, their_value = percentile(our_samples, percent), percentile(their_samples, percent)
+        if their_value > 0 and min(our_value, their_value) < math.inf:  # false for NaN: a round without samples
+            ratios.append(min(our_value, _INFINITE) / min(their_value, _INFINITE))
     if not ratios:
         return Interval()
     import numpy as np  # importing it earlier than it is needed would change the memory of measured processes
@@ -128,8 +135,8 @@ def paired(ours: Samples, theirs: Samples, percent: float = 50) -> Interval:
     middle = float(np.median(logs))
     random = np.random.default_rng(1)  # the same samples give the same interval
     drawn = np.median(random.choice(logs, (RESAMPLES, len(logs))), axis=1)
-    tail, wider = (1 - LEVEL) / 2, _student(len(logs)) / _student(math.inf)
-    low, high = (middle + wider * (end - middle) for end in np.quantile(drawn, [tail, 1 - tail]))
+    tail, widening = (1 - LEVEL) / 2, _student(len(logs)) / _student(math.inf)
+    low, high = (middle + widening * (end - middle) for end in np.quantile(drawn, [tail, 1 - tail]))
     return Interval(math.exp(middle), math.exp(low), math.exp(high), len(logs))
 
 

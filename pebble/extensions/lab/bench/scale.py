@@ -2,9 +2,10 @@
 
 Boards at a stock mosquitto, a page server and one viewer. The boards are cheap, all on one thread: a connection and a
 will each, retained capabilities, four heartbeats a second, and nothing that obeys. The latency is that of a voltage,
-from the publish call of one more board until the viewer has it; one that the page has replaced by a newer one is lost.
+from the publish call of one more board, the probe, until the viewer has it. A voltage that the page never sent, because
+a newer one replaced it, counts as lost.
 
-``python -m pebble.extensions.lab.bench.scale PORT COUNT`` are the boards.
+``python -m pebble.extensions.lab.bench.scale PORT COUNT`` runs the boards.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from pebble.extensions.lab.bench.rounds import Progress, measure_rounds
 from pebble.extensions.lab.bench.show import Shown, digits, plain_table
 from pebble.extensions.lab.bench.usage import cpu_s, pss_mb
 from pebble.extensions.lab.rig.processes import HOST, OPERATORS, Processes
+from pebble.extensions.lab.rig.scripted_operator import paced
 from pebble.extensions.lab.rig.testbed import PageServer
 from pebble.extensions.lab.rig.worker_end import answer, serve_on_thread
 from pebble.transports import Message, QoS
@@ -44,7 +46,7 @@ PROBE_HZ: Final = 10.0
 HEARTBEAT_S: Final = 0.25
 _PROBE = "probe"
 _KEEPALIVE_S = 10
-_UP_S, _LATE_S, _POLL_S = 120.0, 1.0, 0.05
+_UP_S, _LATE_S = 120.0, 1.0  # for the page to show all boards; for the last voltages
 
 Publish = Callable[[str, bytes], object]
 
@@ -103,16 +105,16 @@ def measure(boards: int, seconds: float) -> Iterator[Cell]:
         crowd.answer(_UP_S)
         pids = dict(zip(PROCESSES, (server.pid, broker.pid, crowd.pid), strict=True))
         with Viewer(server.url) as viewer:
-            params, topic, sent = {"boards": boards}, CHARGING_LEVEL.topic(_base(_PROBE)), dict[float, int]()
+            params, topic = {"boards": boards}, CHARGING_LEVEL.topic(_base(_PROBE))
             publish = connected(broker.port, _PROBE)
-            viewer.wait_until(lambda: viewer.online >= boards, f"{boards} boards")
-            publish(topic, _voltage(0.0))
-            viewer.wait_until(lambda: bool(viewer.values), "a voltage")
+            server.wait_until(lambda: viewer.online >= boards, _UP_S)
+            publish(topic, _voltage(0.0))  # from the first one on the page knows the probe
+            server.wait_until(lambda: bool(viewer.values), _UP_S)
             before, began = {name: cpu_s([pid]) for name, pid in pids.items()}, time.monotonic()
-            for number in range(round(seconds * PROBE_HZ)):
-                time.sleep(max(0.0, began + number / PROBE_HZ - time.monotonic()))
+            sent_ns: dict[float, int] = {}  # by value: each is sent once
+            for number in paced(seconds, PROBE_HZ):
                 value = round(7 + number / 1000, 3)
-                sent[value] = time.monotonic_ns()
+                sent_ns[value] = time.monotonic_ns()
                 publish(topic, _voltage(value))
             took = time.monotonic() - began
             for name, pid in pids.items():
@@ -120,8 +122,8 @@ def measure(boards: int, seconds: float) -> Iterator[Cell]:
                 yield round_cell(PAGE, CPU, "%", [used], {**params, "process": name})
             yield round_cell(PAGE, MEMORY, "MB", [pss_mb(server.pid)], params)
             time.sleep(_LATE_S)
-            arrived = [(viewer.values[value] - ns) / 1e6 for value, ns in sent.items() if value in viewer.values]
-        yield round_cell(PAGE, LATENCY, "ms", arrived, params, sent=len(sent))
+            latencies = [(viewer.values[value] - ns) / 1e6 for value, ns in sent_ns.items() if value in viewer.values]
+        yield round_cell(PAGE, LATENCY, "ms", latencies, params, sent=len(sent_ns))
 
 
 class Viewer:
@@ -151,14 +153,6 @@ class Viewer:
         """Number of robots that the page shows as online."""
         return len(self._online)
 
-    def wait_until(self, condition: Callable[[], bool], what: str) -> None:
-        """Wait until the page meets ``condition``. Raises PebbleError that names ``what`` if it does not in time."""
-        end = time.monotonic() + _UP_S
-        while not condition():
-            if time.monotonic() > end:
-                raise PebbleError(f"the page does not show {what}, but {self.online} boards")
-            time.sleep(_POLL_S)
-
     def _send(self, op: str, **fields: Any) -> None:
         self._socket.send(json.dumps({"op": op, **fields}))
 
@@ -167,7 +161,9 @@ class Viewer:
             message = json.loads(text)
             if message["op"] == "ping":
                 self._send("echo", n=message["n"], t=time.monotonic() * 1000)
-            for ref, metric, value, _ in message["set"] if message["op"] == "state" else ():
+            if message["op"] != "state":
+                continue
+            for ref, metric, value, _ in message["set"]:
                 if metric == "web/liveness" and value["online"]:
                     self._online.add(ref)
                 elif metric == CHARGING_LEVEL.metric:
@@ -184,7 +180,7 @@ def connected(port: int, name: str) -> Publish:
     will = Message(ONLINE.topic(_base(name)), b'{"t": 0, "online": false}', QoS.DELIVERED, retain=True)
     sock.sendall(packets.connect(name, modern=False, bridge=False, keepalive_s=_KEEPALIVE_S, will=will,
                                  username=None, password=None))  # fmt: skip
-    if sock.recv(4)[3:] != b"\0":
+    if sock.recv(4)[3:] != b"\0":  # the return code of a CONNACK
         raise PebbleError(f"the broker does not admit {name}: it may open no more files")
     return lambda topic, payload: sock.sendall(
         packets.publish(topic, payload, 0, 0, retain=True, modern=False, expires_s=None)
@@ -218,7 +214,7 @@ def main(port: int, count: int) -> None:
     due = time.monotonic()
     while not ended.is_set():
         for topic, publish in boards:
-            due = max(due + HEARTBEAT_S / count, time.monotonic() - HEARTBEAT_S)
+            due = max(due + HEARTBEAT_S / count, time.monotonic() - HEARTBEAT_S)  # what is later is not made up for
             time.sleep(max(0.0, due - time.monotonic()))
             publish(topic, b'{"t": %d, "online": true}' % int(1000 * time.time()))
 

@@ -47,7 +47,7 @@ class Shown:
 
 
 def finish(shown: Shown, folder: Path, console: Console) -> int:
-    """Print and write everything; return 0 if results are complete. PebbleError if a file cannot be written."""
+    """Print and write everything; return 0 if results are complete. Raises PebbleError if a file cannot be written."""
     results = shown.results
     results.save(file := folder / f"{results.bench}.json")  # before anything that may fail
     for table in shown.tables:
@@ -86,18 +86,19 @@ def digits(value: float) -> str:
     """Return three significant digits; a dash for NaN, "never" for infinity."""
     if not math.isfinite(value):
         return "–" if math.isnan(value) else "never"
-    size = abs(float(f"{value:.3g}"))  # 99.96 is 100
-    return f"{value:.0f}" if size >= 100 else f"{value:.1f}" if size >= 10 else f"{value:.2f}"
+    rounded = abs(float(f"{value:.3g}"))  # 99.96 is shown as 100, not as 100.0
+    places = 0 if rounded >= 100 else 1 if rounded >= 10 else 2
+    return f"{value:.{places}f}"
 
 
 def middle(cell: Cell | None) -> str:
-    """Return the median of the rounds as text."""
+    """Return the median of the rounds' medians as text; a dash if nothing was measured."""
     medians = cell.medians() if cell else []
     return digits(median(medians)) if medians else "–"
 
 
 def spread(cell: Cell | None) -> str:
-    """Return ``0.34 (0.31 to 0.39)``: the median of the rounds, and the ends if there are several."""
+    """Return ``0.34 (0.31 to 0.39)``: the median, the smallest and the largest of the rounds' medians."""
     medians = cell.medians() if cell else []
     ends = f" ({digits(min(medians))} to {digits(max(medians))})" if len(medians) > 1 else ""
     return f"{middle(cell)}{ends}"
@@ -105,7 +106,9 @@ def spread(cell: Cell | None) -> str:
 
 def compared(ours: Cell | None, base: Cell | None, percent: float = 50) -> str:
     """Return the ratio to the baseline as text; empty for the baseline itself, or if there is none."""
-    return "" if ours is None or base is None or ours is base else str(ratio(ours, base, percent))
+    if ours is None or base is None or ours is base:
+        return ""
+    return str(ratio(ours, base, percent))
 
 
 def percentiles(cell: Cell, *percents: float) -> list[str]:

@@ -31,15 +31,8 @@ _TOUCH = ("a0", "a1", "a2")
 
 def bridge(remote_port: int, local_port: int, base: str) -> None:
     """Forward commands to the local broker, everything else to the remote one; publish heartbeats."""
-
-    def to_local(message: MQTTMessage) -> None:
-        local.paho.publish(message.topic, message.payload, message.qos, message.retain)
-
-    def to_remote(message: MQTTMessage) -> None:
-        remote.paho.publish(message.topic, message.payload, message.qos, message.retain)
-
-    remote = StockClient(to_local, [(f"{base}/{INCOMING}/#", 1)], at_once=False)
-    local = StockClient(to_remote, [(f"{base}/{OUTGOING}/#", 1)], at_once=False)
+    remote = StockClient(lambda message: local.publish(message), [(f"{base}/{INCOMING}/#", 1)], at_once=False)
+    local = StockClient(remote.publish, [(f"{base}/{OUTGOING}/#", 1)], at_once=False)
     remote.open(remote_port)
     local.open(local_port)
     for number in itertools.count():
@@ -55,14 +48,17 @@ def serial_bridge(local_port: int, base: str, device: str, *, reports: bool) -> 
 
     def drive(message: MQTTMessage) -> None:
         command = json.loads(message.payload)
-        left, right = (max(-1.0, min(1.0, command["z"] + side * command["x"])) for side in (1, -1))
-        port.write(b"M %.3f %.3f\n" % (left, right))
+        left, right = command["z"] + command["x"], command["z"] - command["x"]
+        port.write(b"M %.3f %.3f\n" % (max(-1.0, min(1.0, left)), max(-1.0, min(1.0, right))))
 
     local = StockClient(drive, [(DRIVE.topic(base), 1)], at_once=False).open(local_port)
     unfinished = b""
     while True:  # without pyserial's own readline, which reads byte by byte
-        *lines, unfinished = (unfinished + port.read(max(1, min(port.in_waiting, _PIECE)))).split(b"\n")
-        for line in lines if reports else ():
+        data = unfinished + port.read(max(1, min(port.in_waiting, _PIECE)))
+        *lines, unfinished = data.split(b"\n")
+        if not reports:
+            continue
+        for line in lines:
             fields = dict(token.split("=", 1) for token in line.decode().split() if "=" in token)
             if all(name in fields for name in _TOUCH):
                 local.send(TOUCH_SENSORS, base, {"value": {name: int(fields[name]) for name in _TOUCH}})

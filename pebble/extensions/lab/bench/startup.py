@@ -2,9 +2,9 @@
 
 Every launch is a fresh robot at a remote broker that runs already; an operator subscribes there, and sends drive
 commands at 20 Hz, before the launcher is started. ``first heartbeat``, ``all ready`` and ``first drive obeyed`` count
-from just before that, the last one until a line that moves the wheels has reached the MCU's pty. ``late …``: from the
-begin of a connection until the last retained topic has arrived. ``minimal``: a robot without motors, whose memory (PSS)
-and threads are measured, too; ``floor``: one process with the same connections (floor.py).
+from just before that, the last one until a line that moves the wheels has reached the MCU's pty. ``late service``: from
+the begin of a service's connection until the last retained topic has arrived. ``minimal``: a robot without motors,
+whose memory (PSS) and threads are measured, too; ``floor``: one process with the same connections (floor.py).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Set
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,13 +29,12 @@ from pebble.extensions.lab.bench.results import Cell, Results, begin, round_cell
 from pebble.extensions.lab.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.extensions.lab.bench.show import RATIOS, Shown, compared, plain_table, spread
 from pebble.extensions.lab.bench.usage import pss_mb, threads
-from pebble.extensions.lab.rig.processes import HOST
 from pebble.extensions.lab.rig.robot import BASE, KINDS, Config, Robot, one_robot
 from pebble.runtime.connections import local_transport
-from pebble.transports import Message, MqttSettings, Transport, create
+from pebble.transports import Message, Transport
 
 STARTED: Final = ("first heartbeat", "all ready", "first drive obeyed")
-LATE: Final = ("late operator", "late service")
+LATE: Final = "late service"
 MEMORY, THREADS = "PSS", "threads"
 _SETTLED_S = 0.5  # from the first heartbeat until memory is read
 _LATE_S = 10.0  # for one late subscriber
@@ -56,7 +55,7 @@ class Floor(Robot):
         return {program.name: program.pid for program in (self.launcher, self.local_broker) if program is not None}
 
 
-#: What is launched, of each kind: a robot, one without motors, and a floor.
+#: Of each kind a whole robot, a robot without motors and a floor are launched: the class of each, and its services.
 PARTS: Final[Mapping[str, tuple[type[Robot], Mapping[str, Config]]]] = {
     "": (Robot, {}),
     "minimal": (Robot, {"serial_mcu_bridge": {"enabled": False}}),
@@ -92,11 +91,10 @@ def run(settings: Settings, console: Console) -> Shown:
 
 def table(results: Results) -> Table:
     """Return the times of both variants, and their ratio."""
-    ours, theirs = "zenoh", "mqtt"
-    grid = plain_table("Median (minimum to maximum) of the launches", ["", "unit", theirs, ours, f"{ours} / {theirs}"],
+    grid = plain_table("Median (minimum to maximum) of the launches", ["", "unit", "mqtt", "zenoh", "zenoh / mqtt"],
                         left=2, caption=RATIOS)  # fmt: skip
-    for measure, unit in (*((name, "s") for name in STARTED), *((name, "ms") for name in LATE)):
-        mqtt, zenoh = results.find(theirs, measure), results.find(ours, measure)
+    for measure, unit in (*((name, "s") for name in STARTED), (LATE, "ms")):
+        mqtt, zenoh = results.find("mqtt", measure), results.find("zenoh", measure)
         grid.add_row(measure, unit, spread(mqtt), spread(zenoh), compared(zenoh, mqtt))
     return grid
 
@@ -108,8 +106,8 @@ def floor_table(results: Results) -> Table:
     for measure, unit in ((STARTED[0], "s"), (MEMORY, "MB"), (THREADS, "")):
         row = list[str]()
         for kind in KINDS:
-            ours, floor = (results.find(f"{kind} {name}", measure) for name in ("minimal", "floor"))
-            row += [spread(ours), spread(floor), compared(ours, floor)]
+            minimal, floor = results.find(f"{kind} minimal", measure), results.find(f"{kind} floor", measure)
+            row += [spread(minimal), spread(floor), compared(minimal, floor)]
         grid.add_row(measure, unit, *row)
     return grid
 
@@ -128,16 +126,19 @@ def launch(variant: str, joins: int) -> Iterator[Cell]:
             robot.launch()
             robot.expect(lambda: subscriber.first_heartbeat_ns is not None, "no heartbeat", UP_S)
             robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", UP_S)
-            robot.expect(lambda: bool(part or _obeyed(robot, began_ns)), "no drive command was obeyed", UP_S)
-        times = (subscriber.first_heartbeat_ns or 0, subscriber.ready_ns or 0, *_obeyed(robot, began_ns)[:1])
-        for name, at_ns in zip(STARTED, times, strict=False):
+            times_ns = [subscriber.first_heartbeat_ns or 0, subscriber.ready_ns or 0]
+            if not part:  # the others have no motors
+                robot.expect(lambda: bool(_obeyed(robot, began_ns)), "no drive command was obeyed", UP_S)
+                times_ns.append(_obeyed(robot, began_ns)[0])
+        for name, at_ns in zip(STARTED, times_ns, strict=False):
             yield round_cell(variant, name, "s", [(at_ns - began_ns) / 1e9])
         time.sleep(_SETTLED_S)
         pids = robot.processes().values()
         yield round_cell(variant, MEMORY, "MB", [sum(map(pss_mb, pids))])
         yield round_cell(variant, THREADS, "", [sum(map(threads, pids))])
         if not part:
-            yield from _late(robot, joins)
+            topics = _retained_topics(_service(robot))  # start-up work finishes meanwhile
+            yield round_cell(kind, LATE, "ms", [_late_ms(topics, _service(robot)) for _ in range(joins)])
 
 
 def _obeyed(robot: Robot, since_ns: int) -> list[int]:
@@ -145,17 +146,11 @@ def _obeyed(robot: Robot, since_ns: int) -> list[int]:
     return [line.ns for line in robot.lines(since_ns) if line.drive is not None and any(line.drive)]
 
 
-# -- late subscribers, operators and services, wait for all retained messages of a running robot
+# -- late services wait for all retained messages of a running robot
 
 
-def _late(robot: Robot, joins: int) -> Iterator[Cell]:
-    connections: Sequence[Callable[[], Transport]] = (
-        lambda: create("mqtt", f"operator-{time.monotonic_ns()}", MqttSettings(host=HOST, port=robot.remote_port)),
-        lambda: local_transport(load(robot.config), "late-service"),
-    )
-    for name, connect in zip(LATE, connections, strict=True):
-        topics = _retained_topics(connect())  # start-up work finishes meanwhile
-        yield round_cell(robot.kind, name, "ms", [_late_ms(topics, connect()) for _ in range(joins)])
+def _service(robot: Robot) -> Transport:
+    return local_transport(load(robot.config), "late-service")
 
 
 def _retained_topics(transport: Transport) -> set[str]:
@@ -163,11 +158,10 @@ def _retained_topics(transport: Transport) -> set[str]:
     messages: list[Message] = []
     with transport:
         transport.subscribe(_EVERYTHING, messages.append, direct=True)
-        topics, before = set[str](), -1
-        while before < len(topics):
-            before = len(topics)
+        topics, earlier = set[str](), None
+        while topics != earlier:
             time.sleep(_QUIET_S)
-            topics = {message.topic for message in messages if message.retain}
+            earlier, topics = topics, {message.topic for message in messages if message.retain}
     return topics
 
 

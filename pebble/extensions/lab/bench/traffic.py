@@ -14,7 +14,6 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -135,6 +134,7 @@ def _use(testbed: Testbed, seconds: float) -> None:
             receiver.request("video", "json")
             receiver.request("audio", "pcm")
         end = time.monotonic() + _READY_S
+        # a receiver knows an encoding of its pictures, and of its sound, once they arrive
         while silent := [receiver.robot.name for receiver in receivers if len(receiver.encoding) < 2]:
             poll()
             if time.monotonic() > end:
@@ -152,8 +152,8 @@ def cells_of(robots: Analysed) -> Iterator[Cell]:
         if robot.latency is not None:
             yield round_cell(name, "heartbeat latency", "ms", [robot.latency.median_ms], p95_ms=robot.latency.p95_ms)
         for bandwidth in robot.bandwidth:
-            about = {"messages": bandwidth.family, "time": bandwidth.time}
-            yield round_cell(name, "bandwidth", "kbit/s", [bandwidth.median_kbps], about, p95_kbps=bandwidth.p95_kbps)
+            params = {"messages": bandwidth.family, "time": bandwidth.time}
+            yield round_cell(name, "bandwidth", "kbit/s", [bandwidth.median_kbps], params, p95_kbps=bandwidth.p95_kbps)
 
 
 def media_table(robots: Analysed) -> Table:
@@ -162,9 +162,11 @@ def media_table(robots: Analysed) -> Table:
     table = plain_table("Table 4.1: media, kbit/s of active seconds", ["robot", "", *heads], left=2)
     for name, paper in TABLE_4_1.items():
         measured = [robots[name].of(family) if name in robots else None for family in (VIDEO, AUDIO)]
-        shown = [("–", "–") if row is None else (f"{row.median_kbps:.2f}", f"{row.p95_kbps:.2f}") for row in measured]
+        shown = list[str]()
+        for bandwidth in measured:
+            shown += ["–", "–"] if bandwidth is None else [f"{bandwidth.median_kbps:.2f}", f"{bandwidth.p95_kbps:.2f}"]
         table.add_row(name, "paper", *(f"{value:.2f}" for value in paper))
-        table.add_row("", "here", *chain(*shown))
+        table.add_row("", "here", *shown)
     return table
 
 
@@ -175,6 +177,7 @@ def figures(robots: Analysed) -> Sequence[Picture]:
 
 
 def _draw(robots: Analysed) -> Figure:
+    """Draw the figures of robots that were recorded, each in a panel."""
     from pebble.extensions.lab.bench.plots import panels
     from pebble.extensions.recordings.traffic.figures import draw_bandwidth, draw_latency, draw_outages
 

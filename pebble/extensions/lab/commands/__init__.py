@@ -1,1 +1,1 @@
-"""The commands of the laboratory."""
+"""The commands of the extension lab: ``sim``, ``demo`` and ``bench``."""

@@ -15,7 +15,7 @@ from pebble.extensions.operator.commands.options import Output, Quick, split_nam
 
 FOLDER, REPORT = Path("bench-results"), Path("build/report")
 _LONGEST_S = 3600.0  # of one phase
-_MODULES = {"impair": "impair.trials"}  # that are not in the module of their name
+_MODULES = {"impair": "impair.trials"}  # of comparisons that are not in the module of their name
 
 Variants = Annotated[str | None, typer.Option(help="Some of them, separated by commas.", metavar="NAMES")]
 Seconds = Annotated[
@@ -41,7 +41,7 @@ def control(
     quick: Quick = False,
     output: Output = FOLDER,
 ) -> int:
-    """Round trips between two services: MQTT and Zenoh; unloaded, and beside camera frames.
+    """Messages between two services: MQTT and Zenoh; unloaded, and beside camera frames.
 
     Each round starts two processes and a broker or hub for each variant. Needs mosquitto.
 
@@ -66,25 +66,25 @@ def bridge(seconds: Seconds = None, quick: Quick = False, output: Output = FOLDE
 def startup(quick: Quick = False, output: Output = FOLDER) -> int:
     """Return how fast a robot starts: first heartbeat, all services ready, first drive command executed.
 
-    And how fast an operator or a service that connects later receives all retained messages. Every launch is a new
-    simulated robot. Needs mosquitto.
+    And how fast a service that connects later receives all retained messages. Every launch is a new simulated robot.
+    Needs mosquitto.
     """
     return _run("startup", quick, output)
 
 
 @app.command()
 def cost(quick: Quick = False, output: Output = FOLDER) -> int:
-    """Return what a robot costs: memory, CPU and threads of each of its processes.
+    """Return what a robot costs: memory and CPU of each of its processes.
 
-    Idle, driven 20 times a second, and sending pictures (640x480, 15 per second) and sound to an operator in two
-    forms. Whole simulated robots; needs mosquitto.
+    Idle, driven 20 times a second, and sending pictures (640x480, 15 per second) and sound to an operator. Whole
+    simulated robots; needs mosquitto.
     """
     return _run("cost", quick, output)
 
 
 @app.command()
 def frames(variants: Variants = None, seconds: Seconds = None, quick: Quick = False, output: Output = FOLDER) -> int:
-    """Camera frames from one process to others: latency, CPU and memory."""
+    """Camera frames from one process to others: latency and CPU."""
     return _run("frames", quick, output, variants=variants, seconds=seconds)
 
 
@@ -147,20 +147,20 @@ def report(
     return run(names, folder, quick=quick, console=Console(highlight=False))
 
 
-def _chosen(option: str, text: str, known: Collection[str]) -> tuple[str, ...]:
+def _chosen(option: str, text: str, available: Collection[str]) -> tuple[str, ...]:
     """Return the names in a text that separates them by commas. Raises PebbleError for an unknown one."""
     names = split_names(text)
-    if unknown := [name for name in names if name not in known]:
-        raise PebbleError(f"--{option}: unknown {', '.join(unknown)}: there are {', '.join(known)}")
+    if unknown := [name for name in names if name not in available]:
+        raise PebbleError(f"--{option}: unknown {', '.join(unknown)}: there are {', '.join(available)}")
     if len(set(names)) < len(names):
         raise PebbleError(f"--{option}: name each one once")
     return tuple(names)
 
 
 def _run(name: str, quick: bool, output: Path, **options: Any) -> int:
-    """Measure, print and write; return 0 if every result has enough rounds. Raises PebbleError.
+    """Run the comparison ``name``, print and write its results; return 0 if they are complete. Raises PebbleError.
 
-    An option that is text names some of the values of the full run.
+    ``options`` replace fields of its Settings, unless they are None. Text names some of the full run's values.
     """
     from rich.console import Console
 
@@ -170,12 +170,12 @@ def _run(name: str, quick: bool, output: Path, **options: Any) -> int:
     from pebble.transports.segments import sweep
 
     comparison = import_module(f"pebble.extensions.lab.bench.{_MODULES.get(name, name)}")
-    given = {
-        option: _chosen(option, value, getattr(comparison.FULL, option)) if isinstance(value, str) else value
-        for option, value in options.items()
-        if value is not None
-    }
-    settings, console = replace(comparison.QUICK if quick else comparison.FULL, **given), Console()
+    settings, console = comparison.QUICK if quick else comparison.FULL, Console()
+    for option, value in options.items():
+        if isinstance(value, str):
+            settings = replace(settings, **{option: _chosen(option, value, getattr(comparison.FULL, option))})
+        elif value is not None:
+            settings = replace(settings, **{option: value})
     check_folder(output)
     with interrupted_by_signals():
         try:

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 _SERIAL = ("goob", "fred", "goob_imu")
 _WIFI = ("minilamp", "benjr")
-_NAMED = (*_WIFI, "world")
-#: The kinds that each option is for.
-_OF = {
+_NAMED = (*_WIFI, "world")  # kinds that take an id or a file
+#: By option: the kinds that take it. An option that is missing here is for all kinds.
+_KINDS_OF = {
     "link": _SERIAL,
     "broker": (*_WIFI, "fleet"),
     "password_file": (*_WIFI, "fleet"),
@@ -104,7 +104,7 @@ def sim(
         from pebble.extensions.lab.simulation.networked import run_fleet
 
         return run_fleet(address, robots)
-    return _wireless(kind, name, address, config, called, trace=trace, files=files)
+    return _run_wireless(kind, name, address, config, called, trace=trace, files=files)
 
 
 def demo(
@@ -133,12 +133,14 @@ def demo(
 def _check_options(context: typer.Context, kind: str) -> None:
     """Raise BadParameter for an option that this ``kind`` of simulation does not have."""
     for parameter in context.command.params:
-        source = context.get_parameter_source(str(parameter.name))
-        if source is not None and source.name == "COMMANDLINE" and kind not in _OF.get(str(parameter.name), (kind,)):
+        name = str(parameter.name)
+        source = context.get_parameter_source(name)
+        is_given = source is not None and source.name == "COMMANDLINE"
+        if is_given and name in _KINDS_OF and kind not in _KINDS_OF[name]:
             raise typer.BadParameter(f"{kind} takes no {parameter.opts[0]}")
 
 
-def _wireless(
+def _run_wireless(
     kind: str,
     id_: str | None,
     broker: MqttSettings,
@@ -148,13 +150,16 @@ def _wireless(
     trace: Path | None,
     files: Path | None,
 ) -> int:
+    """Run a MiniLAMP or BenJr. From ``config`` come its level of security, and what the command line does not name."""
     from pebble.contract.identity import Identity
     from pebble.extensions.lab.simulation.networked import run
 
-    identity, security = Identity("pebble", "robots", id_ or kind), None
-    if config is not None:
-        identity, security = Identity(config.robot.system, config.robot.type, id_ or config.robot.id), config.security
-        called = called or config.robot.name or ""
+    if config is None:
+        identity, security = Identity("pebble", "robots", id_ or kind), None
+    else:
+        robot = config.robot
+        identity, security = Identity(robot.system, robot.type, id_ or robot.id), config.security
+        called = called or robot.name or ""
     typer.echo(f"{identity} connects to the broker at {broker.host}:{broker.port}; Ctrl-C ends it")
     return run(kind, identity, broker, name=called, security=security, trace=trace, files=files)
 

@@ -20,11 +20,10 @@ from rich.console import Console
 from pebble.contract import DRIVE
 from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
-from pebble.extensions.lab.demo import phone
 from pebble.extensions.lab.demo.brokers import EMBEDDED, broker_program
 from pebble.extensions.lab.demo.operator import FIRST_ROUND_S, STEPS, TAKE_OVER, Operator
 from pebble.extensions.lab.demo.outcome import Outcomes, outcome_of
-from pebble.extensions.lab.demo.phone import Phone
+from pebble.extensions.lab.demo.phone import Phone, require_terminal
 from pebble.extensions.lab.demo.view import View, show_outcomes
 from pebble.extensions.lab.rig.processes import HOST
 from pebble.extensions.lab.rig.robot import SimulatedRobot
@@ -59,7 +58,7 @@ def run(seconds: float | None = None, *, embedded: bool = False, for_phones: boo
         raise PebbleError(f"one round of driving takes {SHORTEST_S:.0f} s: give it at least that many seconds")
     require_packages()
     if for_phones:
-        phone.require_terminal()
+        require_terminal()
     program = EMBEDDED if embedded else broker_program()
     with ending_on_signals() as ending, Testbed(ending) as testbed:
         demo = Demo(testbed, console, ending, seconds)
@@ -77,18 +76,18 @@ class Demo:
         self._testbed, self._console, self._ending, self._seconds = testbed, console, ending, seconds
         self._outcomes = Outcomes()
 
-    def start(self, broker: str | None, opened: Phone | None) -> None:
-        """Start every process, and connect to the broker."""
+    def start(self, broker: str | None, phone: Phone | None) -> None:
+        """Start every process, and connect to the broker. ``broker``: a module to run in mosquitto's place."""
         console, testbed = self._console, self._testbed
         name = "mosquitto" if broker is None else "amqtt"
         console.print(f"Two brokers ({name}): a remote one, and the one that Fred carries.")
         testbed.start_brokers(broker)
         console.print(_ROBOTS)
-        self._start_page(opened)
+        self._start_page(phone)
         self._broker_url = f"mqtt://{HOST}:{testbed.broker_port}"
         self._invite()
         testbed.start_robots()
-        if opened is None and self._seconds is None:
+        if phone is None and self._seconds is None:
             threading.Thread(target=self._index, name="pebble-demo-index", daemon=True).start()
         self._operator = Operator(testbed.broker_port)
         self._operator.connect()
@@ -119,18 +118,18 @@ class Demo:
         elif self._outcomes.steps():
             self._console.print("Every robot moved and stopped as commanded.", style="green")
 
-    def _start_page(self, opened: Phone | None) -> None:
-        """Start the operator page, and a recorder for its tab Recordings."""
+    def _start_page(self, phone: Phone | None) -> None:
+        """Start the operator page, open to other machines if ``phone`` is given, and a recorder for its Recordings."""
         console, testbed = self._console, self._testbed
         recordings = testbed.folder / "recordings"
         recordings.mkdir()
         testbed.start_recorder(recordings, *_RECORDED)
-        settings = {"cameras_in_turn": self._seconds is None, **({} if opened is None else opened.settings)}
+        settings = {"cameras_in_turn": self._seconds is None, **({} if phone is None else phone.settings)}
         self._page_url = usual_or_free(testbed, self._ending, recordings=recordings, **settings).url
         print_line(console, f"See and drive them in a browser: {self._page_url}")
         print_line(console, f"Its Recordings show what they do, from {recordings}, which the demo deletes at its end.")
-        if opened is not None:
-            opened.show(self._page_url, console)
+        if phone is not None:
+            phone.show(self._page_url, console)
 
     def _index(self) -> None:
         """Request the data that Recordings shows first, now and then, so that the server has it ready for visitors."""
@@ -141,7 +140,7 @@ class Demo:
 
     def _invite(self) -> None:
         """Print the broker's address, and commands to paste into another terminal in this folder."""
-        port, pebble, url = self._testbed.broker_port, _pebble(), self._broker_url
+        port, pebble, url = self._testbed.broker_port, _pebble_command(), self._broker_url
         drive = f'mosquitto_pub -h {HOST} -p {port} -t {DRIVE.topic(_GOOB.base)} -m \'{{"x": 0, "z": 0.3}}\''
         lines = {
             "look at its drive commands": f"{pebble} topic echo {DRIVE.metric} --robot {_GOOB.id} --url {url}",
@@ -168,7 +167,8 @@ class Demo:
         self._operator.begin(f"the robots are yours: {self._page_url}" if self._seconds is None else "")
         end = math.inf if self._seconds is None else time.monotonic() + self._seconds
         while not self._ending.wait(_POLL_S) and not self._testbed.unexpected_exits():
-            if time.monotonic() > (end if self._operator.rounds else end + _SLOW_S):
+            more_s = 0.0 if self._operator.rounds else _SLOW_S  # for the first round
+            if time.monotonic() > end + more_s:
                 break
             view.update()
             self._judge_completed()
@@ -189,7 +189,7 @@ class Demo:
         return wrong + [f"{step}: not done" for step in steps if self._outcomes.of(robot.name, step) is None]
 
 
-def _pebble() -> str:
+def _pebble_command() -> str:
     """Return the shortest text that runs this environment's program in this folder."""
     program = Path(sys.executable).with_name("pebble")
     if not program.exists():
@@ -206,9 +206,9 @@ def print_line(console: Console, line: str) -> None:
 def usual_or_free(testbed: Testbed, ending: threading.Event, **settings: Any) -> PageServer:
     """Start the page at its usual port, or at a free port if another program uses that."""
     with suppress(PebbleError):
-        usual = testbed.start_page(DEFAULT_PORT, **settings)
-        usual.wait(ending)
-        return usual
+        page = testbed.start_page(DEFAULT_PORT, **settings)
+        page.wait(ending)
+        return page
     page = testbed.start_page(**settings)
     page.wait(ending)
     return page

@@ -88,7 +88,7 @@ STEPS = (*(step.name for step in SCRIPT), EMERGENCY_STOP, AFTER_RESET)  # of eve
 
 
 class EndedEarlyError(Exception):
-    """An error: the demo ends, or a person has taken the robot."""
+    """An error that ends a step: the demo ends, or a person has taken the robot with the script."""
 
 
 class Operator:
@@ -103,7 +103,7 @@ class Operator:
         self.rounds = 0
         self.events: deque[tuple[float, str]] = deque(maxlen=_MOST_WAITING)
         self.completed: deque[Driven] = deque(maxlen=_MOST_WAITING)
-        self._doing = "discovering robots"
+        self._step = "discovering robots"  # the present one
         self.visitors = Visitors(NAME)
         self.drivers: dict[str, ScriptedOperator] = {}  # by base topic
         self._drawing: set[str] = set()  # base topics of robots that have listed the script for their trail
@@ -129,7 +129,7 @@ class Operator:
         return [name for name in names if name not in ready]
 
     def show(self, event: str) -> None:
-        self._doing = event
+        self._step = event
         self.events.append((time.monotonic(), f"operator {event}"))
 
     @property
@@ -137,11 +137,14 @@ class Operator:
         """The present step, with the robots that it leaves alone."""
         robots, now = self.discovery.all_robots(), time.monotonic()
         others = [f"{robot.name} {why}" for robot in robots if (why := self.visitors.taken(robot, now))]
-        return "; ".join([self._doing, *others])
+        return "; ".join([self._step, *others])
 
-    def begin(self, yours: str = "") -> None:
-        """Start driving all robots discovered so far, round after round. With ``yours`` drive once, then show it."""
-        self._thread = threading.Thread(target=self._run, args=(yours,), name="operator", daemon=True)
+    def begin(self, invitation: str = "") -> None:
+        """Start driving all robots discovered so far, round after round.
+
+        With ``invitation`` drive one round, then show this text in place of a step.
+        """
+        self._thread = threading.Thread(target=self._run, args=(invitation,), name="operator", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -158,17 +161,18 @@ class Operator:
             if address is not None and any(script.get("file") == TRAIL for script in files):
                 self._drawing.add(address.identity.base)
 
-    def _mine(self, robot: RobotView) -> bool:
+    def _is_free(self, robot: RobotView) -> bool:
         return self.visitors.free(robot, time.monotonic())
 
     # -- the operator's thread
 
-    def _run(self, yours: str) -> None:
+    def _run(self, invitation: str) -> None:
+        """Drive round after round, or once before the invitation; at the end of the demo leave the robots at rest."""
         robots = self.discovery.all_robots()
         with suppress(EndedEarlyError):
             scripted = [robot.base for robot in robots if robot.offers("autonomy")]
             self._until(lambda: self._drawing.issuperset(scripted), _LISTED_S)
-            while not (yours and self.rounds):
+            while not (invitation and self.rounds):
                 self._show_trails(robots)
                 for step in SCRIPT:
                     self._begin(step.name, robots)
@@ -178,7 +182,7 @@ class Operator:
                     self._take_over(robots)
                 self.rounds += 1
             self._release()
-            self._doing = yours
+            self._step = invitation
             while True:
                 self._show_trails(robots)
                 self._wait(_TRAIL_S)
@@ -186,28 +190,30 @@ class Operator:
         self._drive(STOP)
 
     def _begin(self, step: str, robots: Sequence[RobotView]) -> None:
-        """Choose the robots that are free."""
-        self._doing = step
+        """Begin a step with those of the robots that are free."""
+        self._step = step
         self._release()
         self.visitors.begin_step(time.monotonic())
-        self._robots = [robot for robot in robots if self._mine(robot)]
+        self._robots = [robot for robot in robots if self._is_free(robot)]
 
     def _complete(self, step: str, drive: Drive, began: float, released: float, ended: float) -> None:
         """Note the command of this step for each robot that is still free."""
-        for robot in filter(self._mine, self._robots):
+        for robot in filter(self._is_free, self._robots):
             self.completed.append(Driven(robot.name, step, wheels_of(drive), began, released, ended))
 
     def _wait(self, seconds: float) -> None:
-        if self._stopping.wait(seconds) or (self._scripted is not None and not self._mine(self._scripted)):
+        """Wait. Raises EndedEarlyError if the demo ends, or if a person has taken the robot with the script."""
+        if self._stopping.wait(seconds) or (self._scripted is not None and not self._is_free(self._scripted)):
             raise EndedEarlyError
 
     def _until(self, condition: Callable[[], bool], timeout: float, steady_s: float = 0.0) -> None:
         """Wait, at most ``timeout``, until the condition has held for ``steady_s``."""
-        since = time.monotonic()
-        end = since + timeout
+        false_at = time.monotonic()  # when the condition was last false
+        end = false_at + timeout
         while (now := time.monotonic()) < end:
-            since = since if condition() else now
-            if since < now - steady_s:
+            if not condition():
+                false_at = now
+            if now - false_at > steady_s:
                 return
             self._wait(_POLL_S)
 
@@ -226,7 +232,7 @@ class Operator:
         return sent
 
     def _free_drivers(self) -> list[ScriptedOperator]:
-        return [self._driver(robot) for robot in self._robots if self._mine(robot)]
+        return [self._driver(robot) for robot in self._robots if self._is_free(robot)]
 
     def _driver(self, robot: RobotView) -> ScriptedOperator:
         if robot.base not in self.drivers:
@@ -267,8 +273,8 @@ class Operator:
     # -- a step, an emergency stop, and a script
 
     def _perform(self, step: Step) -> None:
-        began, flash = time.monotonic(), isinstance(step.lights, LightsFlash)
-        channel = c.LIGHTS_FLASH if flash else c.LIGHTS_SOLID
+        began = time.monotonic()
+        channel = c.LIGHTS_FLASH if isinstance(step.lights, LightsFlash) else c.LIGHTS_SOLID
         lights = codec.encode(channel, step.lights)
         for robot in self._robots:
             self._publish(robot.topic(channel), lights)
@@ -332,11 +338,11 @@ class Operator:
         for robot in [robot for robot in robots if robot.offers("autonomy")]:
             self._begin("scripts", [robot])
             self._scripted = robot
-            with suppress(EndedEarlyError):
+            with suppress(EndedEarlyError):  # a person has taken it: go on with the next robot
                 self._wait(0.0)
                 self._follow(robot)
             self._scripted = None
-            self._wait(0.0)
+            self._wait(0.0)  # raises if the demo ends
 
     def _follow(self, robot: RobotView) -> None:
         """Start the script, drive for a moment, and wait until it has arrived."""
@@ -346,8 +352,8 @@ class Operator:
             with suppress(PayloadError):
                 tags.append(codec.decode(c.APRILTAG_DATA, message.payload))
 
-        def scripted() -> bool:
-            """True if the robot reports that no person drives in place of its script."""
+        def script_drives() -> bool:
+            """True if the robot reports that its script runs and no person drives in place of it."""
             status = robot.autonomy
             return status is not None and status.running and status.overridden is not True
 
@@ -363,7 +369,7 @@ class Operator:
             stack.callback(self._command, robot, AutonomyCommand(action="stop"))
             self._command(robot, AutonomyCommand(action="start", file=FOLLOW, config=config))
             self._publish(c.SOUNDBOARD_COMMAND.topic(robot.base), sound)
-            self._until(lambda: bool(tags) and scripted(), _START_S)
+            self._until(lambda: bool(tags) and script_drives(), _START_S)
             self._wait(_APPROACH_S)
             self.show(f"TAKES OVER: drives {robot.name}, {FOLLOW} is overruled")
             took_over = time.monotonic()
@@ -372,7 +378,7 @@ class Operator:
             self.show(f"LETS GO: {robot.name} waits {HOLD_S:.0f} s for another command")
             self._wait(HOLD_S - _BEFORE_SCRIPT_S)
             self._complete(TAKE_OVER, _BACK, took_over, released, time.monotonic())
-            self._until(scripted, _STATUS_S)
+            self._until(script_drives, _STATUS_S)
             self.show(f"GIVES BACK: {FOLLOW} drives {robot.name} again")
             self._until(lambda: abs(distance_m() - DISTANCE_M) <= TOLERANCE_M, _ARRIVAL_S, _STEADY_S)
             self.show(f"ENDS: {FOLLOW}, {robot.name} sees tag {TAG_ID} at {distance_m():.2f} m")

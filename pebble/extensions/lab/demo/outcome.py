@@ -35,10 +35,10 @@ class Outcome(NamedTuple):
 
 def outcome_of(driven: Driven, entries: Sequence[Entry]) -> Outcome:
     """Return the outcome of a step, by the motors' changes in ``entries``, which are in the order of time."""
-    motors = [(entry.ns / 1e9, entry.motors) for entry in entries if entry.motors is not None]
-    motors = [(at, wheels) for at, wheels in motors if at < driven.ended]
-    moved = any(driven.began <= at < driven.released and _same_way(wheels, driven.wheels) for at, wheels in motors)
-    off_s = max(0.0, _off_at(motors) - driven.released)
+    changes = [(entry.ns / 1e9, entry.motors) for entry in entries if entry.motors is not None]
+    changes = [(at, wheels) for at, wheels in changes if at < driven.ended]
+    moved = any(driven.began <= at < driven.released and _same_way(wheels, driven.wheels) for at, wheels in changes)
+    off_s = max(0.0, _off_at(changes) - driven.released)
     wrong = ""
     if not moved:
         wrong = "it did not move as commanded"
@@ -53,13 +53,15 @@ def _same_way(wheels: Wheels, commanded: Wheels) -> bool:
     return all(speed * wanted > 0 for speed, wanted in zip(wheels, commanded, strict=True))
 
 
-def _off_at(motors: Sequence[tuple[float, Wheels]]) -> float:
+def _off_at(changes: Sequence[tuple[float, Wheels]]) -> float:
     """Return the time at which the motors were last switched off; infinite if they run at the end."""
-    running = [index for index, (_, wheels) in enumerate(motors) if any(wheels)]
-    if not running:
-        return -math.inf
-    after = motors[running[-1] + 1 :]
-    return after[0][0] if after else math.inf
+    off_at = -math.inf  # they have not run
+    for at, wheels in changes:
+        if any(wheels):
+            off_at = math.inf
+        elif off_at == math.inf:
+            off_at = at
+    return off_at
 
 
 class Outcomes:
@@ -69,10 +71,9 @@ class Outcomes:
         self._worst: dict[tuple[str, str], Outcome] = {}
 
     def add(self, outcome: Outcome) -> None:
-        key = outcome.robot, outcome.step
-        self._worst[key] = max(
-            outcome, self._worst.get(key, outcome), key=lambda judged: (bool(judged.wrong), judged.off_s)
-        )
+        earlier = self.of(outcome.robot, outcome.step)
+        if earlier is None or (bool(outcome.wrong), outcome.off_s) >= (bool(earlier.wrong), earlier.off_s):
+            self._worst[outcome.robot, outcome.step] = outcome
 
     def of(self, robot: str, step: str) -> Outcome | None:
         return self._worst.get((robot, step))

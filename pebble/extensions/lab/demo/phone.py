@@ -72,8 +72,9 @@ def qr_lines(text: str) -> Iterator[str]:
     """Yield a QR code in black blocks on white."""
     dark = QRCodeEncoder.create().encode(text) == 0
     used = np.argwhere(dark)
-    dark = np.pad(dark[used.min() : used.max() + 1, used.min() : used.max() + 1], _QUIET)
-    if len(dark) % 2:
+    first, end = used.min(), used.max() + 1  # the code is a square, perhaps with white around it
+    dark = np.pad(dark[first:end, first:end], _QUIET)
+    if len(dark) % 2:  # two rows become one line
         dark = np.pad(dark, ((0, 1), (0, 0)))
     for upper, lower in zip(dark[::2], dark[1::2], strict=True):
         yield "".join(_BLOCKS[bool(above), bool(below)] for above, below in zip(upper, lower, strict=True))

@@ -26,8 +26,8 @@ class View:
         self._console, self._operator, self._robots, self._ending = console, operator, robots, ending
         self._had_terminal = console.is_terminal
         self._began = time.monotonic()
-        self._known: set[str] = set()  # the robots that were named
-        self._step = ""  # that was printed last
+        self._named: set[str] = set()  # robots with a line
+        self._step = ""  # the one that was printed last
 
     def update(self) -> None:
         """Print a line for each newly discovered robot, and for each step and event that begins."""
@@ -35,12 +35,12 @@ class View:
             while self._operator.events:
                 at, line = self._operator.events.popleft()
                 self._print(at, line, "bold yellow")
-                self._step = line.removeprefix("operator ")  # it is one of the steps
+                self._step = line.removeprefix("operator ")  # the operator's activity tells it as well
             now = time.monotonic()
             for robot in self._robots:
                 discovered = self._operator.discovery.robots.get(robot.base)
-                if discovered is not None and discovered.capabilities and robot.name not in self._known:
-                    self._known.add(robot.name)
+                if discovered is not None and discovered.capabilities and robot.name not in self._named:
+                    self._named.add(robot.name)
                     self._print(now, f"{robot.name} is online: {robot.runs_on}, {discovered.transport} inside")
             if self._operator.activity != self._step:
                 self._step = self._operator.activity

@@ -1,4 +1,4 @@
-"""Robots that people have taken from the demo's operator, by driving or stopping them. Pure."""
+"""Visitors: people who take robots from the demo's operator, by driving or stopping them. Pure."""
 
 import math
 from collections import defaultdict, deque
@@ -23,8 +23,8 @@ class Visitors:
         self.left_alone: set[str] = set()  # names of robots that were found to be taken
         self.own_ids: set[str] = set()  # under which the operator itself has control
         self._name = name
-        self._driven: dict[str, tuple[float, str]] = {}  # by base topic: when a person had it, and who
-        self._moved: dict[str, float] = {}  # by base topic: when a person's command came
+        self._had: dict[str, tuple[float, str]] = {}  # by base topic: when a person last had it, and who
+        self._moved: dict[str, float] = {}  # by base topic: when a person's last command came
         self._sent: defaultdict[str, deque[bytes]] = defaultdict(partial(deque, maxlen=_SENT))  # by topic
         self._step_began = 0.0
 
@@ -38,7 +38,7 @@ class Visitors:
         if sent and message.payload in sent:
             sent.remove(message.payload)
         elif address is not None and not message.retain:
-            self._driven[address.identity.base] = now, "another program"
+            self._had[address.identity.base] = now, "another program"
             self._moved[address.identity.base] = now
 
     def begin_step(self, now: float) -> None:
@@ -49,11 +49,11 @@ class Visitors:
         """Return why the robot counts as a person's now; empty if it is free."""
         state = robot.control.state if robot.controlled else None
         if state is not None and state.id and state.id not in self.own_ids:
-            self._driven[robot.base] = now, robot.control.who
+            self._had[robot.base] = now, robot.control.who
         stop = robot.stopped_by
         if stop is not None and stop.by != self._name:
             return f"is stopped by {stop.by or 'unknown'}"
-        at, who = self._driven.get(robot.base, (-math.inf, ""))
+        at, who = self._had.get(robot.base, (-math.inf, ""))
         return f"is driven by {who}" if now - at < DRIVES_S else ""
 
     def rests(self, robot: RobotView, now: float) -> bool:
@@ -62,8 +62,9 @@ class Visitors:
 
     def free(self, robot: RobotView, now: float) -> bool:
         """True if no person has had the robot in the present step; else note it as left alone."""
-        taken = self.taken(robot, now)
-        if self._driven.get(robot.base, (-math.inf, ""))[0] < self._step_began and not taken:
+        taken = self.taken(robot, now)  # first: it notes a person who has control
+        had_at, _ = self._had.get(robot.base, (-math.inf, ""))
+        if had_at < self._step_began and not taken:
             return True
         self.left_alone.add(robot.name)
         return False

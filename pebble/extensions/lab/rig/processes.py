@@ -21,7 +21,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.media.child import tied_to_parent
 from pebble.extensions.operator.places import mosquitto_path
 
-#: In this order they end: robots while the brokers to which they report it still run, MCUs after what they move.
+#: Kinds of processes, in the order in which they end: robots say so to brokers, which end later, as MCUs do.
 OPERATORS, ROBOTS, MCUS, BROKERS = range(4)
 
 HOST = "127.0.0.1"  # of brokers
@@ -29,7 +29,7 @@ _PORTS = 10_100, 32_768  # below those of outgoing connections, on Linux and els
 _LONGEST_FOLDER = 40  # characters: Unix sockets live below, and their paths end at 108 bytes
 
 Wrap = Callable[[Sequence[str]], Sequence[str]]  # extends a command, so that it runs in another network
-Each = Callable[[bytes], object]  # gets one line of a program's standard output
+OnLine = Callable[[bytes], object]  # gets each line of a program's standard output
 _STEP_S = 0.01
 _END_S = 4.0  # for workers and operators
 _BROKER_START_S = 15.0  # amqtt takes a while to import on a small machine
@@ -48,23 +48,23 @@ class Program:
 
     has_input: ClassVar = False  # it ends with its standard input, not with the thread that starts it
 
-    def __init__(self, name: str, command: Sequence[str], log: Path, each: Each | None = None) -> None:
-        """Start the program. ``each`` gets its lines of output, on another thread.
+    def __init__(self, name: str, command: Sequence[str], log: Path, on_line: OnLine | None = None) -> None:
+        """Start the program. ``on_line`` gets its lines of output, on another thread.
 
-        Without ``each`` standard output is in the log, as errors are.
+        Without ``on_line`` standard output is in the log, as errors are.
         """
         self.name, self.log = name, log
         with log.open("ab") as errors:
             self._process = subprocess.Popen(
                 command if self.has_input else tied_to_parent(command, signal.SIGTERM),
                 stdin=subprocess.PIPE if self.has_input else subprocess.DEVNULL,
-                stdout=errors if each is None else subprocess.PIPE,
+                stdout=errors if on_line is None else subprocess.PIPE,
                 stderr=errors,
                 start_new_session=True,
             )
         self.pid = self._process.pid
-        if each is not None:
-            threading.Thread(target=self._read, args=(each,), name=f"output of {name}", daemon=True).start()
+        if on_line is not None:
+            threading.Thread(target=self._read, args=(on_line,), name=f"output of {name}", daemon=True).start()
 
     @property
     def code(self) -> int | None:
@@ -103,9 +103,9 @@ class Program:
         if not self.ended:
             self._process.terminate()
 
-    def _read(self, each: Each) -> None:
+    def _read(self, on_line: OnLine) -> None:
         for line in self._process.stdout or ():
-            each(line)
+            on_line(line)
 
 
 class Worker(Program):
@@ -118,16 +118,19 @@ class Worker(Program):
 
     def __init__(self, name: str, command: Sequence[str], log: Path) -> None:
         self._answers: queue.Queue[dict[str, Any] | None] = queue.Queue()
-        super().__init__(name, command, log, each=lambda line: self._answers.put(json.loads(line)))
+        super().__init__(name, command, log, lambda line: self._answers.put(json.loads(line)))
 
     def answer(self, timeout: float) -> dict[str, Any]:
         """Return the next answer.
 
         Raises PebbleError with its log if it has ended, or does not answer within ``timeout`` s.
         """
-        why = f"did not answer within {timeout:.0f} s"
-        with suppress(queue.Empty):
-            if (answer := self._answers.get(timeout=timeout)) is not None:
+        try:
+            answer = self._answers.get(timeout=timeout)
+        except queue.Empty:
+            why = f"did not answer within {timeout:.0f} s"
+        else:
+            if answer is not None:
                 return answer
             why = f"ended with code {self._process.wait()}"
         raise PebbleError(f"{self.name} {why}\n{self.tail()}".rstrip())
@@ -148,9 +151,9 @@ class Worker(Program):
             with suppress(BrokenPipeError):  # it ended by itself
                 self._process.stdin.close()
 
-    def _read(self, each: Each) -> None:
-        super()._read(each)
-        self._answers.put(None)
+    def _read(self, on_line: OnLine) -> None:
+        super()._read(on_line)
+        self._answers.put(None)  # no answer follows: the process has ended
 
 
 def mosquitto_command(port: int, stem: Path, extra: Sequence[str] = (), host: str = HOST) -> list[str]:
@@ -222,8 +225,8 @@ class Processes:
     The end of the ``with`` block ends all of them, those of a kind at the same time; then it deletes the folder.
     """
 
-    ends_s: ClassVar[tuple[float, ...]] = (_END_S, 6.0, 2.0, 2.0)  # what is left of each kind after that is killed
-    keep = False  # the folder
+    ends_s: ClassVar[tuple[float, ...]] = (_END_S, 6.0, 2.0, 2.0)  # by kind: seconds until processes are killed
+    keep = False  # the folder is not deleted
 
     def __init__(self, prefix: str = "pbl-") -> None:
         usual = tempfile.gettempdir()  # mkdtemp makes a 0700 folder in it
@@ -232,10 +235,10 @@ class Processes:
         self._kinds: dict[Program, int] = {}
 
     def __enter__(self) -> Self:
-        with ExitStack() as failed:
-            failed.push(self)
+        with ExitStack() as stack:
+            stack.push(self)  # ends what was started if a later process does not start
             self.start()
-            failed.pop_all()
+            stack.pop_all()
         return self
 
     def start(self) -> None:
@@ -278,7 +281,7 @@ def python(module: str, *arguments: object) -> list[str]:
 
 
 def end_all(programs: Iterable[Program], within_s: float = _END_S) -> None:
-    """Send SIGTERM to all (to workers: the end of input); kill those that still run after it, with their children."""
+    """Send SIGTERM to all (to workers: the end of input); kill those that do not end in time, and their children."""
     programs, deadline = list(programs), time.monotonic() + within_s
     for program in programs:
         program.ask_to_end()

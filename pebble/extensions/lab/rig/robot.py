@@ -96,13 +96,12 @@ class Robot(SimulatedRobot):
         name: str = NAME,
         folder: Path | None = None,
         services: Mapping[str, Config] | None = None,
-        reports: bool | None = False,
+        reports: bool = False,
         wrap: Wrap = unchanged,
     ) -> None:
         super().__init__(running, name, folder or running.folder)
         self.kind = kind
         self._remote_host, self.remote_port = remote
-        self.broker_ports = [self.remote_port]  # and that of its own local broker, once it runs
         self.run_dir, self.config, self.port = (self.folder / file for file in ("run", f"{name}.json", "mcu"))
         self.local_broker: Broker | None = None
         self.local_port: int | None = None  # of the local broker, which may be that of several robots
@@ -110,7 +109,7 @@ class Robot(SimulatedRobot):
         self._started: list[Program] = []
         motors = {"serial": {"baud": 460_800}, "telemetry": {"publish_touch_sensors": reports}}
         self._services: dict[str, Config] = {"mqtt_bridge": {}, "serial_mcu_bridge": motors, **(services or {})}
-        self._own: Config = {"robot": {"id": name}, "transport": {"kind": kind}}
+        self._base_config: Config = {"robot": {"id": name}, "transport": {"kind": kind}}  # without services
 
     def prepare(self, ending: threading.Event | None = None) -> None:
         """Start the processes that the robot needs, and write its config; stop waiting once ``ending`` is set.
@@ -121,7 +120,6 @@ class Robot(SimulatedRobot):
             self.local_broker = self.running.broker("local", folder=self.folder, wrap=self._wrap)
             self.programs.append(self.local_broker)
             self.local_port = self.local_broker.port
-            self.broker_ports.append(self.local_port)
             if self._wrap is unchanged:  # else it is in another network
                 self.local_broker.wait()
         self._trace.touch()
@@ -135,7 +133,7 @@ class Robot(SimulatedRobot):
             },
         }
         services = {name: {"enabled": True, **fields} for name, fields in self._services.items()}
-        contents = deep_merge(deep_merge(self._own, {"services": services}), connections)
+        contents = deep_merge(deep_merge(self._base_config, {"services": services}), connections)
         self.config.write_text(json.dumps(contents, indent=1))
 
     def launch(self) -> None:
@@ -164,12 +162,12 @@ class Robot(SimulatedRobot):
 
     def processes(self) -> dict[str, int]:
         """Return the process ids of the launcher, its children (a hub among them) and the local broker, by name."""
-        names = {name[:15]: name for name in self._programs()}  # as long as they are in the kernel
+        names = {name[:15]: name for name in self._programs()}  # the kernel keeps 15 characters of a name
         pids = {"launcher": self.launcher.pid}
         for pid in children(self.launcher.pid):
             with suppress(OSError):  # it has just ended
-                comm = Path(f"/proc/{pid}/comm").read_text().strip()
-                pids[names.get(comm, comm)] = pid
+                kernel_name = Path(f"/proc/{pid}/comm").read_text().strip()
+                pids[names.get(kernel_name, kernel_name)] = pid
         return pids if self.local_broker is None else pids | {"mosquitto": self.local_broker.pid}
 
     def complete(self) -> bool:

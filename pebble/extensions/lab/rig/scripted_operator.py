@@ -35,10 +35,10 @@ def paced(
 
 
 class ScriptedOperator:
-    """The operator of one robot, over a link that carries everything; one thread calls it.
+    """The operator of one robot; one thread calls it.
 
-    ``robot`` gets the robot's messages elsewhere. ``publish`` sends a message at once. ``wait`` waits so many seconds;
-    an exception from it, or true, ends what is being done. ``device`` is shown to people who want control.
+    Its owner passes the robot's messages to ``robot``. ``publish`` sends a message at once. ``wait`` waits so many
+    seconds; an exception from it, or true, ends what is being done. ``device`` is shown to people who want control.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class ScriptedOperator:
         if self.control.asked_by:
             self.control.release()
         self.tick()
-        if self._is_of_a_person():
+        if self._person_has_control():
             return math.inf
         drive = replace(drive, valid_ms=VALID_MS, key=self.control.key or drive.key)
         message = Message(self.robot.estop.drive_topic, codec.encode(DRIVE, drive), QoS(DRIVE.default_qos))
@@ -99,7 +99,7 @@ class ScriptedOperator:
         self.control.release()
         self.tick()
 
-    def _is_of_a_person(self) -> bool:
+    def _person_has_control(self) -> bool:
         state = self.robot.control.state if self.robot.controlled else None
         return state is not None and state.id not in ("", self.control.id)
 

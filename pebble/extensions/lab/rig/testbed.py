@@ -15,7 +15,6 @@ import msgspec
 
 from pebble.config.raw import deep_merge
 from pebble.errors import PebbleError
-from pebble.extensions.lab.rig.page import Ready
 from pebble.extensions.lab.rig.processes import HOST, OPERATORS, Processes, Program, python
 from pebble.extensions.lab.rig.robot import MEDIA, START_S, Config, Robot, SimulatedRobot
 from pebble.extensions.lab.simulation.world.program import port_path, trace_path
@@ -62,7 +61,7 @@ class LinuxRobot(Robot):
         self.played = folder / "played"
         self._imu = folder / "imu"  # a serial port
         self.instances: dict[str, Config] = {}
-        self._own = config | {"services": config["services"] | {"av_daemon": {}}}
+        self._base_config = config | {"services": config["services"] | {"av_daemon": {}}}
         raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
         camera = {"video": {"device": f"{running.room_file}#{name}"}}
         self._services = {
@@ -135,14 +134,14 @@ class PageServer(Program):
         self.url = ""  # with a slash at the end; empty until it can be opened
         fields = {"broker": {"host": HOST, "port": broker_port}, "host": HOST, "server": "demo", **settings}
         command = python("pebble.extensions.lab.rig.page", msgspec.json.encode(fields, enc_hook=str).decode())
-        super().__init__("the operator page", command, folder / "page.log", self._take)
+        super().__init__("the operator page", command, folder / "page.log", self._note_url)
 
     def wait(self, ending: threading.Event | None = None) -> None:
         """Wait until the page can be opened at ``url``, or ``ending``. Raises PebbleError if it cannot."""
         self.wait_until(lambda: bool(self.url), START_S, ending)
 
-    def _take(self, line: bytes) -> None:
-        self.url = msgspec.json.decode(line, type=Ready).url
+    def _note_url(self, line: bytes) -> None:
+        self.url = line.decode().strip()
 
 
 class Testbed(Processes):
@@ -202,7 +201,7 @@ class Testbed(Processes):
         """Wait until all robots can be driven. Raises PebbleError after half a minute, or if a process ends."""
         discovery, end = Discovery(), time.monotonic() + _READY_S
         with create("mqtt", "testbed", MqttSettings(host=HOST, port=self.broker_port)) as transport:
-            transport.subscribe(ALL_OUTGOING, lambda one: discovery.receive(one, time.monotonic(), time.time()))
+            transport.subscribe(ALL_OUTGOING, lambda message: discovery.receive(message, time.monotonic(), time.time()))
             while sum(robot.ready(time.monotonic()) for robot in discovery.all_robots()) < len(self.robots):
                 if (problems := self.unexpected_exits()) or time.monotonic() > end:
                     raise PebbleError("; ".join(problems) or "the robots did not become ready to drive")

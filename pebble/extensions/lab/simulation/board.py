@@ -14,8 +14,8 @@ from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
 from pebble.extensions.lab.simulation.micropython.runner import Runner
 from pebble.extensions.lab.simulation.motion import RobotMotion
 
-_REPLAYED_S = 0.5  # a pause up to this is replayed turn by turn; output during a longer one is discarded
-_DEADLINES_S = 2.0  # simulated part of a longer pause: all deadlines of the firmware are over by then
+_REPLAYED_S = 0.5  # after a pause up to this all turns of the loop are made up for
+_DEADLINES_S = 2.0  # after a longer one only these, without their output: all of the firmware's deadlines are over then
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ class SimulatedMcu:
         output = self._advance(now, self.profile.tick_s)
         self.board.console.type(data)
         output += self._turn(now)
-        while (unread := self.board.console.unread) and self._clock.now() <= now:
+        while (unread := self.board.console.unread) and self._clock.now() <= now:  # else the firmware blocks
             output += self._turn(now)
             if self.board.console.unread == unread:  # the firmware reads nothing now
                 break
@@ -90,8 +90,8 @@ class SimulatedMcu:
 
     def tick(self, now: float) -> bytes:
         """Advance to ``now``; return the board's output until then."""
-        first, self._boot_output = self._boot_output, b""
-        return first + self._advance(now, self.profile.turn_s) + self._turn(now)
+        boot_output, self._boot_output = self._boot_output, b""
+        return boot_output + self._advance(now, self.profile.turn_s) + self._turn(now)
 
     # -- time
 
@@ -99,14 +99,11 @@ class SimulatedMcu:
         """Run the loop every ``turn_s`` until just before ``now``; return the board's output."""
         output = b""
         behind = now - self._clock.now()
-        if behind <= turn_s:
-            return output
-        replayed = behind <= _REPLAYED_S
-        until = now if replayed else self._clock.now() + _DEADLINES_S
-        while (moment := self._clock.now() + turn_s) < min(now, until):
-            turned = self._turn(moment)
-            output += turned if replayed else b""
-        return output
+        is_long_pause = behind > _REPLAYED_S
+        until = min(now, self._clock.now() + _DEADLINES_S) if is_long_pause else now
+        while (moment := self._clock.now() + turn_s) < until:
+            output += self._turn(moment)
+        return b"" if is_long_pause else output
 
     def _turn(self, now: float) -> bytes:
         """Run one turn of the firmware's loop at ``now``, unless the firmware still blocks then."""

@@ -35,16 +35,19 @@ class Body:
         self.motion = motion or RobotMotion()
         self.battery = Battery(self.cells)
         self.on_motors: Callable[[float, Pair], None] = lambda _now, _motors: None
-        self._rolled = self._changed_at = board.clock.now()
-        self._motors = self._reported = (0.0, 0.0)
-        self._stale = False
+        self._advanced_at = self._changed_at = board.clock.now()  # of motion and battery; of the outputs
+        self._motors = self._reported = (0.0, 0.0)  # as the outputs set them; as passed to on_motors
+        self._stale = False  # the outputs have changed since the motors were set by them
         board.pins.before_change = self.before_output_change
 
     def before_output_change(self) -> None:
-        """Advance to the present time before an output of the board changes; several may change in one turn."""
+        """Advance to the present time before an output of the board changes.
+
+        Several may change in one turn: changes within a millisecond are reported together.
+        """
         now = self.board.clock.now()
         if self._stale and now == self._changed_at:
-            return
+            return  # another output changes at the same moment
         if now - self._changed_at > _ONE_TURN_S:
             self.end_turn()
         self.advance()
@@ -60,9 +63,10 @@ class Body:
     def advance(self) -> None:
         """Advance motion and battery to the present time."""
         now = self.board.clock.now()
-        seconds, self._rolled = now - self._rolled, max(now, self._rolled)
+        seconds = now - self._advanced_at
         if seconds <= 0.0:
             return
+        self._advanced_at = now
         self._read_outputs()
         at_rest = self._motors == (0.0, 0.0) == (self.motion.left_mm_s, self.motion.right_mm_s)
         slices = 1 if at_rest else min(_MOST_SLICES, math.ceil(seconds / _SLICE_S))
@@ -86,9 +90,8 @@ class Body:
 
     def half_bridge(self, pins: tuple[PinName, PinName]) -> float:
         """Return the speed of a motor on half a DRV8833: the first pin high turns it forward."""
-        forward, back = pins
-        level = self.board.duty
-        return round(level(forward) - level(back), 4) + 0.0  # 16-bit duties; + 0.0: no −0.0
+        forward, back = map(self.board.duty, pins)
+        return round(forward - back, 4) + 0.0  # 16-bit duties; + 0.0: no −0.0
 
     def measure_battery(self) -> None:
         """Connect the battery to its pin, through the divider that the firmware assumes."""
@@ -190,7 +193,7 @@ class GoobImu(Body):
         board.bus.attach(self.pins.IMU, self.imu)
 
 
-BODIES: Final[dict[str, type[Body]]] = {kind.kind: kind for kind in (Goob, Fred, Minilamp, Benjr, GoobImu)}
+BODIES: Final[dict[str, type[Body]]] = {body.kind: body for body in (Goob, Fred, Minilamp, Benjr, GoobImu)}
 
 
 def body_of(kind: str, board: Board, motion: RobotMotion | None = None) -> Body:

@@ -9,7 +9,6 @@ import select
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from types import TracebackType
 from typing import Any, Self
 
 from pebble.contract.identity import Identity
@@ -33,8 +32,8 @@ class Fleet:
         self.broker = broker
         self.robots: list[WirelessRobot] = []
         self._epoll = select.epoll()
-        self._due: list[float] = []  # by the robots' numbers
-        self._of: dict[int, int] = {}  # file descriptor to the number of its robot
+        self._due: list[float] = []  # by the number of a robot: when its next turn is due
+        self._number_of: dict[int, int] = {}  # by the file descriptor of a socket: the number of its robot
 
     def add(self, kind: str, identity: Identity, *, moving_s: float = _MOVING_S, **options: Any) -> WirelessRobot:
         """Add a robot. Its first turn comes when the fleet runs."""
@@ -60,59 +59,65 @@ class Fleet:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _turn(self) -> None:
         """Wait for a ready socket or for the next robot that is due; run a turn of those robots."""
         wait = min(self._due, default=0.0) - time.monotonic()
         for descriptor, _ in self._epoll.poll(min(_LONGEST_S, max(0.0, wait))):
-            self._due[self._of[descriptor]] = 0.0
+            self._due[self._number_of[descriptor]] = 0.0
         now = time.monotonic() + _GRAIN_S
         for number, due in enumerate(self._due):
             if due <= now:
                 self._step(number)
 
     def _step(self, number: int) -> None:
+        """Run a turn of a robot, watch the sockets that it has opened, and set when its next turn is due."""
         robot, network = self.robots[number], self.robots[number].network
         network.unread = False
         robot.step()
         for sock in network.new_sockets:  # closing a descriptor removes it from epoll; its number may be used again
             if sock.fileno() >= 0:
-                self._of[sock.fileno()] = number
+                self._number_of[sock.fileno()] = number
                 self._epoll.register(sock, _EVENTS)
         network.new_sockets.clear()
         self._due[number] = time.monotonic() + (0.0 if network.unread else robot.pause_s)
 
 
 class ConnectionReporter:
-    """A reporter of robots that cannot connect: one line, and another when that changes. Call ``poll`` often."""
+    """A reporter of robots that cannot connect: a line when they cannot, and when the reason changes or they can.
+
+    Call ``poll`` often.
+    """
 
     def __init__(self, robots: Sequence[WirelessRobot], report: Callable[[str], None]) -> None:
         self._robots, self._report = robots, report
-        self._fine_at = time.monotonic()
-        self._reported = ""
+        self._online_at = time.monotonic()  # when all robots were last online
+        self._reported = ""  # what the last line was about: "online", or a reason
 
     def poll(self) -> None:
         offline = [robot for robot in self._robots if not robot.online]
         if not offline:
-            self._fine_at = time.monotonic()
-            if self._reported != "online":
-                self._report_change("online", self._robots)
-        elif time.monotonic() - self._fine_at > _OFFLINE_S:
-            reasons = Counter(robot.problem for robot in offline)
-            self._report_change(reasons.most_common(1)[0][0] or "no answer", offline)
+            self._online_at = time.monotonic()
+            self._report_change("online", self._robots)
+        elif time.monotonic() - self._online_at > _OFFLINE_S:
+            ((most_common_reason, _),) = Counter(robot.problem for robot in offline).most_common(1)
+            self._report_change(most_common_reason or "no answer", offline)
 
-    def _report_change(self, what: str, whose: Sequence[WirelessRobot]) -> None:
-        if what == self._reported:
+    def _report_change(self, state: str, robots: Sequence[WirelessRobot]) -> None:
+        """Report that robots are ``online``, or why they are not, unless this was reported last."""
+        if state == self._reported:
             return
-        self._reported = what
-        who = whose[0].identity.id if len(whose) == 1 else f"{len(whose)} robots"
-        where = f"the broker at {whose[0].broker.host}:{whose[0].broker.port}"
-        goes_on = "it keeps trying" if len(whose) == 1 else "they keep trying"
-        self._report(
-            f"{who}: connected to {where}" if what == "online" else f"{who}: cannot reach {where}: {what}; {goes_on}"
-        )
+        self._reported = state
+        who, goes_on = f"{len(robots)} robots", "they keep trying"
+        if len(robots) == 1:
+            who, goes_on = robots[0].identity.id, "it keeps trying"
+        broker = f"the broker at {robots[0].broker.host}:{robots[0].broker.port}"
+        if state == "online":
+            self._report(f"{who}: connected to {broker}")
+        else:
+            self._report(f"{who}: cannot reach {broker}: {state}; {goes_on}")
 
 
 def members(count: int) -> Iterator[tuple[str, Identity]]:

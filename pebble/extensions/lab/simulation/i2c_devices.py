@@ -46,7 +46,8 @@ class Mpu6050:
             return
         self._pointer = data[0]
         for offset, value in enumerate(data[1:]):
-            if (register := (data[0] + offset) % 128) != _WHO_AM_I:
+            register = (data[0] + offset) % 128
+            if register != _WHO_AM_I:  # which cannot be written
                 self._registers[register] = value
 
     def read(self, count: int) -> bytes:

@@ -22,7 +22,7 @@ import msgspec
 from pebble.extensions.lab.simulation.trace import complete_lines
 
 _CHUNK_S = 0.02
-_DELAY_LIMIT_S = 0.1  # what it is late by, it catches up, but never more than this
+_DELAY_LIMIT_S = 0.1  # a delay is made up for, but no more of it than this
 _EVENTS = "events.jsonl"
 _BUSY = "loudspeaker: audio open error: Device or resource busy"
 
@@ -63,7 +63,10 @@ class _StoppedError(Exception):
 
 
 class _Sound(msgspec.Struct):
-    """A source of sound: ``read(count)`` returns at most that many frames, b"" at the end."""
+    """A source of sound: ``read(count)`` returns at most that many frames, b"" at the end.
+
+    A frame is a sample of each channel.
+    """
 
     file: str
     rate: int
@@ -117,15 +120,16 @@ class _Recorder:
 
 def _play(sound: _Sound, recorder: _Recorder) -> bool:
     """Play in real time until the end or a signal; False if it was stopped."""
-    due, frames, size, stopped = 0.0, 0, sound.channels * sound.width, False
+    due, frames, stopped = 0.0, 0, False
     try:
-        for number, chunk in enumerate(sound.chunks()):
-            if number == 0:
+        for chunk in sound.chunks():
+            if not frames:
                 recorder.begin()
                 due = time.monotonic()
             recorder.add(chunk)
-            frames += len(chunk) // size
-            due = max(due, time.monotonic() - _DELAY_LIMIT_S) + len(chunk) / size / sound.rate
+            count = len(chunk) // (sound.channels * sound.width)
+            frames += count
+            due = max(due, time.monotonic() - _DELAY_LIMIT_S) + count / sound.rate
             time.sleep(max(0.0, due - time.monotonic()))
     except _StoppedError:
         stopped = True

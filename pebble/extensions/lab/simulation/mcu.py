@@ -31,6 +31,7 @@ def actions(mcu: PtyMcu) -> dict[str, Callable[[], None]]:
 
 
 def _run_commands(mcu: PtyMcu, end: EndSignal) -> None:
+    """Execute the lines of standard input; when it closes, request the end of the program."""
     commands = actions(mcu)
     for line in sys.stdin:
         action = commands.get(line.strip())

@@ -62,6 +62,7 @@ class RobotMotion:
         self._roll(left_mm, right_mm)
 
     def _roll(self, left_mm: float, right_mm: float) -> None:
+        """Turn the wheels by these distances, and move the robot as far as the ground lets it."""
         self.left_mm += left_mm
         self.right_mm += right_mm
         turn, ahead = (right_mm - left_mm) / self.wheels.track_mm, (left_mm + right_mm) / 2

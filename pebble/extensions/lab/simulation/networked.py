@@ -56,22 +56,22 @@ def run_fleet(broker: MqttSettings, robots: int) -> int:
     def show(line: str) -> None:
         print(line, flush=True)  # noqa: T201
 
-    def status() -> str:
-        moving = sum(robot.moving for robot in fleet.robots)
-        return f"{sum(robot.online for robot in fleet.robots)} of {robots} online, {moving} moving"
+    def show_status() -> None:
+        online = sum(robot.online for robot in fleet.robots)
+        show(f"{online} of {robots} online, {sum(robot.moving for robot in fleet.robots)} moving")
 
-    def job() -> None:
+    def report() -> None:
         nonlocal due
         reporter.poll()
         if time.monotonic() >= due:
             due = time.monotonic() + _STATUS_S
-            show(status())
+            show_status()
 
     with Fleet(broker) as fleet:
         for kind, identity in members(robots):
             fleet.add(kind, identity)
         reporter = ConnectionReporter(fleet.robots, show)
         show(f"{robots} robots, {fleet.robots[0].identity.id} and so on; Ctrl-C ends it")
-        fleet.run(lambda: not end.wait(0.0), job)
-        show(status())
+        fleet.run(lambda: not end.wait(0.0), report)
+        show_status()
         return int(not all(robot.online for robot in fleet.robots))

@@ -8,7 +8,6 @@ import time
 import tty
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from pebble.errors import DeviceError
@@ -79,9 +78,9 @@ class PtyMcu:
         self._mcu = SimulatedMcu(kind, time.monotonic(), motion=motion, on_motors=self._moved)
         self._tick_s = self._mcu.profile.tick_s
         self._recorder = _Recorder(self.trace, is_text=self._mcu.profile.is_text, output=trace_output)
-        self._master: int | None = None
-        self._tty = ""
-        self._host = False
+        self._master: int | None = None  # the MCU's end of the pty; None while it is unplugged
+        self._tty = ""  # the path of the host's end
+        self._host = False  # a program has the port open
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"pebble-sim {kind}", daemon=True)
 
@@ -105,7 +104,7 @@ class PtyMcu:
     def __enter__(self) -> Self:
         return self.open()
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def unplug(self) -> None:
@@ -121,6 +120,7 @@ class PtyMcu:
             self._recorder.event("unplugged")
 
     def replug(self) -> None:
+        """Make a pty, and let the symlink lead to it. Raises OSError if the symlink cannot be made."""
         with self._lock:
             if self._master is not None:
                 return
@@ -167,13 +167,14 @@ class PtyMcu:
     # -- the MCU's thread
 
     def _run(self) -> None:
-        looked = time.monotonic()
+        read_at = time.monotonic()
         while not self._ending.is_set():
             self._wait()
             with self._lock:
-                before, looked = looked, time.monotonic()
-                if self._traces_late and looked - before > self._tick_s + _LATE_S:
-                    self.trace.add(Entry(round(looked * 1e9), "late", f"{looked - before:.3f}"))
+                last_read_at, read_at = read_at, time.monotonic()
+                pause_s = read_at - last_read_at
+                if self._traces_late and pause_s > self._tick_s + _LATE_S:
+                    self.trace.add(Entry(round(read_at * 1e9), "late", f"{pause_s:.3f}"))
                 if self._master is not None:
                     self._poll_host(self._master)
                 self._transmit(self._mcu.tick(time.monotonic()))
@@ -187,6 +188,7 @@ class PtyMcu:
             time.sleep(self._tick_s if self._master is None else min(self._tick_s, _NO_HOST_S))
 
     def _poll_host(self, master: int) -> None:
+        """Receive from the host, and note when a program opens or closes the port."""
         poller = select.poll()
         poller.register(master, select.POLLIN)
         events = poller.poll(0)

@@ -52,7 +52,7 @@ class WirelessRobot:
         clock = RealClock()
         uid = hashlib.sha256(identity.base.encode()).digest()[:6]
         self.network = HostNetwork(clock, platform=OF_ROBOT[kind].platform)
-        self.board = Board(clock, self.network, uid, seed=secrets.randbits(64))  # another one at each start
+        self.board = Board(clock, self.network, uid, seed=secrets.randbits(64))  # other random numbers at each start
         self.board.files = Files(files)
         self.body = body_of(kind, self.board)
         self.body.on_motors = self._moved
@@ -108,12 +108,15 @@ class WirelessRobot:
 
     def _mqtt(self) -> dict[str, Any]:
         """Return the section ``mqtt`` of the board's private_config.json."""
-        broker, tls = self.broker, self.broker.tls
+        broker = self.broker
+        tls: Any = broker.tls is not None
+        if broker.tls is not None and broker.tls.ca_cert is not None:
+            tls = {"ca": _CA_FILE}
         login = {"username": broker.username, "password": broker.password} if broker.username is not None else {}
-        ca: Any = {"ca": _CA_FILE} if tls is not None and tls.ca_cert is not None else tls is not None
-        return {"host": broker.host, "port": broker.port, "tls": ca, **login}
+        return {"host": broker.host, "port": broker.port, "tls": tls, **login}
 
     def _moved(self, now: float, motors: Motors) -> None:
+        """Note that the body's motors have changed."""
         self._motors = motors
         if self._on_motors is not None:
             self._on_motors(now, motors)

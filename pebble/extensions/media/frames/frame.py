@@ -98,7 +98,7 @@ def _raw(data: Bytes, info: FrameInfo) -> Bytes:
     cv2 = _opencv(f"a frame of format {info.format}")
     if info.width % 2 or info.height % 2:
         raise PayloadError(f"{info.format} of {info.width}x{info.height}: sides must be even")
-    if info.format == "nv12":
+    if info.format == "nv12":  # a plane of brightness, then one of colour, half as high
         rows = _rows(data, info, info.height * 3 // 2, info.width)
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(rows), cv2.COLOR_YUV2BGR_NV12))
     rows = _rows(data, info, info.height, 2 * info.width)
@@ -130,9 +130,9 @@ def _jpeg(data: Bytes, info: FrameInfo, width: int | None) -> Bytes:
     """Return the decoded JPEG, at 1/2, 1/4 or 1/8 size if that is enough for ``width``: much less work."""
     cv2 = _opencv(f"a frame of format {info.format}")
     scale = _scale(info.width, width)
-    flags = {1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}
+    reduced = {2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8}
     try:
-        pixels = cv2.imdecode(data, flags.get(scale, cv2.IMREAD_REDUCED_COLOR_8))
+        pixels = cv2.imdecode(data, reduced.get(scale, cv2.IMREAD_COLOR))
     except cv2.error:  # an empty or undecodable buffer
         pixels = None
     if pixels is None:
@@ -140,14 +140,17 @@ def _jpeg(data: Bytes, info: FrameInfo, width: int | None) -> Bytes:
     return np.asarray(pixels)
 
 
-def _scale(has: int, wanted: int | None) -> int:
-    if wanted is None or wanted <= 0:
-        return 1
-    return next((scale for scale in (8, 4, 2) if has // scale >= wanted), 1)
+def _scale(width: int, wanted: int | None) -> int:
+    """Return the largest divisor of a picture's ``width`` that leaves the ``wanted`` pixels."""
+    for scale in (8, 4, 2):
+        if wanted is not None and 0 < wanted <= width // scale:
+            return scale
+    return 1
 
 
-def _resized(found: Bytes, width: int) -> Bytes:
+def _resized(pixels: Bytes, width: int) -> Bytes:
     cv2 = _opencv("a picture of another size")
-    height = max(1, round(found.shape[0] * width / found.shape[1]))
-    how = cv2.INTER_AREA if width < found.shape[1] else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(found, (width, height), interpolation=how))
+    old_height, old_width = pixels.shape[:2]
+    height = max(1, round(old_height * width / old_width))
+    interpolation = cv2.INTER_AREA if width < old_width else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(pixels, (width, height), interpolation=interpolation))

@@ -9,14 +9,14 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 import zenoh
 
 from pebble.errors import TransportError
 from pebble.extensions.media.frames import memory, shared_memory, views
-from pebble.extensions.media.frames.frame import Frame, FrameInfo, decode
+from pebble.extensions.media.frames.frame import Bytes, Frame, FrameInfo, decode
 from pebble.extensions.media.frames.session import METADATA, SharingError, StreamNames, open_reading
 from pebble.transports.counters import Counters
 from pebble.transports.peers import prepare_run_dir
@@ -29,8 +29,6 @@ log = logging.getLogger(__name__)
 #: Bytes that a reader may have mapped. Zenoh leaves the memory of dead writers mapped until the process ends (zenoh
 #: #2787): beyond this limit the reader receives frames as bytes, and `problem` explains it.
 MAPPED_LIMIT = 256 << 20
-
-_T = TypeVar("_T")
 
 
 class FrameReader:
@@ -54,12 +52,12 @@ class FrameReader:
         self.counters = Counters()
         self._count_received, self._count_shared = map(self.counters.adder, ("received", "shared"))
         self.problem = ""
-        self._latest: _LatestFrames[_Arrival] = _LatestFrames(depth)  # closed while the reader is
+        self._latest = _LatestFrames(depth)  # closed while the reader is
         self.running: set[int] = set()  # ids of writers
-        self._seen: set[int] = set()  # those that were counted
-        self._newest = 0, 0  # the frame that has arrived: its writer and number
-        self._replaced = -1  # the writer before that
-        self._sharing_ended = threading.Event()
+        self._seen: set[int] = set()  # ids of writers that were counted
+        self._newest = 0, 0  # writer and number of the newest frame that has arrived
+        self._replaced = -1  # the writer before that of the newest frame
+        self._must_reopen = threading.Event()
         self._lacked_room = False  # in shared memory, when the session was opened
         self._changing = threading.Lock()
         self._pid = 0
@@ -146,14 +144,16 @@ class FrameReader:
         end = None if timeout is None else time.monotonic() + timeout
         while not self._latest.closed:
             check_process(self._pid)
-            if self._sharing_ended.is_set():
+            if self._must_reopen.is_set():
                 self._reopen()
             arrival = self._latest.take(end)
-            frame = None if arrival is None or self._sharing_ended.is_set() else self._frame(arrival)
-            if frame is not None:
-                return frame
-            if arrival is None and end is not None and time.monotonic() >= end:
-                return None
+            if arrival is None:
+                if end is not None and time.monotonic() >= end:
+                    return None
+            elif not self._must_reopen.is_set():
+                frame = self._frame(arrival)
+                if frame is not None:
+                    return frame
         return None
 
     def __iter__(self) -> Iterator[Frame]:
@@ -164,6 +164,7 @@ class FrameReader:
                 yield frame
 
     def _frame(self, arrival: _Arrival) -> Frame | None:
+        """Return the frame that has arrived; None if its memory was overwritten meanwhile."""
         info, payload = arrival
         buffer = payload.as_shm()
         if buffer is None:
@@ -188,7 +189,7 @@ class FrameReader:
             self.counters.add("refused")
             return
         missed = self._missed(info)
-        if missed < 0:
+        if missed is None:
             return
         if missed:
             self.counters.add("missed", missed)
@@ -196,17 +197,20 @@ class FrameReader:
         if skipped := self._latest.put((info, sample.payload)):
             self.counters.add("skipped", skipped)
 
-    def _missed(self, info: FrameInfo) -> int:
-        """Return how many frames were lost before this frame; -1 if this frame is an old one."""
+    def _missed(self, info: FrameInfo) -> int | None:
+        """Return how many frames were lost before this frame; None if this frame is an old one."""
         writer, number = self._newest
-        if info.writer == self._replaced or (info.writer == writer and info.sequence <= number):
-            return -1  # of a writer that was replaced; or sent as bytes, overtaken by a shared one: counted as missed
+        if info.writer == self._replaced:
+            return None
+        if info.writer == writer and info.sequence <= number:
+            return None  # sent as bytes, overtaken by a shared one: it was counted as missed
         if info.writer != writer:
             self._replaced = writer
         self._newest = info.writer, info.sequence
         return info.sequence - number - 1 if info.writer == writer else 0
 
     def _on_writer(self, sample: zenoh.Sample) -> None:
+        """Note that a writer begins or ends; let the session be reopened if sharing memory with it changes."""
         try:
             writer_id, size, segment = self._names.writer_of(str(sample.key_expr))
         except ValueError:
@@ -220,17 +224,18 @@ class FrameReader:
             self._seen.add(writer_id)
             self.counters.add("writers")
         self.running.add(writer_id)
-        if new and size and self._lacked_room:  # it has found room: so may this reader
+        if new and size and self._lacked_room:  # this writer has found room: so may the reader
             self._lacked_room = False
             self._reopen_soon("")
         if size and self.shared and (problem := self._why_not_map(size, segment)):
             self._reopen_soon(problem)
 
     def _why_not_map(self, size: int, segment: str) -> str:
-        mapped = memory.mappings()
-        if any(file.endswith(segment) for _, _, file in mapped):
-            return ""  # as before: only the connection was lost
-        if (total := sum(end - start for start, end, _ in mapped)) > MAPPED_LIMIT:
+        """Return why a writer's segment of ``size`` bytes must not be mapped; "" if it may be."""
+        if any(file.endswith(segment) for _, _, file in memory.mappings()):
+            return ""  # it is mapped already: only the connection was lost
+        total = memory.mapped()
+        if total > MAPPED_LIMIT:
             return (
                 f"writers of {self._names.stream} were restarted so often that {total >> 20} MiB of their memory are "
                 "lost until this process is restarted: from now on it gets frames as bytes"
@@ -239,14 +244,14 @@ class FrameReader:
         return "" if shared_memory.lockable(needed) else self._memlock_problem(needed)
 
     def _reopen_soon(self, problem: str) -> None:
-        """Request that the next `read` reopens the session without sharing: the thread that calls this cannot."""
+        """Let the next `read` reopen the session, as Zenoh's thread cannot; with a ``problem``, without sharing."""
         self.problem = problem
-        self._sharing_ended.set()
+        self._must_reopen.set()
         self._latest.wake()
 
     def _reopen(self) -> None:
         with self._changing:
-            self._sharing_ended.clear()
+            self._must_reopen.clear()
             if self._latest.closed:
                 return
             self.counters.add("reopened")
@@ -260,8 +265,8 @@ class FrameReader:
 _Arrival = tuple[FrameInfo, zenoh.ZBytes]
 
 
-class _LatestFrames(Generic[_T]):
-    """A bounded queue of the newest items, in order, from any thread to one thread."""
+class _LatestFrames:
+    """A bounded queue of the newest frames, in order, from any thread to one thread."""
 
     def __init__(self, depth: int) -> None:
         self._depth = depth
@@ -270,23 +275,24 @@ class _LatestFrames(Generic[_T]):
 
     def reopen(self) -> None:
         self.closed = False
-        self._items: deque[_T | None] = deque()
+        self._items: deque[_Arrival | None] = deque()  # None only wakes the reading thread
         self._wakeup = Wakeup()
 
-    def put(self, item: _T) -> int:
-        """Add an item; return how many older items were dropped for it."""
-        items, thrown = self._items, 0
-        items.append(item)
+    def put(self, arrival: _Arrival) -> int:
+        """Add a frame; return how many older frames were dropped for it."""
+        items, dropped = self._items, 0
+        items.append(arrival)
         while len(items) > self._depth:
             try:
-                thrown += items.popleft() is not None
+                if items.popleft() is not None:
+                    dropped += 1
             except IndexError:  # taken in that moment
                 break
         self._wakeup.set()
-        return thrown
+        return dropped
 
-    def take(self, end: float | None) -> _T | None:
-        """Return the oldest item; None at the time ``end`` (monotonic seconds) or when woken."""
+    def take(self, end: float | None) -> _Arrival | None:
+        """Return the oldest frame; None at the time ``end`` (monotonic seconds) or when woken."""
         items, wakeup = self._items, self._wakeup
         while True:
             try:
@@ -301,12 +307,12 @@ class _LatestFrames(Generic[_T]):
             self._wakeup.set()
 
     def close(self) -> None:
-        """Drop waiting items: they pin the writer's memory."""
+        """Drop waiting frames: they pin the writer's memory."""
         self.closed = True
         self._items.clear()
         self._items.append(None)
         self._wakeup.set()
 
 
-def _copy(data: bytes) -> np.ndarray[Any, np.dtype[np.uint8]]:
+def _copy(data: bytes) -> Bytes:
     return np.frombuffer(data, np.uint8).copy()

@@ -61,16 +61,16 @@ class StreamNames:
 def open_writing(names: StreamNames, *, shared: bool) -> zenoh.Session:
     """Open the writer's session. Raises TransportError if it cannot listen, for example beside another writer."""
     check_socket_path(names.socket)
-    return _open(names.folder, [names.socket], [], shared=shared)
+    return _open(names, [names.socket], [], shared=shared)
 
 
 def open_reading(names: StreamNames, *, shared: bool) -> zenoh.Session:
     """Open a reader's session. The writer need not be running yet."""
-    return _open(names.folder, [], [names.socket], shared=shared)
+    return _open(names, [], [names.socket], shared=shared)
 
 
-def _open(folder: Path, listen: list[Path], connect: list[Path], *, shared: bool) -> zenoh.Session:
-    config = json.loads(session_config(ZenohSettings(run_dir=folder), "peer", listen=listen, connect=connect))
+def _open(names: StreamNames, listen: list[Path], connect: list[Path], *, shared: bool) -> zenoh.Session:
+    config = json.loads(session_config(ZenohSettings(run_dir=names.folder), "peer", listen=listen, connect=connect))
     config["connect"]["retry"] = _RETRY
     # Implicit sharing would copy once per reader into a second pool, and share frames that are sent as bytes.
     config["transport"]["shared_memory"] = {
@@ -83,8 +83,8 @@ def _open(folder: Path, listen: list[Path], connect: list[Path], *, shared: bool
         return open_session(json.dumps(config))
     except zenoh.ZError as error:
         kind = SharingError if shared and "shm" in str(error) else TransportError
-        raise kind(f"frames at {(listen or connect)[0]}: {error}") from None
+        raise kind(f"frames at {names.socket}: {error}") from None
     except BaseException as error:
         if not shared or type(error).__name__ != "PanicException":  # pyo3's, which is no Exception and not importable
             raise
-        raise SharingError(f"no shared memory for frames at {(listen or connect)[0]}: {error}") from None
+        raise SharingError(f"no shared memory for frames at {names.socket}: {error}") from None

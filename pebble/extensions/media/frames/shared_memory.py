@@ -10,14 +10,12 @@ import resource
 import time
 from typing import Any
 
-import numpy as np
 import zenoh
 import zenoh.shm
 
 from pebble.errors import TransportError
 from pebble.extensions.media.frames import views
-
-Bytes = np.ndarray[Any, np.dtype[np.uint8]]
+from pebble.extensions.media.frames.frame import Bytes
 
 STARVED_S = 1.0  # after this long without a free slot, slots of dead or stopped readers are reclaimed
 MARGIN = 64 << 10  # bytes in addition to the frames: the allocator's own, and rounding
@@ -33,12 +31,12 @@ class SharedPool:
         self.size = size
         self._provider = zenoh.shm.ShmProvider.default_backend(size)
         self._policy = zenoh.shm.GarbageCollect()
-        self._starved_since: float | None = None
+        self._starved_since: float | None = None  # since when no slot was free
         self.reclaimed = 0  # how often slots were taken from readers that died or stopped
 
     def segment(self) -> str:
         """Return the name of its file in /dev/shm; "" if Zenoh does not report it."""
-        match = _segment(repr(self._provider.alloc(1, policy=self._policy)))
+        match = _segment(repr(self._provider.alloc(1, policy=self._policy)))  # Zenoh prints it for each allocation
         return f"{match[1]}.zenoh" if match else ""
 
     def allocate(self, size: int) -> Chunk | None:
@@ -108,7 +106,7 @@ def lockable(size: int) -> bool:
         address = ctypes.c_void_p(ctypes.addressof(probe))
         allowed = _libc.mlock2(address, ctypes.c_size_t(size), _MLOCK_ONFAULT) == 0
         _libc.munlock(address, ctypes.c_size_t(size))
-        del probe
+        del probe  # else the mapping could not be closed
     return bool(allowed)
 
 

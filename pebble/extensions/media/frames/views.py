@@ -17,6 +17,8 @@ import numpy as np
 import zenoh
 import zenoh.shm
 
+from pebble.extensions.media.frames.frame import Bytes
+
 log = logging.getLogger(__name__)
 
 #: Versions of eclipse-zenoh whose buffers this module was tested with: tests/ext/media/frames/test_views.py.
@@ -28,7 +30,6 @@ _POINTER = re.compile(r"\bbuf: PtrInSegment \{ ptr: (0x[0-9a-f]+)")
 _WORD = ctypes.sizeof(ctypes.c_void_p)
 _HEAD = object.__basicsize__  # before that is Python's own: reference count and type
 
-Bytes = np.ndarray[Any, np.dtype[np.uint8]]
 Buffer = Any  # zenoh.shm.ZShm | zenoh.shm.ZShmMut
 
 
@@ -41,27 +42,22 @@ class SelfTest:
 
     def __init__(self) -> None:
         self._once = threading.Lock()
-        self.offset: int | None = None
+        self.offset: int | None = None  # in a buffer object, of the address of its bytes
         self.problem: str | None = None  # None: not tested yet
 
     def test(self) -> str:
-        problem = self.problem
-        return self._test_once() if problem is None else problem
-
-    def _test_once(self) -> str:
+        """Return the problem; "" if views work. The first call tests it."""
+        if self.problem is not None:
+            return self.problem
         with self._once:
-            if self.problem is None:
-                self.problem = self._find()
-                if self.problem:
+            if self.problem is None:  # no other thread has tested it meanwhile
+                try:
+                    self.offset = _calibrate()
+                    self.problem = ""
+                except (UnexpectedLayoutError, zenoh.ZError) as error:
+                    self.problem = str(error)
                     log.warning("frames are copied: %s", self.problem)
-        return self.problem
-
-    def _find(self) -> str:
-        try:
-            self.offset = _calibrate()
-        except (UnexpectedLayoutError, zenoh.ZError) as error:
-            return str(error)
-        return ""
+            return self.problem
 
 
 self_test = SelfTest()
@@ -86,8 +82,9 @@ def array(buffer: Buffer, size: int, *, writable: bool = False, owner: object = 
 
 def _array(buffer: Buffer, size: int, offset: int, *, writable: bool, owner: object = None) -> Bytes:
     raw = (ctypes.c_ubyte * size).from_address(_read_word(buffer, offset))
-    raw._owners = (buffer, owner)  # type: ignore[attr-defined]
-    return np.frombuffer(memoryview(raw) if writable else memoryview(raw).toreadonly(), np.uint8)
+    raw._owners = (buffer, owner)  # type: ignore[attr-defined]  # keeps both alive
+    view = memoryview(raw)
+    return np.frombuffer(view if writable else view.toreadonly(), np.uint8)
 
 
 def _read_word(buffer: Buffer, offset: int) -> int:
@@ -133,8 +130,9 @@ def _printed(buffer: Buffer) -> int:
     return int(printed[1], 16)
 
 
-def _only(found: list[set[int]]) -> int:
-    common = set.intersection(*found)
+def _only(offsets: list[set[int]]) -> int:
+    """Return the offset that is in all sets. Raises UnexpectedLayoutError if there is not exactly one."""
+    common = set.intersection(*offsets)
     if len(common) != 1:
         raise UnexpectedLayoutError(
             f"the address of a buffer is at {sorted(common) or 'none'} of its words, not at one"
@@ -160,8 +158,8 @@ def _check(buffer: Buffer, size: int, offset: int) -> None:
     _expect(_array(received, size, offset, writable=False).tobytes() == second == bytes(received), "a view reads wrong")
 
 
-def _expect(true: bool, otherwise: str) -> None:
-    if not true:
+def _expect(holds: bool, otherwise: str) -> None:
+    if not holds:
         raise UnexpectedLayoutError(otherwise)
 
 

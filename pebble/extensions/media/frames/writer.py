@@ -16,7 +16,7 @@ import zenoh
 
 from pebble.errors import TransportError
 from pebble.extensions.media.frames import memory, shared_memory, views
-from pebble.extensions.media.frames.frame import FrameInfo, encode
+from pebble.extensions.media.frames.frame import Bytes, FrameInfo, encode
 from pebble.extensions.media.frames.session import METADATA, SharingError, StreamNames, open_writing
 from pebble.extensions.media.frames.shared_memory import MARGIN, Chunk, SharedPool
 from pebble.transports import segments
@@ -26,15 +26,14 @@ from pebble.transports.zenoh.session import check_process, close_at_exit, close_
 
 log = logging.getLogger(__name__)
 
-Bytes = np.ndarray[Any, np.dtype[np.uint8]]
 Data = bytes | bytearray | memoryview | np.ndarray[Any, Any]
 
 SMALL = 16 << 10  # bytes: frames up to this size are sent as bytes, which is as fast and pins no memory
 RETRY_S = 30.0  # from the opening without room in shared memory until it is looked for again
+_NEVER = float("inf")
 #: What happens to a frame when a reader accepts nothing; neither blocks the writer. DROP: it is dropped after a
 #: millisecond, which is right for small messages: sound, and the reference to a picture in shared memory.
 #: A picture sent as bytes takes longer than that: BLOCK_FIRST lets one wait and drops those after it.
-_NEVER = float("inf")
 _DROP, _BLOCK_FIRST = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK_FIRST
 
 
@@ -56,7 +55,7 @@ class FrameWriter:
         self._pool_size = 0 if capacity <= SMALL else slots * capacity + MARGIN
         self.counters = Counters()
         self.problem = ""
-        self._retry_at = _NEVER
+        self._retry_at = _NEVER  # when room in shared memory is looked for again
         self._writer_id = 0
         self._pid = 0
         self._sequence = 0
@@ -66,9 +65,9 @@ class FrameWriter:
         self._publishers: tuple[zenoh.Publisher, zenoh.Publisher] | None = None
         self._pool: SharedPool | None = None
         self._lock: FileLock | None = None
-        self._memory: Path | None = None
+        self._memory: Path | None = None  # the pool's file
         self._tokens: list[Any] = []
-        self._readers: set[str] = set()
+        self._readers: set[str] = set()  # keys of their tokens
 
     # -- opening and closing
 
@@ -90,7 +89,8 @@ class FrameWriter:
             if not self._has_room():
                 self._retry_at = time.monotonic() + RETRY_S
         small = self._declare_publisher(session, _DROP)
-        self._publishers = small, self._declare_publisher(session, _BLOCK_FIRST) if self._pool_size else small
+        pictures = self._declare_publisher(session, _BLOCK_FIRST) if self._pool_size else small
+        self._publishers = small, pictures
         follow = zenoh.handlers.Callback(self._on_reader, indirect=False)
         liveliness = session.liveliness()
         size, segment = (0, "") if self._pool is None else (self._pool.size, self._pool.segment())
@@ -135,7 +135,8 @@ class FrameWriter:
                 lock.release()
 
     def _why_not_shared(self) -> str:
-        if self._pool_size == 0 or shared_memory.lockable(needed := self._pool_size + 2 * METADATA):
+        needed = self._pool_size + 2 * METADATA
+        if self._pool_size == 0 or shared_memory.lockable(needed):
             return ""
         return shared_memory.memlock_problem(needed, f"the writer of {self._names.stream}")
 
@@ -236,10 +237,12 @@ class FrameWriter:
         publishers = self._publishers
         if publishers is None:
             return False
+        small, pictures = publishers
         sequence = self._sequence + 1
         stamped = msgspec.structs.replace(info, sequence=sequence, writer=self._writer_id)
         try:
-            publishers[0 if shared else 1].put(payload, attachment=encode(stamped))
+            publisher = small if shared else pictures  # what is sent of a shared frame is a reference to it
+            publisher.put(payload, attachment=encode(stamped))
         except zenoh.ZError as error:  # closed meanwhile
             log.debug("a frame of %s was not sent: %s", self._names.stream, error)
             return False
@@ -262,23 +265,21 @@ class Slot:
     @property
     def array(self) -> Bytes:
         """One-dimensional, writable array, not zeroed. Raises TransportError when the slot was sent or dropped."""
-        return self._take(keep=True).view()
+        return self._held().view()
 
     def send(self, info: FrameInfo) -> bool:
         """Send the frame; False if there are no readers left."""
-        buffer = self._take().take()
+        buffer = self._held().take()
+        self._chunk = None
         return self._writer._is_wanted() and self._writer._put(buffer, info, shared=True)
 
     def drop(self) -> None:
         self._chunk = None
 
-    def _take(self, *, keep: bool = False) -> Chunk:
-        chunk = self._chunk
-        if chunk is None:
+    def _held(self) -> Chunk:
+        if self._chunk is None:
             raise TransportError("this slot has been sent or dropped")
-        if not keep:
-            self._chunk = None
-        return chunk
+        return self._chunk
 
 
 def _flat(data: Data) -> Bytes:

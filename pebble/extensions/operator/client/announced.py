@@ -15,9 +15,10 @@ from pebble.contract.capabilities import (
     SystemOffer,
     VideoOffer,
 )
+from pebble.extensions.operator.client.named_topics import json_object
+from pebble.extensions.operator.client.robot_topics import section_of
 
 _LARGEST = 4096  # bytes of a heartbeat or status that are looked at
-_decode = msgspec.json.Decoder().decode
 
 
 def announced(base: str, payload: bytes) -> dict[str, Any]:
@@ -28,16 +29,13 @@ def announced(base: str, payload: bytes) -> dict[str, Any]:
     """
     if len(payload) > _LARGEST or b'"subscribes"' not in payload:
         return {}
-    try:
-        decoded = _decode(payload)
-    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
+    decoded = json_object(payload) or {}
+    subscribes = decoded.get("subscribes")
+    if subscribes is None:  # a status has it inside its value
+        subscribes = section_of(decoded, "value").get("subscribes")
+    if not isinstance(subscribes, list):
         return {}
-    listed: Any = None
-    for level in (decoded, decoded.get("value") if isinstance(decoded, dict) else None):
-        listed = level.get("subscribes") if isinstance(level, dict) and listed is None else listed
-    if not isinstance(listed, list):
-        return {}
-    has = {channel for channel in _KNOWN if channel.suffix in listed}
+    has = {channel for channel in _KNOWN if channel.suffix in subscribes}
     value: dict[str, Any] = msgspec.to_builtins(_value(base, has)) if has else {}
     return value
 
@@ -49,6 +47,8 @@ _KNOWN = (
 
 
 def _value(base: str, has: set[c.Channel]) -> CapabilitiesValue:
+    """Return the capabilities of a robot that has subscribed to these channels."""
+
     def flag(channel: c.Channel) -> FlagOffer:
         return FlagOffer(available=channel in has, controls=channel in has)
 

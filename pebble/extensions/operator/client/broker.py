@@ -22,7 +22,7 @@ Handler = Callable[[Message, float], None]  # the message, and the monotonic tim
 MAX_MESSAGES: Final = 10_000  # on their way to the event loop
 MAX_BYTES: Final = 64 << 20  # of their payloads
 ANSWER_S: Final = 0.25  # a broker that acknowledges nothing for longer would deliver commands late, all at once
-_DELIVER_S: Final = 0.01  # for them at a time: whatever else is due must not wait for a flood
+_DELIVER_S: Final = 0.01  # for messages at a time: other tasks must not wait for a flood of them
 
 
 def problem_of(transport: Transport) -> str:
@@ -58,9 +58,9 @@ class Arrived:
         with self._lock:
             if not self._waiting:
                 return None
-            arrived = self._waiting.popleft()
-            self._bytes -= len(arrived[1].payload)
-            return arrived
+            handler, message, at = self._waiting.popleft()
+            self._bytes -= len(message.payload)
+            return handler, message, at
 
 
 class Broker:
@@ -77,7 +77,7 @@ class Broker:
         self._watchers: list[Callable[[], None]] = []
         self._arrived = Arrived()
         self._woken = False  # deliver is about to be called
-        #: Whether a robot, by its base, takes commands only with a name.
+        #: True for the base topic of a robot that takes commands only with a name.
         self.is_named: Callable[[str], bool] = lambda _base: False
         self.names = NamedTopics(settings.username or "", lambda base: self.is_named(base))
         self.transport.policy.forms = self.names.forms

@@ -92,6 +92,7 @@ def in_small_segments(settings: Any) -> Any:
 
 
 def _report_missing(transport: Transport, before: str = "") -> str:
+    """Log what cannot be received, unless it is the same as ``before``; return it."""
     not_received = transport.not_received if transport.state is State.CONNECTED else ""
     if not_received not in ("", before):
         log.error("%s", not_received)
@@ -117,6 +118,7 @@ def resolve(target: Target) -> tuple[str, Any, Names, str]:
 
 
 def _account(settings: Any) -> str | None:
+    """Return the account at the broker: "" for none; None without a broker."""
     return settings.username or "" if isinstance(settings, MqttSettings) else None
 
 
@@ -191,9 +193,13 @@ def subscribed_stop(transport: Transport, base: str) -> RobotEstop:
     return robot
 
 
-def wait_for(condition: Callable[[], object], seconds: float) -> bool:
-    """Wait until ``condition`` is true; return False if it is not within ``seconds``."""
+def wait_for(condition: Callable[[], object], seconds: float, read: Callable[[], None] = lambda: None) -> bool:
+    """Wait until ``condition`` is true, with ``read`` before each look; return False after ``seconds``."""
     end = time.monotonic() + seconds
-    while not (is_met := bool(condition())) and time.monotonic() < end:
+    while True:
+        read()
+        if condition():
+            return True
+        if time.monotonic() >= end:
+            return False
         time.sleep(_STEP_S)
-    return is_met

@@ -18,18 +18,18 @@ from pebble.contract.channels import Channel
 from pebble.contract.payloads import ControlRequest, ControlState
 from pebble.errors import PayloadError
 from pebble.extensions.operator.client.pace_of_link import WIDE, Pace, ms
-from pebble.extensions.operator.client.robot_estop import MAX_OWNERS, RobotEstop
+from pebble.extensions.operator.client.robot_estop import RobotEstop
 from pebble.motion import lease
 from pebble.transports import Message, QoS
 
 UNANSWERED = "does not answer"
 ASKS_S = 30.0  # so long a driver is asked
-APART = 1.5  # times what lies between two requests: until then the other client has the rest of the robot
+APART = 1.5  # periods of requests that a client waits for its turn, so that another gets all motor owners meanwhile
 IDLE_S = 60.0  # without a gesture control is given back
 
 _STATE_BYTES = 1024  # the contract allows 300
 _ID = 8  # characters of an id, and of a key
-_KEYS = 8  # in one command: motor owners read no more
+_KEYS = 8  # at most in one command: motor owners read no more
 _NAME, _DEVICE = 40, 20  # characters, as robots cut them
 
 
@@ -66,11 +66,8 @@ class RobotControl:
             return False
         if not message.payload:
             return self._states.pop(owner, None) is not None
-        if owner not in self._states and len(self._states) >= MAX_OWNERS:
-            unlisted = next((other for other in self._states if other not in self._estop.owners), None)
-            if unlisted is None:
-                return False
-            del self._states[unlisted]
+        if not self._estop.makes_room(self._states, owner):
+            return False
         with suppress(PayloadError):
             state: ControlState = codec.decode(CONTROL_STATE, message.payload)
             if max(map(len, (state.id, state.key, state.asks_id))) <= _ID:
@@ -91,12 +88,12 @@ class ControlClient:
         self.robot = robot
         self.id = secrets.token_hex(4)
         self.wanted = self.held = False
-        self.decided = ""  # the key of the owner that decides: a new one needs a new gesture
+        self.decided = ""  # the deciding owner's key while control is held: with another key a new gesture is needed
         self.failed = ""
-        self.passed_over = ""  # the id of who was not let drive
+        self.passed_over = ""  # the id of a client whose request was declined here
         self._by, self._device, self._pace_of = by, device, pace_of
-        self._take = False
-        self._asked_at = self._answered_at = self._due_at = 0.0
+        self._take = False  # the next request takes control from its holder
+        self._asked_at = self._answered_at = self._due_at = 0.0  # due: the next request
         self._out: list[Message] = []
 
     # -- what is wanted
@@ -104,7 +101,7 @@ class ControlClient:
     def ask(self, now: float, *, over: bool = False) -> None:
         """Start requesting control: ask its holder or, with ``over``, take it."""
         if not self.wanted:
-            self.failed, self._out = "", []  # a release that was not sent yet is none
+            self.failed, self._out = "", []  # a release that was not sent yet is void
         self.wanted, self._take = True, over
         self._asked_at = self._answered_at = self._due_at = now
         self.update(now)
@@ -128,18 +125,19 @@ class ControlClient:
         state = self.robot.state
         if not self.wanted or state is None:
             return
-        is_ours = state.id == self.id
-        if self.held and not is_ours and state.id:  # it was taken over, or ended while this client was not heard
+        if state.id == self.id:
+            self.held, self.decided, self._take = True, state.key, False
+            return
+        if self.held and state.id:  # it was taken over, or ended while this client was not heard
             self._give_up(f"{self.robot.who} has control now")
             return
-        if self.held and not is_ours:  # free: it has ended, or the motor owner was started again
+        if self.held:  # free: it has ended, or the motor owner was started again
             self._asked_at = self._answered_at = self._due_at = now
-        self.held, self.decided = is_ours, state.key if is_ours else ""
-        if is_ours:
-            self._take = False
-        elif state.asks_id:  # of this client, or of another: then it waits for its turn
+        self.held, self.decided = False, ""
+        if state.asks_id:  # of this client, or of another, for whose turn this one waits
             self._answered_at = now
-        if not is_ours and state.id and self._has_any():
+        has_another_owner = any(owner.id == self.id for owner in self.robot.states)
+        if state.id and has_another_owner:  # the other client gets the rest of the robot
             self._out = [self._message(CONTROL, want="release")]
             self._due_at = max(self._due_at, now + APART * self._pace_of().control_s)
 
@@ -151,8 +149,9 @@ class ControlClient:
         if self.wanted and now >= self._due_at:
             pace = self._pace_of()
             self._due_at = now + pace.control_s
-            channel, at = CONTROL_TAKE if self._take else CONTROL, ms(now) if pace.stamped else UNSET
-            self._out.append(self._message(channel, for_ms=pace.control_for_ms, t=at))
+            channel = CONTROL_TAKE if self._take else CONTROL
+            sent_ms = ms(now) if pace.stamped else UNSET
+            self._out.append(self._message(channel, for_ms=pace.control_for_ms, t=sent_ms))
             self._take = False
         out, self._out = self._out, []
         return out
@@ -183,14 +182,13 @@ class ControlClient:
         self.release()
         self.failed = why
 
-    def _has_any(self) -> bool:
-        return any(state.id == self.id for state in self.robot.states)
-
     def _hopeless(self, now: float) -> str:
         """Return why to give up the request; empty to continue."""
         if now - self._answered_at > self._pace_of().answer_s:
             return f"{self.robot.base.rpartition('/')[2]} {UNANSWERED}"
-        return f"{self.robot.who} drives on" if now - self._asked_at > ASKS_S else ""
+        if now - self._asked_at > ASKS_S:
+            return f"{self.robot.who} drives on"
+        return ""
 
     def _message(
         self,

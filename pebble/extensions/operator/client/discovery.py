@@ -22,9 +22,11 @@ class Discovery:
 
     def awaits_heartbeat(self, waited_s: float) -> bool:
         """True if a robot may exist although none of its heartbeats was received for ``waited_s``."""
-        robots = [robot.liveness for robot in self.all_robots()]
-        awaited = [silent_after(link=liveness.link) for liveness in robots if liveness.received_at is None]
-        return waited_s < max(awaited, default=0.0 if robots else silent_after())
+        robots = self.all_robots()
+        if not robots:
+            return waited_s < silent_after()
+        silent = [robot.liveness for robot in robots if not robot.live]
+        return any(waited_s < silent_after(link=liveness.link) for liveness in silent)
 
     def receive(self, message: Message, now: float, wall: float) -> None:
         """Update from a message that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds)."""

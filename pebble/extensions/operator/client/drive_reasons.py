@@ -12,7 +12,7 @@ from typing import NamedTuple
 from pebble.contract.payloads import EstopState
 
 SILENT_S = 1.5  # a robot is not called silent before
-RESET_S = 0.6  # robots refuse whoever has not paused for 0.5 s after a reset
+RESET_S = 0.6  # after a reset, robots refuse commands until they have paused for 0.5 s
 LATE_S = 0.6  # of a round trip, or of a command: one that takes longer is not sent, or moves nothing
 SLOW_S, SLOW_SPEED = 0.3, 0.4  # from this round trip on, the speed is limited
 
@@ -51,11 +51,11 @@ class Situation(NamedTuple):
     late_s: float = 0.0
 
 
-#: Of a terminal, and as far as it has them of the page.
+#: The order in which a terminal looks for a reason, and a page for those that it shares with this table.
 ORDER = tuple(Code)
-#: Of the page's server, for what a page has asked of it.
+#: The reasons for which the page's server refuses a drive command of a page.
 SERVER_ORDER = (Code.BROKER, Code.NO_DRIVE, Code.STOPPED, Code.STOPPING, Code.RESET, Code.SILENT)
-#: Of the server, for scripts; a person and a script go together where the robot arbitrates.
+#: The reasons for which it refuses to start a script; LEASE only where the robot does not arbitrate.
 SCRIPT_ORDER = (Code.UNSEEN, Code.STOPPED, Code.LEASE)
 
 _APPLIES: dict[Code, Callable[[Situation], bool]] = {
@@ -133,7 +133,8 @@ def words(
 def person(by: str, *, login: bool = True) -> str:
     """Return the sender ``by`` in words for people.
 
-    ``local`` is a user without a login, perhaps with a device. ``login``: this server requires logins.
+    ``local`` is a user without a login, perhaps with a device. ``login``: this server requires logins, so that user is
+    at another one.
     """
     if by.partition(" ")[0] != "local":
         return by

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 from pebble.contract import STATUS, codec
 from pebble.errors import PayloadError
+from pebble.extensions.operator.client.robot_topics import section_of
 
 _STATUS_BYTES = 64 * 1024
 _WHY = 300  # characters
@@ -38,10 +39,7 @@ def driveable_of(status: bytes) -> Driveable | None:
 
 def is_held(status: bytes, program: str) -> bool:
     """True if ``program`` is requested, but waits while a person drives over a thin link."""
-    section: Any = _value(status)
-    for level in ("services", program, "state"):
-        section = section.get(level) if isinstance(section, dict) else None
-    return bool(section == "held")
+    return bool(section_of(_value(status), f"services.{program}").get("state") == "held")
 
 
 def _value(status: bytes) -> dict[str, Any]:

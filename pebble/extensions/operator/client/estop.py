@@ -52,7 +52,7 @@ class Order(NamedTuple):
 
     name: str
     payload: bytes
-    named: bool  # robots, by who presses; False: all that publish anything
+    named: bool  # it is for the robots that its sender names; False: for all that publish anything
     hold: bool  # it lasts until it is ended
     own_only: bool  # topics that a robot's capabilities name are used only if they are incoming ones of its own
 
@@ -68,14 +68,14 @@ class RobotStop:
         self.next: float = now  # when to send again, unless it is confirmed or spared
         self._order, self._began = order, now
         self._sent_at = float("-inf")
-        self._script_ended = False
+        self._script_ended = False  # the end of a script was sent
         self._given_up = False
         self._names_due = False  # it was sent before it was known that the robot reads topics with a name
         self._status_topic, self._online_topic = STATUS.topic(base), ONLINE.topic(base)
-        self._is_offline = False  # as its broker has called it
-        self.stamp = 0.0  # the newest one of what its broker retains, in epoch seconds
-        self._boots: dict[str, str] = {}  # by owner, the newest one in which it has listed this stop
-        self._settled = False  # each owner that had listed it has saved it, cannot save anything, or was reset
+        self._is_offline = False  # as the newest retained heartbeat says
+        self.stamp = 0.0  # the newest stamp of the messages that its broker retains, in epoch seconds
+        self._boots: dict[str, str] = {}  # by owner: its ``boot`` when its state listed this stop last
+        self._settled = False  # each owner has saved the stop, cannot save anything, or was reset since
 
     @property
     def progress(self) -> Progress:
@@ -104,7 +104,7 @@ class RobotStop:
     @property
     def unconfirmed(self) -> dict[str, str]:
         """Return the reasons by owner, for owners that have not confirmed."""
-        return {owner: why for owner in self.estop.owners if (why := self._lacks(owner))}
+        return {owner: "has not confirmed" for owner in self.estop.owners if not self._has_taken_it(owner)}
 
     @property
     def why(self) -> str:
@@ -121,21 +121,24 @@ class RobotStop:
             return "its broker refuses emergency stops, so it gets zeros" if self.estop.drives else "it does not drive"
         if not self.estop.owners:
             return "its capabilities list no valid motor owners"
-        why = ", ".join(
-            [f"{owner} {why}" for owner, why in self.unconfirmed.items()] + [_ZEROS] * bool(self.estop.zeros)
-        )
+        reasons = [f"{owner} {why}" for owner, why in self.unconfirmed.items()]
+        if self.estop.zeros:
+            reasons.append(_ZEROS)
+        why = ", ".join(reasons)
         return why if self.live else f"{why}: it may be off"
 
     @property
     def sending(self) -> bool:
         """True if the stop is still being repeated."""
-        unsettled = self.progress is Progress.CONFIRMED and not self._settled
         unsent = self._names_due or self._sent_at == float("-inf")
-        is_due = unsent or unsettled or self.progress in (Progress.WAITING, Progress.OLD)
-        return not self._given_up and is_due
+        unsaved = self.progress is Progress.CONFIRMED and not self._settled
+        unconfirmed = self.progress in (Progress.WAITING, Progress.OLD)
+        return not self._given_up and (unsent or unsaved or unconfirmed)
 
     def receive(self, message: Message, now: float) -> None:
-        self.live = self.live or (not message.retain and bool(message.payload.strip()))  # anybody may remove a value
+        """Update from a message of this robot, retained or not."""
+        if not message.retain and message.payload.strip():  # with an empty message others may remove a retained one
+            self.live = True
         if message.retain and len(message.payload) <= _STAMPED_BYTES:
             self._take_retained(message)
         if message.topic == self._status_topic:
@@ -146,14 +149,16 @@ class RobotStop:
             return
         if self.estop.has_capabilities and not had_capabilities:
             self.next, self._names_due = now, self.estop.named  # its topics may be others
-        listing = [owner for owner in self.estop.owners if self._lists_it(owner)]
-        self._boots |= {owner: self.estop.states[owner].boot for owner in listing}
+        for owner in self.estop.owners:
+            if self._lists_it(owner):
+                self._boots[owner] = self.estop.states[owner].boot
         if self.confirmed_s is None:
             if self.estop.owners and self.estop.available and not (self.unconfirmed or self.estop.zeros):
                 self.confirmed_s = now - self._began
         elif (self._order.hold or not self._settled) and self.unconfirmed:
             self.confirmed_s, self._settled = None, False  # it has restarted, and saved nothing
-            self._began = now if self._order.hold else self._began
+            if self._order.hold:
+                self._began = now
             self.next = max(now, self._sent_at + REPEAT_S)
         if self.confirmed_s is not None and not self._settled:
             self._settled = all(map(self._survives, self.estop.owners))
@@ -165,7 +170,9 @@ class RobotStop:
                 self._is_offline = codec.decode(ONLINE, message.payload).online is False
 
     def tick(self, now: float, *, again: bool = True) -> list[Message]:
-        if now < self.next or not self.sending or not (again or self._sent_at == float("-inf")):
+        """Return the messages to publish now. ``again`` False: only if the robot was sent nothing yet."""
+        was_sent = self._sent_at > float("-inf")
+        if now < self.next or not self.sending or (was_sent and not again):
             return []
         self._sent_at, self.next, self._names_due = now, now + REPEAT_S, False
         messages = []
@@ -176,17 +183,16 @@ class RobotStop:
             messages.append(_message(AUTONOMY_COMMAND, self.estop.script_topic, _END_SCRIPT))
         topics = dict.fromkeys((self.estop.drive_topic, *self.estop.zeros))
         messages += [_message(DRIVE, topic, _ZERO) for topic in topics]
-        own_only = self._order.own_only
-        return [message for message in messages if not own_only or _is_incoming(message.topic, self.estop.base)]
+        if self._order.own_only:
+            return [message for message in messages if _is_incoming(message.topic, self.estop.base)]
+        return messages
 
     def give_up(self) -> None:
         """Stop sending to this robot."""
         self._given_up = True
 
-    def _lacks(self, owner: str) -> str:
-        return "" if self._has_taken_it(owner) else "has not confirmed"
-
     def _survives(self, owner: str) -> bool:
+        """True if a power cut would change nothing for this owner, or if it cannot save anything."""
         state = self.estop.states.get(owner)
         return state is not None and (state.persisted is not False or not state.latched)
 
@@ -236,23 +242,23 @@ class StopSender:
         self.omitted = 0  # messages of robots for which ``robots`` had no room
         self._began = self._now = now
         self._ended = False
-        self._passed: set[str] = set()  # robots that are not in ``robots`` and got the stop
-        self._passed_at = float("-inf")  # since then
-        self._passing: list[Message] = []  # such stops, to be sent now
+        self._overflow: set[str] = set()  # robots for which ``robots`` has no room, and that got the stop
+        self._overflow_at = float("-inf")  # since then
+        self._overflow_out: list[Message] = []  # stops of such robots, to be sent now
 
     @property
     def collecting(self) -> bool:
         """True if more robots will be stopped when they publish something."""
-        return (
-            not self.order.named and not self._ended and (self.order.hold or self._now < self._began + self._collect_s)
-        )
+        if self.order.named or self._ended:
+            return False
+        return self.order.hold or self._now < self._began + self._collect_s
 
     @property
     def finished(self) -> bool:
         """True if nothing more will be sent."""
-        return self._ended or not (
-            self.order.hold or self.collecting or any(robot.sending for robot in self.robots.values())
-        )
+        if self._ended:
+            return True
+        return not (self.order.hold or self.collecting or any(robot.sending for robot in self.robots.values()))
 
     @property
     def confirmed(self) -> bool:
@@ -268,7 +274,7 @@ class StopSender:
         times = [robot.next for robot in self.robots.values() if robot.sending]
         if not self.order.hold:
             times.append(self._began + (self._collect_s if self.collecting else GIVE_UP_S))
-        return self._now if self._passing else min(times, default=None)
+        return self._now if self._overflow_out else min(times, default=None)
 
     def receive(self, message: Message, now: float) -> None:
         """Update from a message of a robot, retained or not."""
@@ -277,10 +283,10 @@ class StopSender:
         if address is None or address.direction is not Direction.OUTGOING:
             return
         base = address.identity.base
-        if (robot := self.robots.get(base)) is not None:
-            robot.receive(message, now)
-        # An empty message removes what was retained: it is no sign of a robot.
-        elif self.collecting and message.payload and not address.identity.is_server:
+        is_sign_of_robot = message.payload and not address.identity.is_server  # empty: it removes a retained one
+        if base in self.robots:
+            self.robots[base].receive(message, now)
+        elif self.collecting and is_sign_of_robot:
             self._receive_first(base, message, now)
 
     def tick(self, now: float, *, again: bool = True) -> list[Message]:
@@ -291,19 +297,21 @@ class StopSender:
         self._now = now
         if not self.order.hold and now >= self._began + GIVE_UP_S:
             self.end()
-        passing, self._passing = self._passing, []
-        return [message for robot in self.robots.values() for message in robot.tick(now, again=again)] + passing
+        messages: list[Message] = []
+        for robot in self.robots.values():
+            messages += robot.tick(now, again=again)
+        return messages + self._take_overflow()
 
     def tick_robot(self, base: str, now: float, *, again: bool = True) -> list[Message]:
         """Return the messages of ``tick`` for this robot alone, after a message from it."""
-        passing, self._passing = self._passing, []
         robot = self.robots.get(base)
-        return passing if robot is None else robot.tick(now, again=again) + passing
+        messages = [] if robot is None else robot.tick(now, again=again)
+        return messages + self._take_overflow()
 
     def end(self) -> None:
         """Stop sending. Stopped robots stay stopped."""
         self._ended = True
-        self._passing.clear()
+        self._overflow_out.clear()
         for robot in self.robots.values():
             robot.give_up()
 
@@ -311,6 +319,10 @@ class StopSender:
     def _collect_s(self) -> float:
         """Return for how many seconds newly heard robots are stopped: longer if there are too many to be confirmed."""
         return GIVE_UP_S if self.omitted else COLLECT_S
+
+    def _take_overflow(self) -> list[Message]:
+        messages, self._overflow_out = self._overflow_out, []
+        return messages
 
     def _receive_first(self, base: str, message: Message, now: float) -> None:
         """Handle the first message of a robot that is not in ``robots``."""
@@ -320,11 +332,11 @@ class StopSender:
             self.robots[base] = robot
             return
         self.omitted += 1
-        if now >= self._passed_at + REPEAT_S:
-            self._passed, self._passed_at = set(), now
-        if base not in self._passed:
-            self._passed.add(base)
-            self._passing += robot.tick(now)
+        if now >= self._overflow_at + REPEAT_S:
+            self._overflow, self._overflow_at = set(), now
+        if base not in self._overflow:
+            self._overflow.add(base)
+            self._overflow_out += robot.tick(now)
 
 
 def send(publish: Callable[..., bool], messages: Iterable[Message]) -> None:

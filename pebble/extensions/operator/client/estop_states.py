@@ -25,27 +25,26 @@ class Reset:
 
     @property
     def waiting(self) -> list[str]:
-        """Return the owners that have not answered yet."""
-        return [owner for owner in self.shown if self._free(owner) is None]
+        """Return the owners that have not answered yet: their states still show the same stop."""
+        return [owner for owner in self.shown if not self._has_answered(owner)]
 
     @property
     def free(self) -> bool:
         """True if every owner has confirmed that it is no longer stopped."""
-        return all(self._free(owner) for owner in self.shown)
+        return all(self._is_free(owner) for owner in self.shown)
 
     def refusals(self) -> dict[str, str]:
         """Return why owners are still stopped, in words. Call this when no answer is missing, or after a timeout."""
-        return {owner: self._refusal(owner) for owner in self.shown if not self._free(owner)}
+        return {owner: self._refusal(owner) for owner in self.shown if not self._is_free(owner)}
 
-    def _free(self, owner: str) -> bool | None:
-        """True if the owner is free; None until its state shows it.
-
-        ``reset_refused`` in the state may be about another reset.
-        """
+    def _has_answered(self, owner: str) -> bool:
+        """True if the owner is free or was stopped again. ``reset_refused`` may be about another reset."""
         before, now = self.shown[owner], self.robot.states.get(owner)
-        if now is None or (now.latched and (now.boot, now.count) == (before.boot, before.count)):
-            return None
-        return not now.latched
+        return now is not None and (not now.latched or (now.boot, now.count) != (before.boot, before.count))
+
+    def _is_free(self, owner: str) -> bool:
+        state = self.robot.states.get(owner)
+        return state is not None and not state.latched
 
     def _refusal(self, owner: str) -> str:
         before, now = self.shown[owner], self.robot.states.get(owner)
@@ -55,6 +54,6 @@ class Reset:
             return "it has restarted since"
         if now.count != before.count:
             return f"stopped again meanwhile by {now.by or 'unknown'}"
-        return (
-            "the reset reached it too late" if now.reset_refused == "old" else "no answer (may this account reset it?)"
-        )
+        if now.reset_refused == "old":
+            return "the reset reached it too late"
+        return "no answer (may this account reset it?)"

@@ -54,6 +54,7 @@ class Setting(Struct, frozen=True, kw_only=True):
         return free_text and not _FILE_WORDS.isdisjoint(words)
 
     def entry(self) -> dict[str, Any]:
+        """Return the setting as an entry of ``configs``."""
         entry: dict[str, Any] = {
             "key": self.key,
             "label": self.label or self.key,
@@ -77,10 +78,11 @@ def listed(configs: object) -> list[Setting]:
 
     Invalid entries are left out; an unknown type counts as text.
     """
-    settings, entries = [], configs if isinstance(configs, list) else []
-    for entry in entries:
+    settings: list[Setting] = []
+    for entry in configs if isinstance(configs, list) else ():
         with suppress(ValidationError, TypeError, KeyError):
-            settings.append(convert(entry if entry["type"] in _TYPES else {**entry, "type": "string"}, Setting))
+            kind = entry["type"] if entry["type"] in _TYPES else "string"
+            settings.append(convert({**entry, "type": kind}, Setting))
     return settings
 
 
@@ -140,17 +142,19 @@ def _bool(key: str, raw: Any) -> bool:
 
 def _numeric(setting: Setting, raw: Any) -> int | float:
     is_integer = setting.type == "int"
+    error = SettingError(f"{setting.key} must be a {'whole ' if is_integer else ''}number")
     if isinstance(raw, bool) or not isinstance(raw, int | float | str):
-        raise SettingError(f"{setting.key} must be a {'whole ' if is_integer else ''}number")
+        raise error
     if isinstance(raw, str):
-        if not (_integer if is_integer else _number)(raw):
-            raise SettingError(f"{setting.key} must be a {'whole ' if is_integer else ''}number")
+        matches = _integer if is_integer else _number
+        if not matches(raw):
+            raise error
         return int(raw) if is_integer else _finite(setting.key, raw)
     number = _finite(setting.key, raw)
     if not is_integer:
         return number
     if not number.is_integer() or abs(number) >= 1e15:
-        raise SettingError(f"{setting.key} must be a whole number")
+        raise error
     return int(raw)
 
 

@@ -38,6 +38,7 @@ class Heartbeats:
             self._transport.close()
 
     def _open(self) -> None:
+        """Connect with MQTT 5 or, if the broker refuses that, as configured; then subscribe."""
         for settings in (replace(self._settings, protocol="5", sends_retained=False), self._settings):
             transport = self._transport = create("mqtt", f"pebble-heartbeats-{os.getpid()}", settings)
             transport.open(0.0)

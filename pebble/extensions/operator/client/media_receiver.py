@@ -45,10 +45,10 @@ class MediaReceiver:
         request = self.requests.get(medium)
         if request is None:
             request = ViewerRequest(self.robot.base, medium, self.robot.capabilities)
-            request.want(encoding, time.monotonic())  # raises before anything is subscribed to
+            request.check(encoding)  # before anything is subscribed to
             self.requests[medium] = request
             self._subscribe(medium, request)
-        request.want(encoding, time.monotonic())  # its time to wait begins here, when payloads can arrive
+        request.want(encoding, time.monotonic())
         while not request.settled:
             send(self._transport, request.tick(time.monotonic()))
             time.sleep(_STEP_S)
@@ -61,15 +61,6 @@ class MediaReceiver:
                 send(self._transport, request.tick(now))
         if self._video.wants_keyframe and "video" in self.requests:
             send(self._transport, self.requests["video"].keyframe(self.encoding.get("video"), now))
-
-    def summary(self, medium: Medium, now: float) -> str:
-        """Return a line for display: ``h264 10/s 212 kbit/s, 45 ms``; empty while nothing arrives."""
-        meter = self.pictures if medium == "video" else self.sounds
-        rate, age_s = meter.rate(now), meter.age_s(now)
-        if not rate or medium not in self.encoding:
-            return ""
-        age = "" if age_s is None else f", {1000 * age_s:.0f} ms"
-        return f"{self.encoding[medium]} {rate:.0f}/s {meter.bitrate(now) / 1000:.0f} kbit/s{age}"
 
     def close(self) -> None:
         """Withdraw the requests."""
@@ -92,9 +83,11 @@ class MediaReceiver:
             self._is_known.set()
 
     def _subscribe(self, medium: Medium, request: ViewerRequest) -> None:
+        take_payload = self._on_video if medium == "video" else self._on_audio
+
         def on_media(message: Message) -> None:
             request.receive(message, time.monotonic())
-            (self._on_video if medium == "video" else self._on_audio)(message.payload)
+            take_payload(message.payload)
 
         def on_flag(message: Message) -> None:
             request.receive(message, time.monotonic())

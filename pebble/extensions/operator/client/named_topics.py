@@ -56,7 +56,7 @@ class NamedTopics:
         elif not why_not("", self.account):
             payload = _without_claim(message.payload, self.account)
             yield Message(with_name(message.topic, self.account), payload, message.qos)
-        elif command.metric == DRIVE.metric and not _moves(message.payload):
+        elif command.metric == DRIVE.metric and not moves(message.payload):
             yield message
         elif not is_stop:
             raise NoNameError(command.identity.id, self.account)
@@ -66,9 +66,11 @@ class NamedTopics:
         command = _command(topic) if person else None
         if command is None or not self._is_named(command.identity.base):
             return payload
-        plain = _object(payload)
-        body = plain.get("value") if plain is not None and isinstance(plain.get("value"), dict) else plain
-        if plain is None or body is None or "by" in body:
+        plain = json_object(payload)
+        if plain is None:
+            return payload
+        body = plain["value"] if isinstance(plain.get("value"), dict) else plain
+        if "by" in body:
             return payload
         body["by"] = person
         return msgspec.json.encode(plain)
@@ -77,11 +79,13 @@ class NamedTopics:
 def _command(topic: str) -> ParsedTopic | None:
     """Return the parts of a command's topic, if it has no account yet."""
     parsed = parse_topic(topic)
-    incoming = parsed is not None and parsed.direction is Direction.INCOMING
-    return parsed if parsed is not None and incoming and not parsed.metric.startswith(f"{BY}/") else None
+    if parsed is None or parsed.direction is not Direction.INCOMING or parsed.metric.startswith(f"{BY}/"):
+        return None
+    return parsed
 
 
-def _moves(payload: bytes) -> bool:
+def moves(payload: bytes) -> bool:
+    """True if a drive command moves a robot, or cannot be read here."""
     try:
         return bool(codec.decode(DRIVE, payload).moves)
     except PayloadError:  # the robot refuses it, or has other rules
@@ -92,13 +96,14 @@ def _without_claim(payload: bytes, account: str) -> bytes:
     """Return the payload without a sender, as the account alone identifies the sender."""
     if f'"{account}'.encode() not in payload:
         return payload
-    command = _object(payload)
+    command = json_object(payload)
     if command is None or str(command.get("by")).partition("@")[0] != account:
         return payload
     return msgspec.json.encode({key: value for key, value in command.items() if key != "by"})
 
 
-def _object(payload: bytes) -> dict[str, Any] | None:
+def json_object(payload: bytes) -> dict[str, Any] | None:
+    """Return the JSON object in a payload; None if it has none."""
     try:
         plain = _decoder.decode(payload)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):

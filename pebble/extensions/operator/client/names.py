@@ -1,4 +1,4 @@
-"""Finds topics and channels by what a user types (``drive-values``, ``outgoing/online``, a whole topic)."""
+"""The names of topics and channels as a user types them: ``drive-values``, ``outgoing/online``, a whole topic."""
 
 import difflib
 from collections.abc import Iterator
@@ -67,6 +67,7 @@ class Names:
         return channel
 
     def _place(self, channel: Channel, name: str) -> str:
+        """Return the topic or filter of a channel that was found by ``name``."""
         if channel.is_pattern:
             return f"{self.base}/{channel.direction}/{name.removeprefix(f'{channel.direction}/')}"
         if self._addresses is not None:

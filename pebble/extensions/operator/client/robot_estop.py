@@ -124,6 +124,7 @@ class RobotEstop:
         return True
 
     def _topic(self, listed: object, channel: Channel) -> str:
+        """Return the topic that capabilities list for a channel; the channel's own if that is invalid or another's."""
         default = channel.topic(self.base)
         try:
             topic = check_topic(listed) if isinstance(listed, str) else default
@@ -140,12 +141,19 @@ class RobotEstop:
             state = codec.decode(ESTOP_STATE, payload)
         except PayloadError:
             return False
-        if owner not in self._states and len(self._states) >= MAX_OWNERS:
-            unlisted = next((other for other in self._states if other not in self.owners), None)
-            if unlisted is None:
-                return False
-            del self._states[unlisted]
+        if not self.makes_room(self._states, owner):
+            return False
         self._states[owner] = _clean(state)
+        return True
+
+    def makes_room(self, states: dict[str, Any], owner: str) -> bool:
+        """Make room for a motor owner's state, by removing that of an unlisted owner; return False if none is."""
+        if owner in states or len(states) < MAX_OWNERS:
+            return True
+        unlisted = next((other for other in states if other not in self.owners), None)
+        if unlisted is None:
+            return False
+        del states[unlisted]
         return True
 
 

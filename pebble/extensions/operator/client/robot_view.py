@@ -161,18 +161,20 @@ class RobotView:
         """Derive capabilities from the subscriptions in a heartbeat or status, unless the robot publishes its own."""
         if not self.capabilities or "announced" in self.capabilities:
             value = announced(self.base, payload)
-            self.capabilities = self.capabilities if value == self.capabilities else value or self.capabilities
+            if value and value != self.capabilities:
+                self.capabilities = value
 
     def _receive_stop(self, channel: c.Channel, message: Message, now: float) -> None:
         """Handle capabilities, or the state of a motor owner. Empty capabilities remove nothing."""
-        latched = self.latched
+        was_latched = self.latched
         self.estop.receive(message)
-        if latched and not self.latched:
+        if was_latched and not self.latched:
             self.reset_at = now
         if channel is c.CAPABILITIES:
             with suppress(PayloadError):
-                before = {} if self.is_assumed else self.capabilities
-                self.capabilities = codec.decode(c.CAPABILITIES, message.payload).value or before
+                published = codec.decode(c.CAPABILITIES, message.payload).value
+                if published or self.is_assumed:
+                    self.capabilities = published
 
     def _note_retained_drive(self, message: Message) -> None:
         """Note whether a drive command that moves the robot is retained.
@@ -276,8 +278,9 @@ class RobotView:
     @property
     def slow_s(self) -> float | None:
         """Return how many seconds commands take over a thin link; None if the robot is offline or its link wide."""
-        link = self.link
-        return None if link is None or link.level == "wide" or self.liveness.reported_offline else way_s(link)
+        if self.link is None or self.link.level == "wide" or self.liveness.reported_offline:
+            return None
+        return way_s(self.link)
 
     @property
     def pace(self) -> Pace:
@@ -311,8 +314,10 @@ class RobotView:
     @property
     def itself(self) -> str:
         """Return the sentence that the robot drives by itself; empty if it does not."""
-        waits = self.latched or (self.autonomy is not None and self.autonomy.overridden is True)
-        return words("itself", self.name, script=self.script) if self.script and not waits else ""
+        is_overridden = self.autonomy is not None and self.autonomy.overridden is True
+        if not self.script or self.latched or is_overridden:
+            return ""
+        return words("itself", self.name, script=self.script)
 
     def situation(self, now: float) -> Situation:
         """Return the facts for and against driving that the robot itself publishes."""

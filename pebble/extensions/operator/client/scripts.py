@@ -46,10 +46,11 @@ class RobotScripts:
 
     def receive(self, message: Message) -> None:
         """Update from a message of this robot; malformed ones are ignored."""
-        channel, before = self._channels.get(message.topic), self.status
+        channel, status_before = self._channels.get(message.topic), self.status
         if channel is not AUTONOMY_FILES:
             self.robot.receive(channel, message, 0.0, 0.0)
-            self.answers += self.status is not before and not message.retain
+            if self.status is not status_before and not message.retain:
+                self.answers += 1
         elif len(message.payload) <= _BYTES:
             with suppress(PayloadError):
                 listed = codec.decode(AUTONOMY_FILES, message.payload).files
@@ -82,17 +83,18 @@ def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
 
     Raises PebbleError.
     """
-    form = forms.listed(entry.get("configs"))
-    options = {option: (setting, value) for setting in form for option, value in options_of(setting)}
+    options: dict[str, tuple[forms.Setting, bool | None]] = {}  # by name: the setting, and the value of a flag
+    for setting in forms.listed(entry.get("configs")):
+        options |= {option: (setting, value) for option, value in options_of(setting)}
     chosen: dict[str, Any] = {}
     remaining = iter(words)
     for word in remaining:
-        option, given, text = word.partition("=")
+        option, equals_sign, text = word.partition("=")
         if option not in options:
             names = ", ".join(options) or "it has none"
             raise PebbleError(f"{option} is no option of {entry['file']}: {names}")
         setting, value = options[option]
-        if value is None and not given:
+        if value is None and not equals_sign:  # the value is the next word
             following = next(remaining, None)
             if following is None:
                 raise PebbleError(f"{option} needs a value")
@@ -105,9 +107,9 @@ def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
 
 
 def options_of(setting: forms.Setting) -> list[tuple[str, bool | None]]:
-    """Return the option names of a setting, the script's before those made from its key.
+    """Return the options of a setting by name, each with the value that a flag sets, or None if a value follows.
 
-    For a flag: each option with its value.
+    The script's own names come before those made from the setting's key.
     """
     key = setting.key.replace("_", "-")
     on = _distinct(setting.arg, f"--{key}")
@@ -117,5 +119,7 @@ def options_of(setting: forms.Setting) -> list[tuple[str, bool | None]]:
     return [*((option, True) for option in on), *((option, False) for option in off)]
 
 
-def _distinct(own: str | None, made: str) -> list[str]:
-    return list(dict.fromkeys((own, made))) if own and own.startswith("--") else [made]
+def _distinct(option_of_script: str | None, option_of_key: str) -> list[str]:
+    if option_of_script is None or not option_of_script.startswith("--"):
+        return [option_of_key]
+    return list(dict.fromkeys((option_of_script, option_of_key)))

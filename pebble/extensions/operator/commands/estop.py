@@ -138,12 +138,12 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
         report = _Report(sender, outbox)
         try:
             with _heartbeats(target, every=every) as heartbeats, listening(target, transport) as second:
-                listener, subscribing = _listen(second, _filters(names.base))
+                listener, subscribing = _listen(second, names.base)
                 while not sender.finished:
                     for message in heartbeats.take() if heartbeats else ():
                         sender.receive(message, time.monotonic())
                     outbox.publish()
-                    _receive(listener, sender, _until_due(sender, hears=heartbeats is not None))
+                    _receive(listener, sender, _until_due(sender, has_heartbeats=heartbeats is not None))
                     outbox.publish()
                     report.connection(
                         "" if transport.state is State.CONNECTED else transport.problem or "no connection"
@@ -169,8 +169,9 @@ def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
         yield heartbeats
 
 
-def _listen(transport: Transport, filters: list[str]) -> tuple[Listener, threading.Thread]:
+def _listen(transport: Transport, base: str) -> tuple[Listener, threading.Thread]:
     """Subscribe on a thread, so that a slow network does not delay the stop; return the listener and the thread."""
+    filters = [channel.filter(base) for channel in (ESTOP_STATE, CAPABILITIES, STATUS, ONLINE, *SYNONYMS)]
     listener = Listener(transport, ())
 
     def subscribe() -> None:
@@ -182,23 +183,20 @@ def _listen(transport: Transport, filters: list[str]) -> tuple[Listener, threadi
     return listener, subscribing
 
 
-def _filters(base: str) -> list[str]:
-    return [channel.filter(base) for channel in (ESTOP_STATE, CAPABILITIES, STATUS, ONLINE, *SYNONYMS)]
+def _until_due(sender: StopSender, *, has_heartbeats: bool) -> float:
+    """Return for how many seconds to wait for messages; less while heartbeats come on another connection."""
+    most_s = _HEARD_S if has_heartbeats and sender.collecting else _TICK_S
+    return most_s if sender.due is None else min(most_s, sender.due - time.monotonic())
 
 
-def _until_due(sender: StopSender, *, hears: bool) -> float:
-    due, most = sender.due, _HEARD_S if hears and sender.collecting else _TICK_S
-    return most if due is None else min(most, due - time.monotonic())
-
-
-def _receive(listener: Listener, sender: StopSender, left: float) -> None:
-    """Handle the messages that have arrived, or wait up to ``left`` seconds for one."""
+def _receive(listener: Listener, sender: StopSender, wait_s: float) -> None:
+    """Handle the messages that have arrived; if there is none, wait up to ``wait_s`` seconds for one."""
     for _ in range(_BATCH):
-        message = listener.next(left)
+        message = listener.next(wait_s)
         if message is None:
             return
         sender.receive(message, time.monotonic())
-        left = 0.0
+        wait_s = 0.0
 
 
 class _Outbox:
@@ -206,8 +204,8 @@ class _Outbox:
 
     def __init__(self, transport: Transport, sender: StopSender) -> None:
         self._transport, self._sender = transport, sender
-        self._waiting: set[str] = set()
-        self._left: set[str] = set()
+        self._waiting: set[str] = set()  # robots whose stop the transport has accepted
+        self._sent: set[str] = set()  # robots whose stop has left it
 
     def publish(self) -> None:
         send(self._accepts, self._sender.tick(time.monotonic()))  # waits for no acknowledgement
@@ -215,14 +213,14 @@ class _Outbox:
     def has_sent(self, base: str) -> bool:
         """True if a stop of this robot has reached the other end of the connection."""
         if self._transport.state is State.CONNECTED and not self._transport.outgoing.waiting:
-            self._left |= self._waiting
+            self._sent |= self._waiting
             self._waiting.clear()
-        return base in self._left
+        return base in self._sent
 
     def _accepts(self, topic: str, payload: bytes, *, qos: QoS) -> bool:
         accepted = self._transport.publish(topic, payload, qos=qos, urgent=True)
         if accepted and topic.count("/") > 2:
-            self._waiting.add("/".join(topic.split("/", 3)[:3]))
+            self._waiting.add("/".join(topic.split("/", 3)[:3]))  # the robot's base topic
         return accepted
 
 
@@ -275,7 +273,7 @@ def _echo(line: str, *, err: bool = False) -> None:
 
 
 def _line(robot: RobotStop, *, is_early: bool, sent: bool) -> str:
-    """Return the progress of the stop of a robot in words; nothing is missing yet while it ``is_early``."""
+    """Return the progress of the stop of a robot in words. While it ``is_early``, no answer is called missing."""
     match robot.progress:
         case Progress.CONFIRMED if not robot.estop.latched:
             return "was stopped, and reset since"
@@ -294,7 +292,9 @@ def _line(robot: RobotStop, *, is_early: bool, sent: bool) -> str:
             return f"NOT CONFIRMED, no longer sent: {_why(robot)}"
     if is_early:
         return "stop sent" if sent else ""
-    return f"stop sent, not confirmed yet: {_why(robot)}" if sent else "STOP NOT SENT YET: it waits for the network"
+    if not sent:
+        return "STOP NOT SENT YET: it waits for the network"
+    return f"stop sent, not confirmed yet: {_why(robot)}"
 
 
 def _why(robot: RobotStop) -> str:
@@ -308,6 +308,7 @@ def _why(robot: RobotStop) -> str:
 
 
 def _reset(target: Target) -> int:
+    """Show the robot's stops, ask, reset them, and wait for the answer."""
     with connected(target) as (transport, names), listening(target, transport) as second:
         view, name = RobotView(names.base), shown(id_of(names.base))
         robot = view.estop
@@ -343,23 +344,19 @@ def _status(target: Target, *, every: bool) -> int:
             discovery.receive(message, time.monotonic(), time.time())
 
         is_remote = target.remote or str(target.url).startswith("mqtt")  # within a robot there is no heartbeat
-        for channel in (ESTOP_STATE, STATUS, CAPABILITIES, *((ONLINE, LINK) if is_remote else ())):
+        of_robots = (ESTOP_STATE, STATUS, CAPABILITIES)
+        for channel in (*of_robots, ONLINE, LINK) if is_remote else of_robots:
             transport.subscribe(channel.filter(names.base), take, direct=True)
         if not every:
-            wait_for(
-                lambda: names.base in discovery.robots and discovery.robots[names.base].estop.has_capabilities,
-                _ANSWER_S,
-            )
+            wait_for(lambda: any(robot.estop.has_capabilities for robot in discovery.all_robots()), _ANSWER_S)
             transport.ask([topic for robot in discovery.all_robots() for topic in robot.estop.missing])
         if is_remote:
-            robots_now, began = discovery.all_robots, time.monotonic()
+            began = time.monotonic()
             wait_for(lambda: not discovery.awaits_heartbeat(time.monotonic() - began), float("inf"))
-            wait_for(
-                lambda: not any(robot.liveness.received_at and robot.estop.lacks for robot in robots_now()), _ANSWER_S
-            )
+            wait_for(lambda: not any(robot.live and robot.estop.lacks for robot in discovery.all_robots()), _ANSWER_S)
         robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
     for robot in robots:
-        _print_states(robot.estop, robot.driveable, silent=is_remote and robot.liveness.received_at is None)
+        _print_states(robot.estop, robot.driveable, silent=is_remote and not robot.live)
     if not robots:
         typer.echo("no robot has published an emergency stop or capabilities")
     return 0 if robots else 1
@@ -370,7 +367,9 @@ def _print_states(robot: RobotEstop, driveable: Driveable | None = None, *, sile
 
     ``silent``: it sends no heartbeat at present.
     """
-    name, now = f"{id_of(robot.base)}{': no heartbeat; its last state' if silent else ''}", time.time()
+    name, now = id_of(robot.base), time.time()
+    if silent:
+        name += ": no heartbeat; its last state"
     lines = [
         f"{name}: {show.stopped(state, now)} ({owner}{'' if state.persisted else ', NOT SAVED'})"
         for owner, state in robot.latched.items()
@@ -388,6 +387,7 @@ def _print_states(robot: RobotEstop, driveable: Driveable | None = None, *, sile
 
 
 def _absent(robot: RobotEstop) -> str:
+    """Return why a robot has no emergency stop."""
     if robot.old:
         return "its firmware has none"
     if robot.has_capabilities and not robot.available:

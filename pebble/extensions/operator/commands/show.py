@@ -64,10 +64,10 @@ def body(payload: bytes, width: int) -> str:
         with suppress(RecursionError):
             line = json.dumps(plain, ensure_ascii=False)
             return shown(line if len(line) <= width else json.dumps(plain, ensure_ascii=False, indent=2))
-    value = recognised(payload)
-    if value is None and _is_text(payload):
+    binary_format = recognised(payload)
+    if binary_format is None and _is_text(payload):
         return shown(payload.decode())
-    return f"{value or 'binary'}, {len(payload)} bytes\n{hex_dump(payload[:_DUMPED], width)}"
+    return f"{binary_format or 'binary'}, {len(payload)} bytes\n{hex_dump(payload[:_DUMPED], width)}"
 
 
 def parsed(payload: bytes) -> Any:
@@ -79,7 +79,7 @@ def parsed(payload: bytes) -> Any:
 
 
 def recognised(payload: bytes) -> str | None:
-    """Return the name of a binary format, by its first bytes; empty if unknown."""
+    """Return the name of a binary format, by its first bytes; None if it is unknown."""
     return next((name for start, name in RECOGNISERS.items() if payload.startswith(start)), None)
 
 
@@ -187,7 +187,8 @@ def print_listing(listing: Listing, now: float, wall: float) -> None:
     if not listing.records:
         typer.echo("no topics received; a longer --seconds may show slower ones")
         return
-    base, rows = None, list[Sequence[str | Text]]()
+    base: str | None = None
+    rows: list[Sequence[str | Text]] = []
     for topic in sorted(listing.records):
         address = parse_topic(topic)
         if address is not None and address.identity.base != base:
@@ -234,7 +235,9 @@ def _cells(record: TopicRecord, now: float, wall: float) -> tuple[str, str, str,
     if record.last is None:
         return retained, "", "", ""
     hz = record.meter.rate(now)
-    rate = f"{hz:.1f} Hz" if hz else "once" if record.meter.count else ""
+    rate = "once" if record.meter.count else ""
+    if hz:
+        rate = f"{hz:.1f} Hz"
     return retained, rate, size(len(record.last.payload)), _age(record, record.last, now, wall)
 
 

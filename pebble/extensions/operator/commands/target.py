@@ -49,7 +49,7 @@ def with_target(*, program: str = "tool", robot: bool = False) -> Callable[[Call
             target = {option.name: given.pop(option.name) for option in (*options, *_CREDENTIALS)}
             return command(**given, target=Target(**target, program=program))
 
-        signature = inspect.signature(command, eval_str=True)
+        signature = inspect.signature(command, eval_str=True)  # typer makes its options from this
         declared = list(signature.parameters.values())
         at = list(signature.parameters).index("target")
         parameters = [*declared[:at], *options, *declared[at + 1 :], *_CREDENTIALS]

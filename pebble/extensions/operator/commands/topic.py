@@ -12,15 +12,16 @@ from typing import Annotated
 import typer
 
 from pebble.config.visible import shown
-from pebble.contract import DRIVE, codec
+from pebble.contract import DRIVE
 from pebble.contract.identity import parse_topic
-from pebble.errors import PayloadError, PebbleError, TransportError
+from pebble.errors import PebbleError, TransportError
 from pebble.extensions.media.rate_meter import RateMeter
 from pebble.extensions.operator.client.connection import Listener, Target, connected, put_names, subscribed_stop
 from pebble.extensions.operator.client.estop_states import RobotEstop
+from pebble.extensions.operator.client.named_topics import moves
 from pebble.extensions.operator.client.names import Names, id_of
 from pebble.extensions.operator.commands import show
-from pebble.extensions.operator.commands.draft import Draft, draft
+from pebble.extensions.operator.commands.draft import draft
 from pebble.extensions.operator.commands.expand import expand
 from pebble.extensions.operator.commands.target import with_target
 from pebble.extensions.operator.commands.topic_contract import contract
@@ -160,14 +161,21 @@ def pub(
         message = draft(names, topic, payload, retain=retain, qos=qos, force=force)
         for warning in message.warnings:
             typer.echo(f"pebble: warning: {warning}", err=True)
-        estop_of_robot = cache(lambda: _estop(transport, names, message.topic))
-        estop = estop_of_robot() if not force and _moves(names, message) else None
+        robot_of_message = cache(lambda: _estop(transport, names, message.topic))  # read once, and only if needed
+
+        def is_named(_base: str) -> bool:
+            robot = robot_of_message()
+            return robot is not None and robot.named
+
+        moves_robot = names.channel(message.topic) is DRIVE and moves(message.payload)
+        stoppable = robot_of_message() if moves_robot and not force else None
         if not force:
-            put_names(transport, names, lambda _base: (known := estop_of_robot()) is not None and known.named)
-        for number in range(1 if rate is None else count or sys.maxsize):
+            put_names(transport, names, is_named)
+        repetitions = 1 if rate is None else count or sys.maxsize
+        for number in range(repetitions):
             if number:
                 time.sleep(1 / (rate or 1))
-            _refuse_stopped(estop)
+            _refuse_stopped(stoppable)
             if not transport.publish(
                 message.topic, message.payload, qos=QoS(message.qos), retain=message.retain, shared=True
             ):
@@ -209,17 +217,8 @@ def _print_rate(meter: RateMeter, *, silent: bool) -> None:
     sys.stdout.flush()
 
 
-def _moves(names: Names, message: Draft) -> bool:
-    """True if the message would move a robot."""
-    if names.channel(message.topic) is not DRIVE:
-        return False
-    try:
-        return bool(codec.decode(DRIVE, message.payload).moves)
-    except PayloadError:  # robots refuse it, or have other rules: treat it as a command that moves
-        return True
-
-
 def _refuse_stopped(robot: RobotEstop | None) -> None:
+    """Raise PebbleError if the robot is stopped now."""
     if robot is not None and robot.stopped_by is not None:
         raise PebbleError(
             f"{show.stopped_line(robot, time.time())}; it is not driven (--force publishes anyway). "
@@ -242,4 +241,5 @@ def _warn_of_dropped(listener: Listener) -> None:
 
 
 def _end(seconds: float | None) -> float:
+    """Return the monotonic time at which to end; infinity without a limit."""
     return float("inf") if seconds is None else time.monotonic() + seconds

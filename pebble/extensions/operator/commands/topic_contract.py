@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel
 from pebble.extensions.operator.client.names import base_of
 from pebble.extensions.operator.contract.docs import authority, payload_name, rate, travels
-
-if TYPE_CHECKING:
-    pass
 
 
 def contract(

@@ -34,8 +34,8 @@ def document() -> str:
             "schemas": all_schemas["$defs"],
         },
     }
-    document = json.loads(json.dumps(described).replace('"#/$defs/', '"#/components/schemas/'))
-    return "# Written by python -m pebble.extensions.operator.contract.docs.\n" + msgspec.yaml.encode(document).decode()
+    renamed = json.loads(json.dumps(described).replace('"#/$defs/', '"#/components/schemas/'))
+    return "# Written by python -m pebble.extensions.operator.contract.docs.\n" + msgspec.yaml.encode(renamed).decode()
 
 
 def _name(channel: Channel) -> str:

@@ -1,4 +1,4 @@
-"""Generates the topic tables, payloads.schema.json and asyncapi.yaml."""
+"""The generator of the topic tables, payloads.schema.json and asyncapi.yaml."""
 
 import inspect
 import json
@@ -27,7 +27,7 @@ _JSON_TYPES = {Any: "any", NoneType: "null", bool: "boolean", int: "integer", fl
 def topics_document() -> str:
     """Return the tables of all topics, and of the fields of all payloads."""
     kinds = _table(("kind", "direction", "QoS", "retained", "meaning"), map(_kind_row, Kind))
-    channels = (section for direction in (INCOMING, OUTGOING) for section in _direction(direction))
+    channels = (*_sections(INCOMING), *_sections(OUTGOING))
     return "\n".join(["# Topics\n", "## Kinds\n", kinds, *channels, "## Payloads\n", *map(_payload, _structs())])
 
 
@@ -57,7 +57,8 @@ def _kind_row(kind: Kind) -> tuple[str, ...]:
     return (kind.name, kind.direction, str(kind.qos), _yes(kind.retain), kind.meaning)
 
 
-def _direction(direction: str) -> tuple[str, ...]:
+def _sections(direction: str) -> tuple[str, ...]:
+    """Return headings and tables of the channels of one direction."""
     channels = [channel for channel in CHANNELS if channel.direction == direction]
     return (
         f"## {direction.capitalize()}\n",
@@ -110,10 +111,13 @@ def _structs() -> list[type[Payload]]:
 
 
 def _collect(kind: Any, structs: dict[type[Payload], None]) -> None:
+    """Add a struct, or those inside a type such as ``list[Struct]``, and the structs of its fields."""
     if isinstance(kind, type) and issubclass(kind, Payload) and kind not in structs:
         structs[kind] = None
-        for member in [*get_type_hints(kind).values(), *([CapabilitiesValue] if kind is Capabilities else ())]:
+        for member in get_type_hints(kind).values():
             _collect(member, structs)
+        if kind is Capabilities:  # its value is declared as any object
+            _collect(CapabilitiesValue, structs)
     for inner in get_args(kind):
         _collect(inner, structs)
 

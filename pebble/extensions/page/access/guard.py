@@ -26,7 +26,7 @@ CONTENT_SECURITY_POLICY = (
     "connect-src 'self'; worker-src 'self'; media-src 'self' blob:; manifest-src 'self'; base-uri 'none'; "
     "form-action 'self'; frame-ancestors 'none'; frame-src http: https:"  # streams of robots, by a person's click
 )
-_split = re.compile(r"(\[[0-9a-f:.]+\]|[^\[\]:@/\s]+)(?::\d{1,5})?", re.ASCII | re.IGNORECASE).fullmatch
+_HOST_AND_PORT = re.compile(r"(\[[0-9a-f:.]+\]|[^\[\]:@/\s]+)(?::\d{1,5})?", re.ASCII | re.IGNORECASE)
 #: Added to each response that does not set them itself.
 _HEADERS = {
     "content-security-policy": CONTENT_SECURITY_POLICY,
@@ -85,7 +85,7 @@ class Guard:
             receive = _replay(body, receive)
         try:
             await self._app(scope, receive, send)
-        except asyncio.CancelledError:  # it still waited when the server ended
+        except asyncio.CancelledError:  # the server ends while it still handles this request
             with contextlib.suppress(RuntimeError):  # its answer has begun
                 await _refuse(scope, receive, send, 503, "the server ends")
 
@@ -98,17 +98,20 @@ class Guard:
         if scope["method"] == "POST":
             if not _is_own_origin(scope, headers):
                 return 403, "this request comes from another site"
-            if content_type(headers) not in ((_JSON, FORM) if scope["path"] == STOP_PATH else (_JSON,)):
+            takes_form = scope["path"] == STOP_PATH
+            kind = content_type(headers)
+            if kind != _JSON and not (takes_form and kind == FORM):
                 return 415, "send JSON as application/json"
         return None
 
     def _is_known(self, headers: Headers) -> bool:
+        """True if the request has one Host header, with an address or with a name of this server."""
         hosts = headers.getlist("host")
-        parts = _split(hosts[0]) if len(hosts) == 1 else None
-        if parts is None:
+        if len(hosts) != 1 or (host := _without_port(hosts[0])) is None:
             return False
-        name = canonical(parts[1])
-        return is_address(name) or not self._names.isdisjoint((name, "*." + name.partition(".")[2]))
+        name = canonical(host)
+        wildcard = "*." + name.partition(".")[2]  # certificates may have such names
+        return is_address(name) or name in self._names or wildcard in self._names
 
 
 def content_type(headers: Headers) -> str:
@@ -118,14 +121,22 @@ def content_type(headers: Headers) -> str:
 
 def host_names(settings: WebSettings) -> frozenset[str]:
     """Return the names by which browsers may address the server, besides addresses."""
-    names: set[str] = {"localhost"}
-    names |= {parts[1] for name in settings.names if (parts := _split(name)) is not None}  # behind a forwarded port
+    names = ["localhost"]
+    names += filter(None, map(_without_port, settings.names))  # with a port: it is forwarded to the server's
     if not is_loopback(settings.host):
-        names.add(settings.host)
-        hostname = socket.gethostname()
-        of_machine = (hostname, f"{hostname.partition('.')[0]}.local")
-        names |= {*(of_machine if settings.certificate is None else certificates.show(settings.certificate).names)}
+        names.append(settings.host)
+        if settings.certificate is not None:
+            names += certificates.show(settings.certificate).names
+        else:
+            hostname = socket.gethostname()
+            names += [hostname, f"{hostname.partition('.')[0]}.local"]
     return frozenset(map(canonical, names))
+
+
+def _without_port(host: str) -> str | None:
+    """Return the name or address in ``HOST`` or ``HOST:PORT``; None if the text is neither."""
+    parts = _HOST_AND_PORT.fullmatch(host)
+    return None if parts is None else parts[1]
 
 
 def is_address(name: str) -> bool:

@@ -51,7 +51,7 @@ class _Hashing:
         try:
             check = request.app.state.people.check
             return await asyncio.get_running_loop().run_in_executor(
-                self._thread, check, login.user, login.password, _address(request)
+                self._thread, check, login.user, login.password, address_of(request)
             )
         finally:
             self._waiting -= 1
@@ -93,6 +93,11 @@ def printable(text: str) -> str:
     return "".join(char if " " <= char <= "~" else "?" for char in text[:32])
 
 
+def address_of(connection: HTTPConnection) -> str:
+    """Return the address of the browser, for the audit log; "" if it is unknown."""
+    return connection.client.host if connection.client else ""
+
+
 def _cookie(settings: WebSettings) -> str:
     """Return the cookie's name. With the prefix, browsers accept it only from this host, over https, for all paths."""
     return "__Host-pebble" if settings.certificate else "pebble"
@@ -113,7 +118,7 @@ async def _login(request: Request) -> Response:
         login = _decoder.decode(await request.body())
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return _answer(400, "This needs a user and a password")
-    audit, address = request.app.state.audit, _address(request)
+    audit, address = request.app.state.audit, address_of(request)
     try:
         user = await _hashing.check(request, login)
     except TooManyTriesError as error:
@@ -134,6 +139,7 @@ async def _login(request: Request) -> Response:
 
 
 def _logged_in(request: Request, user: User, address: str) -> Response:
+    """Begin a session in place of the browser's old one; return the answer with its cookie. Raises DatabaseError."""
     settings, people = request.app.state.settings, request.app.state.people
     if old := request.cookies.get(_cookie(settings)):
         people.end_session(old)
@@ -157,22 +163,18 @@ async def _logout(request: Request) -> Response:
     if settings.login and session is not None:
         try:
             people.end_session(request.cookies[_cookie(settings)])
-        except DatabaseError as error:  # this browser forgets it in any case
+        except DatabaseError as error:  # this browser forgets its cookie in any case
             response = _unavailable("log out", error)
-        request.app.state.audit.write("logout", user=session.user, address=_address(request))
+        request.app.state.audit.write("logout", user=session.user, address=address_of(request))
     secure = settings.certificate is not None
     response.delete_cookie(_cookie(settings), path="/", secure=secure, httponly=True, samesite="strict")
     return response
 
 
-def _unavailable(what: str, error: DatabaseError) -> JSONResponse:
-    _log.log(what, logging.ERROR, "%s: nobody can %s", error, what)
-    return _answer(503, f"The server cannot store that you {what}: {error.why}")
+def _unavailable(action: str, error: DatabaseError) -> JSONResponse:
+    _log.log(action, logging.ERROR, "%s: nobody can %s", error, action)
+    return _answer(503, f"The server cannot store that you {action}: {error.why}")
 
 
 def _answer(status: int, why: str, **headers: str) -> JSONResponse:
     return JSONResponse({"ok": status == 200, "why": why}, status, headers={**_NO_STORE, **headers})
-
-
-def _address(request: Request) -> str:
-    return request.client.host if request.client else ""

@@ -54,6 +54,7 @@ def drive(
         driver = TerminalDriver(
             names.base, by=by, device=device, speed=speed, turn=turn, heartbeat=heartbeat, assume=assume
         )
+        # A robot that takes only commands with the sender's account in the topic says so, after it was subscribed to.
         put_names(transport, names, lambda base: base == names.base and driver.robot.named)
         typer.echo(_KEYS)
         with opened() as terminal:

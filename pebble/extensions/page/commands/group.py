@@ -22,8 +22,8 @@ from pebble.extensions.fleet.people import has_user
 from pebble.extensions.operator.client.page_packages import require_packages
 from pebble.extensions.operator.commands.options import BrokerUrl, CaCert, PasswordFile, host_of
 from pebble.extensions.operator.commands.target import broker_of
-from pebble.extensions.page.commands.people import PEOPLE, TLS, PeopleOption, default_folder, register_people
-from pebble.extensions.page.config import WebInterface, WebTls
+from pebble.extensions.page.commands.people import TLS, PeopleOption, default_folder, register_people
+from pebble.extensions.page.config import PEOPLE, WebInterface, WebTls
 from pebble.runtime.connections import REMOTE_RECONNECT_S
 from pebble.transports import MqttSettings
 
@@ -79,22 +79,26 @@ def serve(
         raise PebbleError("which robots is missing: name either a robot's config file or --url mqtt://BROKER")
     require_packages()
     folder = None if tls is None else tls.absolute()
-    empty = folder is not None and not all((folder / file).is_file() for file in (SERVER_CERT, SERVER_KEY))
+    is_empty = folder is not None and not all((folder / file).is_file() for file in (SERVER_CERT, SERVER_KEY))
+    usable_folder = None if is_empty else folder
     if recordings is not None and not recordings.is_dir():
         raise PebbleError(f"--recordings {recordings}: there is no such folder")
-    options = {
+    given = {
         "host": None if host is None else host_of("--host", host),
         "port": port,
         "names": tuple(host_of("--name", text, name_of_page) for text in name or ()),
         "people": people,
         "recordings": recordings,
     }
+    options = {key: value for key, value in given.items() if value is not None}
     if url is not None:
         broker = replace(broker_of("--url", url, password_file, ca_cert), reconnect_max_s=REMOTE_RECONNECT_S)
-        settings, plain = _of_url(broker, options, None if empty else folder), False
+        settings = _settings_of_url(broker, options, usable_folder)
+        allows_http = False
     else:
-        settings, plain = _of_config(Path(str(config)), options, None if empty else folder)
-    if missing := _missing(settings, plain=plain, empty=empty):
+        settings, allows_http = _settings_of_config(Path(str(config)), options, usable_folder)
+    needs_certificate = is_empty or (settings.certificate is None and not allows_http)
+    if missing := _missing(settings, needs_certificate=needs_certificate, is_empty=is_empty):
         _print_missing(settings, missing, folder or default_folder() / TLS)
         return 2
     return _run(settings)
@@ -124,11 +128,10 @@ def register(app: typer.Typer) -> None:
 # -- settings
 
 
-def _of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) -> WebSettings:
+def _settings_of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) -> WebSettings:
     from pebble.extensions.page.setting import WebSettings
 
-    chosen = {key: value for key, value in options.items() if value is not None}
-    settings = WebSettings(**{"broker": broker, "people": default_folder() / PEOPLE, **chosen})
+    settings = WebSettings(**{"broker": broker, "people": default_folder() / PEOPLE, **options})
     folder = folder or _default_tls_folder(settings.host)
     if folder is not None:
         settings = replace(
@@ -137,15 +140,13 @@ def _of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) 
     return replace(settings, login=settings.certificate is not None or not is_loopback(settings.host))
 
 
-def _of_config(file: Path, options: dict[str, Any], folder: Path | None) -> tuple[WebSettings, bool]:
+def _settings_of_config(file: Path, options: dict[str, Any], folder: Path | None) -> tuple[WebSettings, bool]:
     """Return the settings, and whether the config allows plain http."""
     from pebble.extensions.page.run import settings_or_all_problems
 
     config = load(file)
     web = config.section(WebInterface)
-    chosen = {key: value for key, value in options.items() if value is not None}
-    chosen["names"] = (*web.names, *options["names"])
-    web = msgspec.structs.replace(web, **chosen)
+    web = msgspec.structs.replace(web, **{**options, "names": (*web.names, *options["names"])})
     if folder is None and web.tls.certificate is None and not web.plain_http:
         folder = _default_tls_folder(web.host)
     if folder is not None:
@@ -165,33 +166,36 @@ def _default_tls_folder(host: str) -> Path | None:
     return folder if not is_loopback(host) and (folder / SERVER_CERT).is_file() else None
 
 
-def _missing(settings: WebSettings, *, plain: bool, empty: bool) -> list[str]:
+def _missing(settings: WebSettings, *, needs_certificate: bool, is_empty: bool) -> list[str]:
     """Return which of "certificate" and "user" are needed and missing.
 
-    ``empty``: the folder that --tls names is empty.
+    A page that only this machine reaches needs neither, unless --tls names a folder that ``is_empty``.
     """
-    if not settings.login and not empty:
+    if not settings.login and not is_empty:
         return []
-    lacks_certificate = empty or not (settings.certificate is not None or plain)
-    missing = ["certificate"] if lacks_certificate else []
-    return missing if has_user(settings.people) else [*missing, "user"]
+    missing = ["certificate"] if needs_certificate else []
+    if not has_user(settings.people):
+        missing.append("user")
+    return missing
 
 
 def _print_missing(settings: WebSettings, missing: list[str], folder: Path) -> None:
-    others = (
-        f"other machines reach {settings.host}" if not is_loopback(settings.host) else "a page with --tls has a login"
-    )
-    lines = [f"pebble: {others}, so the page needs a {' and a '.join(missing)}:"]
+    reason = "a page with --tls has a login"
+    if not is_loopback(settings.host):
+        reason = f"other machines reach {settings.host}"
+    lines = [f"pebble: {reason}, so the page needs a {' and a '.join(missing)}:"]
     if "certificate" in missing:
         lines.append(f"    pebble cert init --folder {folder} {' '.join(own_names())}")
     if "user" in missing:
         lines.append(f"    pebble web user add {_me()} --role admin --people {settings.people}")
-    repeated = " ".join(sys.argv[1:])
-    tls = "" if "--tls" in repeated or "certificate" not in missing else f" --tls {folder}"
-    typer.echo("\n".join([*lines, f"    pebble {repeated}{tls}"]), err=True)
+    again = f"    pebble {' '.join(sys.argv[1:])}"
+    if "certificate" in missing and "--tls" not in again:
+        again += f" --tls {folder}"
+    typer.echo("\n".join([*lines, again]), err=True)
 
 
 def _me() -> str:
+    """Return this machine's user, or "alice" if the page allows no such name."""
     try:
         user = getpass.getuser().lower()
     except (KeyError, OSError):

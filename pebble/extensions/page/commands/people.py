@@ -18,10 +18,9 @@ from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.roles import Role
 from pebble.extensions.operator.commands.show import print_table
 from pebble.extensions.operator.places import Places
-from pebble.extensions.page.config import WebHandler, WebInterface
+from pebble.extensions.page.config import PEOPLE, WebHandler, WebInterface
 from pebble.runtime.as_owner import as_owner
 
-PEOPLE = "people.sqlite"
 PLACES = Places()
 TLS = "tls"
 
@@ -140,14 +139,14 @@ def default_folder() -> Path:
 def _file(config: Path | None, people: Path | None) -> Path:
     """Return the named database, or that of the page served by this machine's robot, or the user's own."""
     if people is None and config is None:
-        config = _of_machine()
+        config = _config_of_machine()
     if people is not None or config is None:
         return (people or default_folder() / PEOPLE).absolute()
     loaded = load(config)
     return loaded.section(WebInterface).people or loaded.state_dir() / PEOPLE
 
 
-def _of_machine() -> Path | None:
+def _config_of_machine() -> Path | None:
     """Return the config that `pebble setup` wrote, if its robot serves a page.
 
     Raises PebbleError if it may not be read.
@@ -156,7 +155,7 @@ def _of_machine() -> Path | None:
     try:
         if not file.exists():
             return None
-        file.read_bytes()
+        file.read_bytes()  # before load, which does not say what to do
     except PermissionError:
         raise PebbleError(
             f"{file}: this user may not read it: use sudo, or name another database, --people FILE"

@@ -18,9 +18,10 @@ from pebble.extensions.page.drive.driven_robot import SILENCE_S, Command, Driven
 from pebble.extensions.page.messages import DriveOp
 from pebble.transports import Message
 
-HELD_S, PERIOD_S = 0.4, 0.05  # a key after its last repetition; between two commands
-_BURST = 8  # as many keys at once were held back on the way, and are old
-_TWICE_S = 0.6  # between two presses of Escape
+HELD_S = 0.4  # so long a key counts as held after its last repetition
+PERIOD_S = 0.05  # between two commands
+_BURST = 8  # so many keys at once were held back on the way, and are old
+_TWICE_S = 0.6  # at most, between two presses of Escape that are a stop
 _AXES = {
     "w": ("z", 1), UP: ("z", 1), "s": ("z", -1), DOWN: ("z", -1),
     "d": ("x", 1), RIGHT: ("x", 1), "a": ("x", -1), LEFT: ("x", -1),
@@ -45,16 +46,23 @@ class TerminalDriver:
         self._assumes, self._heard_at = assume, float("inf")
         self._willing = True  # to have control as soon as it is free
         self._held: dict[str, tuple[int, float]] = {}  # by axis: the direction, and when its key last arrived
-        self._gesture, self._pressed, self._reason, self._note = 0, False, "", ""
+        self._gesture = 0  # the number of the newest one
+        self._pressed = False  # a key is held: of this gesture, or of an ended one, which moves nothing any more
+        self._reason = ""  # why the robot cannot be driven now
+        self._note = ""  # about the keyboard, for the person
         self._key_at = self._ticked_at = self._escape_at = float("-inf")
-        self._out, self._failures = list[Command](), list[str]()  # the latter of the newest request for control
+        self._out: list[Command] = []  # to be sent with the next tick
+        self._failures: list[str] = []  # why the newest request for control has failed
 
     @property
     def filters(self) -> list[str]:
-        """Filters of the topics that :meth:`receive` needs; the link's only outside of the robot."""
-        channels = (c.ESTOP_STATE, c.CONTROL_STATE, c.CAPABILITIES, c.ONLINE, c.CHARGING_LEVEL, c.AUTONOMY_STATUS)
-        further = [*([c.LINK] if self._heartbeat else []), *([c.DRIVE] if self._assumes else [])]
-        return [channel.filter(self.robot.base) for channel in (*channels, *further)]
+        """Return filters of the topics that :meth:`receive` needs."""
+        channels = [c.ESTOP_STATE, c.CONTROL_STATE, c.CAPABILITIES, c.ONLINE, c.CHARGING_LEVEL, c.AUTONOMY_STATUS]
+        if self._heartbeat:  # as heartbeats, the state of the link exists only outside of the robot
+            channels.append(c.LINK)
+        if self._assumes:
+            channels.append(c.DRIVE)
+        return [channel.filter(self.robot.base) for channel in channels]
 
     def receive(self, message: Message, now: float, wall: float) -> None:
         self.robot.receive(channel_of(message.topic.removeprefix(f"{self.robot.base}/")), message, now, wall)
@@ -76,7 +84,8 @@ class TerminalDriver:
                 self._held[axis], self._key_at, self._willing = (direction, now), now, True
             elif not key.isascii():
                 self._note = f"this keyboard types {key}: W A S D need a Latin layout; the arrows drive, too"
-            self._escape_at = now if key == ESCAPE else self._escape_at
+            if key == ESCAPE:
+                self._escape_at = now
         if len(keys) >= _BURST:
             self.end(now)
 
@@ -86,9 +95,12 @@ class TerminalDriver:
             self.end(now)
         self._ticked_at = now
         self._assume(now)
-        self._tab.clock.echo(self._tab.clock.ping(now), 1000 * now, now)  # no network is between keys and driver
+        clock = self._tab.clock
+        clock.echo(clock.ping(now), 1000 * now, now)  # at once: no network is between keys and driver
         view = self._driven.shown(self._tab, now)
-        is_published = self._driven.published is not None if view.keeps else self.robot.situation(now).published
+        is_published = self.robot.situation(now).published
+        if view.keeps:  # the robot decides who drives it, and says who does
+            is_published = self._driven.published is not None
         if self._willing and is_published and not view.by and not view.asking:
             self._take(now, over=False)
         self._out += self._driven.update(now)
@@ -96,13 +108,14 @@ class TerminalDriver:
         self._drive(now)
         zeros, requests = self._driven.tick(now)
         topic, commands, self._out = self.robot.estop.drive_topic, [*self._out, *zeros], []
-        drives = [Message(topic, self.robot.encode(command.drive), command.qos) for command in commands]
-        return [*(self.stop.tick(now) if self.stop else []), *drives, *([] if problem else requests)]
+        messages = [] if self.stop is None else self.stop.tick(now)
+        messages += [Message(topic, self.robot.encode(command.drive), command.qos) for command in commands]
+        return messages if problem else messages + requests
 
     def end(self, now: float, *, leave: bool = False) -> None:
         """End the gesture for good; with ``leave`` also release control. A pause follows before the next gesture."""
         self._out += self._tab.interrupt(self._gesture, now)
-        self._pressed, self._key_at = True, now
+        self._pressed, self._key_at = True, now  # as if a key were held, which must be released first
         if leave:
             self._willing = False
             self._out += self._driven.release(self._tab, now)
@@ -116,11 +129,13 @@ class TerminalDriver:
         """Return the status line: the command sent, or why none is sent. Parts of it come from others."""
         view, robot = self._driven.shown(self._tab, self._ticked_at), self.robot
         x, z, _ = self._wanted(self._ticked_at)
-        idle = self._reason or ("let go first" if self._pressed else "ready")
+        motion = self._reason or ("let go first" if self._pressed else "ready")
+        if self._driven.state is State.MOVING:
+            motion = f"driving x {x:+.2f} z {z:+.2f}"
         parts = (
             self.name,
             robot.itself,
-            f"driving x {x:+.2f} z {z:+.2f}" if self._driven.state is State.MOVING else idle,
+            motion,
             self.unconfirmed and f"EMERGENCY STOP NOT CONFIRMED: {self.unconfirmed}",
             f"{view.asks} asks for control: l lets {view.asks} drive" if view.you and view.asks else "",
             *([] if view.you else self._failures),
@@ -131,7 +146,7 @@ class TerminalDriver:
         return " · ".join(filter(None, parts))
 
     def _assume(self, now: float) -> None:
-        """Assume that the robot is a board that drives, if it has been online for a while without capabilities."""
+        """Assume that a silent board drives, once it has been online for a while, if the person says so."""
         if self._assumes:
             self._heard_at = min(self._heard_at, now) if self.robot.online(now) else float("inf")
             if now - self._heard_at >= HEARD_S:
@@ -145,7 +160,8 @@ class TerminalDriver:
         """Send a command of the gesture, or a zero at its end."""
         x, z, y = self._wanted(now)
         moves = bool(x or z or y)
-        self._gesture += moves and not self._pressed
+        if moves and not self._pressed:
+            self._gesture += 1
         self._pressed = moves or (self._pressed and now - self._key_at < HELD_S)
         if moves or self._driven.state is State.MOVING:
             op = DriveOp(ref=self.robot.base, g=self._gesture, t=1000 * now, x=x, z=z, y=y)
@@ -153,20 +169,29 @@ class TerminalDriver:
 
     def _why_not(self, now: float) -> str:
         """Return why the robot cannot be driven; empty if it can."""
-        view, sends = self._driven.shown(self._tab, now), self.stop is not None and not self.stop.finished
-        situation = self.robot.situation(now)._replace(driven=view.by != "" and not view.you, listening=not view.you)
-        situation = situation._replace(stopping=sends, online=situation.online if self._heartbeat else True)
-        who = f"{view.by} ({view.device}{', ' * bool(view.device)}name {'' if view.checked else 'not '}checked)"
+        view, situation = self._driven.shown(self._tab, now), self.robot.situation(now)
+        situation = situation._replace(
+            driven=view.by != "" and not view.you,
+            listening=not view.you,
+            stopping=self.stop is not None and not self.stop.finished,
+        )
+        if not self._heartbeat:
+            situation = situation._replace(online=True)
+        device = f"{view.device}, " if view.device else ""
+        driver = f"{view.by} ({device}name {'' if view.checked else 'not '}checked)"
         code, stopped = first_reason(situation), self.robot.stopped_by
-        why = words(code, self.name, stopped=stopped, driven=who, script=self.robot.script)
-        return why or (PARKED if self.robot.parked else "")
+        why = words(code, self.name, stopped=stopped, driven=driver, script=self.robot.script)
+        if not why and self.robot.parked:
+            return PARKED
+        return why
 
     def _wanted(self, now: float) -> tuple[float, float, float]:
         """Return x, z and y from the held keys."""
         held = {axis: direction for axis, (direction, at) in self._held.items() if now - at < HELD_S}
         turn, speed, up = self._turn * held.get("x", 0), self._speed * held.get("z", 0), self._speed * held.get("y", 0)
         most = max(1.0, abs(speed + turn), abs(speed - turn))  # no wheel is faster than 1
-        return round(turn / most, 3) + 0.0, round(speed / most, 3) + 0.0, round(up, 3) + 0.0
+        x, z, y = round(turn / most, 3), round(speed / most, 3), round(up, 3)
+        return x + 0.0, z + 0.0, y + 0.0  # -0.0 becomes 0.0
 
     def _begin_stop(self, now: float) -> None:
         self.end(now)

@@ -46,7 +46,7 @@ class Event(Enum):
     ENDED = "its page gives control back, has gone, or has rested for a minute"
     LOST = "the robot has taken control away"
     MOVES = "a command of its page may move it"
-    LETS_GO = "the gesture's own zero has come"
+    LETS_GO = "the zero that ends a gesture has come: its driver released the inputs"
     INTERRUPTED = "a stop, silence, a command that is refused, or another robot ends the gesture"
 
 
@@ -90,12 +90,16 @@ class Tab:
     device: str
     clock: PageClock = field(default_factory=PageClock)
     moves: "DrivenRobot | None" = None
-    gesture: int = -1  # by which it moves that
-    over: int = -1  # this gesture and all before it have ended
+    gesture: int = -1  # by which it moves that robot
+    last_ended: int = -1  # this gesture and all before it have ended
+
+    def end_until(self, gesture: int) -> None:
+        """Note that this gesture, and all before it, have ended for good."""
+        self.last_ended = max(self.last_ended, gesture)
 
     def interrupt(self, gesture: int, now: float) -> list[Command]:
-        """End this gesture, and all before it, for good."""
-        self.over = max(self.over, gesture)
+        """End this gesture, and all before it, for good; halt the robot if the page moves it by one of them."""
+        self.end_until(gesture)
         return [] if self.moves is None or self.gesture > gesture else self.moves.interrupt(now)
 
 
@@ -106,7 +110,7 @@ class Wish:
     client: ControlClient
     granted: Callable[[], None]
     failed: Callable[[str], None]
-    ended_at: float = float("inf")
+    ended_at: float = float("inf")  # since when the client has wanted nothing more
 
 
 class DrivenRobot:
@@ -116,11 +120,12 @@ class DrivenRobot:
         self.ref = ref
         self.state = State.FREE
         self.tab: Tab | None = None  # that has control
-        self.client: ControlClient | None = None  # by which the robot has given it
+        self.client: ControlClient | None = None  # by which the robot has given control; None: this server has
         self._view, self._changed = view, changed
-        self._decided = ""  # the key with which it was given
+        self._given_key = ""  # the key with which the robot has given control
         self._wishes: dict[Tab, Wish] = {}
-        self._idle_from = self._sent_at = self._received_at = float("-inf")
+        self._idle_from = float("-inf")  # when control was given, or the last gesture ended
+        self._sent_at = self._received_at = float("-inf")  # the last command of the gesture
         self._repeats: list[float] = []  # when to send a zero again
         self._awaited = ("", float("-inf"))  # a page, by its token, that had control; and until when
         self.renew_key()
@@ -155,7 +160,7 @@ class DrivenRobot:
     @property
     def moved_by(self) -> str:
         """Return the user who moves the robot now, by a gesture or by the robot's state; empty if none does."""
-        if other := self._elsewhere():
+        if other := self._held_elsewhere():
             return other.by
         return self.tab.user if self.tab is not None and self.state is State.MOVING else ""
 
@@ -164,12 +169,12 @@ class DrivenRobot:
         return self.tab is tab or tab in self._wishes
 
     def awaits(self, token: str, now: float) -> bool:
-        """True, once, if a page with this token recently had control and no other client has it now."""
+        """True if a page with this token recently had control, and no client has it now. It is said only once."""
         awaited, until = self._awaited
         if awaited != token:
             return False
         self._awaited = ("", float("-inf"))
-        return now <= until and self.state is State.FREE and self._elsewhere() is None
+        return now <= until and self.state is State.FREE and self._held_elsewhere() is None
 
     def at_rest(self, now: float) -> bool:
         """True if the robot has nothing that must be remembered."""
@@ -182,7 +187,7 @@ class DrivenRobot:
         if state is not None:
             asks = (state.asks or "somebody") if state.asks_id else ""
             view = replace(view, asks=asks, checked=state.named, others=state.others)
-        if (other := self._elsewhere()) is not None:
+        if (other := self._held_elsewhere()) is not None:
             return replace(view, by=other.by, device=other.device)
         if self.tab is None:
             return view
@@ -194,17 +199,22 @@ class DrivenRobot:
     def take(
         self, tab: Tab, now: float, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool
     ) -> list[Command]:
-        """Request control, ``over``: even from its holder; return the commands for a handover at this server."""
+        """Request control, ``over``: even from its holder; return the commands for a handover at this server.
+
+        ``granted``, or ``failed`` with the reason, is called with the answer: now, or after the robot's next state.
+        """
         robot = self._view()
         if robot is not None and robot.controlled:
-            wish = self._wishes.get(tab)
-            client = ControlClient(robot.control, by=tab.user, device=tab.device, pace_of=lambda: robot.pace)
-            wish = self._wishes[tab] = Wish(client if wish is None else wish.client, granted, failed)
-            wish.client.ask(now, over=over)
+            if tab in self._wishes:
+                client = self._wishes[tab].client
+            else:
+                client = ControlClient(robot.control, by=tab.user, device=tab.device, pace_of=lambda: robot.pace)
+            self._wishes[tab] = Wish(client, granted, failed)
+            client.ask(now, over=over)
             self._changed.add(self.ref)
             return []
-        if self.tab is not tab and not over and (who := self._active(now)):
-            failed(words(Code.LEASE, driven=who))
+        if self.tab is not tab and not over and (driver := self._active_driver(now)):
+            failed(words(Code.LEASE, driven=driver))
             return []
         commands = [] if self.tab is tab else self._give(tab, None, now)
         granted()
@@ -229,8 +239,8 @@ class DrivenRobot:
         """Note that the robot has published a state, or was replaced by another robot."""
         commands: list[Command] = []
         for tab, wish in list(self._wishes.items()):
-            commands += self._answered(tab, wish, now)
-        if self.client is None and self.keeps:  # it was this server's to give, and is no more
+            commands += self._follow_wish(tab, wish, now)
+        if self.client is None and self.keeps:  # this server has given control, and now only the robot may
             commands += self._on(Event.LOST, now)
         self._changed.add(self.ref)
         return commands
@@ -244,7 +254,7 @@ class DrivenRobot:
         """
         if not (op.x or op.z or op.y):
             return self._zero(tab, op, now), ""
-        if op.g <= tab.over:
+        if op.g <= tab.last_ended:
             return [], LET_GO
         if why := self._why_not(tab, op, now) or blocked:
             return tab.interrupt(op.g, now), why
@@ -254,7 +264,7 @@ class DrivenRobot:
             self._on(Event.MOVES, now)
         self._received_at = now
         pace = self.pace
-        if now - self._sent_at < pace.step_s:
+        if now - self._sent_at < pace.step_s:  # a thin link carries fewer commands than the page sends
             return [], ""
         self._sent_at = now
         drive = self._signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=WIDE.valid_ms))
@@ -283,8 +293,8 @@ class DrivenRobot:
         messages: list[Message] = []
         for tab, wish in list(self._wishes.items()):
             messages += wish.client.tick(now)
-            commands += self._answered(tab, wish, now)
-            if self._is_over(wish, now):
+            commands += self._follow_wish(tab, wish, now)
+            if self._has_ended(wish, now):
                 del self._wishes[tab]
         return commands, messages
 
@@ -296,7 +306,7 @@ class DrivenRobot:
         if step is None:
             return []
         if self.state is State.MOVING and self.tab is not None:  # each step from there ends the gesture
-            self.tab.over = max(self.tab.over, self.tab.gesture)
+            self.tab.end_until(self.tab.gesture)
             self.tab.moves, self._idle_from = None, now
         commands = self._final_zero(now) if step.halts else []
         if step.gives_back and self.client is not None:
@@ -308,19 +318,21 @@ class DrivenRobot:
         return commands
 
     def _give(self, tab: Tab, client: ControlClient | None, now: float) -> list[Command]:
-        commands = self._on(Event.GIVEN, now) + tab.interrupt(tab.gesture, now)  # what is held now moves no robot
-        self.tab, self.client, self._decided = tab, client, "" if client is None else client.decided
+        """Give a page control, by its request to the robot or (``client`` None) by this server; halt what moves."""
+        commands = self._on(Event.GIVEN, now) + tab.interrupt(tab.gesture, now)  # a key held down now moves no robot
+        self.tab, self.client, self._given_key = tab, client, "" if client is None else client.decided
         self._idle_from = now
         return commands
 
-    def _answered(self, tab: Tab, wish: Wish, now: float) -> list[Command]:
+    def _follow_wish(self, tab: Tab, wish: Wish, now: float) -> list[Command]:
+        """Note the robot's answer to a page's request, if there is one; return the commands that follow from it."""
         client, robot = wish.client, self._view()
         if robot is None or not robot.controlled or robot.control is not client.robot:
-            client.release()  # it is gone, or was forgotten meanwhile
+            client.release()  # the robot is gone, or was forgotten and has come back meanwhile
         client.update(now)
         had_control = self.client is client
         commands: list[Command] = []
-        if had_control and client.decided != self._decided:
+        if had_control and client.decided != self._given_key:
             commands = self._on(Event.LOST, now)
         if client.held and self.client is not client:
             commands += self._give(tab, client, now)
@@ -332,8 +344,8 @@ class DrivenRobot:
             self._changed.add(self.ref)
         return commands
 
-    def _is_over(self, wish: Wish, now: float) -> bool:
-        """True if the request has ended, and the robot confirms it by its state, or has not answered in time."""
+    def _has_ended(self, wish: Wish, now: float) -> bool:
+        """True if the page wants no control any more, and the robot confirms that or has not answered in time."""
         if not wish.client.done:
             wish.ended_at = float("inf")
             return False
@@ -341,25 +353,26 @@ class DrivenRobot:
         state = self.published
         return state is None or state.id != wish.client.id or now - wish.ended_at > self.pace.answer_s
 
-    def _elsewhere(self) -> ControlState | None:
-        """Return the robot's state if it has given control to another server; else None."""
+    def _held_elsewhere(self) -> ControlState | None:
+        """Return the robot's state of control if it has given control to another server; else None."""
         state = self.published
         if state is None or not state.id or any(wish.client.id == state.id for wish in self._wishes.values()):
             return None
         return replace(state, by=state.by or "somebody")
 
-    def _active(self, now: float) -> str:
+    def _active_driver(self, now: float) -> str:
         """Return the user who drives now, and must be asked for control; empty if control can be taken."""
-        if other := self._elsewhere():
+        if other := self._held_elsewhere():
             return other.by
         if self.tab is None or (self.state is State.HELD and now - self._idle_from >= TAKEN_FROM_IDLE_S):
             return ""
         return self.tab.user
 
     def _why_not(self, tab: Tab, op: DriveOp, now: float) -> str:
+        """Return why this page's gesture may not move the robot now; empty if it may."""
         if self.tab is not tab:
-            other = self._active(now)
-            return words(Code.LEASE if other else Code.LISTENING, driven=other)
+            driver = self._active_driver(now)
+            return words(Code.LEASE if driver else Code.LISTENING, driven=driver)
         if tab.moves is not None and (tab.gesture != op.g or tab.moves is not self):
             return LET_GO  # the end of the earlier gesture was lost
         if tab.moves is not None and now - self._received_at > SILENCE_S:
@@ -370,15 +383,15 @@ class DrivenRobot:
 
     def _zero(self, tab: Tab, op: DriveOp, now: float) -> list[Command]:
         """Return a zero to publish, which is sent in every state. It ends the gesture, and all before it."""
-        tab.over = max(tab.over, op.g)
+        tab.end_until(op.g)
         if tab.moves is self and op.g >= tab.gesture:
             self._on(Event.LETS_GO, now)
-        commands = tab.interrupt(op.g, now)  # what it moves elsewhere
+        commands = tab.interrupt(op.g, now)  # of another robot that the page moves
         if self._is_assumed:
             self._repeat_zeros(now)
         if self.tab is not tab or op.final:
             return [Command(self.ref, FINAL_ZERO), *commands]
-        return [Command(self.ref, self._signed(ZERO)), *commands]  # with the key it is a letting go
+        return [Command(self.ref, self._signed(ZERO)), *commands]  # with the key it is a release by the driver
 
     def _signed(self, drive: Drive) -> Drive:
         """Return the command with the key of control."""
@@ -390,7 +403,8 @@ class DrivenRobot:
         return [Command(self.ref, FINAL_ZERO)]
 
     def _repeat_zeros(self, now: float) -> None:
-        self._repeats = [now + after for after in (assumed.REPEATS_S if self._is_assumed else REPEATS_S)]
+        repeats_s = assumed.REPEATS_S if self._is_assumed else REPEATS_S
+        self._repeats = [now + after_s for after_s in repeats_s]
 
     @property
     def _is_assumed(self) -> bool:

@@ -21,13 +21,13 @@ MOST_WISHES = 16  # of one tab: robots of which it has control, or asks for it
 _ALONE_S = 1.0  # after a group its lights are sent again, by themselves, unless newer ones are there
 
 
-class _Company(NamedTuple):
-    """Lights for the next drive command of a gesture. Sent in a group, they may be lost or refused with it."""
+class _Lights(NamedTuple):
+    """Lights that are sent in a group with the next drive command of a gesture. They may be lost or refused with it."""
 
     metric: str
     message: Message
     by: str
-    sent_at: float = inf
+    grouped_at: float = inf  # when they were sent in a group; inf: they wait for a command
 
 
 class Drivers:
@@ -37,7 +37,7 @@ class Drivers:
         self._broker, self._robots = broker, robots
         self._driven: dict[str, DrivenRobot] = {}
         self._changed: set[str] = set()
-        self._company: dict[str, _Company] = {}  # by robot
+        self._lights: dict[str, _Lights] = {}  # by robot
         self._grouped: set[str] = set()  # robots that were sent a group since their last zero
         self.refusals = Refusals(broker, lambda ref: self.robot(ref).moved_by, robots.view)
 
@@ -55,22 +55,22 @@ class Drivers:
     ) -> None:
         """Request control for a page; ``granted``, or ``failed`` with the reason, is called with the result."""
         now, robot = clock(), self.robot(view.base)
-        wanted = sum(robot.wanted_by(tab) for robot in self._driven.values())
+        wishes = sum(driven.wanted_by(tab) for driven in self._driven.values())
         if why := self.refusals.nameless(view):
             failed(why)
-        elif wanted >= MOST_WISHES and not robot.wanted_by(tab):
+        elif wishes >= MOST_WISHES and not robot.wanted_by(tab):
             failed(f"This page has control of {MOST_WISHES} robots: release one")
         else:
             self._publish(robot.take(tab, now, granted, failed, over=over))
-            self._turn(robot, now)
+            self._publish_due(robot, now)
 
     def release(self, tab: Tab, ref: str) -> bool:
         """Release a page's control, or withdraw its request; return True if it had control."""
         now, robot = clock(), self.robot(ref)
-        had = robot.tab is tab
+        had_control = robot.tab is tab
         self._publish(robot.release(tab, now))
-        self._turn(robot, now)
-        return had
+        self._publish_due(robot, now)
+        return had_control
 
     def drives(self, ref: str) -> bool:
         """True if a page has control of that robot."""
@@ -79,24 +79,29 @@ class Drivers:
     def restore(self, token: str, tab: Tab) -> None:
         """Give a page that has connected again the control that it had; no gesture continues.
 
-        Its old connection may still be open, although no more data arrives on it.
+        ``token`` is that of its old connection, ``tab`` the new one. The old one may still be open, although no more
+        data arrives on it: then it is closed first.
         """
         now = clock()
-        old = {robot.tab for robot in self._driven.values() if robot.tab is not None and robot.tab.token == token}
-        for stalled in [robot for robot in old if robot.clock.problem(now)]:
-            self.closed(stalled)
-        for robot in [robot for robot in self._driven.values() if robot.awaits(token, now)]:
-            if (view := self._robots.view(robot.ref)) is not None:
+        old_tabs = {robot.tab for robot in self._driven.values() if robot.tab is not None and robot.tab.token == token}
+        for old in old_tabs:
+            if old.clock.problem(now):
+                self.closed(old)
+        for robot in list(self._driven.values()):
+            if robot.awaits(token, now) and (view := self._robots.view(robot.ref)) is not None:
                 self.take(tab, view, lambda: None, lambda _why: None, over=False)
 
     def closed(self, tab: Tab, *, for_good: bool = False) -> None:
         """Note that a page's connection has ended; ``for_good``: its user may no longer drive."""
-        now, wanted = clock(), [robot for robot in self._driven.values() if robot.wanted_by(tab)]
+        now, zeros = clock(), list[Command]()
+        wanted = [robot for robot in self._driven.values() if robot.wanted_by(tab)]
+        for robot in wanted:
+            zeros += robot.closed(tab, now, for_good=for_good)
         try:
-            self._publish([zero for robot in wanted for zero in robot.closed(tab, now, for_good=for_good)])
+            self._publish(zeros)
         finally:
             for robot in wanted:
-                self._turn(robot, now)
+                self._publish_due(robot, now)
 
     def closed_all(self) -> None:
         for tab in [robot.tab for robot in self._driven.values() if robot.tab is not None]:
@@ -122,14 +127,14 @@ class Drivers:
 
         Lights and command share a message, so the robot must list both as members of a group.
         """
-        listed = self._robots.capabilities(ref).get("groups")
-        joins = isinstance(listed, list) and DRIVE.metric in listed and channel.metric in listed
-        moves = joins and tab.moves is not None and tab.moves.ref == ref
-        if moves:
-            self._company[ref] = _Company(channel.metric, message, tab.user)
+        groups = self._robots.capabilities(ref).get("groups")
+        takes_group = isinstance(groups, list) and DRIVE.metric in groups and channel.metric in groups
+        joins = takes_group and tab.moves is not None and tab.moves.ref == ref
+        if joins:
+            self._lights[ref] = _Lights(channel.metric, message, tab.user)
         else:
-            self._company.pop(ref, None)  # these are newer
-        return moves
+            self._lights.pop(ref, None)  # the caller sends newer ones
+        return joins
 
     def stop(self, ref: str, by: str) -> None:
         """Publish a zero for any user, also without control."""
@@ -151,15 +156,16 @@ class Drivers:
 
     def tick(self, now: float) -> None:
         for ref, robot in list(self._driven.items()):
-            self._turn(robot, now)
+            self._publish_due(robot, now)
             if robot.at_rest(now):
                 del self._driven[ref]
-        for ref in [ref for ref, company in self._company.items() if now - company.sent_at >= _ALONE_S]:
-            self._publish_company(ref)
+        for ref, lights in list(self._lights.items()):
+            if now - lights.grouped_at >= _ALONE_S:
+                self._publish_lights(ref)
 
     # -- inside
 
-    def _turn(self, robot: DrivenRobot, now: float) -> None:
+    def _publish_due(self, robot: DrivenRobot, now: float) -> None:
         """Publish what is due for a robot; requests for control come after the zeros of the former driver."""
         commands, messages = robot.tick(now)
         self._publish(commands)
@@ -174,24 +180,24 @@ class Drivers:
         accepted = True
         for ref, drive, qos in commands:
             topic, view = self._robots.topic(ref, DRIVE), self._robots.view(ref) or RobotView(ref)
-            payload, company = view.encode(drive), self._company.get(ref)
-            if drive.moves and company is not None and company.sent_at == inf:
-                members = {DRIVE.metric: payload, company.metric: company.message.payload}
+            payload, lights = view.encode(drive), self._lights.get(ref)
+            if drive.moves and lights is not None and lights.grouped_at == inf:
+                members = {DRIVE.metric: payload, lights.metric: lights.message.payload}
                 topic, payload = GROUP.topic(ref), joined(members)
-                self._company[ref] = company._replace(sent_at=clock())
+                self._lights[ref] = lights._replace(grouped_at=clock())
                 self._grouped.add(ref)
             accepted = self._broker.publish(topic, payload, qos=qos, by=by) and accepted
             if not drive.moves:
                 if ref in self._grouped:
                     self._grouped.remove(ref)
                     self._broker.publish(GROUP.topic(ref), joined({DRIVE.metric: payload}), qos=qos, by=by)
-                self._publish_company(ref)
+                self._publish_lights(ref)
         if self._changed:
             self._robots.mark_drivers(set(self._changed))
             self._changed.clear()
         return accepted
 
-    def _publish_company(self, ref: str) -> None:
-        if (company := self._company.pop(ref, None)) is not None:
-            lights = company.message
-            self._broker.publish(lights.topic, lights.payload, qos=lights.qos, by=company.by)
+    def _publish_lights(self, ref: str) -> None:
+        if (lights := self._lights.pop(ref, None)) is not None:
+            message = lights.message
+            self._broker.publish(message.topic, message.payload, qos=message.qos, by=lights.by)

@@ -1,4 +1,4 @@
-"""Decides why a page's request to a robot is refused now, in words for people; "" if it is not refused."""
+"""The reasons why a page's request to a robot is refused now, in words for people; "" if it is not refused."""
 
 import time
 from collections.abc import Callable
@@ -30,13 +30,15 @@ class Refusals:
         self.is_stopping: Callable[[str], bool] = lambda _ref: False
 
     def of_driving(self, ref: str) -> str:
-        """Return why no page may move this component."""
+        """Return why no page may move this component; empty if one may."""
         robot = self._robot_of(ref) or RobotView(ref)
         why = self._words(robot, first_reason(self._situation(robot), SERVER_ORDER)) or self.nameless(robot)
-        return why or (PARKED if robot.parked else "")
+        if not why and robot.parked:
+            return PARKED
+        return why
 
     def nameless(self, robot: RobotView) -> str:
-        """Return why the component takes no commands of this server, which has no account."""
+        """Return why a component that takes only commands with a name takes none of this server; empty if it does."""
         return why_not(robot.name, self._broker.names.account) if robot.named else ""
 
     def of_op(self, op: m.RobotOp) -> str:
@@ -49,7 +51,9 @@ class Refusals:
         order = (Code.BROKER,) if isinstance(op, m.FlagOp) else (Code.BROKER, Code.SILENT)  # a broker remembers flags
         why = self._words(robot, first_reason(self._situation(robot), order))
         why = why or self.nameless(robot) or robot_commands.refusal(op, robot.capabilities)
-        return self._of_script(robot) if isinstance(op, m.AutonomyOp) and not why else why
+        if not why and isinstance(op, m.AutonomyOp):
+            return self._of_script(robot)
+        return why
 
     def _of_script(self, robot: RobotView) -> str:
         """Return why no script may be started now."""

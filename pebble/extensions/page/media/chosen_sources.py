@@ -10,7 +10,7 @@ from pebble.extensions.page.robots import Robots
 
 log = logging.getLogger(__name__)
 
-_PICTURE = "picture-from "  # what a setting of the server begins with; then the component
+_PICTURE = "picture-from "  # begins the key of a setting in the people's database; the component follows
 
 
 class ChosenSources:

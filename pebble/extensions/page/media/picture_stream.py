@@ -3,7 +3,7 @@
 import asyncio
 import struct
 import time
-from typing import Final
+from typing import Final, NamedTuple
 
 from pebble.extensions.media.picture_header import PictureHeader, PictureSequence
 from pebble.extensions.operator.client.broker import Broker
@@ -20,7 +20,15 @@ _MAX_CHAIN: Final = 240  # pictures since a key frame
 _MAX_CHAIN_BYTES: Final = 8 << 20  # of these pictures
 _HEAD: Final = struct.Struct(">IB")
 _RESCUE_HEAD: Final = struct.Struct(">IBQ")
+_KEY_FRAME_WANTED, _CANNOT_DECODE = 1, 2  # a page's answer to a frame; 0: it was drawn
 _AT_REST: Final = PictureView(state="rest", why="", encoding="", per_second=0, kbits=0, viewers=0)
+
+
+class KeyFrame(NamedTuple):
+    """A picture that needs no picture before it."""
+
+    payload: bytes
+    received_at: float  # monotonic
 
 
 class PageViewer:
@@ -38,33 +46,35 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         super().__init__(broker, robots, ref, "video", "web/picture", _AT_REST)
         self._rescue = RescueStream(self._on_rescued)
         self._sequence = PictureSequence()
-        self._chain: list[bytes] = []  # the newest key frame and all pictures since; empty: it would be too long
+        #: The newest key frame and all pictures since; empty: one is missing, or it would be too long.
+        self._chain: list[bytes] = []
         self._chain_bytes = 0
-        self.key: tuple[bytes, float] | None = None  # the newest key frame, and when it came, monotonic
+        self.key: KeyFrame | None = None  # the newest one
         self._seq = 0
 
     # -- pages
 
-    def acknowledge(self, viewer: PageViewer, seq: int, what: int) -> None:
-        """Handle a page's answer: 0 drawn, 1 key frame wanted, 2 encoding cannot be decoded."""
+    def acknowledge(self, viewer: PageViewer, seq: int, answer: int) -> None:
+        """Handle a page's answer to the frame ``seq``."""
         now = time.monotonic()
         frame = viewer.queue.acknowledge(seq, now)
-        is_valid = frame is not None or seq == NO_FRAME
-        if what == 1 and is_valid:
-            viewer.queue.note_keyframe_request(now)
-        elif what == 2 and is_valid:
-            viewer.queue.cannot_decode(self._arrivals.encoding if frame is None else frame.encoding)
+        if frame is not None or seq == NO_FRAME:
+            if answer == _KEY_FRAME_WANTED:
+                viewer.queue.note_keyframe_request(now)
+            elif answer == _CANNOT_DECODE:
+                viewer.queue.cannot_decode(self._arrivals.encoding if frame is None else frame.encoding)
         viewer.wakeup.set()
-        if what:
+        if answer:
             self._request.wake()
 
     # -- pictures
 
     def receive(self, payload: bytes) -> None:
         now = time.monotonic()
-        header, fits = self._sequence.take(payload), self._sequence.complete
+        header = self._sequence.take(payload)
         if header is None:
             return
+        fits = self._sequence.complete  # with it: no picture before this one is missing
         self._note(header.encoding, len(payload), now)
         self._extend_chain(payload, header, fits=fits)
         self._rescue.feed(payload, keyframe=header.keyframe)
@@ -76,7 +86,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
     def _extend_chain(self, payload: bytes, header: PictureHeader, *, fits: bool) -> None:
         grown = self._chain_bytes + len(payload)
         if header.keyframe:
-            self.key = payload, time.monotonic()
+            self.key = KeyFrame(payload, time.monotonic())
             self._chain, self._chain_bytes = [payload], len(payload)
         elif fits and self._chain and len(self._chain) < _MAX_CHAIN and grown <= _MAX_CHAIN_BYTES:
             self._chain.append(payload)
@@ -85,16 +95,17 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
             self._chain, self._chain_bytes = [], 0
 
     def _offer(self, payload: bytes, header: PictureHeader, now: float) -> None:
+        """Queue a picture for each page that can show it; have a key frame requested soon for those that wait."""
         seq = self._next_seq()
         frame = Frame(seq, _HEAD.pack(seq, 0) + payload, header.encoding, header.keyframe)
-        urgent = False
+        some_wait = False
         for viewer in self.viewers:
             queue = viewer.queue
             if queue.rescued or queue.decodes(header.encoding):
                 queue.offer_direct(frame, now)
                 viewer.wakeup.set()
-            urgent = urgent or (queue.waiting and not queue.rescued)
-        if urgent and header.encoding == "h264":
+            some_wait = some_wait or (queue.waiting and not queue.rescued)
+        if some_wait and header.encoding == "h264":
             self._request.wake()
 
     def _skip(self, now: float) -> None:
@@ -119,12 +130,13 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
 
     async def _follow(self) -> None:
         robot = self.robot
-        await self._request.follow(robot, best("video", offered(robot.capabilities, "video"), self._can()))
+        encoding = best("video", offered(robot.capabilities, "video"), self._usable_encodings())
+        await self._request.follow(robot, encoding)
         if not self._request.problem:
             await self._help_viewers()
 
-    def _can(self) -> list[frozenset[str]]:
-        """Return the encodings that each viewer decodes, or those that this server converts if it decodes none."""
+    def _usable_encodings(self) -> list[frozenset[str]]:
+        """Return for each viewer the encodings that it decodes or, if it decodes none, that this server converts."""
         encodings = frozenset(BEST_FIRST["video"])
         converted = frozenset(name for name in encodings if not rescue.unavailable(name))
         return [viewer.queue.can & encodings or converted for viewer in self.viewers]
@@ -140,7 +152,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         wanted = assess(queues, self._arrivals.encoding, now, can_rescue=can_rescue)
         if can_rescue and any(queue.rescued for queue in queues):
             self._rescue.start(self._chain)
-            wanted = wanted or not self._chain  # it begins at a key frame, too
+            wanted = wanted or not self._chain  # without a chain, the rescue stream begins at the next key frame
         else:
             self._rescue.stop()
         if wanted and not changing:

@@ -12,14 +12,14 @@ from pebble.contract import CAMERA, MEDIA_STATUS
 from pebble.extensions.operator.client.broker import Broker
 from pebble.extensions.operator.client.media_request.offer import BEST_FIRST, refusal
 from pebble.extensions.page.media import rescue
-from pebble.extensions.page.media.picture_stream import PageViewer, PictureStream
+from pebble.extensions.page.media.picture_stream import KeyFrame, PageViewer, PictureStream
 from pebble.extensions.page.media.stream import Streams
 from pebble.extensions.page.robots import Robots
 
-_ANSWER: Final = struct.Struct(">IB")  # number of a frame, and what became of it
+_ANSWER: Final = struct.Struct(">IB")  # of a page: the number of a frame, and an answer of PictureStream
 _MOST_STILLS: Final = 200  # of cameras that rest; the oldest goes
 _FRESH_S: Final = 4.5  # of a camera that is on, no still is older: key frames come each 4 s
-_GLIMPSE_S: Final = 6.0  # until a camera sends a key frame
+_GLIMPSE_S: Final = 6.0  # so long a still is waited for
 _TURN_S: Final = 5.0  # until the next camera's turn
 
 
@@ -29,8 +29,8 @@ class MediaHub(Streams[PictureStream]):
     def __init__(self, broker: Broker, robots: Robots) -> None:
         super().__init__(CAMERA, lambda ref: PictureStream(broker, robots, ref))
         self._robots = robots
-        self._last: dict[str, tuple[bytes, float]] = {}  # key frames of streams that have ended
-        self._looking: dict[str, asyncio.Task[None]] = {}
+        self._last: dict[str, KeyFrame] = {}  # of streams that have ended
+        self._looking: dict[str, asyncio.Task[None]] = {}  # tasks that fetch a still
 
     async def serve(self, websocket: WebSocket, ref: str, can: frozenset[str]) -> None:
         """Send the pictures of ``ref`` to a page that decodes ``can``, until either end closes the socket."""
@@ -54,8 +54,10 @@ class MediaHub(Streams[PictureStream]):
         if is_on and not self._has_fresh(ref) and ref not in self._looking:
             self._looking[ref] = asyncio.create_task(self._glimpse(ref))
         key = self._key(ref)
-        jpeg = None if key is None else await asyncio.to_thread(rescue.newest_jpeg, [key[0]])
-        return None if key is None or jpeg is None else (jpeg, key[1])
+        if key is None:
+            return None
+        jpeg = await asyncio.to_thread(rescue.newest_jpeg, [key.payload])
+        return None if jpeg is None else (jpeg, key.received_at)
 
     async def look_in_turn(self) -> None:
         """Turn on one camera after another for a moment, while a page shows the fleet."""
@@ -67,13 +69,13 @@ class MediaHub(Streams[PictureStream]):
                     await self._glimpse(ref)
                     await asyncio.sleep(_TURN_S)
 
-    def _key(self, ref: str) -> tuple[bytes, float] | None:
+    def _key(self, ref: str) -> KeyFrame | None:
         stream = self.get(ref)
-        return (None if stream is None else stream.key) or self._last.get(ref)
+        return stream.key if stream is not None and stream.key is not None else self._last.get(ref)
 
     def _has_fresh(self, ref: str) -> bool:
         key = self._key(ref)
-        return key is not None and time.monotonic() - key[1] < _FRESH_S
+        return key is not None and time.monotonic() - key.received_at < _FRESH_S
 
     async def _glimpse(self, ref: str) -> None:
         """Request a robot's pictures, as a page would, until there is one."""
@@ -88,8 +90,9 @@ class MediaHub(Streams[PictureStream]):
             self._looking.pop(ref, None)
 
     def _forget(self, ref: str, task: asyncio.Task[None]) -> None:
+        """Keep the last key frame of a stream that has ended."""
         if (key := self._key(ref)) is not None:
-            self._last.pop(ref, None)
+            self._last.pop(ref, None)  # so that it is the newest in the table
             self._last[ref] = key
         if len(self._last) > _MOST_STILLS:
             del self._last[next(iter(self._last))]

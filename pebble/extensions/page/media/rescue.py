@@ -47,10 +47,6 @@ class RescueStream:
         self._fed = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
 
-    @property
-    def started(self) -> bool:
-        return self._task is not None
-
     def start(self, chain: Sequence[bytes]) -> None:
         """Start with ``chain``: the newest key frame and all pictures since."""
         if self._task is None:
@@ -63,7 +59,7 @@ class RescueStream:
         if self._task is None:
             return
         if keyframe or sum(map(len, self._pending)) > _MAX_WAITING_BYTES:
-            self._pending.clear()  # the decoder notices what is missing, and waits for a key frame
+            self._pending.clear()  # if differences are lost, the decoder notices that, and waits for a key frame
         self._pending.append(payload)
         self._fed.set()
 

@@ -25,7 +25,7 @@ from pebble.transports import QoS
 
 MAX_PAYLOAD: Final = 256 << 10  # bytes of one packet
 WINDOW: Final = 32  # packets sent and not acknowledged: what waits in a slow connection cannot be taken back
-MAX_PACKETS, MAX_BYTES = 10, 256 << 10  # that wait before it
+MAX_PACKETS, MAX_BYTES = 10, 256 << 10  # that wait to be sent
 _NAMES: Final = {Codec.OPUS: "opus", Codec.PCM16LE: "pcm"}
 _MAX_ANSWERS: Final = 8  # that wait for one page
 _HEAD: Final = struct.Struct(">BI")
@@ -37,7 +37,7 @@ NoteTalk = Callable[[str, Session, str, str], None]  # component, session, devic
 
 
 class SoundQueue:
-    """The packets that wait for one page; a newer one replaces the oldest. Pure."""
+    """The packets that wait for one page; if there are too many, the oldest goes. Pure."""
 
     def __init__(self) -> None:
         self._queue: deque[bytes] = deque()
@@ -71,11 +71,11 @@ class SoundPage:
         self.queue = SoundQueue()
         self.answers: deque[TalkAnswer] = deque(maxlen=_MAX_ANSWERS)
         self.wakeup = asyncio.Event()
-        self.over = -1  # its newest talk that has ended, or was refused
+        self.last_ended = -1  # its newest talk that has ended, or was refused
 
     def answer(self, talk: int, *, on: bool, why: str = "") -> None:
         if not on:
-            self.over = max(self.over, talk)
+            self.last_ended = max(self.last_ended, talk)
         self.answers.append(TalkAnswer(talk=talk, on=on, why=why))
         self.wakeup.set()
 
@@ -109,10 +109,8 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
     def receive_voice(self, page: SoundPage, talk: int, piece: int, sound: bytes) -> None:
         """Handle 20 ms of a page's voice. The first piece begins a talk, if that is allowed."""
         now = time.monotonic()
-        if talk <= page.over:
-            return
-        self._release(now)
-        if talk <= page.over:
+        self._end_silent_talk(now)  # perhaps this one
+        if talk <= page.last_ended:
             return
         if self._talk is None or page is not self._talker or talk != self._talk.number:
             if why := self._why_not(page):
@@ -126,19 +124,20 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
                 self._interrupt("The server cannot reach the broker")
 
     def end_talk(self, page: SoundPage, talk: int) -> None:
-        page.over = max(page.over, talk)
+        page.last_ended = max(page.last_ended, talk)
         if self._talk is not None and talk == self._talk.number:
             self._end_talk(page)
 
     def _begin(self, page: SoundPage, talk: int, now: float) -> None:
         self._talk, self._talker = Talk(talk, now), page
-        page.over = talk - 1
+        page.last_ended = talk - 1
         self._voice.begin(time.time())
         page.answer(talk, on=True)
         self._note_talk(self.ref, page.session, page.device, page.address)
         self._request.wake()
 
     def _why_not(self, page: SoundPage) -> str:
+        """Return why the page may not talk now; empty if it may."""
         if "drive" not in page_rights(page.session.role):
             return f"The role {page.session.role} may not do this"
         if self._talker is not None and self._talker is not page:
@@ -156,7 +155,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
             return f"The connection of {robot.name} is too slow for a voice"
         return ""
 
-    def _release(self, now: float) -> None:
+    def _end_silent_talk(self, now: float) -> None:
         """End a talk whose page has stopped sending."""
         if self._talk is not None and self._talk.is_over(now):
             self._interrupt(f"No sound came in time for {SILENT_S:g} s")
@@ -169,20 +168,22 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
 
     def _end_talk(self, page: SoundPage) -> None:
         if page is self._talker and self._talk is not None:
-            page.over = max(page.over, self._talk.number)
+            page.last_ended = max(page.last_ended, self._talk.number)
             self._talk = self._talker = None
             self._request.wake()
 
     # -- requests, and what pages are shown
 
     async def _follow(self) -> None:
-        self._release(time.monotonic())
+        self._end_silent_talk(time.monotonic())
         robot = self.robot
         if why := refusal(self.ref, robot.capabilities, "audio") or self._unheard():
             self._interrupt(why)
-        await self._request.follow(robot, best("audio", offered(robot.capabilities, "audio"), self._listening()))
+        encoding = best("audio", offered(robot.capabilities, "audio"), self._listeners_encodings())
+        await self._request.follow(robot, encoding)
 
-    def _listening(self) -> list[frozenset[str]]:
+    def _listeners_encodings(self) -> list[frozenset[str]]:
+        """Return the encodings that each listener plays. Pages that only talk are no listeners."""
         return [viewer.can for viewer in self.viewers if viewer.can]
 
     def _make_view(self, state: str, why: str, _rate: float, _kbits: float) -> SoundView:
@@ -190,14 +191,14 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
             state=state,
             why=why,
             encoding=self._arrivals.encoding,
-            listeners=len(self._listening()),
+            listeners=len(self._listeners_encodings()),
             talker="" if self._talker is None else self._talker.session.user,
         )
 
     def _problem(self) -> str:
-        listening = self._listening()
-        lacking = sum(self._arrivals.encoding not in can for can in listening)
-        return f"{lacking} of {len(listening)} browsers cannot play {self._arrivals.encoding}" if lacking else ""
+        encodings, arriving = self._listeners_encodings(), self._arrivals.encoding
+        lacking = sum(arriving not in playable for playable in encodings)
+        return f"{lacking} of {len(encodings)} browsers cannot play {arriving}" if lacking else ""
 
 
 class SoundHub(Streams[SoundStream]):
@@ -226,6 +227,7 @@ def _encoding(payload: bytes) -> str:
 
 
 async def _send(websocket: WebSocket, page: SoundPage) -> None:
+    """Send answers and packets in turn, and wait while there is neither, until the socket is closed."""
     try:
         while True:
             payload = page.queue.take()

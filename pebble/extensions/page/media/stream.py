@@ -23,8 +23,7 @@ from pebble.extensions.page.robots import Robots
 log = logging.getLogger(__name__)
 
 _WHAT: Final[dict[Medium, str]] = {"video": "picture", "audio": "sound"}
-_SILENT_S: Final = 2.0
-_SILENT_PERIODS: Final = 3.0
+_SILENT_S, _SILENT_PERIODS = 2.0, 3.0  # see Arrivals.flowing
 _GONE, _BAD_REQUEST = 1001, 4400  # codes of a closed socket
 
 ViewerT = TypeVar("ViewerT")
@@ -41,20 +40,22 @@ class Arrivals:
 
     def add(self, encoding: str, size: int, now: float) -> bool:
         """Note a payload; return True if its encoding differs from the previous one."""
-        begins = self._newest_at is None or encoding != self.encoding
+        is_new_encoding = self._newest_at is None or encoding != self.encoding
         self.meter.add(now, size)
         self._newest_at, self.encoding = now, encoding
-        return begins
+        return is_new_encoding
 
     def quiet_s(self, now: float) -> float | None:
         """Return for how long nothing has arrived; None if nothing ever has."""
         return None if self._newest_at is None else now - self._newest_at
 
     def flowing(self, now: float) -> bool:
+        """True if payloads arrive: a silence counts after 2 s or, if they are rare, after three of their periods."""
         if self._newest_at is None:
             return False
         rate = self.meter.rate(self._newest_at)
-        return now - self._newest_at <= max(_SILENT_S, _SILENT_PERIODS / rate if rate else 0.0)
+        silence_s = max(_SILENT_S, _SILENT_PERIODS / rate) if rate else _SILENT_S
+        return now - self._newest_at <= silence_s
 
 
 class MediaStream(ABC, Generic[ViewerT, ViewT]):
@@ -64,7 +65,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
     """
 
     def __init__(self, broker: Broker, robots: Robots, ref: str, medium: Medium, metric: str, view: ViewT) -> None:
-        """Store the arguments. Pages show the state ``metric``; ``view`` is its value at rest, which they have."""
+        """Store the arguments. Pages show the state ``metric``; ``view`` is its value while nothing is requested."""
         self.ref = ref
         self.viewers: set[ViewerT] = set()
         self.view = self._at_rest = view  # as shown last
@@ -148,6 +149,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
             self._robots.set_server_metric(self.ref, self._metric, view)
 
     def _state(self, now: float) -> tuple[str, str]:
+        """Return the medium's state, and why it is no better, for people."""
         if self._request.problem:
             return "refused", self._request.problem
         if self._arrivals.flowing(now):

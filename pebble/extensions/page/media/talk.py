@@ -10,7 +10,7 @@ SAMPLES: Final = RATE // PIECES_PER_S
 PIECE_BYTES: Final = 2 * SAMPLES
 SILENT_S: Final = 1.0  # without a piece that is in time, after which a talk is over
 LATE_S: Final = 0.3  # what a stalled connection has held back longer than that is not played
-_DRIFT_S: Final = 2e-5  # a piece: the clock of a page's microphone may be slow by a thousandth
+_DRIFT_S: Final = 2e-5  # in each piece: the clock of a page's microphone may be slow by a thousandth
 
 
 class Talk:
@@ -19,13 +19,13 @@ class Talk:
     def __init__(self, number: int, now: float) -> None:
         self.number = number  # of that page's connection
         self._received_at = now  # of the last piece that was in time
-        self._least = float("inf")  # the smallest lateness of its pieces
+        self._begun_at = float("inf")  # when the page spoke piece 0, as the fastest of its pieces shows
 
     def takes(self, piece: int, now: float) -> bool:
         """True if this piece, counted from 0 by the page's microphone, arrives in time."""
-        late = now - piece / PIECES_PER_S
-        self._least = min(self._least + _DRIFT_S, late)
-        if late - self._least > LATE_S:
+        begun_at = now - piece / PIECES_PER_S  # as if this piece had not been delayed
+        self._begun_at = min(self._begun_at + _DRIFT_S, begun_at)
+        if begun_at - self._begun_at > LATE_S:
             return False
         self._received_at = now
         return True

@@ -16,8 +16,8 @@ from pebble.errors import PebbleError
 from pebble.extensions.recordings.seek import questions
 
 MOST_WAITING: Final = 64  # questions
-_END_S: Final = 2.0
-SILENT_S: Final = 300.0  # after a sign of life of a job
+_END_S: Final = 2.0  # so long the end of a killed process is waited for
+SILENT_S: Final = 300.0  # a job that has shown no sign of life for so long is ended
 
 AnswerT = TypeVar("AnswerT")
 
@@ -85,13 +85,13 @@ class Job:
         self.ready = False
         self.why = ""  # it failed
         self.unread = ""  # it is ready, but this could not be read
-        answers, theirs = multiprocessing.Pipe(duplex=False)
-        self._process = _spawn().Process(target=function, args=(theirs, *arguments), daemon=True)
+        answers, job_end = multiprocessing.Pipe(duplex=False)
+        self._process = _spawn().Process(target=function, args=(job_end, *arguments), daemon=True)
         try:
             self._process.start()
         except OSError as error:
             self.why = f"no process could be started: {error.strerror or error}"
-        theirs.close()
+        job_end.close()  # here: answers then ends with the process
         self._task = asyncio.create_task(self._follow(answers))
 
     @property
@@ -103,6 +103,7 @@ class Job:
         await asyncio.gather(self._task, return_exceptions=True)
 
     async def _follow(self, answers: Connection) -> None:
+        """Take the job's answers until it is ready, has failed, or is silent for too long; then end its process."""
         loop, readable = asyncio.get_running_loop(), asyncio.Event()
         loop.add_reader(answers.fileno(), readable.set)
         try:
@@ -124,6 +125,7 @@ class Job:
                 await asyncio.to_thread(self._process.join, _END_S)
 
     def _take(self, what: str, value: Any) -> None:
+        """Handle an answer of the job: its share of the work ("done"), its end, or why it failed."""
         if what == "done":
             self.done = value
         elif what == "ready":

@@ -41,7 +41,7 @@ TEXT, BINARY = 0, 1
 MEDIUM: Final = struct.Struct(">Bd")  # what a binary message is, and when it was received, in epoch milliseconds
 FOR_DECODER, PICTURE, SOUND = range(3)  # the first is not shown: later pictures build on it
 _NICE: Final = 10  # driving comes first
-_STEP_NS: Final = 10**9  # that is read at once
+_STEP_NS: Final = 10**9  # of a recording, that is read at once
 _GAP_NS: Final = 2 * 10**9  # a longer time without messages is left out
 _FLUSH_S: Final = 0.05
 _PLAYED_S: Final = 0.25  # between two messages about where it is
@@ -81,8 +81,9 @@ class Link:
         self._write(BINARY, MEDIUM.pack(what, at_ms) + payload)
 
     def read(self, seconds: float) -> list[m.FromReplay]:
-        """Return the page's messages that arrive in time. Raises EOFError once the page is gone."""
-        if not select.select([self._connection], [], [], seconds)[0]:
+        """Return the page's messages that arrive within ``seconds``. Raises EOFError once the page is gone."""
+        readable, _, _ = select.select([self._connection], [], [], seconds)
+        if not readable:
             return []
         data = self._connection.recv(1 << 16)
         if not data:
@@ -122,8 +123,8 @@ class RobotSource:
 
     def state_before(self, at_ns: int, _publishes: object) -> list[Recorded]:
         """Return each topic's newest value, the last log lines, and the pictures since a key frame."""
-        archive, log = self._archive, LOGS.topic(self._ref)
-        state = [message for message in archive.state(self._ref, at_ns + 1) if message.channel.topic != log]
+        archive, log_topic = self._archive, LOGS.topic(self._ref)
+        state = [message for message in archive.state(self._ref, at_ns + 1) if message.channel.topic != log_topic]
         pictures = archive.pictures(self._ref, at_ns + 1)
         self._begins(at_ns, pictures[-1] if pictures else None)
         return [*state, *archive.log_lines(self._ref, at_ns + 1), *pictures]
@@ -133,7 +134,7 @@ class PlayedRobot:
     """A recorded robot in the form for a page: the output of its player."""
 
     def __init__(self, link: Link, archive: Archive, ref: str, at_ns: int) -> None:
-        self.sent = self.skipped = 0
+        self.sent = self.skipped = 0  # as the player wants of an output; they are not counted
         self.moves = False
         self._newest_ns = at_ns  # of what was sent
         self.player = Player(
@@ -163,7 +164,8 @@ class PlayedRobot:
             self._take_medium(message)
         elif metric == LOGS.metric:
             line = line_of(message.payload)
-            self._lines += () if line is None else (line,)
+            if line is not None:
+                self._lines.append(line)
         elif not message.payload:
             self._values[metric] = None, at_ns / 1e6
         else:
@@ -176,10 +178,11 @@ class PlayedRobot:
     # -- what the page asks for
 
     def _wait(self, seconds: float) -> None:
+        """Send what is due, then wait for the page's requests, and handle them. The player calls this."""
         self._flush(time.monotonic())
         ops = self._link.read(seconds)
         seeks = [op for op in ops if isinstance(op, m.Seek)]
-        if seeks:  # of several only the last one is wanted
+        if seeks:  # the page wants only the last of several
             self.player.seek(_ns(seeks[-1].at))
         for op in ops:
             if isinstance(op, m.Play):
@@ -194,9 +197,11 @@ class PlayedRobot:
     def _begin(self, at_ns: int, picture: Recorded | None) -> None:
         """Start again at another time after a seek."""
         self._picture, self._newest_ns = picture, at_ns
-        self._values: dict[str, tuple[Any, float]] = {}
-        self._lines: list[msgspec.Raw] = []
-        self._line, self._is_new, self._rested = 1, True, False
+        self._values: dict[str, tuple[Any, float]] = {}  # to be sent, by metric: the value, and when it came in ms
+        self._lines: list[msgspec.Raw] = []  # to be sent
+        self._next_line = 1  # the number of the first of them
+        self._is_new = True  # nothing was sent since the seek
+        self._rested = False  # the page was told that the player rests
         self._robot = RobotView(self._ref)
         self._flushed_at = self._played_at = self._liveness_at = self._pictured_at = float("-inf")
         player = self.player
@@ -224,16 +229,17 @@ class PlayedRobot:
             self._values["web/liveness"] = liveness_of(self._robot, position_ms / 1e3), position_ms
         if self._values or self._is_new:
             self._is_new = False
-            values = ((self._ref, metric, raw, position_ms - at) for metric, (raw, at) in self._values.items())
+            values = ((self._ref, metric, raw, position_ms - at_ms) for metric, (raw, at_ms) in self._values.items())
             self._link.write(m.State(now=position_ms, set=tuple(values)))
             self._values = {}
         if self._lines:
             lines = tuple(self._lines)
-            self._link.write(m.Logs(ref=self._ref, origin="recording", first=self._line, lines=lines))
-            self._line += len(lines)
+            self._link.write(m.Logs(ref=self._ref, origin="recording", first=self._next_line, lines=lines))
+            self._next_line += len(lines)
             self._lines = []
 
     def _take_value(self, metric: str, message: Recorded) -> None:
+        """Keep a value for the next flush, in the form for pages."""
         payload, received = message.payload, message.log_ns / 1e9
         if metric == c.CAPABILITIES.metric:
             payload = harmless(payload, self._ref, self._replayed)
@@ -247,15 +253,19 @@ class PlayedRobot:
         self._values[metric] = msgspec.Raw(payload), received * 1e3
 
     def _take_medium(self, message: Recorded) -> None:
+        """Send sound that is played at its speed, and every picture; those that are not shown only for the decoder."""
         payload, at_ms, now = message.payload, message.log_ns / 1e6, time.monotonic()
         if not is_picture(payload):
             if self.player.speed == 1 and not self.player.paused:
                 self._link.write_medium(SOUND, at_ms, payload)
             return
-        before = self._picture is not None and message.log_ns <= self._picture.log_ns
-        shown = message is self._picture if before else now - self._pictured_at >= _PICTURE_S
-        self._pictured_at = now if shown else self._pictured_at
-        self._link.write_medium(PICTURE if shown else FOR_DECODER, at_ms, payload)
+        if self._picture is not None and message.log_ns <= self._picture.log_ns:  # one of those that lead to it
+            is_shown = message is self._picture
+        else:
+            is_shown = now - self._pictured_at >= _PICTURE_S
+        if is_shown:
+            self._pictured_at = now
+        self._link.write_medium(PICTURE if is_shown else FOR_DECODER, at_ms, payload)
 
 
 def _ns(ms: float) -> int:

@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 import msgspec
 from msgspec import Meta, Struct
@@ -48,20 +48,21 @@ _export_decoder = msgspec.json.Decoder(ExportRequest)
 
 @dataclass(slots=True)
 class _Timeline:
-    """A timeline and the job that makes it. ``made``: JSON, that of an earlier job while this one runs."""
+    """A timeline and the job that makes it."""
 
-    paths: list[str]
-    active: bool
+    paths: list[str]  # of its recordings
+    active: bool  # one of them was still being written
     target: Path
     job: Job
     began_at: float  # seconds since the machine was started
-    made: bytes | None = None
+    json_text: bytes | None = None  # while the job runs, that of an earlier job
 
     def newest(self) -> bytes | None:
+        """Return the timeline as JSON, if this or an earlier job has made it."""
         if self.job.ready and self.target.exists():
-            self.made = self.target.read_bytes()
+            self.json_text = self.target.read_bytes()
             self.target.unlink()
-        return self.made
+        return self.json_text
 
 
 @dataclass(slots=True)
@@ -98,8 +99,7 @@ class Recordings:
         self.process.close()
         for timeline in self._timelines.values():
             await timeline.job.end()
-        if self._export is not None:
-            await self._export.job.end()
+        await self.end_export()
         self._scratch.cleanup()
 
     async def timeline(self, day: str, robot: str, *, again: bool = False) -> bytes | float:
@@ -164,6 +164,7 @@ class Recordings:
         return self.scratch / name
 
     def _is_old(self, timeline: _Timeline, paths: list[str], *, active: bool, again: bool) -> bool:
+        """True if the timeline must be made again from the present recordings."""
         if timeline.job.running:
             return False
         if timeline.job.why:
@@ -179,6 +180,7 @@ class Recordings:
 
 
 def _period_of(day: str) -> tuple[int, int]:
+    """Return the begin and end of a day in UTC, in epoch nanoseconds."""
     try:
         begin = datetime.strptime(day, "%Y-%m-%d").replace(tzinfo=UTC)
         end = begin + timedelta(days=1)
@@ -241,9 +243,10 @@ async def _begin_export(request: Request, recordings: Recordings) -> Response:
         raise BadQuestionError(str(error)) from None
     number = await recordings.export(wanted)
     session = login.session_of(request)
-    user, address = "" if session is None else session.user, "" if request.client is None else request.client.host
+    user = "" if session is None else session.user
     detail = f"{wanted.form}, {round((wanted.until - wanted.since) / 1000)} s from {round(wanted.since / 1000)}"
-    request.app.state.audit.write("export", ref=wanted.robot, user=user, address=address, detail=detail)
+    audit = request.app.state.audit
+    audit.write("export", ref=wanted.robot, user=user, address=login.address_of(request), detail=detail)
     return JSONResponse({"id": number}, 202)
 
 
@@ -251,7 +254,9 @@ async def _export(request: Request, recordings: Recordings) -> Response:
     export = recordings.export_of(request.path_params["id"])
     if export is None:
         return PlainTextResponse("there is no such export", 404)
-    state = "running" if export.job.running else "ready" if export.job.ready else "failed"
+    state = "ready" if export.job.ready else "failed"
+    if export.job.running:
+        state = "running"
     size = export.target.stat().st_size if state == "ready" else 0
     why = export.job.why or export.job.unread
     return JSONResponse({"state": state, "done": export.job.done, "why": why, "name": export.name, "bytes": size})
@@ -277,7 +282,14 @@ def _json(data: bytes) -> Response:
 
 def robot_and_time(connection: HTTPConnection) -> tuple[str, float]:
     """Return the robot and the time that a page asks for. Raises BadQuestionError."""
-    return _robot(connection), _number(connection, "at", _LATEST_MS)
+    robot = _robot(connection)
+    try:
+        at_ms = float(connection.query_params.get("at", ""))
+    except ValueError:
+        at_ms = math.nan
+    if not 0 <= at_ms <= _LATEST_MS:
+        raise BadQuestionError(f"at: a number from 0 to {_LATEST_MS:g} is needed")
+    return robot, at_ms
 
 
 def _robot(request: HTTPConnection) -> str:
@@ -287,14 +299,3 @@ def _robot(request: HTTPConnection) -> str:
         return Identity(*levels).base
     except (TypeError, ValueError, PebbleError):
         raise BadQuestionError(f'robot: "{text[:100]}" is none: write system/type/id') from None
-
-
-def _number(request: HTTPConnection, name: str, most: float) -> float:
-    text: Any = request.query_params.get(name)
-    try:
-        value = float(text)
-    except (TypeError, ValueError):
-        value = math.nan
-    if not 0 <= value <= most:
-        raise BadQuestionError(f"{name}: a number from 0 to {most:g} is needed")
-    return value

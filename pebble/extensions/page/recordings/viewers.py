@@ -53,8 +53,8 @@ async def _relay(websocket: WebSocket, link: socket.socket) -> None:
     reader, writer = await asyncio.open_unix_connection(sock=link)
     tasks = {asyncio.create_task(_send(websocket, reader)), asyncio.create_task(_receive(websocket, writer))}
     try:
-        (ended, *_), _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        await _close(websocket, ended.result())
+        ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        await _close(websocket, next(iter(ended)).result())
     finally:
         for task in tasks:
             task.cancel()

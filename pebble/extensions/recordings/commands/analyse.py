@@ -68,8 +68,9 @@ def analyse(
             indexed = sources(places, scratch, progress)
         for line in indexed.unread:
             typer.echo(f"pebble: {shown(line)}", err=True)
-        for base in () if indexed.unread else bases:
-            check_name("robot", base, indexed.robots, places)
+        if not indexed.unread:
+            for base in bases:
+                check_name("robot", base, indexed.robots, places)
         traffic = analyse_traffic(
             indexed, scratch, since_ns=since_ns, until_ns=until_ns, robots=bases, progress=progress
         )

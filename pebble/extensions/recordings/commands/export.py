@@ -26,7 +26,7 @@ from pebble.extensions.recordings.exports.unfinished import unfinished
 from pebble.extensions.recordings.files.recorded import Recorded
 from pebble.extensions.recordings.files.rewrite import Copy, write_copy
 from pebble.extensions.recordings.files.writer import RecordingWriter
-from pebble.extensions.recordings.library import Damages, files, merged, problems
+from pebble.extensions.recordings.library import Damages, files, merged, problems, reported
 
 
 class Form(StrEnum):
@@ -40,13 +40,7 @@ class Form(StrEnum):
     MCAP = "mcap"
 
 
-_BY_SUFFIX = {
-    ".jsonl": Form.LINES,
-    ".mkv": Form.MKV,
-    ".mp4": Form.MP4,
-    ".wav": Form.WAV,
-    ".mcap": Form.MCAP,
-}
+_BY_SUFFIX = {".jsonl": Form.LINES} | {f".{form}": form for form in (Form.MKV, Form.MP4, Form.WAV, Form.MCAP)}
 
 
 def export(
@@ -104,35 +98,36 @@ def import_(
 def _export(
     form: Form, read: Callable[[], Iterable[Recorded]], target: Path, robot: str, on_time: Callable[[int], None]
 ) -> str:
-    if form is Form.FOXGLOVE:
-        counts = write_foxglove(read(), target, on_time=on_time)
-        return f"{target}: " + ", ".join(f"{count:,} {name}" for name, count in counts.items())
+    """Write the export; return what it contains, in words."""
     if form in (Form.MKV, Form.MP4):
         film = write_film(read, target, robot, on_time=on_time)
         sound = "no sound" if film.sound is None else f"{show.duration(film.sound.seconds)} of sound"
         lost = f", {film.left_out:,} pictures that cannot be decoded left out" if film.left_out else ""
         return f"{target}: {show.duration(film.seconds)}, {film.pictures:,} pictures, {sound}{lost}"
+    messages = reported(read(), on_time)
+    if form is Form.FOXGLOVE:
+        counts = write_foxglove(messages, target)
+        return f"{target}: " + ", ".join(f"{count:,} {name}" for name, count in counts.items())
     if form is Form.WAV:
-        return f"{target}: {show.duration(write_wav(read(), target, robot, on_time=on_time).seconds)} of sound"
+        return f"{target}: {show.duration(write_wav(messages, target, robot).seconds)} of sound"
     with unfinished(target) as path, path.open("wb") as out:
-        if form is Form.LINES:
-            count = write_lines(read(), out, on_time=on_time)
-        else:
-            count = write_copy(read(), out, on_time=on_time)
+        count = write_lines(messages, out) if form is Form.LINES else write_copy(messages, out)
     return f"{target}: {count:,} messages"
 
 
-def _import(found: Iterable[Recorded | BadLine], copy: Copy) -> Counter[str]:
+def _import(lines: Iterable[Recorded | BadLine], copy: Copy) -> Counter[str]:
+    """Add the messages of the lines to a recording; return how many there were, bad lines and cut payloads."""
     counted = Counter[str]()
-    for item in found:
-        if isinstance(item, BadLine):
+    for line in lines:
+        if isinstance(line, BadLine):
             counted["bad"] += 1
             if counted["bad"] <= 3:
-                typer.echo(f"pebble: line {item.number}: {shown(item.problem)}", err=True)
+                typer.echo(f"pebble: line {line.number}: {shown(line.problem)}", err=True)
             continue
-        copy.add(item)
+        copy.add(line)
         counted["messages"] += 1
-        counted["truncated"] += TRUNCATED in item.channel.metadata
+        if TRUNCATED in line.channel.metadata:
+            counted["truncated"] += 1
     return counted
 
 

@@ -15,11 +15,11 @@ from pebble.extensions.recordings.commands.options import RobotOption, Since, Un
 from pebble.extensions.recordings.commands.progress import progress
 from pebble.extensions.recordings.commands.report import errors_of_files, period_words, report_left, report_unread
 from pebble.extensions.recordings.files.reader import RecordingFile
-from pebble.extensions.recordings.files.recorded import Recorded, RecordingError
+from pebble.extensions.recordings.files.recorded import Recorded, RecordingError, finished_path
 from pebble.extensions.recordings.files.rewrite import Keeps, rewrite
 from pebble.extensions.recordings.library import ACTIVE, FOREVER_NS, SUFFIX, files, robot_of
 from pebble.extensions.recordings.recorder.finisher import mend as mend_leftover
-from pebble.extensions.recordings.recorder.folder import DAMAGED, Folder, finished_path
+from pebble.extensions.recordings.recorder.folder import DAMAGED, Folder
 from pebble.extensions.recordings.traffic.index import index_path
 from pebble.runtime.as_owner import as_owner
 
@@ -53,36 +53,41 @@ def rm(
 
     A file that cannot be read completely stays as it is. One that is named is deleted, whatever is in it.
     """
-    if not folder.is_dir() and robot is None and since is None and until is None:
+    if robot is None and since is None and until is None:
+        if folder.is_dir():
+            raise PebbleError("what to delete is missing: name --robot, --since or --until")
         with as_owner(folder.parent):
             return _delete_whole(folder, yes=yes)
-    if robot is None and since is None and until is None:
-        raise PebbleError("what to delete is missing: name --robot, --since or --until")
     since_ns, until_ns = period(since, until)
     base = None if robot is None else base_of(robot)
 
     def keeps(message: Recorded) -> bool:
-        inside = since_ns <= message.log_ns < until_ns
-        return not inside or (base is not None and robot_of(message.channel) != base)
+        is_inside = since_ns <= message.log_ns < until_ns
+        return not is_inside or (base is not None and robot_of(message.channel.topic) != base)
 
-    owner = Folder(_existing(folder))
+    if not folder.is_dir():
+        raise PebbleError(f"{folder}: there is no such folder")
+    owner = Folder(folder)
     with as_owner(folder), owner.taken():  # a recorder would write retained values again
         return _rm(owner, base, (since_ns, until_ns), keeps, yes=yes)
 
 
 def _rm(owner: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keeps, *, yes: bool) -> int:
-    entries, folder = owner.entries(), owner.root
-    unsure = sum(
-        report_left(f"{entry.path}: is not finished, or damaged") for entry in entries if not entry.is_finished
-    )
-    finished = [entry.path for entry in entries if entry.is_finished]
+    """Delete what ``keeps`` does not accept from a recorder's files, which must be locked; return the exit code."""
+    finished, unsure = list[Path](), 0  # unsure: files that stay, and may hold something to delete
+    for entry in owner.entries():
+        if entry.is_finished:
+            finished.append(entry.path)
+        else:
+            report_left(f"{entry.path}: is not finished, or damaged")
+            unsure += 1
     if not unsure:
-        check_names(Query(base), finished, [folder])
+        check_names(Query(base), finished, [owner.root])
     due = [path for path in finished if _reaches_into(path, *period_ns)]
     what = f"{shown(base)} " if base else "everything "
     if period_ns != (0, FOREVER_NS):
         typer.echo(f"{what}{period_words(*period_ns)}")
-    if not yes and not typer.confirm(f"Delete {what}from {len(due)} files in {folder}?"):
+    if not yes and not typer.confirm(f"Delete {what}from {len(due)} files in {owner.root}?"):
         return 1
     deleted = 0
     with progress("deleting", len(due)) as advance:
@@ -90,7 +95,8 @@ def _rm(owner: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keep
             try:
                 copy = rewrite(path, path, keeps=keeps)
             except (PebbleError, OSError) as error:
-                unsure += report_left(error)
+                report_left(error)
+                unsure += 1
                 continue
             if copy.left_out:
                 deleted += copy.left_out
@@ -145,21 +151,17 @@ def _mend_file(source: Path, target: Path | None) -> int:
 
 
 def _mend_all(folder: Folder) -> int:
+    """Finish the files that a killed recorder left; return the exit code."""
     unfinished, failed = [entry.path for entry in folder.entries() if entry.is_active], False
     for path in unfinished:
         try:
             copy = mend_leftover(path)
         except (PebbleError, OSError) as error:
-            failed |= bool(report_left(f"{path.name}: {error}"))
+            report_left(f"{path.name}: {error}")
+            failed = True
             continue
-        failed |= not copy.is_whole
+        failed = failed or not copy.is_whole
         typer.echo(f"{finished_path(path).name}: {copy.messages:,} messages, {copy.missing:,} missing")
     if not unfinished:
         typer.echo("nothing to mend")
     return 1 if failed else 0
-
-
-def _existing(folder: Path) -> Path:
-    if not folder.is_dir():
-        raise PebbleError(f"{folder}: there is no such folder")
-    return folder

@@ -16,7 +16,7 @@ from pebble.extensions.recordings.commands.options import RecordingsArgument, Ro
 from pebble.extensions.recordings.commands.progress import progress
 from pebble.extensions.recordings.commands.report import local_time, one_line, report_unread
 from pebble.extensions.recordings.files.recorded import RecordingError
-from pebble.extensions.recordings.library import Damages, files, merged, problems, robot_in
+from pebble.extensions.recordings.library import Damages, files, merged, problems, robot_of
 from pebble.extensions.recordings.recorder.folder import MEDIA, NAME
 
 _SHOWN_TOPICS = 30  # of one recording; the rest is counted
@@ -43,27 +43,27 @@ def list_(places: RecordingsArgument, since: Since = None, until: Until = None, 
 def info(places: RecordingsArgument, since: Since = None, until: Until = None, check: Check = False) -> int:
     """Show robots, topics, and what happened to the recording."""
     looked, unread = _looked_at(places, since, until, check=check, inside=True)
-    topics, sizes = Counter[str](), sum(info.size for info in looked)
+    topics = Counter[str]()
     for info in looked:
         topics.update(info.topics)
-    messages = sum(info.messages for info in looked)
-    times = [info for info in looked if info.messages]
-    if times:
-        begin, end = min(info.first_ns for info in times), max(info.last_ns for info in times)
+    messages, size = sum(info.messages for info in looked), sum(info.size for info in looked)
+    filled = [info for info in looked if info.messages]
+    if filled:
+        begin, end = min(info.first_ns for info in filled), max(info.last_ns for info in filled)
         typer.echo(f"{local_time(begin)} to {local_time(end)} ({show.duration((end - begin) / 1e9)})")
-    typer.echo(f"{messages:,} messages, {show.size(sizes)} in {len(looked)} files")
+    typer.echo(f"{messages:,} messages, {show.size(size)} in {len(looked)} files")
     missing = sum(info.missing for info in looked)
     if missing:
         typer.echo(f"{missing:,} messages are missing: files were damaged")
     for robot in sorted(set().union(*(info.robots for info in looked))):
-        counts = Counter({topic[len(robot) + 1 :]: n for topic, n in topics.items() if robot_in(topic) == robot})
+        counts = Counter({topic[len(robot) + 1 :]: n for topic, n in topics.items() if robot_of(topic) == robot})
         typer.echo(f"\n{one_line(shown(robot))}: {counts.total():,} messages")
         _print_topics(counts)
-    noted = (topic for topic in topics if robot_in(topic) is None and not topic.startswith("$recorder/"))
-    others = Counter({topic: topics[topic] for topic in noted})
-    if others:
-        typer.echo(f"\nTopics that are of no robot: {others.total():,} messages")
-    _print_topics(others)
+    no_robots = (topic for topic in topics if robot_of(topic) is None and not topic.startswith("$recorder/"))
+    counts = Counter({topic: topics[topic] for topic in no_robots})
+    if counts:
+        typer.echo(f"\nTopics that are of no robot: {counts.total():,} messages")
+    _print_topics(counts)
     _print_events(info.path for info in looked if info.readable)
     return report_unread(unread)
 
@@ -112,14 +112,14 @@ def _looked_at(
     ``inside``: count only messages of the period, for which files that reach beyond it are read.
     """
     since_ns, until_ns = period(since, until)
-    counted_ns = {"since_ns": since_ns, "until_ns": until_ns} if inside else {}
+    counted_period = {"since_ns": since_ns, "until_ns": until_ns} if inside else {}
     paths = files(places)
     looked, unread = [], []
     size = sum(path.stat().st_size for path in paths if path.exists())
     with progress("reading", len(paths)) as advance:
         for number, path in enumerate(paths, 1):
             try:
-                info = catalogue.look_at(path, whole=check or size <= _CHECKED, **counted_ns)
+                info = catalogue.look_at(path, whole=check or size <= _CHECKED, **counted_period)
             except RecordingError as error:
                 if not path.exists():  # finished, renamed or deleted meanwhile
                     continue
@@ -149,7 +149,9 @@ def _state(info: FileInfo) -> str:
         return f"{info.missing:,} missing"
     if not info.readable:
         return "cannot be read"
-    return "damaged" if info.damaged or info.problem else "" if info.finished else "unfinished"
+    if info.damaged or info.problem:
+        return "damaged"
+    return "" if info.finished else "unfinished"
 
 
 def _print_events(paths: Iterable[Path]) -> None:

@@ -47,12 +47,15 @@ def progress(what: str, total: int) -> Iterator[Callable[[float], None]]:
 
 @contextmanager
 def progress_of_time(paths: list[Path], since_ns: int, until_ns: int) -> Iterator[Callable[[int], None]]:
-    first, last = [], [0]
+    """Yield a function that reports the time of the message that is being exported."""
+    first_ns, last_ns = [], [0]
     for path in paths:
         with RecordingFile(path) as file:
-            first += [file.first_ns] if file.chunks else []
-            last += [file.last_ns] if file.damage.finished else []
-    begin = max(since_ns, min(first, default=0))
-    end = min(until_ns, max(last))
+            if file.chunks:
+                first_ns.append(file.first_ns)
+            if file.damage.finished:
+                last_ns.append(file.last_ns)
+    begin = max(since_ns, min(first_ns, default=0))
+    end = min(until_ns, max(last_ns))
     with progress("exporting", end - begin) as advance:
         yield lambda log_ns: advance(log_ns - begin)

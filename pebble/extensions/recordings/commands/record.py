@@ -67,7 +67,8 @@ def record(
         media=media,
     )
     kind, transport, names, where = resolve(target)
-    chosen = tuple(filters) if filters else (f"{names.base}/#",) if target.config is not None else EVERYTHING
+    default = EVERYTHING if target.config is None else (f"{names.base}/#",)
+    chosen = tuple(filters) if filters else default
     for filter_ in chosen:
         check_filter(filter_)
     recorder = Recorder(into, options, {"filters": " ".join(chosen)})
@@ -128,16 +129,14 @@ def _serve(recorder: Recorder, source: Source, ends_at: float | None) -> None:
 
 def _line(recorder: Recorder, source: Source, seconds_: float) -> str:
     counters = recorder.counters
-    parts = [
-        f"{show.duration(seconds_)}",
-        f"{counters['messages']:,} messages",
-        show.size(counters["bytes"]),
-    ]
+    parts = [show.duration(seconds_), f"{counters['messages']:,} messages", show.size(counters["bytes"])]
     if counters["dropped"]:
         parts.append(f"{counters['dropped']:,} dropped")
     if not source.connected:
         parts.append(f"not connected: {source.problem}")
-    return "  ".join(parts + [recorder.blocked] * bool(recorder.blocked))
+    if recorder.blocked:
+        parts.append(recorder.blocked)
+    return "  ".join(parts)
 
 
 def _print_start(source: Source, where: str, into: Path) -> None:

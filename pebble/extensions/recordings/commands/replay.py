@@ -74,7 +74,11 @@ def replay(
     options = Options(system=base or SYSTEM, incoming=incoming, only=tuple(only or ()))
     if incoming and speed < _WITH_COMMANDS:
         raise PebbleError(f"--speed {speed:g} would drive a robot for longer than it was: leave out --incoming")
-    connection = settings_of(url, password=password(password_file), password_file=password_file, ca_cert=ca_cert)
+    kind, settings = settings_of(url, password=password(password_file), password_file=password_file, ca_cert=ca_cert)
+
+    def make_transport(name: str, will: Message | None) -> Transport:
+        return create(kind, name.replace("/", "-"), settings, will=will)
+
     since_ns, until_ns = period(since, until)
     source, rules = _read(recordings, options)
     make_player = partial(
@@ -82,7 +86,7 @@ def replay(
         since_ns=since_ns, until_ns=until_ns, speed=speed, loop=loop,
     )  # fmt: skip
     playing = _Playing()
-    player = playing.play(_maker(*connection), rules, make_player)
+    player = playing.play(make_transport, rules, make_player)
     typer.echo(f"{player.sent} sent, {player.skipped} skipped")
     unread = report_unread(problems(source.damages))
     return unread if playing.ended in ("", "SIGINT") else 1
@@ -93,22 +97,16 @@ def _read(recordings: list[Path], options: Options) -> tuple[ReplaySource, Rules
     source = ReplaySource(files(recordings))
     topics = {channel.topic for channel in source.channels if not channel.topic.startswith("$")}
     rules = Rules(options, source.channels)
-    for filter_ in () if problems(source.damages) else options.only:
-        if not any(matches(filter_, topic) for topic in topics):
-            check_name("topic", filter_, topics, recordings)
+    if not problems(source.damages):
+        for filter_ in options.only:
+            if not any(matches(filter_, topic) for topic in topics):
+                check_name("topic", filter_, topics, recordings)
     if not rules.robots:
         report_unread(problems(source.damages))
         raise PebbleError("there is nothing to publish in this recording; see --only and --incoming")
     if source.missing:
         typer.echo(f"pebble: {source.missing:,} messages are missing in this recording: files were damaged", err=True)
     return source, rules
-
-
-def _maker(kind: str, settings: object) -> Make:
-    def make(name: str, will: Message | None) -> Transport:
-        return create(kind, name.replace("/", "-"), settings, will=will)
-
-    return make
 
 
 class _Playing:

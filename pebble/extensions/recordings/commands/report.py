@@ -9,7 +9,7 @@ import typer
 
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
-from pebble.extensions.recordings.library import FOREVER_NS
+from pebble.extensions.recordings.files.recorded import FOREVER_NS
 
 
 @contextmanager
@@ -28,9 +28,9 @@ def report_unread(lines: list[str]) -> int:
     return 1 if lines else 0
 
 
-def report_left(error: object) -> int:
+def report_left(error: object) -> None:
+    """Print that a file stays as it is, and why."""
     typer.echo(f"pebble: left as it is: {shown(str(error))}", err=True)
-    return 1
 
 
 def local_time(ns: int, *, fraction: bool = False) -> str:
@@ -41,15 +41,17 @@ def local_time(ns: int, *, fraction: bool = False) -> str:
 
 def period_words(since_ns: int, until_ns: int) -> str:
     """Return a period in words: in local time with its zone, and in UTC."""
-    local, utc = (
-        f"from {_end(since_ns, zone, 'the beginning')} to {_end(until_ns, zone, 'the end')}" for zone in (None, UTC)
-    )
+    local, utc = _words(since_ns, until_ns, None), _words(since_ns, until_ns, UTC)
     return local if local == utc else f"{local}, that is {utc}"
 
 
-def _end(ns: int, zone: tzinfo | None, name: str) -> str:
-    if not 0 < ns < FOREVER_NS:
-        return name
+def _words(since_ns: int, until_ns: int, zone: tzinfo | None) -> str:
+    begin = _moment(since_ns, zone) if since_ns > 0 else "the beginning"
+    end = _moment(until_ns, zone) if until_ns < FOREVER_NS else "the end"
+    return f"from {begin} to {end}"
+
+
+def _moment(ns: int, zone: tzinfo | None) -> str:
     return f"{datetime.fromtimestamp(ns // 10**9, UTC).astimezone(zone):%Y-%m-%d %H:%M:%S %Z}"
 
 

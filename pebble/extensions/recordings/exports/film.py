@@ -9,12 +9,11 @@ from typing import Any, Final
 
 from pebble.contract import OUTGOING
 from pebble.extensions.media import pyav
-from pebble.extensions.media.packets import PBAT
 from pebble.extensions.recordings.exports.film_sound import RATE, SoundResult, SoundTrack
-from pebble.extensions.recordings.exports.lines import Progress
 from pebble.extensions.recordings.exports.unfinished import unfinished
 from pebble.extensions.recordings.files.recorded import Recorded, RecordingError
-from pebble.extensions.recordings.stamps import is_picture
+from pebble.extensions.recordings.library import reported
+from pebble.extensions.recordings.stamps import is_media, is_picture
 
 #: By the ending of the film: FFmpeg's names of the container and of the encoder of its sound.
 _FORMATS: Final = {".mkv": ("matroska", "libopus"), ".mp4": ("mp4", "aac")}
@@ -42,11 +41,12 @@ def write_film(
     target: Path,
     robot: str,
     *,
-    on_time: Progress = lambda _log_ns: None,
+    on_time: Callable[[int], None] = lambda _log_ns: None,
 ) -> FilmResult:
     """Write the pictures and the sound of ``robot`` (its base) to ``target``, which ends in .mkv or .mp4.
 
-    The messages are read twice: for the sound, then for the pictures, which take long. If several topics carry
+    The messages are read twice: for the sound, then for the pictures, which take long; ``on_time`` is called with the
+    log time of each, in the first round with 0. If several topics carry
     pictures, or sound, the first one counts. The film has the size of its first picture. Raises RecordingError if there
     are no pictures or ``target`` cannot be written; PebbleError without PyAV.
     """
@@ -58,12 +58,12 @@ def write_film(
         wav = path.with_name("sound.wav")  # it may become as large as the film
         try:
             with SoundTrack(wav) as sound:
-                for at_ms, payload in _media(read(), robot, lambda _log_ns: on_time(0)):
+                for at_ms, payload in _media(reported(read(), lambda _log_ns: on_time(0)), robot):
                     if not is_picture(payload):
                         sound.add(payload, at_ms)
             with av.open(str(path), "w", format=container, options=_MUXER.get(container, {})) as out:
                 pictures = _Pictures(av, out)
-                media = _media(read(), robot, on_time)
+                media = _media(reported(read(), on_time), robot)
                 tracks = [pictures.packets((at_ms, payload) for at_ms, payload in media if is_picture(payload))]
                 if sound.result.packets:
                     tracks.append(_sound_packets(av, wav, out, codec))
@@ -78,17 +78,11 @@ def write_film(
     return FilmResult(seconds, pictures.count, pictures.left_out, sound.result if sound.result.packets else None)
 
 
-def write_wav(
-    messages: Iterable[Recorded],
-    target: Path,
-    robot: str,
-    *,
-    on_time: Progress = lambda _log_ns: None,
-) -> SoundResult:
+def write_wav(messages: Iterable[Recorded], target: Path, robot: str) -> SoundResult:
     """Write the sound of ``robot`` (its base) to ``target``, from its first sample on. Raises RecordingError."""
     with unfinished(target) as path, SoundTrack(path) as track:
         first_ms = None
-        for at_ms, payload in _media(messages, robot, on_time):
+        for at_ms, payload in _media(messages, robot):
             if not is_picture(payload):
                 first_ms = at_ms if first_ms is None else first_ms
                 track.add(payload, at_ms - first_ms)
@@ -97,18 +91,20 @@ def write_wav(
     return track.result
 
 
-def _media(messages: Iterable[Recorded], robot: str, on_time: Progress) -> Iterator[tuple[int, bytes]]:
+def _media(messages: Iterable[Recorded], robot: str) -> Iterator[tuple[int, bytes]]:
     """Yield the messages of one topic of pictures and one of sound, with milliseconds since the first message."""
-    below, topics, first_ms = f"{robot}/{OUTGOING}/", dict[bool, str](), None
+    first_ms = None
+    first_topics: dict[str, str] = {}  # of pictures, and of sound: the topic that counts
     for message in messages:
-        on_time(message.log_ns)
         topic, payload = message.channel.topic, message.payload
-        if topic.startswith(below) and message.channel.metadata.get("retained") != "1":
-            picture = is_picture(payload)
-            if (picture or payload.startswith(PBAT)) and topics.setdefault(picture, topic) == topic:
-                log_ms = message.log_ns // 10**6
-                first_ms = log_ms if first_ms is None else first_ms
-                yield log_ms - first_ms, payload
+        is_old = message.channel.metadata.get("retained") == "1"
+        if is_old or not topic.startswith(f"{robot}/{OUTGOING}/") or not is_media(payload):
+            continue
+        kind = "pictures" if is_picture(payload) else "sound"
+        if first_topics.setdefault(kind, topic) == topic:
+            log_ms = message.log_ns // 10**6
+            first_ms = log_ms if first_ms is None else first_ms
+            yield log_ms - first_ms, payload
 
 
 def _sound_packets(av: Any, path: Path, out: Any, codec: str) -> Iterator[Any]:

@@ -66,7 +66,7 @@ class SoundTrack:
         if missing > _HOLE_MS * RATE // 1000 or not self._written:
             self._silence(missing)
         elif missing < -_HOLE_MS * RATE // 1000:
-            samples = samples[-missing:]
+            samples = samples[-missing:]  # the first ones are of a time that already has sound
         if len(samples):
             self.result.packets += 1
             self._write(samples)

@@ -18,7 +18,6 @@ from pebble.extensions.recordings.exports.foxglove_messages import (
     stamped,
     time_of,
 )
-from pebble.extensions.recordings.exports.lines import Progress
 from pebble.extensions.recordings.exports.unfinished import unfinished
 from pebble.extensions.recordings.files.recorded import Channel, Recorded, Schema
 from pebble.extensions.recordings.files.rewrite import Copy
@@ -29,12 +28,7 @@ JSON: Final = "json"
 LEFT_OUT: Final = "left out"
 
 
-def write_foxglove(
-    messages: Iterable[Recorded],
-    target: Path,
-    *,
-    on_time: Progress = lambda _log_ns: None,
-) -> dict[str, int]:
+def write_foxglove(messages: Iterable[Recorded], target: Path) -> dict[str, int]:
     """Write ``messages`` to the MCAP file ``target``; return the number by schema, with ``json`` and ``left out``.
 
     Left out are unknown media, pictures that build on missing ones, and removals of retained messages. Raises
@@ -46,7 +40,6 @@ def write_foxglove(
         export = _Export(Copy(writer), schemas)
         for message in messages:
             export.add(message)
-            on_time(message.log_ns)
         writer.finish()
     return dict(export.counts)
 
@@ -80,7 +73,7 @@ class _Export:
         if topic not in self._channels:
             schema = Schema(protobuf.DESCRIPTOR.full_name, "protobuf", self._schemas.descriptors(protobuf))
             self._channels[topic] = Channel(0, topic, "protobuf", {}, schema)
-        stamp = _time_of(message)
+        stamp = time_of(message.payload, message.log_ns, message.publish_ns)
         self._copy.add(Recorded(self._channels[topic], 0, message.log_ns, stamp, stamped(protobuf, stamp)))
         self.counts[protobuf.DESCRIPTOR.name] += 1
 
@@ -89,9 +82,6 @@ class _Export:
         if payload is None:
             self.counts[LEFT_OUT] += 1
             return
-        self._copy.add(Recorded(Channel(0, topic, JSON), 0, message.log_ns, _time_of(message), payload))
+        stamp = time_of(message.payload, message.log_ns, message.publish_ns)
+        self._copy.add(Recorded(Channel(0, topic, JSON), 0, message.log_ns, stamp, payload))
         self.counts[JSON] += 1
-
-
-def _time_of(message: Recorded) -> int:
-    return time_of(message.payload, message.log_ns, message.publish_ns)

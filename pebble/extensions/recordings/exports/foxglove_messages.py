@@ -125,8 +125,9 @@ class Media:
         """
         from pebble.extensions.media.sound import SoundDecoder
 
-        decoder = self._sounds.get(topic) or self._sounds.setdefault(topic, SoundDecoder())
-        sound = decoder.feed(payload)
+        if topic not in self._sounds:
+            self._sounds[topic] = SoundDecoder()
+        sound = self._sounds[topic].feed(payload)
         if sound is None:
             return None
         schema, ending = SOUND
@@ -142,7 +143,9 @@ class Media:
         """
         from pebble.extensions.media.decode import VideoDecoder
 
-        return self._pictures.get(topic) or self._pictures.setdefault(topic, VideoDecoder())
+        if topic not in self._pictures:
+            self._pictures[topic] = VideoDecoder()
+        return self._pictures[topic]
 
 
 class Telemetry:
@@ -160,8 +163,8 @@ class Telemetry:
 
     def convert(self, topic: str, payload: bytes) -> Converted | None:
         """Return the converted payload; None if it is to stay as it is, also if it does not fit its channel."""
-        levels = topic.split("/", 3)
-        channel = channel_of(levels[3]) if len(levels) == 4 and levels[3].startswith((c.INCOMING, c.OUTGOING)) else None
+        below_base = "".join(topic.split("/", 3)[3:])
+        channel = channel_of(below_base) if below_base.startswith((c.INCOMING, c.OUTGOING)) else None
         convert = None if channel is None else self._converters.get(channel)
         if convert is None:
             return None
@@ -178,11 +181,11 @@ class Telemetry:
     def _odometry(self, topic: str, payload: bytes) -> Converted | None:
         """Convert odometry. Some robots send metres, under other names (paper A.8.12)."""
         odometry = codec.decode(c.WHEEL_ODOMETRY, payload)
-        value, per_metre = odometry.value, 1.0 if odometry.unit == "m" else _MILLIMETRES
-        x, y = (_number(value, f"{axis}_mm", axis) for axis in "xy")
+        value = odometry.value
+        x, y = _number(value, "x_mm", "x"), _number(value, "y_mm", "y")
         if x is None or y is None:
             return None
-        per_metre = _MILLIMETRES if "x_mm" in value else per_metre
+        per_metre = 1.0 if odometry.unit == "m" and "x_mm" not in value else _MILLIMETRES
         heading = _number(value, "heading_rad", "theta_rad", "heading") or 0.0
         return Converted(self._pose(f"{_id(topic)}/odom", x / per_metre, y / per_metre, 0.0, heading), "pose")
 
@@ -271,13 +274,14 @@ def as_object(payload: bytes) -> bytes | None:
 
 
 def _id(topic: str) -> str:
-    """Return the robot's id, after which its frame is named."""
+    """Return the id of a topic's robot, after which Foxglove's frames of reference are named."""
     return "/".join(topic.split("/")[2:3])
 
 
 def _number(value: dict[str, Any], *names: str) -> float | None:
     """Return the first of the named fields that is a number; None if there is none."""
-    values = (value.get(name) for name in names)
-    return next(
-        (float(number) for number in values if isinstance(number, int | float) and not isinstance(number, bool)), None
-    )
+    for name in names:
+        number = value.get(name)
+        if isinstance(number, int | float) and not isinstance(number, bool):
+            return float(number)
+    return None

@@ -6,7 +6,7 @@ cuts payloads at 8192 bytes unless asked otherwise. We add ``retained``: the log
 messages that are from before them only, ours as they were published.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from decimal import Decimal
 from functools import partial
@@ -25,8 +25,6 @@ TRUNCATED: Final = "truncated"  # of a channel: its payloads were cut before the
 LONGEST_LINE: Final = 96 << 20  # bytes; the largest message of a recording takes less
 _TEXT_MOST: Final = 1 << 16  # bytes of a payload that is written as text, too
 _LATEST_NS: Final = (1 << 63) - 1
-
-Progress = Callable[[int], None]  # called with the log time of each message
 
 
 class BadLine(Struct, frozen=True):
@@ -63,7 +61,7 @@ _encoder = msgspec.json.Encoder()
 _decoder = msgspec.json.Decoder(_Line)
 
 
-def write_lines(messages: Iterable[Recorded], out: BinaryIO, *, on_time: Progress = lambda _log_ns: None) -> int:
+def write_lines(messages: Iterable[Recorded], out: BinaryIO) -> int:
     """Write a line for each message; return their number.
 
     Stamps have nine decimals, so that reading the lines restores the same nanoseconds. Payloads of up to 64 KiB are
@@ -73,7 +71,6 @@ def write_lines(messages: Iterable[Recorded], out: BinaryIO, *, on_time: Progres
     for message in messages:
         out.write(_encoder.encode(_line(message)) + b"\n")
         count += 1
-        on_time(message.log_ns)
     return count
 
 
@@ -82,7 +79,8 @@ def read_lines(file: BinaryIO) -> Iterator[Recorded | BadLine]:
 
     Raises RecordingError at a line that is too long for memory.
     """
-    for number, line in enumerate(iter(partial(file.readline, LONGEST_LINE + 1), b""), 1):
+    bounded_lines = iter(partial(file.readline, LONGEST_LINE + 1), b"")  # until it returns no bytes
+    for number, line in enumerate(bounded_lines, 1):
         if len(line) > LONGEST_LINE:
             raise RecordingError(f"{file.name}: line {number} is longer than {LONGEST_LINE:,} bytes")
         if not line.isspace():
@@ -103,16 +101,10 @@ def _line(message: Recorded) -> _Written:
         payload_b64=payload,
     )
     if len(payload) <= _TEXT_MOST:
-        _add_text(line, payload)
+        with suppress(UnicodeDecodeError, msgspec.DecodeError, RecursionError):
+            line.payload_text = payload.decode()
+            line.payload_json = msgspec.json.decode(payload)
     return line
-
-
-def _add_text(line: _Written, payload: bytes) -> None:
-    try:
-        line.payload_text = payload.decode()
-        line.payload_json = msgspec.json.decode(payload)
-    except (UnicodeDecodeError, msgspec.DecodeError, RecursionError):
-        pass
 
 
 def _message(number: int, line: bytes) -> Recorded | BadLine:

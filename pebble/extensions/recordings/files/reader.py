@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from mcap.summary import Summary
 
 DAMAGE: Final = "pebble.damage"  # metadata of a copy of a file of which a part was missing
-MISSING: Final = "missing_messages"  # an item of it
+MISSING: Final = "missing_messages"  # an item of this metadata
 
 _LARGEST_SUMMARY: Final = 256 << 20
 _TAIL, _CHECKSUM = 37, 4  # bytes: of a footer and what follows it, of the checksum in it
@@ -79,10 +79,10 @@ class RecordingFile:
         self.path, self.damage = path, Damage()
         self.channels: dict[int, Channel] = {}
         self.chunks: list[Chunk] = []
-        self.is_ours = True  # and its messages are numbered
-        self.statistics: Statistics | None = None  # None: it is not finished, or does not say all
+        self.is_ours = True  # written by Pebble, which numbers messages
+        self.statistics: Statistics | None = None  # None: the file is not finished, or its summary is incomplete
         self._schemas: dict[int, Schema] = {}
-        self._metadata: list[int] = []  # where they are
+        self._metadata: list[int] = []  # positions of these records
         self._scan = Scan(self._read, self.damage)
         self._recent = lru_cache(_KEPT)(partial(self._unpacked, chooses=lambda _channel: True))
         try:
@@ -156,14 +156,16 @@ class RecordingFile:
             streams = ((chunk.start_ns, partial(self._unpacked_later, chunk, chooses)) for chunk in chunks)
             yield from in_time_order(streams)
             return
-        due = 0 if len(chunks) == len(self.chunks) else None
+        expected = 0 if len(chunks) == len(self.chunks) else None  # number of the next message; None: not known
         for chunk in chunks:
             messages, numbers = self._unpacked(chunk, chooses)
             if numbers is not None and self.statistics is None:
-                self.damage.missing += 0 if due is None else max(0, numbers[0] - due)
-                due = numbers[1] + 1
-            elif due is not None:
-                due += chunk.messages  # they are counted as damaged
+                first, last = numbers
+                if expected is not None:
+                    self.damage.missing += max(0, first - expected)
+                expected = last + 1
+            elif expected is not None:
+                expected += chunk.messages  # they are counted as damaged
             yield from messages
 
     def messages(self, chunk: Chunk) -> list[Recorded]:
@@ -174,7 +176,7 @@ class RecordingFile:
         """Return the file's metadata by name; of several with one name the last."""
         from mcap.records import Metadata
 
-        found: dict[str, dict[str, str]] = {}
+        by_name: dict[str, dict[str, str]] = {}
         for at in self._metadata:
             try:
                 record = self._record(at)
@@ -182,8 +184,8 @@ class RecordingFile:
                 self.damage.add(at, error)
                 continue
             if isinstance(record, Metadata):
-                found[record.name] = record.metadata
-        return found
+                by_name[record.name] = record.metadata
+        return by_name
 
     # -- a finished file
 
@@ -237,7 +239,7 @@ class RecordingFile:
         self.chunks, self.statistics = chunks, counted
         return True
 
-    # -- one that is not
+    # -- an unfinished file
 
     def _look_through(self) -> None:
         """Find chunks and channels, from where the last scan ended."""
@@ -254,9 +256,9 @@ class RecordingFile:
                 self._name(self._record(at), is_certain=False)
 
     def _learn(self, chunk: Chunk) -> None:
-        """Take the channels that a chunk declares."""
+        """Note the channels that a chunk declares."""
         try:
-            for _ in self._message_records(chunk):
+            for _ in self._message_records(chunk):  # notes them
                 pass
         except DamageError as error:
             self.damage.add(chunk.at, error, chunk.messages)
@@ -271,11 +273,14 @@ class RecordingFile:
         try:
             for data, begin, end in self._message_records(chunk):
                 number, sequence, log_ns, publish_ns = MESSAGE.unpack_from(data, begin)
-                first, last = sequence if first < 0 else first, sequence
+                if first < 0:
+                    first = sequence
+                last = sequence
                 if number not in chosen:
                     channel = self.channels.get(number) or Channel(number, f"{UNNAMED}{number}", "")
                     chosen[number] = channel if chooses(channel) else None
-                self.damage.unnamed += number not in self.channels
+                if number not in self.channels:
+                    self.damage.unnamed += 1
                 if (chosen_channel := chosen[number]) is not None:
                     payload = data[begin + MESSAGE.size : end]
                     messages.append(Recorded(chosen_channel, sequence, log_ns, publish_ns, payload))
@@ -286,7 +291,7 @@ class RecordingFile:
         return messages, (first, last) if first >= 0 else None
 
     def _message_records(self, chunk: Chunk) -> Iterator[tuple[bytes, int, int]]:
-        """Yield the data of a chunk with the begin and end of each message; take its channels. Raises DamageError."""
+        """Yield the data of a chunk with the begin and end of each message; note its channels. Raises DamageError."""
         data = unpack_chunk(self._read(chunk.at, chunk.length if chunk.length < LARGEST_RECORD else 0))
         for op, begin, end in records(data):
             if op == Op.MESSAGE:
@@ -298,7 +303,10 @@ class RecordingFile:
         yield from self._unpacked(chunk, chooses)[0]
 
     def _name(self, record: McapRecord, *, is_certain: bool = True) -> None:
-        """Take a schema or channel. Beside chunks no checksum protects them: there none replaces another."""
+        """Note a schema or channel.
+
+        ``is_certain`` False: it was outside of chunks, where no checksum protects it, and replaces no other.
+        """
         from mcap.records import Channel as ChannelRecord
         from mcap.records import Schema as SchemaRecord
 
@@ -330,15 +338,17 @@ def in_time_order(streams: Iterable[tuple[int, Callable[[], Iterator[Recorded]]]
 
     ``streams``: each with its first time and a function that opens it; it is opened when that time has come.
     """
-    due = sorted(streams, key=lambda stream: stream[0], reverse=True)
+    unopened = sorted(streams, key=lambda stream: stream[0], reverse=True)  # the earliest last
+    #: Of each open stream: the time of its next message, its number (of equal times the lower one is first), both.
     heap: list[tuple[int, int, Recorded, Iterator[Recorded]]] = []
-    turn = 0
-    while due or heap:
-        while due and (not heap or due[-1][0] <= heap[0][0]):
-            opened = due.pop()[1]()
-            turn += 1
-            if (first := next(opened, None)) is not None:
-                heapq.heappush(heap, (first.log_ns, turn, first, opened))
+    opened = 0
+    while unopened or heap:
+        while unopened and (not heap or unopened[-1][0] <= heap[0][0]):
+            _, open_stream = unopened.pop()
+            stream = open_stream()
+            opened += 1
+            if (first := next(stream, None)) is not None:
+                heapq.heappush(heap, (first.log_ns, opened, first, stream))
         if not heap:
             continue
         _, number, message, stream = heap[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -85,6 +86,18 @@ class Damage:
         ]
         text = ", ".join(words for number, words in reasons if number)
         return f"{text} ({self.why})" if text and self.why else text
+
+
+def finished_path(path: Path) -> Path:
+    """Return the path of a ``.mcap.active`` file once it is finished."""
+    return path.with_name(path.name.removesuffix(ACTIVE) + SUFFIX)
+
+
+def present_path(path: Path) -> Path | None:
+    """Return the path of a listed file now: a recorder may have finished it, or deleted it (None)."""
+    if path.name.endswith(ACTIVE) and not path.exists():
+        path = finished_path(path)
+    return path if path.exists() else None
 
 
 def require_package() -> None:

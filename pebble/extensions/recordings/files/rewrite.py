@@ -27,7 +27,7 @@ class Rewritten:
     left_out: int
     missing: int  # messages that damage has taken
     unread: str  # what could not be read, in words; "" if all was
-    is_whole: bool  # the source held nothing else, but the begin of a record that a kill has cut off
+    is_whole: bool  # the source held nothing more than the begin of a record that a kill has cut off
 
 
 def rewrite(source: Path, target: Path, *, keeps: Keeps = lambda _message: True) -> Rewritten:
@@ -45,9 +45,9 @@ def rewrite(source: Path, target: Path, *, keeps: Keeps = lambda _message: True)
         if in_place and not copy.left_out:
             return copy
         _check(part, copy)
-        about = source.stat()
-        set_mode(part, stat.S_IMODE(about.st_mode))
-        os.utime(part, ns=(about.st_atime_ns, about.st_mtime_ns))
+        status = source.stat()
+        set_mode(part, stat.S_IMODE(status.st_mode))
+        os.utime(part, ns=(status.st_atime_ns, status.st_mtime_ns))
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
@@ -81,14 +81,13 @@ class Copy:
         return self._writer.channel(channel.topic, channel.encoding, channel.metadata, number)
 
 
-def write_copy(messages: Iterable[Recorded], out: File, *, on_time: Callable[[int], None]) -> int:
-    """Write ``messages`` as a recording; return their number. ``on_time`` gets the time of each."""
+def write_copy(messages: Iterable[Recorded], out: File) -> int:
+    """Write ``messages`` as a recording; return their number."""
     writer = RecordingWriter(out)
     writer.metadata("pebble.recording", {"format": "1", "exported": "1"})
     copy = Copy(writer)
     for message in messages:
         copy.add(message)
-        on_time(message.log_ns)
     writer.finish()
     return writer.messages
 
@@ -129,9 +128,9 @@ def _refuse_part(file: RecordingFile) -> None:
         raise RecordingError(f"{file.path}: another program wrote it, and what only that knows would be lost")
 
 
-def _check(part: Path, made: Rewritten) -> None:
+def _check(part: Path, copy: Rewritten) -> None:
     """Read a copy once more before it replaces the source. Raises RecordingError."""
     with RecordingFile(part) as file:
         messages = sum(len(file.messages(chunk)) for chunk in file.chunks)
-        if messages != made.messages or file.damage.report():
+        if messages != copy.messages or file.damage.report():
             raise RecordingError(f"{part.name}: cannot be read again ({file.damage.report() or 'other messages'})")

@@ -42,17 +42,17 @@ class Scan:
 
     def __init__(self, read: Read, damage: Damage) -> None:
         self._read, self._damage = read, damage
-        self._at = len(MAGIC)  # what was looked at ends here
-        self._searched = 0  # no chunk begins before
+        self._at = len(MAGIC)  # where the last record that was found ends
+        self._searched = 0  # after damage, no chunk begins before this position
         self._size, self._ended = 0, False
 
     @property
     def is_cut_off(self) -> bool:
         """True if only zeros, or the beginning of a record, follow the last record, as after a kill."""
-        rest = self._read(self._at, min(self._damage.torn, LARGEST_RECORD))
-        if len(rest) < HEAD.size or not any(rest):
-            return len(rest) >= self._damage.torn
-        op, length = HEAD.unpack_from(rest)
+        tail = self._read(self._at, min(self._damage.torn, LARGEST_RECORD))
+        if len(tail) < HEAD.size or not any(tail):
+            return len(tail) >= self._damage.torn
+        op, length = HEAD.unpack_from(tail)
         return op in _KINDS and length < 1 << 32 and self._at + HEAD.size + length > self._size
 
     def records(self, size: int) -> Iterator[Found]:
@@ -73,13 +73,13 @@ class Scan:
         self._damage.torn = 0 if self._ended else max(0, size - self._at)
 
     def _with_indexes(self, chunk: Found) -> Found:
-        """Pass the indexes behind a chunk, and return it with what they hold."""
+        """Read the indexes behind a chunk, and return the chunk with their channels and number of messages."""
         counts: dict[int, int] = {}
         while (record := self._record_at(self._at)) is not None and record.op == Op.MESSAGE_INDEX:
             channel, length = _INDEX.unpack(self._read(self._at + HEAD.size, _INDEX.size))
             counts[channel], self._at = length // INDEX_ENTRY, record.end
-        are_all = record is not None or self._at >= self._size
-        return chunk._replace(channels=frozenset(counts if are_all else ()), messages=sum(counts.values()))
+        are_complete = record is not None or self._at >= self._size
+        return chunk._replace(channels=frozenset(counts if are_complete else ()), messages=sum(counts.values()))
 
     def _record_at(self, at: int) -> Found | None:
         """Return the record at ``at``; None if there is no complete record."""
@@ -89,13 +89,13 @@ class Scan:
         if op not in _KINDS or end > self._size:
             return None
         if op == Op.CHUNK:
-            is_one = self._is_chunk(at, length)
+            is_valid = self._is_chunk(at, length)
         elif op == Op.MESSAGE_INDEX:
             entries = self._read(at + HEAD.size, _INDEX.size)
-            is_one = length >= _INDEX.size and length == _INDEX.size + _INDEX.unpack(entries)[1]
+            is_valid = length >= _INDEX.size and length == _INDEX.size + _INDEX.unpack(entries)[1]
         else:
-            is_one = self._is_exact(at, length)
-        return Found(op, at, end) if is_one else None
+            is_valid = self._is_exact(at, length)
+        return Found(op, at, end) if is_valid else None
 
     def _is_chunk(self, at: int, length: int) -> bool:
         """True if the lengths in a chunk's head agree."""

@@ -33,12 +33,13 @@ class RecordingWriter:
         from mcap.writer import Writer
 
         self.messages = 0  # that were added
-        self.channels = self.indexed = 0  # channels; channels of each chunk, which the package keeps in memory
+        self.channels = 0  # that were declared
+        self.indexed = 0  # sum of the channels of each chunk: the package keeps an index of each in memory
         self._output = _Output(self, file)
         self._writer = Writer(self._output)  # type: ignore[arg-type]
-        self._named: list[Channel] = []
-        self._new: list[Channel] = []  # since the last flush
-        self._used: set[int] = set()  # channels
+        self._named: list[Channel] = []  # that were declared before the last flush
+        self._new: list[Channel] = []  # that were declared since then
+        self._used: set[int] = set()  # channels with messages since then
         self._log_ns = self._names_again_ns = 0
         self._writer.start(library=library)
 
@@ -108,7 +109,8 @@ class _Output(BufferedIOBase):
     def write(self, data: bytes) -> int:  # type: ignore[override]
         unwritten = memoryview(data)
         while unwritten:
-            unwritten = unwritten[self._file.write(unwritten) :]
+            taken = self._file.write(unwritten)  # None: nothing
+            unwritten = unwritten[taken or 0 :]
         self.size += len(data)
         if data[:1] == _CHUNK:  # the package writes a chunk in one call, and holds back no message
             self.messages = self._writer.messages

@@ -24,16 +24,16 @@ def surplus(entries: Iterable[Entry], options: Options, disk: Disk) -> list[Entr
     yet, and do not count. The newest file of each kind stays.
     """
     listed = [entry for entry in entries if entry.is_active or entry.is_finished]
-    used, free = sum(entry.size for entry in listed), disk.free_bytes
+    used, free, has_inodes = sum(entry.size for entry in listed), disk.free_bytes, disk.has_inodes
     deleted = []
     for entry in _deletable(listed):
-        too_much = options.keep_bytes and used > options.keep_bytes
-        if not too_much and free >= options.free_bytes and disk.has_inodes:
+        is_too_much = options.keep_bytes and used > options.keep_bytes
+        if not is_too_much and free >= options.free_bytes and has_inodes:
             break
         deleted.append(entry)
         used -= entry.size
         free += entry.size
-        disk = Disk(free)
+        has_inodes = True  # that of the deleted file
     return deleted
 
 
@@ -42,9 +42,10 @@ def outdated(entries: Iterable[Entry], options: Options, now: float) -> Entry | 
 
     Only one at a time, because the clock may have been set wrong.
     """
-    age_s = options.keep_media_days * _DAY_S
-    old = (entry for entry in _deletable(list(entries)) if entry.is_media and now - entry.ended > age_s)
-    return next(old, None) if age_s else None
+    if not options.keep_media_days:
+        return None
+    oldest = now - options.keep_media_days * _DAY_S
+    return next((entry for entry in _deletable(list(entries)) if entry.is_media and entry.ended < oldest), None)
 
 
 def _deletable(entries: list[Entry]) -> list[Entry]:

@@ -5,11 +5,10 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from pebble.extensions.recordings.files.recorded import RecordingError
+from pebble.extensions.recordings.files.recorded import SUFFIX, RecordingError, finished_path
 from pebble.extensions.recordings.files.rewrite import Rewritten, rewrite
-from pebble.extensions.recordings.library import SUFFIX
 from pebble.extensions.recordings.recorder.background import Background
-from pebble.extensions.recordings.recorder.folder import DAMAGED, finished_path, rename
+from pebble.extensions.recordings.recorder.folder import DAMAGED, rename
 from pebble.extensions.recordings.recorder.lane import OpenFile
 from pebble.runtime.whole_file import sync_folder
 

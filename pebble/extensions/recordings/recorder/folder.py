@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from pebble.extensions.recordings.files.recorded import RecordingError
+from pebble.extensions.recordings.files.recorded import ACTIVE, SUFFIX, RecordingError
 from pebble.extensions.recordings.files.rewrite import PART
-from pebble.extensions.recordings.library import ACTIVE, SUFFIX
 from pebble.runtime.as_owner import as_owner
 from pebble.runtime.whole_file import sync_folder
 from pebble.transports.own_file import OwnFile
@@ -37,7 +36,7 @@ class Entry:
     """A file of a recorder."""
 
     path: Path
-    number: int  # they grow: names alone do not say which is older, because clocks are set
+    number: int  # of a newer file it is greater; times are not, because clocks are set
     lane: str
     size: int
     ended: float  # when it was written last, seconds since 1970
@@ -71,11 +70,11 @@ class Folder:
             self.root.mkdir(mode=0o750, parents=True, exist_ok=True)
         except OSError as error:
             raise RecordingError(f"{self.root}: {error.strerror}: name another folder") from None
-        used = f"{self.root}: a recorder writes here: stop it first, or name another folder"
-        self.is_locked = self._lock.enter_context(_locked(self.root / LOCK, used))
+        problem = f"{self.root}: a recorder writes here: stop it first, or name another folder"
+        self.is_locked = self._lock.enter_context(_locked(self.root / LOCK, problem))
         self._own = OwnFile(self.root / LOCK)
-        for path in self._files() if self.is_locked else ():
-            if _COPY.fullmatch(path.name):  # was being written when its process was killed
+        for path in self._files():
+            if self.is_locked and _COPY.fullmatch(path.name):  # was being written when its process was killed
                 path.unlink(missing_ok=True)
         self._number = max((self._number, *(entry.number for entry in self.entries())))
 
@@ -140,10 +139,10 @@ class Folder:
 
 
 @contextmanager
-def _locked(path: Path, used: str) -> Iterator[bool]:
+def _locked(path: Path, problem: str) -> Iterator[bool]:
     """Lock the folder; yield False if the file system has no locks.
 
-    Raises RecordingError(used) if another process holds the lock.
+    Raises RecordingError(problem) if another process holds the lock.
     """
     try:
         import fcntl
@@ -158,17 +157,12 @@ def _locked(path: Path, used: str) -> Iterator[bool]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             is_locked = True
         except BlockingIOError:
-            raise RecordingError(used) from None
+            raise RecordingError(problem) from None
         except OSError as error:
             text = "%s cannot be locked (%s): see that nothing else records into its folder, which is not noticed"
             log.warning(text, path, error.strerror)
             is_locked = False
         yield is_locked
-
-
-def finished_path(path: Path) -> Path:
-    """Return the path of a ``.mcap.active`` file once it is finished."""
-    return path.with_name(path.name.removesuffix(ACTIVE) + SUFFIX)
 
 
 def rename(path: Path, target: Path) -> None:

@@ -45,6 +45,7 @@ class Intake:
         return len(self._state) + len(self._media)
 
     def add(self, topic: str, payload: bytes, qos: int | None, retain: bool | None, retained: str, source: str) -> None:
+        """Queue a message, described as in :class:`Item`; count those that are dropped for it."""
         item = Item(self._boot_ns(), topic, payload, qos, retain, retained, source)
         queue = self._media if is_media(payload) else self._state
         with self._lock:

@@ -5,8 +5,9 @@ import re
 from collections.abc import Mapping
 from typing import BinaryIO, Final, NamedTuple
 
+from pebble.extensions.recordings.files.recorded import finished_path
 from pebble.extensions.recordings.files.writer import RecordingWriter
-from pebble.extensions.recordings.recorder.folder import MEDIA, STATE, Folder, finished_path, rename
+from pebble.extensions.recordings.recorder.folder import MEDIA, STATE, Folder, rename
 from pebble.extensions.recordings.stamps import stamp_ns
 from pebble.runtime.whole_file import sync_file
 
@@ -47,7 +48,7 @@ class OpenFile:
         except OSError:
             self.discard()
             raise
-        self._taken = 0
+        self._taken = 0  # written messages that :meth:`take_written` has returned
         self._channels: dict[tuple[object, ...], int] = {}
 
     @property
@@ -122,7 +123,7 @@ def lane_of(topic: str, *, is_media: bool) -> str:
 
 
 class RawFile:
-    """A file whose ``write`` is one system call."""
+    """The unbuffered file as :class:`RecordingWriter` takes it: ``write`` is one system call."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file

@@ -1,7 +1,6 @@
 """The files that a recorder is writing, one for each lane."""
 
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from typing import Final
 
 from pebble.extensions.recordings.recorder.folder import STATE, Folder
@@ -28,7 +27,8 @@ class RetainedValues:
         stored = self._values.get(key)
         if item.retained and stored is not None and not stored.retained:
             return  # fetched by another connection, while a newer one had come
-        if not item.retain and not (item.retain is None and stored is not None):
+        is_retained = stored is not None if item.retain is None else item.retain
+        if not is_retained:
             return
         if item.payload:
             self._values[key] = item._replace(retain=True)
@@ -61,10 +61,6 @@ class OpenFiles:
     def by_lane(self) -> dict[str, OpenFile]:
         """Return a copy of the table, so that files may be opened and taken during an iteration."""
         return dict(self._files)
-
-    @property
-    def paths(self) -> set[Path]:
-        return {file.path for file in self._files.values()}
 
     def lane(self, item: Item) -> str:
         """Return the lane of a message. Beyond a number of robots, their media share a lane."""

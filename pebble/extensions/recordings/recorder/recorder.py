@@ -14,8 +14,7 @@ from typing import Final
 
 from pebble.extensions.recordings.files.recorded import require_package
 from pebble.extensions.recordings.recorder.background import Background
-from pebble.extensions.recordings.recorder.clock import RecordingClock
-from pebble.extensions.recordings.recorder.due import Due
+from pebble.extensions.recordings.recorder.clock import Due, RecordingClock
 from pebble.extensions.recordings.recorder.folder import Folder
 from pebble.extensions.recordings.recorder.intake import FORGET, Clocks, Intake
 from pebble.extensions.recordings.recorder.settings import Options
@@ -121,6 +120,7 @@ class Recorder:
                 return
 
     def _turn(self, due: Due, *, stopping: bool) -> None:
+        """Write what waits, and do what is due; ``stopping``: for the last time."""
         flushing = stopping or due.every("flush", FLUSH_S)
         if flushing:
             self._follow_clock(due)

@@ -32,11 +32,12 @@ class Source:
         self._recorder, self._kind, self._name = recorder, kind, name
         self._filters = list(dict.fromkeys(filters))
         self._ignored = () if any(filter_.startswith(REPLAYED) for filter_ in self._filters) else (REPLAYED,)
-        self._settings, self._is_modern = settings, True
+        self._settings = settings
+        self._is_modern = True  # the broker knows MQTT 5, as far as we know
         self._lost_at = 0  # nanoseconds since 1970; 0: connected, or never was
         self._losses: dict[str, int] = {}
-        self._copies: _Copies | None = None
-        self._wants_copies = self._was_connected = False
+        self._fetching: _RetainedFetch | None = None
+        self._wants_fetch = self._was_connected = False
         self._transport = self._make()
 
     @property
@@ -65,20 +66,20 @@ class Source:
             self._is_modern = False
             self._transport = self._make()
             self._open(0.0)
-        copies = self._copies
-        if copies is not None and (copies.is_done or self._wants_copies):
-            copies.close()
-            self._copies = None
-            if copies.failed:
+        fetching = self._fetching
+        if fetching is not None and (fetching.is_done or self._wants_fetch):
+            fetching.close()
+            self._fetching = None
+            if fetching.failed:
                 self._recorder.note("dropped", why="the retained messages cannot be fetched", **self._about)
-        if self._wants_copies:
-            self._wants_copies = False
-            self._copies = _Copies(self._settings, self._filters, self._record_retained)
+        if self._wants_fetch:
+            self._wants_fetch = False
+            self._fetching = _RetainedFetch(self._settings, self._filters, self._record_retained)
 
     def close(self) -> None:
         self._transport.close()
-        if self._copies is not None:
-            self._copies.close()
+        if self._fetching is not None:
+            self._fetching.close()
 
     def _open(self, timeout: float) -> None:
         self._transport.on_state(self._watch)
@@ -107,7 +108,7 @@ class Source:
                 self._recorder.note_gap(self._lost_at, "no connection", **self._about)
             self._lost_at = 0
             self._recorder.note("connected", **self._about)
-            self._wants_copies = self._kind == "mqtt"
+            self._wants_fetch = self._kind == "mqtt"
             self._recorder.forget_retained(self._name)
             self._was_connected = True
         elif state is State.CONNECTING and self._was_connected and not self._lost_at:
@@ -122,7 +123,7 @@ class Source:
             self._recorder.receive(
                 message.topic, message.payload, int(message.qos), message.retain_requested, source=self._name
             )
-        elif self._kind != "mqtt":  # of a broker the other connection fetches them
+        elif self._kind != "mqtt":  # those of a broker are fetched by the other connection
             self._record_retained(message)
 
     def _record_retained(self, message: Message) -> None:
@@ -131,14 +132,14 @@ class Source:
         self._recorder.receive(message.topic, message.payload, None, True, retained=True, source=self._name)
 
 
-class _Copies:
+class _RetainedFetch:
     """A connection that fetches the retained messages of a broker."""
 
     def __init__(self, settings: MqttSettings, filters: list[str], record: Callable[[Message], None]) -> None:
         self._record = record
         self._quiet_since = float("inf")  # not connected yet
         self._ends_at = time.monotonic() + _LONGEST_S
-        id_ = settings.client_id and f"{settings.client_id}-retained"
+        id_ = settings.client_id and f"{settings.client_id}-retained"  # without an id it has none either
         plain = replace(settings, as_published=False, sends_retained=True, max_qos=0, client_id=id_)
         self._transport = create("mqtt", "pebble-recorder-retained", plain)
         self._transport.on_state(self._watch)

@@ -11,9 +11,8 @@ from typing import Final, NamedTuple
 
 from pebble.extensions.recordings.files.recorded import RecordingError
 from pebble.extensions.recordings.recorder.background import Background
-from pebble.extensions.recordings.recorder.clock import RecordingClock
+from pebble.extensions.recordings.recorder.clock import Due, RecordingClock
 from pebble.extensions.recordings.recorder.disk_space import Disk, outdated, surplus
-from pebble.extensions.recordings.recorder.due import Due
 from pebble.extensions.recordings.recorder.finisher import Finisher
 from pebble.extensions.recordings.recorder.folder import STATE, Folder
 from pebble.extensions.recordings.recorder.intake import EVENTS, FORGET, Intake
@@ -39,8 +38,8 @@ class _Blocked(NamedTuple):
 
     why: str
     since_ns: int
-    dropped: int
-    full: bool
+    dropped: int  # messages until then
+    is_full: bool  # the disk
 
 
 class Context(NamedTuple):
@@ -76,10 +75,11 @@ class Writing:
 
         Without a lock they may be another recorder's; then they stay as they are.
         """
-        open_paths = self._files.paths
+        open_paths = {file.path for file in self._files.by_lane.values()}
         leftovers = [entry.path for entry in self._folder.entries() if entry.is_active and entry.path not in open_paths]
-        for path in leftovers if self._folder.is_locked else ():
-            self._finisher.mend(path)
+        if self._folder.is_locked:
+            for path in leftovers:
+                self._finisher.mend(path)
         return len(leftovers)
 
     # -- messages
@@ -246,7 +246,7 @@ class Writing:
             self.rotate(all_of_them=True)  # while there is room to finish them
             free, wanted = disk.free_bytes >> 20, options.free_bytes >> 20
             self._stand_still(f"the disk is full ({free} MB are free, and {wanted} MB must stay)", full=True)
-        elif self._blocked is not None and (disk.free_bytes >= options.free_bytes or not self._blocked.full):
+        elif self._blocked is not None and (disk.free_bytes >= options.free_bytes or not self._blocked.is_full):
             self.try_again()
 
     def _follow_folder(self) -> None:

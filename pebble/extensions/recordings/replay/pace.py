@@ -11,7 +11,7 @@ class Pace:
     def __init__(self, now: Callable[[], float], *, speed: float) -> None:
         self._now = now
         self._speed = min(max(speed, SLOWEST), FASTEST)
-        self.from_ns, self._from = 0, 0.0  # a position, and when playing went on from it
+        self.from_ns, self._since_s = 0, 0.0  # a position, and when playing went on from it
 
     @property
     def speed(self) -> float:
@@ -23,13 +23,13 @@ class Pace:
         self._speed = min(max(speed, SLOWEST), FASTEST)
 
     def go_on_from(self, position_ns: int) -> None:
-        self.from_ns, self._from = position_ns, self._now()
+        self.from_ns, self._since_s = position_ns, self._now()
 
     @property
     def reached_ns(self) -> int:
         """Return the present position, if nothing delays it."""
-        return self.from_ns + int((self._now() - self._from) * self._speed * 1e9)
+        return self.from_ns + int((self._now() - self._since_s) * self._speed * 1e9)
 
     def due_s(self, position_ns: int, now: float) -> float:
         """Return the seconds until a position is reached; negative if it is passed."""
-        return (position_ns - self.from_ns) / 1e9 / self._speed + self._from - now
+        return (position_ns - self.from_ns) / 1e9 / self._speed + self._since_s - now

@@ -4,8 +4,7 @@ from collections.abc import Callable, Iterator
 from typing import Final, Protocol
 
 from pebble.extensions.recordings.files.reader import Chooses
-from pebble.extensions.recordings.files.recorded import Recorded
-from pebble.extensions.recordings.library import FOREVER_NS
+from pebble.extensions.recordings.files.recorded import FOREVER_NS, Recorded
 from pebble.extensions.recordings.replay.pace import Pace
 from pebble.extensions.recordings.replay.rules import Rules, zero
 from pebble.transports import Message
@@ -59,7 +58,7 @@ class BusOutput:
     def __init__(self, rules: Rules, publish: Callable[[Message], bool], wall_ns: Callable[[], int]) -> None:
         self.sent = self.skipped = 0
         self._rules, self._publish, self._wall_ns = rules, publish, wall_ns
-        self._moved: dict[str, None] = {}  # topics of drive commands without a zero after them
+        self._moved: dict[str, None] = {}  # topics of drive commands without a zero after them, as an ordered set
 
     @property
     def moves(self) -> bool:
@@ -89,11 +88,13 @@ class BusOutput:
 
         Without a connection the robot's own deadline has to stop it.
         """
-        self._moved = {topic: None for topic in self._moved if not self._publish(zero(topic))}
+        for topic in list(self._moved):
+            if self._publish(zero(topic)):
+                del self._moved[topic]
 
 
 class Reading:
-    """A position in a recording, at the next message to publish; ``skipped``: how many were left out."""
+    """A position in a recording, at the next message to publish; ``skipped``: how many messages were left out."""
 
     def __init__(self, source: Source, publishes: Chooses, until_ns: int) -> None:
         self.next: Recorded | None = None
@@ -149,8 +150,8 @@ class Player:
         self._pace = Pace(now, speed=speed)
         self._now, self._wait = now, wait
         self._since_ns, self._loop, self._stays, self._longest_gap_ns = since_ns, loop, stays, longest_gap_ns
-        self._begins_ns = 0  # the first message
-        self._waited = 0.0
+        self._begins_ns = 0  # time of the first message
+        self._waited = 0.0  # when ``wait`` returned last
 
     @property
     def sent(self) -> int:
@@ -192,9 +193,10 @@ class Player:
                 self._step()
         finally:
             self._output.halt()
-            for _ in range(_TRIES if self._output.moves else 0):
-                self._wait(_RETRY_S)
-                self._output.halt()
+            if self._output.moves:
+                for _ in range(_TRIES):
+                    self._wait(_RETRY_S)
+                    self._output.halt()
 
     def pause(self) -> None:
         self._pace.from_ns = self.position_ns
@@ -217,12 +219,17 @@ class Player:
         self.ended = True
 
     def _open(self, since_ns: int, position_ns: int = 0) -> None:
+        """Continue with the messages from ``since_ns``, at ``position_ns``; 0: at the first of them."""
         self.at_end = False
         self._reading.open(since_ns)
-        first_ns = position_ns if self._reading.next is None else self._reading.next.log_ns
-        self._pace.go_on_from(max(since_ns, position_ns) if position_ns else first_ns)
+        if position_ns:
+            position_ns = max(since_ns, position_ns)
+        elif self._reading.next is not None:
+            position_ns = self._reading.next.log_ns
+        self._pace.go_on_from(position_ns)
 
     def _step(self) -> None:
+        """Wait, send one message, or end: what is due now."""
         now, reading = self._now(), self._reading
         if now - self._waited > _TICK_S:
             self._pass(0.0)
@@ -238,6 +245,7 @@ class Player:
             self._play(reading.next, now)
 
     def _play(self, message: Recorded, now: float) -> None:
+        """Send the next message if it is due, else wait for a moment."""
         due_s = self._pace.due_s(message.log_ns, now)
         if message.log_ns - self._pace.reached_ns > self._longest_gap_ns:
             self._pace.go_on_from(message.log_ns)

@@ -58,9 +58,9 @@ class _Address(NamedTuple):
     """The topic and the rule for a recorded channel's messages."""
 
     recorded: Identity
-    base: str
-    topic: str
-    declared: Declared | None
+    base: str  # the new one
+    topic: str  # below the new base
+    declared: Declared | None  # the contract's channel
     qos: QoS
 
 
@@ -73,7 +73,7 @@ class Rules:
         Identity(options.system, "robots", "any")
         for filter_ in options.only:
             check_filter(filter_)
-        self._found = lru_cache(maxsize=65_536)(self._find)
+        self._remembered_address = lru_cache(maxsize=65_536)(self._find_address)
         #: The robots that are replayed: recorded base by new base.
         self.robots: dict[str, str] = {}
         for channel in channels:
@@ -99,16 +99,19 @@ class Rules:
         return Outgoing(Message(address.topic, shifted(payload, by_ns), address.qos), moves)
 
     def _listed(self, channel: Channel) -> _Address | None:
-        """Return the channel's address; None if no file named its robot at the start, as it may be a live one."""
+        """Return the channel's address; None also if its robot came later than the start: it may be a live one."""
         address = self._address(channel)
         return address if address is not None and address.base in self.robots else None
 
     def _address(self, channel: Channel) -> _Address | None:
         metadata = channel.metadata
-        return self._found(channel.topic, metadata.get("qos", "0"), metadata.get("retained") == "1")
+        return self._remembered_address(channel.topic, metadata.get("qos", "0"), metadata.get("retained") == "1")
 
-    def _find(self, topic: str, qos: str, retained: bool) -> _Address | None:
-        """Return the address. ``retained``: the recorder received the message as an old one."""
+    def _find_address(self, topic: str, qos: str, retained: bool) -> _Address | None:
+        """Return the address for messages of a topic; None if none is to be published.
+
+        ``retained``: the recorder received them as old ones.
+        """
         parsed = None if topic.startswith("$") else parse_topic(topic)
         if parsed is None or parsed.identity.is_server or not self._wanted(topic):
             return None
@@ -131,7 +134,7 @@ class Rules:
     def _allowed(self, parsed: ParsedTopic, declared: Declared | None, retained: bool) -> bool:
         if parsed.direction != c.INCOMING:
             return declared is not c.BRIDGE_PROBE and not (retained and declared in _HEARTBEATS)
-        if retained or is_reserved(parsed.metric):  # stale; or who stops, resets and drives the robot, or did
+        if retained or is_reserved(parsed.metric):  # stale; or about stops and control
             return False
         return self._options.incoming and declared in _MILD
 
@@ -145,6 +148,7 @@ class Rules:
         return None if command.signed else command.moves
 
     def _add(self, channel: Channel) -> None:
+        """Note the robot of a channel. Raises ReplayError if its new base is its old one, or another robot's."""
         address = self._address(channel)
         if address is None:
             return
@@ -157,8 +161,8 @@ class Rules:
             )
 
 
-def harmless(payload: bytes, recorded: str, base: str) -> bytes:
-    """Return capabilities with their topics below ``base``, without offers that a replay cannot serve.
+def harmless(payload: bytes, old_base: str, new_base: str) -> bytes:
+    """Return capabilities with their topics below ``new_base``, without offers that a replay cannot serve.
 
     Pages publish to the topics that they find here: unchanged, they would drive the real robot. Unreadable capabilities
     become b"".
@@ -169,12 +173,12 @@ def harmless(payload: bytes, recorded: str, base: str) -> bytes:
         return b""
     if not isinstance(plain, dict) or not isinstance(plain.get("value"), dict):
         return b""
-    value = {name: _section(name, section, recorded, base) for name, section in plain["value"].items()}
+    value = {name: _section(name, section, old_base, new_base) for name, section in plain["value"].items()}
     return msgspec.json.encode({**plain, "value": value})
 
 
-def _section(name: str, section: Any, recorded: str, base: str) -> Any:
-    section = _rebased(section, f"{recorded}/", f"{base}/")
+def _section(name: str, section: Any, old_base: str, new_base: str) -> Any:
+    section = _rebased(section, f"{old_base}/", f"{new_base}/")
     return section if name in _WATCHED else _without_controls(section, drives=name == "drive")
 
 

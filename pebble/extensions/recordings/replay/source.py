@@ -9,8 +9,8 @@ from typing import Final
 
 from pebble.contract import HEARTBEAT, ONLINE, OUTGOING, Kind, channel_of
 from pebble.extensions.recordings.files.reader import Chooses, RecordingFile, missing_before
-from pebble.extensions.recordings.files.recorded import Channel, Recorded
-from pebble.extensions.recordings.library import FOREVER_NS, Damages, merged, robot_of
+from pebble.extensions.recordings.files.recorded import FOREVER_NS, Channel, Recorded
+from pebble.extensions.recordings.library import Damages, merged, robots_of
 from pebble.extensions.recordings.seek.archive import Archive
 
 _HEARTBEATS: Final = frozenset({ONLINE.suffix, HEARTBEAT.suffix})
@@ -24,7 +24,7 @@ class ReplaySource:
         """Read the end of each file, or all of an unfinished one. Raises RecordingError."""
         self._paths, self.channels = list(paths), list[Channel]()
         self.damages = Damages()  # of what was read
-        self.missing = 0  # messages, since before these files were mended
+        self.missing = 0  # messages that were missing already when these files were mended
         for path in self._paths:
             with RecordingFile(path) as file:
                 self.channels += file.channels.values()
@@ -42,11 +42,12 @@ class ReplaySource:
 
         Only of channels that ``publishes`` accepts; no heartbeats, since an old one is no sign of life.
         """
-        robots = {robot for channel in self.channels if publishes(channel) and (robot := robot_of(channel))}
-        state = [message for robot in robots for message in self._archive.state(robot, at_ns) if _is_state(message)]
-        pictures = [message for robot in robots for message in self._archive.pictures(robot, at_ns)]
-        known = [*sorted(state, key=_time), *sorted(pictures, key=_time)]
-        return [message for message in known if publishes(message.channel)]
+        state, pictures = list[Recorded](), list[Recorded]()
+        for robot in robots_of(filter(publishes, self.channels)):
+            state += filter(_is_state, self._archive.state(robot, at_ns))
+            pictures += self._archive.pictures(robot, at_ns)
+        messages = [*sorted(state, key=_time), *sorted(pictures, key=_time)]
+        return [message for message in messages if publishes(message.channel)]
 
 
 def _is_state(message: Recorded) -> bool:

@@ -3,6 +3,8 @@
 import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from itertools import islice
+from operator import attrgetter
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -10,7 +12,7 @@ from pebble.contract.channels import LOGS
 from pebble.contract.identity import Direction, parse_topic
 from pebble.errors import PebbleError
 from pebble.extensions.recordings.files.reader import Chunk, RecordingFile
-from pebble.extensions.recordings.files.recorded import Channel, Recorded
+from pebble.extensions.recordings.files.recorded import FOREVER_NS, Channel, Recorded
 from pebble.extensions.recordings.library import recordings_in
 from pebble.extensions.recordings.recorder.folder import MEDIA, NAME
 from pebble.extensions.recordings.recorder.lane import CARRIED, OTHER_MEDIA, lane_of
@@ -23,6 +25,7 @@ _CHAIN_NS, _CHAIN_BYTES = 15 * 10**9, 8 << 20
 LIST_S: Final = 1.0  # between two looks at the folder
 _LONGEST_FILE_NS: Final = 25 * 3600 * 10**9
 _MOST_OPEN: Final = 64  # files that are open at once
+_time = attrgetter("log_ns")
 
 
 class _Named(NamedTuple):
@@ -41,7 +44,7 @@ class Archive:
         self._named: list[_Named] = []
         self._listed_at = float("-inf")
         self._open: dict[Path, RecordingFile] = {}
-        self._failed: dict[Path, str] = {}  # those that cannot be opened, and why
+        self._failed: dict[Path, str] = {}  # why a file cannot be opened
 
     def close(self) -> None:
         while self._open:
@@ -51,15 +54,8 @@ class Archive:
         """Return the messages from and to a robot, from ``since_ns`` to before ``until_ns``."""
         messages: list[Recorded] = []
         for file in self.files(robot, since_ns, until_ns):
-            for chunk in _within(file, _channels_of(file, robot), since_ns, until_ns):
-                messages += (
-                    message
-                    for message in file.messages(chunk)
-                    if since_ns <= message.log_ns < until_ns
-                    and _is_of(message.channel, robot)
-                    and not _is_carried(message.channel)
-                )
-        messages.sort(key=lambda message: message.log_ns)
+            messages += _new_messages(file, robot, since_ns, until_ns)
+        messages.sort(key=_time)
         return messages
 
     def state(self, robot: str, at_ns: int) -> list[Recorded]:
@@ -75,35 +71,23 @@ class Archive:
             missing = topics - newest.keys()
             if not missing:
                 break
-            if chunk.channels and not any(
-                file.channels[number].topic in missing for number in chunk.channels if number in file.channels
-            ):
+            if not _may_hold(file, chunk, missing):
                 continue
             for message in reversed(file.messages(chunk)):
                 topic = message.channel.topic
                 if message.log_ns < at_ns and topic not in newest and _is_of(message.channel, robot):
                     newest[topic] = message
-        return sorted(
-            (message for message in newest.values() if not is_media(message.payload)),
-            key=lambda message: message.log_ns,
-        )
+        return sorted((message for message in newest.values() if not is_media(message.payload)), key=_time)
 
     def log_lines(self, robot: str, at_ns: int) -> list[Recorded]:
         """Return the last lines of a robot's log before ``at_ns``, oldest first."""
-        topic = LOGS.topic(robot)
+        topic, since_ns = LOGS.topic(robot), at_ns - _LOG_NS
         newest_first: list[Recorded] = []
-        for file in reversed(self.files(robot, at_ns - _LOG_NS, at_ns, media=False)):
+        for file in reversed(self.files(robot, since_ns, at_ns, media=False)):
             numbers = frozenset(number for number, channel in file.channels.items() if channel.topic == topic)
-            for chunk in reversed(_within(file, numbers, at_ns - _LOG_NS, at_ns)):
-                lines = [
-                    message
-                    for message in file.messages(chunk)
-                    if message.channel.topic == topic and message.log_ns < at_ns
-                ]
-                newest_first += reversed(lines)
-                if len(newest_first) >= LOG_LINES:
-                    break
-        return sorted(newest_first[:LOG_LINES], key=lambda message: message.log_ns)
+            lines = messages_of(file, numbers, since_ns, at_ns, backwards=True)
+            newest_first += islice(lines, LOG_LINES - len(newest_first))
+        return sorted(newest_first, key=_time)
 
     def pictures(self, robot: str, at_ns: int) -> list[Recorded]:
         """Return the last picture before ``at_ns`` after those that it builds on; empty if there is none."""
@@ -123,21 +107,21 @@ class Archive:
 
     def next_ns(self, robot: str, at_ns: int) -> int | None:
         """Return the time of the first message of the robot from ``at_ns`` on; None if there is none."""
-        earliest_ns: int | None = None
-        for file in sorted(self.files(robot, at_ns, 1 << 63), key=lambda file_: file_.first_ns):
-            if earliest_ns is not None and file.first_ns >= earliest_ns:
+        earliest_ns = FOREVER_NS
+        for file in self.files(robot, at_ns, FOREVER_NS):
+            if file.first_ns >= earliest_ns:
                 break
-            first_ns = _first(file, robot, at_ns)
-            if first_ns is not None:
-                earliest_ns = first_ns if earliest_ns is None else min(earliest_ns, first_ns)
-        return earliest_ns
+            first = next(_new_messages(file, robot, at_ns, earliest_ns), None)
+            if first is not None:
+                earliest_ns = first.log_ns
+        return None if earliest_ns == FOREVER_NS else earliest_ns
 
     def files(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[RecordingFile]:
         """Return the files that may hold messages of a robot in a period, opened, in the order of time."""
-        lane = lane_of(f"{robot}/", is_media=True)
+        media_lanes = (lane_of(f"{robot}/", is_media=True), OTHER_MEDIA) if media else ()
         files = []
         for named in self._list():
-            if named.lane.startswith(MEDIA) and (not media or named.lane not in (lane, OTHER_MEDIA)):
+            if named.lane.startswith(MEDIA) and named.lane not in media_lanes:
                 continue
             if named.begins_ns and not since_ns - _LONGEST_FILE_NS <= named.begins_ns < until_ns:
                 continue
@@ -159,13 +143,14 @@ class Archive:
     # -- files
 
     def _list(self) -> list[_Named]:
+        """Return the files by name. The folder is looked at once a second; files that are gone are closed."""
         now = time.monotonic()
         if now - self._listed_at >= LIST_S:
             paths = (path for place in self._places for path in (recordings_in(place) if place.is_dir() else (place,)))
             self._named = sorted(_named(path) for path in paths if path.is_file())
             self._listed_at = now
             there = {named.path for named in self._named}
-            for path in [path for path in self._open if path not in there]:
+            for path in self._open.keys() - there:
                 self._open.pop(path).close()
             self._failed = {path: why for path, why in self._failed.items() if path in there}
         return self._named
@@ -193,11 +178,9 @@ class Archive:
         """Yield the pictures before a time, newest first."""
         since_ns = at_ns - _CHAIN_NS
         for file in reversed(self.files(robot, since_ns, at_ns)):
-            for chunk in reversed(_within(file, _channels_of(file, robot), since_ns, at_ns)):
-                for message in reversed(file.messages(chunk)):
-                    outgoing = message.channel.topic.startswith(f"{robot}/outgoing/")
-                    if since_ns <= message.log_ns < at_ns and outgoing and is_picture(message.payload):
-                        yield message
+            for message in messages_of(file, _channels_of(file, robot), since_ns, at_ns, backwards=True):
+                if message.channel.topic.startswith(f"{robot}/outgoing/") and is_picture(message.payload):
+                    yield message
 
 
 def metric_of(topic: str) -> tuple[str, bool]:
@@ -208,12 +191,22 @@ def metric_of(topic: str) -> tuple[str, bool]:
     return parsed.metric, parsed.direction is Direction.INCOMING
 
 
-def _first(file: RecordingFile, robot: str, at_ns: int) -> int | None:
-    for chunk in _within(file, _channels_of(file, robot), at_ns, 1 << 63):
-        for message in file.messages(chunk):
-            if message.log_ns >= at_ns and _is_of(message.channel, robot) and not _is_carried(message.channel):
-                return message.log_ns
-    return None
+def messages_of(
+    file: RecordingFile, channels: frozenset[int], since_ns: int, until_ns: int, *, backwards: bool = False
+) -> Iterator[Recorded]:
+    """Yield a file's messages of a period and of the channels with these numbers; ``backwards``: the newest first."""
+    step = -1 if backwards else 1
+    for chunk in _within(file, channels, since_ns, until_ns)[::step]:
+        for message in file.messages(chunk)[::step]:
+            if since_ns <= message.log_ns < until_ns and message.channel.id in channels:
+                yield message
+
+
+def _new_messages(file: RecordingFile, robot: str, since_ns: int, until_ns: int) -> Iterator[Recorded]:
+    """Yield a robot's messages of a period, without those that were copied to the beginning of the file."""
+    for message in messages_of(file, _channels_of(file, robot), since_ns, until_ns):
+        if message.channel.metadata.get("retained") != CARRIED:
+            yield message
 
 
 def _within(file: RecordingFile, channels: frozenset[int], since_ns: int, until_ns: int) -> list[Chunk]:
@@ -227,13 +220,14 @@ def _within(file: RecordingFile, channels: frozenset[int], since_ns: int, until_
     ]
 
 
+def _may_hold(file: RecordingFile, chunk: Chunk, topics: set[str]) -> bool:
+    """True if the chunk has a message of one of the topics, or if its channels are not known."""
+    channels = (file.channels[number] for number in chunk.channels if number in file.channels)
+    return not chunk.channels or any(channel.topic in topics for channel in channels)
+
+
 def _channels_of(file: RecordingFile, robot: str) -> frozenset[int]:
     return frozenset(number for number, channel in file.channels.items() if _is_of(channel, robot))
-
-
-def _is_carried(channel: Channel) -> bool:
-    """True if the message was copied to the beginning of the file, and is older than the file."""
-    return channel.metadata.get("retained") == CARRIED
 
 
 def _is_of(channel: Channel, robot: str) -> bool:

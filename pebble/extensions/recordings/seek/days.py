@@ -1,6 +1,5 @@
 """The days of an archive with their contents, from the summaries of its files."""
 
-import json
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -10,10 +9,12 @@ from typing import Final
 from msgspec import Struct, field
 
 from pebble.contract import DRIVE
+from pebble.extensions.recordings.catalogue import event_in
 from pebble.extensions.recordings.files.reader import Chunk, RecordingFile
-from pebble.extensions.recordings.library import robot_of
+from pebble.extensions.recordings.files.recorded import FOREVER_NS
+from pebble.extensions.recordings.library import robot_of, robots_of
 from pebble.extensions.recordings.recorder.intake import EVENTS
-from pebble.extensions.recordings.seek.archive import Archive
+from pebble.extensions.recordings.seek.archive import Archive, messages_of
 
 DAY_NS: Final = 86_400 * 10**9
 _MOST_DAYS: Final = 31  # of one chunk
@@ -46,7 +47,7 @@ class Days:
     def all(self) -> list[Day]:
         """Return the days, newest first.
 
-        A file counts for each day that has messages of it; its bytes for the first.
+        A file counts for each day on which it has messages; its bytes count for the first.
         """
         by_name: dict[str, Day] = {}
         for file in self._archive.all_files():
@@ -70,32 +71,32 @@ def _days(file: RecordingFile) -> list[Day]:
     if not file.chunks:
         return []
     gaps = _gaps(file)
-    robots = sorted({robot for channel in file.channels.values() if (robot := robot_of(channel)) is not None})
+    robots = sorted(robots_of(file.channels.values()))
     days: list[Day] = []
     for number in sorted({number for chunk in file.chunks for number in _day_numbers(chunk)}):
         begin, end = number * DAY_NS, (number + 1) * DAY_NS
         first, last = max(file.first_ns, begin), min(file.last_ns, end - 1)
         size = 0 if days else file.size
-        within = sum(begin <= ns < end for ns in gaps)
+        gaps_within = sum(begin <= ns < end for ns in gaps)
         driven = _driven(file, begin, end)
-        days.append(Day(_day_of(number * 86_400), robots, size, first / 1e6, last / 1e6, within, driven))
+        days.append(Day(_day_of(number * 86_400), robots, size, first / 1e6, last / 1e6, gaps_within, driven))
     return days
 
 
 def _driven(file: RecordingFile, begin: int, end: int) -> dict[str, float]:
     """Return the driven seconds within a day, by robot."""
-    drives = {number: robot_of(channel) for number, channel in file.channels.items() if _drives(channel.topic)}
-    robots = {number: robot for number, robot in drives.items() if robot is not None}
+    robots: dict[int, str] = {}  # by the number of a channel with drive commands
+    for number, channel in file.channels.items():
+        robot = robot_of(channel.topic)
+        if robot is not None and channel.topic.rpartition("/")[2] == DRIVE.metric:
+            robots[number] = robot
     seconds: dict[str, float] = {}
     for chunk in file.chunks if robots else []:
-        within = max(0, min(chunk.end_ns, end) - max(chunk.start_ns, begin)) / 1e9
-        for robot in {robots[number] for number in chunk.channels if number in robots} if within else ():
-            seconds[robot] = seconds.get(robot, 0.0) + within
+        within_s = max(0, min(chunk.end_ns, end) - max(chunk.start_ns, begin)) / 1e9
+        if within_s:
+            for robot in {robots[number] for number in chunk.channels & robots.keys()}:
+                seconds[robot] = seconds.get(robot, 0.0) + within_s
     return seconds
-
-
-def _drives(topic: str) -> bool:
-    return topic.rpartition("/")[2] == DRIVE.metric
 
 
 def _day_of(seconds: int) -> str:
@@ -122,22 +123,9 @@ def _merge(day: Day, other: Day) -> None:
 
 
 def _gaps(file: RecordingFile) -> list[int]:
-    """Return the gaps that the recorder noted."""
-    numbers = {number for number, channel in file.channels.items() if channel.topic == EVENTS}
-    times = []
-    for chunk in file.chunks if numbers else []:
-        if not chunk.channels.isdisjoint(numbers):
-            times += [
-                message.log_ns
-                for message in file.messages(chunk)
-                if message.channel.id in numbers and _is_gap(message.payload)
-            ]
-    return times
-
-
-def _is_gap(payload: bytes) -> bool:
-    try:
-        event = json.loads(payload)
-    except (ValueError, RecursionError):
-        return False
-    return isinstance(event, dict) and event.get("event") == "gap"
+    """Return the times of the gaps that the recorder noted."""
+    numbers = frozenset(number for number, channel in file.channels.items() if channel.topic == EVENTS)
+    if not numbers:
+        return []
+    noted = messages_of(file, numbers, 0, FOREVER_NS)
+    return [message.log_ns for message in noted if event_in(message.payload).get("event") == "gap"]

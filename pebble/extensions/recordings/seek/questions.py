@@ -22,8 +22,9 @@ import msgspec
 from pebble.errors import PebbleError
 from pebble.extensions.recordings.exports.film import write_film
 from pebble.extensions.recordings.exports.unfinished import unfinished
+from pebble.extensions.recordings.files.recorded import ACTIVE
 from pebble.extensions.recordings.files.rewrite import write_copy
-from pebble.extensions.recordings.library import ACTIVE, Damages, merged, problems, robot_of
+from pebble.extensions.recordings.library import Damages, merged, problems, reported, robot_of
 from pebble.extensions.recordings.seek.archive import Archive
 from pebble.extensions.recordings.seek.days import Days
 from pebble.extensions.recordings.traffic.timeline import timeline as make_timeline
@@ -51,7 +52,7 @@ _days: Days
 def begin(folder: Path) -> None:
     """Prepare this process for questions about the recordings in ``folder``."""
     global _archive, _days
-    _in_background(_NICE)
+    _in_background()
     _archive = Archive(folder)
     _days = Days(_archive)
 
@@ -72,7 +73,7 @@ def files(robot: str, since_ns: int, until_ns: int) -> tuple[list[str], bool]:
 
 def make_timeline_job(answer: Connection, paths: list[str], target: Path, robot: str, period: tuple[int, int]) -> None:
     """Index recordings that have no index, and write the timeline to ``target`` as JSON."""
-    _in_background(_NICE)
+    _in_background()
 
     def work() -> str:
         places, progress = [Path(path) for path in paths], _Progress(answer)
@@ -88,7 +89,7 @@ def export_job(
     answer: Connection, paths: list[str], target: Path, robot: str, period: tuple[int, int], form: str
 ) -> None:
     """Write a period as a film or as MCAP to ``target``."""
-    _in_background(_NICE)
+    _in_background()
     since_ns, until_ns = period
 
     def work() -> str:
@@ -98,7 +99,7 @@ def export_job(
             [Path(path) for path in paths],
             since_ns=since_ns,
             until_ns=until_ns,
-            chooses=lambda channel: robot_of(channel) == robot,
+            chooses=lambda channel: robot_of(channel.topic) == robot,
             damages=damages,
         )
         progress = _Progress(answer)
@@ -110,7 +111,7 @@ def export_job(
             write_film(read, target, robot, on_time=on_time)
         else:
             with unfinished(target) as path, path.open("wb") as out:
-                if not write_copy(read(), out, on_time=on_time):
+                if not write_copy(reported(read(), on_time), out):
                     raise PebbleError(f"there is no message of {robot} in this stretch")
         return "; ".join(problems(damages))
 
@@ -150,14 +151,15 @@ def reason(error: Exception) -> str:
         case MemoryError():
             words = "there is too little memory: end other programs, or choose less"
         case OSError():
-            mend = _MENDS.get(error.errno or 0, "")
-            words = f"{error.filename or 'a file'}: {error.strerror or error}{mend and f'; {mend}'}"
+            words = f"{error.filename or 'a file'}: {error.strerror or error}"
+            if error.errno in _MENDS:
+                words += f"; {_MENDS[error.errno]}"
         case _:
             words = f"{type(error).__name__}: {error}; the log of the server says where"
     return words.partition("\n")[0][:_LONGEST_WHY]
 
 
-def _in_background(nice: int) -> None:
+def _in_background() -> None:
     end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in a terminal reaches the whole group: the parent ends this
-    os.nice(nice)
+    os.nice(_NICE)

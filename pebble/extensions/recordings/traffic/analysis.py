@@ -4,10 +4,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from msgspec import Struct
-
-from pebble.extensions.recordings.files.recorded import RecordingError
-from pebble.extensions.recordings.library import FOREVER_NS
+from pebble.extensions.recordings.files.recorded import FOREVER_NS, RecordingError
 from pebble.extensions.recordings.traffic.duck import connected, parquet
 from pebble.extensions.recordings.traffic.queries import RobotQueries
 from pebble.extensions.recordings.traffic.results import Gap, RobotTraffic, Traffic
@@ -26,18 +23,6 @@ _EVENTS: Final = """
 """
 
 
-class RecorderEvents(Struct):
-    """The events that recorders noted about their own work."""
-
-    gaps: list[Gap]
-    starts: list[int]  # ns; what was before is not known
-    dropped: int = 0
-
-    def breaks(self) -> list[tuple[int, int]]:
-        """Return the times across which no heartbeat interval can be measured."""
-        return [*((gap.since_ns, gap.until_ns) for gap in self.gaps), *((ns, ns) for ns in self.starts)]
-
-
 def analyse(
     sources: Sources,
     scratch: Path,
@@ -52,7 +37,7 @@ def analyse(
     Temporary files are made below ``scratch``. Raises RecordingError, also if there is no message.
     """
     with connected(scratch, memory_mb=_MEMORY_MB, threads=_THREADS) as connection:
-        recorder = recorder_events(connection, sources.indexes, since_ns, until_ns)
+        gaps, dropped = recorder_events(connection, sources.indexes, since_ns, until_ns)
         results, spans = list[RobotTraffic](), list[int]()
         names = [name for name in sources.robots if not robots or name in robots]
         for number, name in enumerate(names):
@@ -68,7 +53,7 @@ def analyse(
         raise RecordingError("there is no message of a robot in this period: see pebble recordings list")
     return Traffic(
         since_ns=min(spans), until_ns=max(spans), recordings=len(sources.indexes), missing=sources.missing,
-        dropped=recorder.dropped, gaps=recorder.gaps, robots=results, unread=sources.unread,
+        dropped=dropped, gaps=gaps, robots=results, unread=sources.unread,
     )  # fmt: skip
 
 
@@ -81,19 +66,23 @@ def _robot(queries: RobotQueries, name: str, messages: int, size: int) -> RobotT
     )  # fmt: skip
 
 
-def recorder_events(connection: Any, indexes: Sequence[Path], since_ns: int, until_ns: int) -> RecorderEvents:
-    """Return the recorders' events of a period; create the table ``breaks`` that `RobotQueries` needs."""
-    events = RecorderEvents([], [])
+def recorder_events(connection: Any, indexes: Sequence[Path], since_ns: int, until_ns: int) -> tuple[list[Gap], int]:
+    """Return the gaps that recorders noted in a period, and how many messages they dropped.
+
+    Create the table ``breaks`` that `RobotQueries` needs: times across which no heartbeat interval can be measured.
+    """
+    gaps, breaks, dropped = list[Gap](), list[tuple[int, int]](), 0
     rows = connection.execute(_EVENTS.format(events=parquet(indexes))).fetchall() if indexes else []
     for event, ns, since, until, why, messages in rows:
         if event == "gap" and since is not None and until is not None and since < until_ns and until >= since_ns:
-            events.gaps.append(Gap(since, until, why or ""))
-            events.dropped += messages
+            gaps.append(Gap(since, until, why or ""))
+            breaks.append((since, until))
+            dropped += messages
         elif event in ("start", "clock"):
-            events.starts.append(ns)
+            breaks.append((ns, ns))  # nothing is known of the time before
         elif event == "dropped" and since_ns <= ns < until_ns:
-            events.dropped += messages
+            dropped += messages
     connection.execute("CREATE TEMP TABLE breaks (since_ns BIGINT, until_ns BIGINT)")
-    for pause in events.breaks():
-        connection.execute("INSERT INTO breaks VALUES (?, ?)", pause)
-    return events
+    for times in breaks:
+        connection.execute("INSERT INTO breaks VALUES (?, ?)", times)
+    return gaps, dropped

@@ -32,6 +32,7 @@ _SETTINGS: Final[dict[Any, Any]] = {
 _SIZE: Final = (4.6, 2.8)  # inches
 _LONGEST_MS, _BIN_MS = 3000, 50
 _TIMES: Final = ((SESSION, "in sessions", _BLUE, -0.14, "o"), (IDLE, "idle", _ORANGE, 0.14, "s"))
+_LEAST_KBPS: Final = 0.01  # a logarithmic axis has no 0
 _TALL: Final = 30  # a highest bar of so many times the lowest makes the axis logarithmic
 
 
@@ -119,22 +120,21 @@ def _bandwidth(robot: RobotTraffic) -> Figure | None:
 
 def draw_bandwidth(axes: Axes, shown: Sequence[Bandwidth]) -> None:
     """Draw the median and the 95th percentile of each family, in sessions and while idle."""
-    names = [family for family in reversed(FAMILIES) if any(bandwidth.family == family for bandwidth in shown)]
+    present = {bandwidth.family for bandwidth in shown}
+    names = [family for family in reversed(FAMILIES) if family in present]
     for time, label, colour, offset, marker in _TIMES:
         of_time = [bandwidth for bandwidth in shown if bandwidth.time == time]
         places = [names.index(bandwidth.family) - offset for bandwidth in of_time]
-        medians = [max(bandwidth.median_kbps, 0.01) for bandwidth in of_time]
-        axes.hlines(
-            places, medians, [max(bandwidth.p95_kbps, 0.01) for bandwidth in of_time], color=colour, linewidth=2
-        )
+        medians = [max(bandwidth.median_kbps, _LEAST_KBPS) for bandwidth in of_time]
+        rights = [max(bandwidth.p95_kbps, _LEAST_KBPS) for bandwidth in of_time]
+        axes.hlines(places, medians, rights, color=colour, linewidth=2)
         axes.plot(medians, places, marker, color=colour, markersize=6, label=label)
-        for bandwidth, place in zip(of_time, places, strict=True):
-            right = max(bandwidth.p95_kbps, 0.01)
+        for bandwidth, right, place in zip(of_time, rights, places, strict=True):
             axes.annotate(
                 _short(bandwidth.median_kbps), (right, place), xytext=(6, 0), textcoords="offset points", va="center",
                 fontsize=7, color="#333",
             )  # fmt: skip
-    values = [max(value, 0.01) for bandwidth in shown for value in (bandwidth.median_kbps, bandwidth.p95_kbps)]
+    values = [max(kbps, _LEAST_KBPS) for bandwidth in shown for kbps in (bandwidth.median_kbps, bandwidth.p95_kbps)]
     axes.set_xscale("log")
     axes.set_xlim(10 ** math.floor(math.log10(min(values) * 0.7)), max(values) * 4)
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -179,6 +179,5 @@ def _svg(draw: Any, robot: RobotTraffic, name: str) -> str:
     text = re.sub(r"<metadata>.*?</metadata>", "", text, count=1, flags=re.DOTALL)
     text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)
     text = re.sub(r'<g id="[^"]*"', "<g", text)
-    return re.sub(
-        r'(<svg[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1), count=1
-    )
+    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
+    return re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)

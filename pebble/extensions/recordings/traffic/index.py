@@ -52,7 +52,7 @@ _BATCH: Final = 50_000  # rows
 _MEMORY_MB: Final = 128
 _LATEST_NS: Final = (1 << 63) - 1
 _OFFLINE: Final = re.compile(rb'"online"\s*:\s*false')
-#: A row while it is collected; -1, and 0 for stamp and medium: none.
+#: A row while it is collected. No value is -1 in ``online``, and 0 in ``stamp`` and ``medium``.
 _ROW: Final = [
     ("channel", "u2"), ("ts", "i8"), ("stamp", "i8"), ("size", "u4"), ("medium", "u1"), ("activity", "u1"),
     ("online", "i1"),
@@ -92,12 +92,11 @@ def index_path(recording: Path) -> Path:
 
 
 def about(index: Path, connection: DuckDBPyConnection) -> About | None:
-    """Return these facts from an index; None for another file. Raises RecordingError if it cannot be read."""
+    """Return the facts in an index; None if the file is not ours. Raises RecordingError if it cannot be read."""
     metadata = dict(connection.execute(f"SELECT key, value FROM parquet_kv_metadata({quoted(index)})").fetchall())
     try:
         texts = {key.decode(): value.decode() for key, value in metadata.items()}
-        numbers = [int(texts[name]) for name in ("size", "changed_ns", "missing")]
-        size, changed_ns, missing = numbers
+        size, changed_ns, missing = (int(texts[name]) for name in ("size", "changed_ns", "missing"))
         return About(texts["recording"], size, changed_ns, missing, texts["unread"])
     except (KeyError, ValueError):
         return None
@@ -167,12 +166,18 @@ class _Rows:
         if activity is None:
             activity = self._declare(message.channel)
         stamp = message.publish_ns if message.publish_ns <= _LATEST_NS else 0
-        medium = SOUND if payload.startswith(PBAT) else PICTURE if is_picture(payload) else 0
-        used = Activity.MEDIA if medium else activity(payload)
-        online = -1 if channel not in self._heartbeats else int(_OFFLINE.search(payload) is None)
-        self._batch.append((channel, message.log_ns, stamp, len(payload), medium, used, online))
+        medium, online = 0, -1
+        if payload.startswith(PBAT):
+            medium = SOUND
+        elif is_picture(payload):
+            medium = PICTURE
+        elif channel in self._heartbeats:
+            online = int(_OFFLINE.search(payload) is None)
+        shown = Activity.MEDIA if medium else activity(payload)
+        self._batch.append((channel, message.log_ns, stamp, len(payload), medium, shown, online))
 
     def _declare(self, channel: Channel) -> Callable[[bytes], Activity]:
+        """Add a channel to the table of channels; return the function for its payloads' activity."""
         topic = parse_topic(channel.topic)
         robot, direction, metric = "", "", channel.topic
         if topic is not None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from pebble.contract import channels as c
-from pebble.extensions.recordings.library import FOREVER_NS
+from pebble.extensions.recordings.files.recorded import FOREVER_NS
 from pebble.extensions.recordings.traffic import results as traffic
 from pebble.extensions.recordings.traffic.activity import SESSION
 from pebble.extensions.recordings.traffic.duck import parquet, quoted
@@ -144,7 +144,7 @@ class RobotQueries:
 
     def __init__(self, connection: DuckDBPyConnection, robot: str) -> None:
         self._connection, self._robot = connection, robot
-        self.machine = ""
+        self.machine = ""  # after :meth:`load`: as in RobotTraffic
 
     def load(self, indexes: Sequence[Path], since_ns: int, until_ns: int) -> None:
         """Create the tables of the messages in a period."""
@@ -158,7 +158,10 @@ class RobotQueries:
         self._connection.execute(indexed)
         self._connection.execute(f"CREATE OR REPLACE TEMP VIEW messages AS FROM indexed WHERE {' AND '.join(inside)}")
         linux, has_online, has_heartbeats = self._row(_ABOUT)
-        self.machine = traffic.LINUX if linux else traffic.MCU if has_heartbeats else traffic.COMPONENT
+        if linux:
+            self.machine = traffic.LINUX
+        else:
+            self.machine = traffic.MCU if has_heartbeats else traffic.COMPONENT
         self._connection.execute(_SECONDS)
         self._connection.execute(_HEARTBEATS, [c.ONLINE.metric if has_online else c.HEARTBEAT.metric])
         self._connection.execute(_ONLINE)

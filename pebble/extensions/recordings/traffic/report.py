@@ -1,7 +1,7 @@
 """The report of an analysis: a single HTML file, and its tables as CSV."""
 
-import html
 from collections.abc import Callable, Iterable
+from html import escape
 from pathlib import Path
 from typing import Final
 
@@ -84,7 +84,7 @@ def _page(traffic: Traffic, advance: Callable[[str, float], None]) -> str:
         advance(f"draw {robot.robot}", number / len(traffic.robots))
         body += _robot(robot, number)
     body.append('<h2 id="words">Words</h2><dl>')
-    body += [f"<dt><b>{_text(word)}</b></dt><dd>{_text(meaning)}</dd>" for word, meaning in _DEFINITIONS]
+    body += [f"<dt><b>{escape(word)}</b></dt><dd>{escape(meaning)}</dd>" for word, meaning in _DEFINITIONS]
     body.append("</dl>")
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Robot traffic</title>'
@@ -101,13 +101,13 @@ def _head(traffic: Traffic) -> Iterable[str]:
         f"<p>{moment(traffic.since_ns // 10**9)} to {moment(traffic.until_ns // 10**9)}: {len(traffic.robots)} robots "
         f"and components, {messages:,} messages, {size / 1e6:,.1f} MB of payload, from {traffic.recordings} "
         f"recordings. Times are UTC. Bandwidths are of payloads, without headers. The figures are those of section "
-        f"4.1 of the paper, for every robot. <small>Pebble {_text(__version__)}</small></p>"
+        f"4.1 of the paper, for every robot. <small>Pebble {escape(__version__)}</small></p>"
     )
-    links = [f'<a href="#robot-{number}">{_text(_id(robot))}</a>' for number, robot in enumerate(traffic.robots)]
+    links = [f'<a href="#robot-{number}">{escape(_id(robot))}</a>' for number, robot in enumerate(traffic.robots)]
     yield f'<nav>{" ".join(links)} <a href="#words">words</a></nav>'
     sentences = remarks(traffic)
     if sentences:
-        items = "".join(f"<li>{_text(remark)}</li>" for remark in sentences)
+        items = "".join(f"<li>{escape(remark)}</li>" for remark in sentences)
         yield f'<h2>What stands out</h2><ul class="remarks">{items}</ul>'
     table = media_bandwidth(traffic)
     if table.rows:
@@ -119,7 +119,7 @@ def _head(traffic: Traffic) -> Iterable[str]:
 
 
 def _robot(robot: RobotTraffic, number: int) -> Iterable[str]:
-    yield f'<h2 id="robot-{number}">{_text(_id(robot))}</h2><p>{_text(_about(robot))}</p><div class="figures">'
+    yield f'<h2 id="robot-{number}">{escape(_id(robot))}</h2><p>{escape(_about(robot))}</p><div class="figures">'
     yield from (_figure(figure, robot) for figure in figures(robot))
     yield "</div>"
 
@@ -130,22 +130,22 @@ def _about(robot: RobotTraffic) -> str:
 
 
 def _figure(figure: Figure, robot: RobotTraffic) -> str:
-    label = _text(f"{figure.title} of {_id(robot)}")
+    label = escape(f"{figure.title} of {_id(robot)}")
     svg = figure.svg.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
     return (
-        f"<figure>{svg}<figcaption><b>{_text(figure.number)}: {_text(figure.title)}</b>{_text(figure.caption)}"
+        f"<figure>{svg}<figcaption><b>{escape(figure.number)}: {escape(figure.title)}</b>{escape(figure.caption)}"
         "</figcaption></figure>"
     )
 
 
 def _table(table: Table) -> str:
-    heads = "".join(f"<th{_class(number)}>{_text(title)}</th>" for number, (_, title) in enumerate(table.columns))
+    heads = "".join(f"<th{_class(number)}>{escape(title)}</th>" for number, (_, title) in enumerate(table.columns))
     rows = "".join(
         f"<tr>{''.join(f'<td{_class(number)}>{_formatted(value)}</td>' for number, value in enumerate(row))}</tr>"
         for row in table.rows
     )
     return (
-        f'<h2>{_text(table.title)}</h2><div class="scroll"><table><thead><tr>{heads}</tr></thead>'
+        f'<h2>{escape(table.title)}</h2><div class="scroll"><table><thead><tr>{heads}</tr></thead>'
         f"<tbody>{rows}</tbody></table></div>"
     )
 
@@ -155,7 +155,9 @@ def _class(column: int) -> str:
 
 
 def _formatted(value: str | float | None) -> str:
-    return "–" if value is None else _text(value) if isinstance(value, str) else f"{value:,.2f}"
+    if isinstance(value, str):
+        return escape(value)
+    return "–" if value is None else f"{value:,.2f}"
 
 
 def _id(robot: RobotTraffic) -> str:
@@ -164,7 +166,3 @@ def _id(robot: RobotTraffic) -> str:
 
 def _times(number: int) -> str:
     return "once" if number == 1 else f"{number:,} times"
-
-
-def _text(text: str) -> str:
-    return html.escape(text)

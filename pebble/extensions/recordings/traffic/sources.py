@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Final
 from msgspec import Struct, field
 
 from pebble.errors import PebbleError
-from pebble.extensions.recordings.library import ACTIVE, files
-from pebble.extensions.recordings.recorder.folder import finished_path
+from pebble.extensions.recordings.files.recorded import ACTIVE, present_path
+from pebble.extensions.recordings.library import files
 from pebble.extensions.recordings.traffic.duck import connected, parquet
 from pebble.extensions.recordings.traffic.index import INDEX, about, index_path, is_of, write_index
 from pebble.runtime.as_owner import require_own
@@ -21,7 +21,7 @@ from pebble.runtime.as_owner import require_own
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
-#: Called with what is done now, and the share of all that is done.
+#: Called with the name of the present step, and how much of the whole work is done (0 to 1).
 Progress = Callable[[str, float], None]
 
 _MEMORY_MB: Final = 128
@@ -76,17 +76,20 @@ def _report(progress: Progress, name: str, before: float, part: float, share: fl
 
 
 def _index(path: Path, spare: Path, connection: DuckDBPyConnection, advance: Callable[[float], None]) -> Path | None:
-    """Return a recording's index, or ``spare`` if there is none beside it; None if the recording has been deleted."""
-    if path.name.endswith(ACTIVE) and not path.exists():
-        path = finished_path(path)  # its recorder finished it a moment ago
-    if not path.exists():
+    """Return a recording's index, made if it is missing; None if the recording has been deleted.
+
+    ``spare``: its path where it cannot be beside the recording.
+    """
+    recording = present_path(path)
+    if recording is None:
         return None
-    is_active = path.name.endswith(ACTIVE)
-    index = index_path(path)
-    if not is_active and is_of(index, path, connection):
+    is_active = recording.name.endswith(ACTIVE)
+    index = index_path(recording)
+    if not is_active and is_of(index, recording, connection):
         return index
-    index = spare if is_active or not _may_write(path.parent) else index
-    write_index(path, index, spare.parent, advance)
+    if is_active or not _may_write(recording.parent):
+        index = spare
+    write_index(recording, index, spare.parent, advance)
     return index
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from pebble.extensions.recordings.traffic.results import AUDIO, VIDEO, Traffic
+from pebble.extensions.recordings.traffic.results import AUDIO, VIDEO, Bandwidth, Traffic
 
 
 class Table(Struct, frozen=True):
@@ -33,11 +33,14 @@ def media_bandwidth(traffic: Traffic) -> Table:
     ]  # fmt: skip
     rows = []
     for robot in traffic.robots:
-        bandwidths = robot.of(VIDEO), robot.of(AUDIO)
-        if any(bandwidths):
-            cells = [(None, None) if row is None else (row.median_kbps, row.p95_kbps) for row in bandwidths]
-            rows.append([robot.robot, *cells[0], *cells[1]])
+        video, audio = robot.of(VIDEO), robot.of(AUDIO)
+        if video is not None or audio is not None:
+            rows.append([robot.robot, *_median_and_p95(video), *_median_and_p95(audio)])
     return Table("table-4-1-media-bandwidth", "Table 4.1: bandwidth of media, of active seconds", columns, rows)
+
+
+def _median_and_p95(bandwidth: Bandwidth | None) -> tuple[float | None, float | None]:
+    return (None, None) if bandwidth is None else (bandwidth.median_kbps, bandwidth.p95_kbps)
 
 
 def _bandwidth(traffic: Traffic) -> Table:

@@ -67,8 +67,8 @@ def timeline(
     """Return a robot's day from the recordings ``paths``; missing indexes are made. Raises RecordingError."""
     indexed = sources(paths, scratch, progress)
     with connected(scratch, memory_mb=_MEMORY_MB) as connection:
-        recorder = recorder_events(connection, indexed.indexes, since_ns, until_ns)
-        gaps = [Stretch(_ms(gap.since_ns), _ms(gap.until_ns), gap.why) for gap in recorder.gaps]
+        noted_gaps, _ = recorder_events(connection, indexed.indexes, since_ns, until_ns)
+        gaps = [Stretch(_ms(gap.since_ns), _ms(gap.until_ns), gap.why) for gap in noted_gaps]
         if robot not in indexed.robots:
             return Timeline(since_ns // 10**6, gaps=gaps)
         queries = RobotQueries(connection, robot)

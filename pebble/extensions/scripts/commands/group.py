@@ -82,14 +82,16 @@ def start(
     if not file or file.startswith("-"):
         raise PebbleError(f'which script? see "pebble script list {robot}"')
     with _scripts(robot, target) as (transport, scripts, _):
-        before, answers, began = scripts.status, scripts.answers, time.monotonic()
-        _sent(transport, scripts.start(transport, file, context.args))
-        wait_for(
-            lambda: scripts.answers > answers and _answered(before, scripts.status, file, time.monotonic() - began),
-            scripts.answer_s,
-        )
+        before, answers_before, began = scripts.status, scripts.answers, time.monotonic()
+        _require_sent(transport, scripts.start(transport, file, context.args))
+
+        def is_answered() -> bool:
+            elapsed_s = time.monotonic() - began
+            return scripts.answers > answers_before and _is_answer(before, scripts.status, file, elapsed_s)
+
+        wait_for(is_answered, scripts.answer_s)
         status = scripts.status
-        if scripts.answers == answers or status is None:
+        if scripts.answers == answers_before or status is None:
             raise PebbleError(f"no answer within {scripts.answer_s:g} s: is the robot up?")
         if not _runs(before, status, file):
             raise PebbleError(shown(status.error or f"{file} does not run"))
@@ -104,7 +106,7 @@ def start(
 def stop(robot: RobotArgument, *, target: Target) -> int:
     """Stop the script that runs. In an emergency: pebble estop."""
     with _scripts(robot, target) as (transport, scripts, _):
-        _sent(transport, scripts.stop(transport))
+        _require_sent(transport, scripts.stop(transport))
         wait_for(lambda: scripts.status is not None and not scripts.status.running, scripts.answer_s)
         if scripts.status is None or scripts.status.running:
             raise PebbleError(
@@ -134,10 +136,14 @@ def _scripts(robot: str, target: Target) -> Iterator[tuple[Transport, RobotScrip
         yield transport, scripts, shown(id_of(names.base))
 
 
-def _answered(before: AutonomyStatus | None, now: AutonomyStatus | None, file: str, elapsed: float) -> bool:
-    if now is None or _runs(before, now, file):
-        return now is not None
-    return bool(now.error) and (before is None or now.error != before.error or elapsed > _SAME_ERROR_S)
+def _is_answer(before: AutonomyStatus | None, now: AutonomyStatus | None, file: str, elapsed_s: float) -> bool:
+    """True if the newest status is the answer to a start: the script runs, or an error says why it does not."""
+    if now is None:
+        return False
+    if _runs(before, now, file):
+        return True
+    is_new_error = before is None or now.error != before.error
+    return bool(now.error) and (is_new_error or elapsed_s > _SAME_ERROR_S)
 
 
 def _runs(before: AutonomyStatus | None, now: AutonomyStatus, file: str) -> bool:
@@ -150,7 +156,7 @@ def _ended(now: AutonomyStatus | None) -> bool:
     return now is not None and not now.running
 
 
-def _sent(transport: Transport, accepted: bool) -> None:
+def _require_sent(transport: Transport, accepted: bool) -> None:
     if not accepted:
         raise TransportError(f"nothing was sent: {transport.problem or 'the connection was lost'}")
 
@@ -171,14 +177,21 @@ def _print_status(status: AutonomyStatus) -> None:
 
 def _option(setting: forms.Setting) -> str:
     """Return an option's line, such as ``--tag-id INT  Tag ID (default: 13)``."""
-    first = {value: option for option, value in reversed(options_of(setting))}
-    flag = setting.type == "bool"
-    shown = f"[{first[True]} | {first[False]}]" if flag else f"{first[None]} {setting.type.upper()}"
-    notes = [", ".join(map(str, setting.options))] if setting.options else []
-    notes += [f"min {setting.min}"] if setting.min is not None else []
-    notes += [f"max {setting.max}"] if setting.max is not None else []
+    names: dict[bool | None, str] = {}  # by the value of a flag, or None: the first name
+    for option, value in options_of(setting):
+        names.setdefault(value, option)
+    usage = f"{names.get(None)} {setting.type.upper()}"
+    if setting.type == "bool":
+        usage = f"[{names[True]} | {names[False]}]"
+    notes = []
+    if setting.options:
+        notes.append(", ".join(map(str, setting.options)))
+    if setting.min is not None:
+        notes.append(f"min {setting.min}")
+    if setting.max is not None:
+        notes.append(f"max {setting.max}")
     notes.append("required" if setting.required else f"default: {setting.default}")
-    return f"{shown:32}  {setting.label or setting.key} ({'; '.join(notes)})"
+    return f"{usage:32}  {setting.label or setting.key} ({'; '.join(notes)})"
 
 
 def _print(line: str) -> None:

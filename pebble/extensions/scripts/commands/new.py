@@ -28,7 +28,7 @@ def write(name: str, folder: Path) -> Iterator[Path]:
     texts = {
         "run.py": _text("run.py.txt"),
         test: _text("test_run.py.txt"),
-        "room.json": _room(),
+        "room.json": files("pebble.extensions.lab.simulation.world").joinpath("room.json").read_text(encoding="utf-8"),
         "goob.json": _robot(target),
         "pytest.ini": _text("pytest.ini"),
     }
@@ -47,10 +47,6 @@ def _alike(target: Path) -> Path | None:
 
 def _text(file: str) -> str:
     return files("pebble.extensions.scripts.commands").joinpath("starter", file).read_text(encoding="utf-8")
-
-
-def _room() -> str:
-    return files("pebble.extensions.lab.simulation.world").joinpath("room.json").read_text(encoding="utf-8")
 
 
 def _robot(target: Path) -> str:

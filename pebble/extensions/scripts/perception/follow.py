@@ -13,15 +13,14 @@ from msgspec import Meta, Struct
 from pebble.extensions.scripts.perception.tags import Place
 
 _STEER_PER_RAD = 0.35  # while driving: 2 rad/s per rad on Goob, stable with pictures that are 200 ms late
-_TURN_PER_RAD = 1.2  # of a pulse
+_TURN_PER_RAD = 1.2  # the power of a pulse
 _LEAST_TURN = 0.12
-_ALIGNED_RAD = 0.08  # at the wanted distance
+_ALIGNED_RAD = 0.08  # at the wanted distance, a smaller angle is not turned to
 _LEAST_DRIVE = 0.08
-_ARRIVED = 0.4  # of the threshold: holding begins here, and ends beyond threshold and hysteresis
+_ARRIVED = 0.4  # holding begins within this share of the threshold, and ends beyond threshold and hysteresis
 _REVERSE_POWER = 0.8
 _NEAR_M = 0.1  # beyond the wanted distance: a tag that is lost here has grown out of the picture
-_AWAY_S = 0.6
-_AWAY_POWER = 0.15
+_AWAY_S, _AWAY_POWER = 0.6, 0.15  # then the robot backs away
 
 Power = Annotated[float, Meta(ge=0, le=1)]
 Gain = Annotated[float, Meta(ge=0)]
@@ -103,28 +102,31 @@ class Follower:
         self.settings = settings
         self._pulses = Pulses()
         self._seen_at = self._reversed_at = float("-inf")
-        self._side = 1.0  # on which the tag was seen last: right
+        self._side = 1.0  # the side on which the tag was seen last, and to which the search turns: right is positive
         self._last = Command()
-        self._holding = self._near = False
+        self._holding = False  # the wanted distance is reached
+        self._near = False  # the tag was near when it was seen last
 
     def step(self, now: float, place: Place | None) -> Command:
-        self._last = self._lost(now) if place is None else self._seen(now, place)
+        self._last = self._without_tag(now) if place is None else self._with_tag(now, place)
         return self._last
 
-    def _seen(self, now: float, place: Place) -> Command:
+    def _with_tag(self, now: float, place: Place) -> Command:
         self._seen_at = self._reversed_at = now
         self._near = place.distance_m < self.settings.target_distance_m + _NEAR_M
         self._side = math.copysign(1.0, place.angle_rad)
         if abs(place.angle_rad) > math.radians(self.settings.forward_cone_deg):
             self._holding = False
             return self._turn(now, place.angle_rad)
-        error = place.distance_m - self.settings.target_distance_m
-        threshold = self.settings.distance_threshold_m
-        band = threshold + self.settings.standoff_hysteresis_m if self._holding else _ARRIVED * threshold
-        self._holding = abs(error) <= band
+        too_far_m = place.distance_m - self.settings.target_distance_m
+        threshold_m = self.settings.distance_threshold_m
+        tolerance_m = threshold_m + self.settings.standoff_hysteresis_m if self._holding else _ARRIVED * threshold_m
+        self._holding = abs(too_far_m) <= tolerance_m
         if not self._holding:
-            return self._approach(error, place.angle_rad)
-        return self._turn(now, place.angle_rad) if abs(place.angle_rad) > _ALIGNED_RAD else Command()
+            return self._approach(too_far_m, place.angle_rad)
+        if abs(place.angle_rad) > _ALIGNED_RAD:
+            return self._turn(now, place.angle_rad)
+        return Command()
 
     def _turn(self, now: float, angle: float) -> Command:
         settings = self.settings
@@ -132,22 +134,24 @@ class Follower:
         x = self._pulses.turn(math.copysign(power, angle), settings.turn_pulse_s, settings.turn_cooldown_s, now)
         return Command(x, 0.0, "turn")
 
-    def _approach(self, error: float, angle: float) -> Command:
-        """Return the command for a tag inside the cone. ``error`` > 0: it is too far away."""
+    def _approach(self, too_far_m: float, angle: float) -> Command:
+        """Return the command for a tag inside the cone; ``too_far_m`` < 0: it is too near."""
         settings = self.settings
         x = max(-settings.turn_power, min(settings.turn_power, _STEER_PER_RAD * angle))
-        if error < 0.0:
-            return Command(x, max(-_REVERSE_POWER, min(-_LEAST_DRIVE, settings.vision_reverse_kp * error)), "back")
-        power = settings.vision_forward_kp * error
-        if error >= settings.distance_threshold_m + settings.vision_forward_floor_distance_m:
+        if too_far_m < 0.0:
+            power = settings.vision_reverse_kp * -too_far_m
+            return Command(x, -min(_REVERSE_POWER, max(_LEAST_DRIVE, power)), "back")
+        power = settings.vision_forward_kp * too_far_m
+        if too_far_m >= settings.distance_threshold_m + settings.vision_forward_floor_distance_m:
             power = max(power, settings.forward_min_power)
         most = min(settings.forward_max_power, 1.0 - abs(x))  # the rest is for steering
         return Command(x, min(most, max(_LEAST_DRIVE, power)), "drive")
 
-    def _lost(self, now: float) -> Command:
+    def _without_tag(self, now: float) -> Command:
+        """Return the command while the tag is not in the picture: go on, back away, wait, or search for it."""
         settings, gone_s = self.settings, now - self._seen_at
         if gone_s <= settings.tag_timeout_s and self._last.reason in ("drive", "back"):
-            return self._last  # one picture more or less
+            return self._last  # it may be missing in a single picture
         self._holding = False
         if self._near and 0.0 < gone_s - settings.tag_timeout_s <= _AWAY_S:
             return Command(0.0, -_AWAY_POWER, "back away")

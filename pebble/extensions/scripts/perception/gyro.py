@@ -8,8 +8,8 @@ log = logging.getLogger(__name__)
 _FRESH_S = 0.3
 _GAP_MS = 100  # samples farther apart are not integrated over
 _LIMIT_DPS = 320.0  # the sensor's protocol ends at 327
-_BIAS_WEIGHT = 0.005  # of a sample at rest, at 100 Hz: 2 s
-_TEST_TURN_RAD = math.pi  # of the wheels, before the sensor is judged
+_BIAS_WEIGHT = 0.005  # of a sample at rest; at 100 Hz the bias follows within 2 s
+_TEST_TURN_RAD = math.pi  # so far the wheels turn the robot before the sensor is judged
 _NOISE_RAD = 0.01  # per sample of the wheels: less may be noise of their sensors, and judges nothing
 _LEAST_RATIO, _MOST_RATIO = 0.5, 2.0  # sensor to wheels; else it is mounted otherwise than flat, x ahead, z up
 
@@ -22,14 +22,14 @@ class GyroHeading:
         self._bias_dps = 0.0
         self._at_rest = 0  # samples
         self._mcu_ms: int | None = None
-        self._at = float("-inf")
-        self._limited = False
-        self._agreed = self._compared = 0.0
+        self._at = float("-inf")  # the newest sample
+        self._limited = False  # a turn since then was too fast for the sensor
+        self._agreed_rad = self._compared_rad = 0.0  # turns by the sensor in the wheels' direction, and by the wheels
         self._trusted = True
 
     def sample(self, z_dps: float, mcu_ms: int, now: float, *, at_rest: bool) -> None:
         """Add a sample; ``at_rest``: no wheel turns, so it shows the bias."""
-        gap_ms = _GAP_MS + 1 if self._mcu_ms is None else mcu_ms - self._mcu_ms
+        gap_ms = 0 if self._mcu_ms is None else mcu_ms - self._mcu_ms
         self._mcu_ms, self._at = mcu_ms, now
         if at_rest:
             self._at_rest += 1
@@ -48,14 +48,15 @@ class GyroHeading:
         return turn
 
     def _compare(self, turn: float, wheels_rad: float) -> None:
+        """Judge the sensor by the wheels, each time that they have turned the robot far enough."""
         if abs(wheels_rad) < _NOISE_RAD:
             return
-        self._agreed += math.copysign(1.0, wheels_rad) * turn
-        self._compared += abs(wheels_rad)
-        if self._compared < _TEST_TURN_RAD:
+        self._agreed_rad += math.copysign(1.0, wheels_rad) * turn
+        self._compared_rad += abs(wheels_rad)
+        if self._compared_rad < _TEST_TURN_RAD:
             return
-        ratio = self._agreed / self._compared
+        ratio = self._agreed_rad / self._compared_rad
         if not _LEAST_RATIO <= ratio <= _MOST_RATIO:
             log.warning("the inertial sensor shows %.0f %% of the wheels' turns: heading from the wheels", 100 * ratio)
             self._trusted = False
-        self._agreed = self._compared = 0.0
+        self._agreed_rad = self._compared_rad = 0.0

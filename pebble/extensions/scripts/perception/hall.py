@@ -13,7 +13,7 @@ _SMALLEST_SWING = 30  # ADC counts between the extremes; less is noise
 _WARM_UP_EXTREMA = 12  # of the sensor's signal, until its range is known
 _WARM_UP_SAMPLES = 400
 _FADE = 0.005  # per extremum: how fast the range follows a signal that becomes smaller; a fast wheel shows few peaks
-_CARRY = 0.72  # of its speed a wheel carries over a sample of 20 ms: motors have a lag of about 60 ms
+_CARRY = 0.72  # the share of its speed that a wheel keeps over a sample of 20 ms: motors have a lag of about 60 ms
 _FULL_SPEED_RAD = 1.25  # phase per sample at full power, until it is known: Goob's
 _SMOOTH = 0.4  # per sample
 _LEAST_SPEED_RAD = 0.3
@@ -50,12 +50,13 @@ class SensorRange:
         return self.high - self.low >= _SMALLEST_SWING
 
     def update(self, value: float) -> None:
+        """Add a value. A clear turn of the signal away from its farthest value ends a half wave."""
         if not self._started:
             self._started = True
             self.low = self.high = self._pivot = value
         self.low, self.high = min(self.low, value), max(self.high, value)
-        beyond = value > self._pivot if self._rising else value < self._pivot
-        if beyond:
+        goes_on = value > self._pivot if self._rising else value < self._pivot
+        if goes_on:
             self._pivot = value
         elif abs(value - self._pivot) > max(_SMALLEST_SWING, 0.3 * (self.high - self.low)):
             self._end_of_half_wave(value)
@@ -87,29 +88,31 @@ class PhaseTracker:
         self.phase: float | None = None  # None: no sample yet
         self.surprise = 0.0  # the sum of all differences from the expected phases
         self.rejected = 0  # samples that fit a turn against the expected one better
-        self._expected = 0.0  # phase per sample
-        self._measured = self._power = 0.0
-        self._per_power = _FULL_SPEED_RAD
-        self._farthest = 0.0  # in the expected direction
+        self._expected = self._measured = 0.0  # speeds: phase per sample
+        self._power = 0.0  # of the last sample
+        self._per_power = _FULL_SPEED_RAD  # the speed at full power, as far as it is learned
+        self._farthest = 0.0  # the farthest phase in the expected direction
         self._falls = falls
 
     def update(self, level: float, power: float) -> float:
         """Return the phase added since the last level."""
-        base = math.asin(level)
+        rising, falling = math.asin(level), math.pi - math.asin(level)  # the level occurs once on each half of the wave
         if self.phase is None:
-            self.phase = self._farthest = math.pi - base if self._falls else base
+            self.phase = self._farthest = falling if self._falls else rising
             return 0.0
         predicted = self.phase + self._predict(power)
-        branches = (base, math.pi - base)
-        phases = [predicted + math.remainder(branch - predicted, math.tau) for branch in branches]
-        nearest = min(phases, key=lambda phase: abs(phase - predicted))
-        onwards = math.copysign(1.0, self._expected)
-        possible = [phase for phase in phases if (phase - self._farthest) * onwards >= -_NOISE_RAD]
+
+        def distance(phase: float) -> float:
+            return abs(phase - predicted)
+
+        phases = [predicted + math.remainder(half - predicted, math.tau) for half in (rising, falling)]
+        nearest = min(phases, key=distance)
+        direction = math.copysign(1.0, self._expected)
+        possible = [phase for phase in phases if (phase - self._farthest) * direction >= -_NOISE_RAD]
         if nearest not in possible:
             self.rejected += 1
-            turn = math.copysign(math.tau, self._expected)
-            nearest = min(possible or [phase + turn for phase in phases], key=lambda phase: abs(phase - predicted))
-        self.surprise += abs(nearest - predicted)
+            nearest = min(possible or [phase + direction * math.tau for phase in phases], key=distance)
+        self.surprise += distance(nearest)
         return self._move_to(self.phase, nearest, power)
 
     def update_pair(self, phase: float, power: float) -> float:
@@ -126,14 +129,15 @@ class PhaseTracker:
         If the expected direction changes, the present phase becomes the farthest one, so that the phase can go back.
         """
         before = self._expected
-        drive = (self._power + power) / 2  # a command comes between two samples
-        self._expected, self._power = _CARRY * before + (1.0 - _CARRY) * self._per_power * drive, power
+        mean_power = (self._power + power) / 2  # a command comes between two samples
+        self._expected, self._power = _CARRY * before + (1.0 - _CARRY) * self._per_power * mean_power, power
         if before * self._expected <= 0.0 and self.phase is not None:
             self._farthest = self.phase
         agrees = self._measured * self._expected > 0.0
         return (self._expected + self._measured) / 2 if agrees else self._expected
 
     def _move_to(self, before: float, phase: float, power: float) -> float:
+        """Set the new phase and learn from it how fast the wheel is; return the phase added."""
         added = phase - before
         self.phase = phase
         self._measured += _SMOOTH * (added - self._measured)
@@ -169,7 +173,7 @@ class HallWheel:
 
     @property
     def mm(self) -> float:
-        """Distance so far; reverse is negative."""
+        """Return the distance so far; reverse is negative."""
         return self._counts.rad / math.pi * self.mm_per_step
 
     @property
@@ -178,7 +182,7 @@ class HallWheel:
 
     @property
     def unknown(self) -> int:
-        """Steps in an unknown direction, which count in no distance."""
+        """Return the number of steps in an unknown direction, which count in no distance."""
         return int(self._counts.unknown_rad / math.pi)
 
     @property
@@ -191,14 +195,14 @@ class HallWheel:
 
     def update(self, sample: HallSample) -> float:
         """Return the distance since the last sample, in mm. Until :attr:`ready` it may correct earlier results."""
-        extrema = self._range.extrema
+        extrema_before = self._range.extrema
         self._range.update(sample.value)
         if sample.quadrature is not None:
             self._second.update(sample.quadrature)
         before = self.mm
         if self._warm_up is not None:
             self._warm_up.append(sample)
-            if self._range.extrema > extrema:
+            if self._range.extrema > extrema_before:
                 self._replay(self._warm_up)
                 return self.mm - before
             self._bound_warm_up(self._warm_up)
@@ -217,9 +221,9 @@ class HallWheel:
 
     def _replay(self, samples: list[HallSample]) -> None:
         """Track all samples so far again, since the range and the first half of the wave are better known now."""
-        self._second_sign = self._second_sensor(samples)
-        starts = [self._replayed(samples, PhaseTracker(falls=falls)) for falls in (False, True)]
-        self._tracker, self._counts = min(starts, key=lambda start: start[0].surprise)
+        self._second_sign = self._sign_of_second(samples)
+        rising, falling = (self._replayed(samples, PhaseTracker(falls=falls)) for falls in (False, True))
+        self._tracker, self._counts = min(rising, falling, key=lambda replayed: replayed[0].surprise)
         if self._range.extrema >= _WARM_UP_EXTREMA:
             self._warm_up = None
 
@@ -230,6 +234,7 @@ class HallWheel:
         return tracker, counts
 
     def _add(self, sample: HallSample, tracker: PhaseTracker, counts: _Counts) -> None:
+        """Add the motion of a sample to the counts, by both sensors if the second one is used."""
         level = self._range.level(sample.value)
         if self._second_sign and sample.quadrature is not None:
             second = self._second_sign * self._second.level(sample.quadrature)
@@ -242,23 +247,24 @@ class HallWheel:
         counts.rad += added
         counts.rad_in_any_direction += abs(added)
 
-    def _second_sensor(self, samples: list[HallSample]) -> int:
+    def _sign_of_second(self, samples: list[HallSample]) -> int:
         """Return the sign with which the second sensor shows the commanded directions, 1 or −1; 0 if it shows none."""
         if not self._second.swings or self._second.extrema < 1:
             return 0
-        agreed = total = run = 0.0  # run: the motion since the direction changed
-        before: tuple[float, int] | None = None
+        agreed = total = 0.0  # motion in the commanded direction (against it: negative), and in any
+        run = 0.0  # the motion since the direction changed
+        last_phase, last_direction = 0.0, 0
         for sample in samples:
             if sample.quadrature is None:
                 return 0
             phase = math.atan2(self._range.level(sample.value), -self._second.level(sample.quadrature))
-            if before is None or before[1] != sample.direction:
+            if sample.direction != last_direction:
                 total, run = total + abs(run), 0.0
             elif sample.direction:
-                moved = math.remainder(phase - before[0], math.tau)
+                moved = math.remainder(phase - last_phase, math.tau)
                 run += moved
                 agreed += moved * sample.direction
-            before = phase, sample.direction
+            last_phase, last_direction = phase, sample.direction
         total += abs(run)
         if total < math.pi or abs(agreed) < _SHARE_AGREED * total:
             return 0

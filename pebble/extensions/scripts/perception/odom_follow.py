@@ -9,8 +9,8 @@ from pebble.contract.payloads import WheelOdometry
 from pebble.extensions.scripts.perception.follow import Command, Follower, FollowSettings
 from pebble.extensions.scripts.perception.tags import Place
 
-_BLIND_S = 6.0  # at most, since the tag was seen
-_SLOW_RAD = math.radians(40.0)  # off the goal; the more beyond, the slower
+_BLIND_S = 6.0  # so long after the tag was seen the robot drives by odometry, at most
+_SLOW_RAD = math.radians(40.0)  # the farther off the goal's direction beyond this, the slower
 _LEAST_SHARE = 0.2
 _TURN_POWER = 0.6
 
@@ -29,8 +29,8 @@ def pose_of(odometry: WheelOdometry | None) -> Pose | None:
         return None
     value = odometry.value
     x, y = _number(value, "x_mm", "x"), _number(value, "y_mm", "y")
-    heading = _number(value, "heading_rad", "theta_rad", "heading")
-    if heading is None and (degrees := _number(value, "heading_deg", "theta_deg")) is not None:
+    heading, degrees = _number(value, "heading_rad", "theta_rad", "heading"), _number(value, "heading_deg", "theta_deg")
+    if heading is None and degrees is not None:
         heading = math.radians(degrees)
     if x is None or y is None or heading is None:
         return None
@@ -39,9 +39,11 @@ def pose_of(odometry: WheelOdometry | None) -> Pose | None:
 
 
 def _number(value: dict[str, Any], *names: str) -> float | None:
+    """Return the first field with one of these names; None if there is none, or it is no finite number."""
     number = next((value[name] for name in names if value.get(name) is not None), None)
-    usable = isinstance(number, int | float) and math.isfinite(number)
-    return float(number) if usable else None  # type: ignore[arg-type]
+    if not isinstance(number, int | float) or not math.isfinite(number):
+        return None
+    return float(number)
 
 
 class OdomFollower:
@@ -50,8 +52,8 @@ class OdomFollower:
     def __init__(self, settings: FollowSettings) -> None:
         self.settings = settings
         self._vision = Follower(replace(settings, tag_timeout_s=0.0))  # how old a place may be is decided here
-        self._place: Place | None = None
-        self._goal: tuple[float, float] | None = None
+        self._place: Place | None = None  # of the tag in the newest picture
+        self._goal: tuple[float, float] | None = None  # x and y to which the robot drives while the tag is out of sight
         self._seen_at = self._planned_at = self._reached_at = float("-inf")
 
     def see(self, now: float, place: Place | None, pose: Pose | None) -> None:
@@ -66,10 +68,13 @@ class OdomFollower:
         vision = self._vision.step(now, place)
         if place is not None:
             return vision
-        blind = None if self._goal is None or pose is None else self._to_goal(now, self._goal, pose)
-        if blind is not None:
-            return blind
-        return Command(reason="goal reached") if now - self._reached_at < self.settings.goal_hold_s else vision
+        if self._goal is not None and pose is not None:
+            blind = self._to_goal(now, self._goal, pose)
+            if blind is not None:
+                return blind
+        if now - self._reached_at < self.settings.goal_hold_s:
+            return Command(reason="goal reached")
+        return vision
 
     def _plan(self, place: Place, pose: Pose) -> tuple[float, float] | None:
         """Return the point on the way to the tag that has the wanted distance from it; None if it is near."""
@@ -88,11 +93,11 @@ class OdomFollower:
         if distance <= settings.odom_goal_tolerance_m or now - self._planned_at > _BLIND_S:
             self._goal, self._reached_at = None, now
             return None
-        off = math.remainder(math.atan2(dy, dx) - pose.heading_rad, math.tau)  # > 0: to the left
-        share = max(-1.0, min(1.0, settings.odom_heading_kp * off / (math.pi / 2)))
-        floor = settings.odom_min_drive_power if distance >= settings.odom_brake_distance_m else 0.0
-        power = min(settings.odom_max_drive_power, max(floor, settings.odom_distance_kp * distance))
-        if abs(off) > _SLOW_RAD:
-            power *= max(_LEAST_SHARE, 1.0 - (abs(off) - _SLOW_RAD) / (math.pi - _SLOW_RAD))
-        x = -share * _TURN_POWER
+        off_rad = math.remainder(math.atan2(dy, dx) - pose.heading_rad, math.tau)  # > 0: to the left
+        steering = max(-1.0, min(1.0, settings.odom_heading_kp * off_rad / (math.pi / 2)))
+        least_power = settings.odom_min_drive_power if distance >= settings.odom_brake_distance_m else 0.0
+        power = min(settings.odom_max_drive_power, max(least_power, settings.odom_distance_kp * distance))
+        if abs(off_rad) > _SLOW_RAD:
+            power *= max(_LEAST_SHARE, 1.0 - (abs(off_rad) - _SLOW_RAD) / (math.pi - _SLOW_RAD))
+        x = -steering * _TURN_POWER
         return Command(x, min(power, 1.0 - abs(x)), "odometry")

@@ -63,7 +63,7 @@ class OdometrySettings(Struct, frozen=True, kw_only=True):
 
     @property
     def step_mm(self) -> tuple[float, float]:
-        """Length of a step of the left and of the right wheel; a step is one magnet."""
+        """Return the length of a step of the left and of the right wheel; a step is one magnet."""
         step = math.pi * self.wheel_diameter_mm / self.magnets
         return self.left_mm_per_event or step, self.right_mm_per_event or step
 
@@ -95,6 +95,7 @@ class _Part:
     turn_rad: float = 0.0
 
     def end(self, start: WheelPose) -> WheelPose:
+        """Return the pose at the end of the arc."""
         half = self.turn_rad / 2
         chord = self.ahead_mm * (math.sin(half) / half if half else 1.0)
         middle = start.heading_rad + half
@@ -112,59 +113,67 @@ class _Wheel:
         self.hall = HallWheel(mm_per_step)
         self.turned_at = float("-inf")
         self.stalls = 0
-        self._turned_mm = 0.0  # where it was then
-        self._idle_since: float | None = None  # with power; None: without, or it turns
+        self._turned_mm = 0.0  # its distance when it last turned
+        self._blocked_since: float | None = None  # it has power and does not turn; inf: counted as a stall already
 
     def update(self, sample: HallSample, now: float) -> float:
         """Return the distance since the last sample, in mm."""
         distance = self.hall.update(sample)
-        if turned := abs(self.hall.mm - self._turned_mm) > _NOISE_MM:
+        has_turned = abs(self.hall.mm - self._turned_mm) > _NOISE_MM
+        if has_turned:
             self._turned_mm, self.turned_at = self.hall.mm, now
-        if turned or not sample.power:
-            self._idle_since = None
-        elif self._idle_since is None:
-            self._idle_since = now
-        elif now - self._idle_since > _STALL_S:
+        if has_turned or not sample.power:
+            self._blocked_since = None
+        elif self._blocked_since is None:
+            self._blocked_since = now
+        elif now - self._blocked_since > _STALL_S:
             self.stalls += 1
-            self._idle_since = math.inf
+            self._blocked_since = math.inf
         return distance
+
+
+class Motor(NamedTuple):
+    """The power of a motor, and the direction in which its wheel may turn: 1, −1, or 0 if it is unknown."""
+
+    power: float
+    direction: int
 
 
 class Directions:
     """The power of both motors, and the direction in which each wheel may turn. One hall sensor does not show it."""
 
     def __init__(self, now: float) -> None:
-        self._power = (0.0, 0.0)  # left, right
-        self._signs = [0, 0]
-        self._signs_until = [now, now]
+        self._power = (0.0, 0.0)  # left and right, as the next two
+        self._directions = [0, 0]
+        self._known_until = [now, now]
 
     def command(self, power: MotorPower, now: float) -> None:
-        self._note_signs(now)
+        self._note_directions(now)
         self._power = (power.left, power.right)
 
-    def at(self, now: float) -> tuple[tuple[float, int], tuple[float, int]]:
-        """Return (power, possible direction) of the left and the right wheel. A coasting wheel keeps its direction."""
-        self._note_signs(now)
-        left, right = (s if now <= until else 0 for s, until in zip(self._signs, self._signs_until, strict=True))
-        return (self._power[0], left), (self._power[1], right)
+    def at(self, now: float) -> tuple[Motor, Motor]:
+        """Return the left and the right motor. A coasting wheel keeps its direction for a while."""
+        self._note_directions(now)
+        known = [direction if now <= self._known_until[side] else 0 for side, direction in enumerate(self._directions)]
+        return Motor(self._power[0], known[0]), Motor(self._power[1], known[1])
 
-    def _note_signs(self, now: float) -> None:
-        for wheel, power in enumerate(self._power):
+    def _note_directions(self, now: float) -> None:
+        for side, power in enumerate(self._power):
             if abs(power) >= _LEAST_POWER:
-                self._signs[wheel] = 1 if power > 0.0 else -1
-                self._signs_until[wheel] = now + _HOLD_S
+                self._directions[side] = 1 if power > 0.0 else -1
+                self._known_until[side] = now + _HOLD_S
 
 
 class Odometry:
     """The odometry of one robot. Pass it every power that the wheels are commanded, and every sample."""
 
     def __init__(self, settings: OdometrySettings, now: float) -> None:
-        self.pose = self._base = WheelPose()
+        self.pose = self._base = WheelPose()  # the base: where the present part begins
         self.distance_mm = 0.0
         self._part = _Part()
-        self._was_ready = True
+        self._was_ready = True  # with the last sample
         self._settings = settings
-        self._power = Directions(now)
+        self._directions = Directions(now)
         self._left, self._right = map(_Wheel, settings.step_mm)
         self._gyro = GyroHeading()
         self._heading_source = "wheels"
@@ -175,7 +184,7 @@ class Odometry:
         return now - max(self._left.turned_at, self._right.turned_at) < _MOVING_S
 
     def power(self, power: MotorPower, now: float) -> None:
-        self._power.command(power, now)
+        self._directions.command(power, now)
 
     def imu(self, imu: ImuFast, now: float) -> None:
         """Add a sample of the inertial sensor."""
@@ -186,26 +195,29 @@ class Odometry:
     def touch(self, values: TouchValues, now: float) -> None:
         """Add a sample of the hall sensors."""
         self._samples += 1
-        settings, (left_power, right_power) = self._settings, self._power.at(now)
+        settings, (left, right) = self._settings, self._directions.at(now)
         second = None if settings.second_channel == "none" else getattr(values, settings.second_channel)
-        left = self._left.update(HallSample(getattr(values, settings.left_channel), second, *left_power), now)
-        right = self._right.update(HallSample(getattr(values, settings.right_channel), None, *right_power), now)
-        self._powered = left_power[0] != 0.0 or right_power[0] != 0.0
-        self._move(left, right, now)
+        left_value, right_value = getattr(values, settings.left_channel), getattr(values, settings.right_channel)
+        left_mm = self._left.update(HallSample(left_value, second, left.power, left.direction), now)
+        right_mm = self._right.update(HallSample(right_value, None, right.power, right.direction), now)
+        self._powered = left.power != 0.0 or right.power != 0.0
+        self._move(left_mm, right_mm, now)
 
-    def _move(self, left: float, right: float, now: float) -> None:
-        turn = (right - left) / self._settings.track_width_mm
+    def _move(self, left_mm: float, right_mm: float, now: float) -> None:
+        """Add the distances of both wheels to the pose."""
+        turn = (right_mm - left_mm) / self._settings.track_width_mm
         measured = self._gyro.take(turn, now)
         self._heading_source = "wheels" if measured is None else "gyro"
         part = self._part
-        part.ahead_mm += (left + right) / 2
+        part.ahead_mm += (left_mm + right_mm) / 2
         part.turn_rad += turn if measured is None else measured
         self.pose = part.end(self._base)
-        ready = self._left.hall.ready and self._right.hall.ready
-        if ready:
-            self.distance_mm += abs(part.ahead_mm) if self.moving(now) or not self._was_ready else 0.0
+        is_ready = self._left.hall.ready and self._right.hall.ready
+        if is_ready:  # the part will not be corrected any more
+            if self.moving(now) or not self._was_ready:
+                self.distance_mm += abs(part.ahead_mm)
             self._base, self._part = self.pose, _Part()
-        self._was_ready = ready
+        self._was_ready = is_ready
 
     def value(self) -> dict[str, Any]:
         """Return the ``value`` of the payload (paper A.8.12), each time with the next ``publish_seq``."""

@@ -10,9 +10,11 @@ class Rate:
 
     def due(self, now: float) -> bool:
         """True if the next turn is due. Turns have fixed times, which do not depend on the times of the events."""
-        self._due = min(self._due, now + 1.0 / self.hz)  # the rate was raised
+        period = 1.0 / self.hz
+        self._due = min(self._due, now + period)  # if the rate was raised
         if now < self._due:
             return False
-        period = 1.0 / self.hz
-        self._due = self._due + period if self._due + period > now else now + period
+        self._due += period
+        if self._due <= now:  # turns were missed
+            self._due = now + period
         return True

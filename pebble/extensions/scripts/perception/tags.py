@@ -11,6 +11,7 @@ from pebble.extensions.scripts.perception.camera_model import CameraModel, Float
 
 FAMILY = "APRILTAG_25H9"  # the original's default, in its spelling
 _PICTURE = "a picture is a numpy array of (height, width, 3) bytes, blue first, or (height, width)"
+#: By the number of colours.
 _HINTS = {(4,): ": leave out the last with picture[:, :, :3]", (1,): ": use picture[:, :, 0]"}
 
 
@@ -103,10 +104,12 @@ class TagFinder:
         height, width = picture.shape[:2]
         grey = picture if picture.ndim == 2 else self._cv2.cvtColor(picture, self._cv2.COLOR_BGR2GRAY)
         corners, ids, _ = self._detector.detectMarkers(grey)
+        numbers: Any = [] if ids is None else np.ravel(ids)
         tags = []
-        for corner, number in zip(corners, [] if ids is None else np.ravel(ids), strict=False):
-            four = np.asarray(corner, float).reshape(4, 2)
-            if (place := self._geometry.place(four, width, height)) is not None:
+        for tag_corners, number in zip(corners, numbers, strict=False):
+            four = np.asarray(tag_corners, float).reshape(4, 2)
+            place = self._geometry.place(four, width, height)
+            if place is not None:
                 tags.append(Tag(int(number), four, place))
         return sorted(tags, key=lambda tag: (tag.id, -tag.area))
 

@@ -1,4 +1,4 @@
-"""Decides which drive commands of a script are published, and when. Pure: the caller receives, waits and has a clock.
+"""The drive commands of a script: which are published, and when. Pure: the caller receives, waits and has a clock.
 
 The wheels belong to the motor owner, whose arbiter decides. This part only knows the messages of owners and other
 senders. It tells a script that its commands have no effect, and keeps it from disturbing others.
@@ -41,9 +41,9 @@ class DriveSender:
         self._turn = float("-inf")  # when the next command may be published
         self._zero_is_last = False  # the newest accepted command is a zero
         self._person_at = float("-inf")
-        self._latched: EstopState | None = None
-        self._owners: dict[str, EstopState] = {}
-        self._barred_at: float | None = None
+        self._latched: EstopState | None = None  # of the owner that was stopped last
+        self._owners: dict[str, EstopState] = {}  # the newest state of each
+        self._barred_at: float | None = None  # when an owner first said that it refuses this run for good
         self._superseded = False  # by a newer run
         self._end = ""  # why this run can never drive again
         self._final = False  # the final zero was published
@@ -58,11 +58,10 @@ class DriveSender:
         signed = replace(wanted, source=SCRIPT, run=self.run)
         obeyed = not self.refusal(now)
         self._pending = None
-        if not signed.moves and not self._zero_is_last:
-            return self._send(signed, now) and obeyed
         if signed.moves and not obeyed:
             return False
-        if now >= self._turn:
+        is_first_zero = not signed.moves and not self._zero_is_last
+        if is_first_zero or now >= self._turn:
             return self._send(signed, now) and obeyed
         self._pending = signed
         return obeyed
@@ -103,13 +102,14 @@ class DriveSender:
         if self._tried:
             for owner, state in states.items():
                 self._compare(owner, self._owners.get(owner), state)
-        before = self._owners if len(self._owners) < _MAX_OWNERS else {}
-        self._owners = {**before, **states}  # one that is gone for a while may come back restarted
-        self._latched = max((s for s in states.values() if s.latched), key=lambda state: state.since, default=None)
-        barring = [state.last_barred for state in states.values() if not newer(self.run, state.last_barred)]
-        if any(run != self.run for run in barring):
+        remembered = self._owners if len(self._owners) < _MAX_OWNERS else {}
+        self._owners = {**remembered, **states}  # an owner that is gone for a while may come back restarted
+        latched = [state for state in states.values() if state.latched]
+        self._latched = max(latched, key=lambda state: state.since, default=None)
+        barred_runs = [state.last_barred for state in states.values() if not newer(self.run, state.last_barred)]
+        if any(run != self.run for run in barred_runs):  # a newer run was barred, so there was one
             self._superseded = True
-        elif barring and self._barred_at is None:
+        elif barred_runs and self._barred_at is None:
             self._barred_at = now
 
     # -- what follows

@@ -1,4 +1,4 @@
-"""Ends a script on a signal, even if its main thread sleeps, is busy, or is blocked in C code."""
+"""The end of a script by a signal, even if its main thread sleeps, is busy, or is blocked in C code."""
 
 import os
 import select
@@ -41,11 +41,13 @@ class Guard:
     def _next(self, timeout: float | None) -> int:
         """Return the next signal that ends the script; after the first only Ctrl-C, or 0 after ``timeout`` seconds."""
         wanted = _NUMBERS if timeout is None else (signal.SIGINT,)
-        while select.select([self._reader], [], [], timeout)[0]:
-            for number in os.read(self._reader, 512):
+        while True:
+            readable, _, _ = select.select([self._reader], [], [], timeout)
+            if not readable:
+                return 0
+            for number in os.read(self._reader, 512):  # one byte for each signal
                 if number in wanted:
                     return number
-        return 0
 
     def _release(self) -> None:
         """Let a forked child end as any program does: a signal to it is not one to the script."""

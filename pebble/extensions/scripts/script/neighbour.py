@@ -21,29 +21,29 @@ class NotGrantedError(PebbleError):
     """An error: the other robot's config does not permit this robot to do that."""
 
 
-class Way(NamedTuple):
-    """The parts of its robot that a neighbour needs. ``check`` raises once the script must end."""
+class RobotParts(NamedTuple):
+    """The parts of the script's own robot that a neighbour needs."""
 
     transport: Transport
     wheels: Wheels
-    latest: Callable[[Channel, float], Any]  # payload of the neighbour
-    check: Callable[[], None]
-    check_drives: Callable[[], None]  # and where it may not drive
+    latest: Callable[[Channel, float], Any]  # returns the newest payload of the neighbour, if it is young enough
+    check: Callable[[], None]  # raises once the script must end
+    check_drives: Callable[[], None]  # also raises if the script may not drive
     clock: Callable[[], float]
 
 
 class Neighbour:
     """The robot ``name`` as ``me`` sees it; :meth:`pebble.script.Robot.neighbour` makes it. Any thread may use it."""
 
-    def __init__(self, name: str, me: Identity, way: Way) -> None:
+    def __init__(self, name: str, me: Identity, own: RobotParts) -> None:
         self.name = name
-        self._me, self._way = me.id, way
+        self._me, self._own = me.id, own
         self._topic = TO_NEIGHBOUR.topic(me.base, robot=name)
         self._sent_at = float("-inf")
-        self._moves = False  # the newest command does
-        self._over = False
+        self._moves = False  # the newest command moves it
+        self._over = False  # the script has ended
         self._lock = threading.Lock()  # else the last command might come after the final zero
-        way.latest(NEIGHBOURS, PRESENT_S)  # subscribes
+        own.latest(NEIGHBOURS, PRESENT_S)  # subscribes
 
     @property
     def online(self) -> bool:
@@ -53,13 +53,11 @@ class Neighbour:
     def latest(self, channel: Channel, max_age: float = 1.0) -> Any:
         """Return the newest payload of ``channel`` that arrived within the last ``max_age`` seconds, or None.
 
-        Does not wait.
-
-        The first call subscribes, and mostly returns None. The other robot's config has to list it in ``shares``, and
-        this one's in ``listens``.
+        Does not wait. The first call subscribes, and mostly returns None. The other robot's config has to list it in
+        ``shares``, and this one's in ``listens``.
         """
-        self._way.check()
-        return self._way.latest(channel, max_age)
+        self._own.check()
+        return self._own.latest(channel, max_age)
 
     def drive(self, x: float = 0.0, z: float = 0.0, y: float = 0.0) -> bool:
         """Drive the other robot, for 0.3 s at most, like :meth:`Robot.drive`.
@@ -67,15 +65,15 @@ class Neighbour:
         False: the command has no effect, as far as is known. Raises NotGrantedError if the other robot's config does
         not permit this robot to drive it.
         """
-        self._way.check_drives()
-        command = Drive(x=float(x), z=float(z), y=float(y), source=SCRIPT, run=self._way.wheels.run)
-        state, now = self._state, self._way.clock()
+        self._own.check_drives()
+        command = Drive(x=float(x), z=float(z), y=float(y), source=SCRIPT, run=self._own.wheels.run)
+        state, now = self._state, self._own.clock()
         if state is not None and DRIVE.metric not in state.commanded.get(self._me, ()):
             raise NotGrantedError(
                 f"{self.name} does not let {self._me} drive it: its config needs "
                 f'services.neighbours.commanded: {{"{self._me}": ["{DRIVE.metric}"]}}'
             )
-        refusal = self._way.wheels.drive_another() or self.why_refused
+        refusal = self._own.wheels.drive_another() or self.why_refused
         if command.moves and refusal:
             return False
         # a change between moving and standing is sent at once, all else at most 50 times a second
@@ -95,17 +93,17 @@ class Neighbour:
         if state is None:
             return f"{self.name} is not heard"
         refusal = state.refused.get(self._me)
-        return refusal.why if refusal is not None and refusal.run == self._way.wheels.run else ""
+        return refusal.why if refusal is not None and refusal.run == self._own.wheels.run else ""
 
     def end(self) -> None:
         """Stop the motion that this script causes there."""
         self._over = True
         if self._moves:
-            self._send(Drive(source=SCRIPT, run=self._way.wheels.run))
+            self._send(Drive(source=SCRIPT, run=self._own.wheels.run))
 
     @property
     def _state(self) -> Neighbours | None:
-        state: Neighbours | None = self._way.latest(NEIGHBOURS, PRESENT_S)
+        state: Neighbours | None = self._own.latest(NEIGHBOURS, PRESENT_S)
         return state
 
     def _send(self, command: Drive) -> bool:
@@ -114,4 +112,4 @@ class Neighbour:
             if command.moves and self._over:
                 return False
             self._moves = command.moves
-            return self._way.transport.publish(self._topic, raw, qos=QoS.DELIVERED, urgent=True)
+            return self._own.transport.publish(self._topic, raw, qos=QoS.DELIVERED, urgent=True)

@@ -70,24 +70,24 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 def _setting(field: inspect.Field, hint: Any) -> Setting:
-    kind, meta, optional = _plain(field.type, field.name)
-    name = field.encode_name
-    flag = meta.get("arg", name.replace("_", "-"))
-    is_flag = (type_ := _kind(kind, field.name)) == "bool"
-    if is_flag and optional:
+    kind, meta, is_optional = _plain(field.type, field.name)
+    name, type_ = field.encode_name, _kind(kind, field.name)
+    option = meta.get("arg", name.replace("_", "-"))
+    is_flag = type_ == "bool"
+    if is_flag and is_optional:
         raise TypeError(f"option {field.name}: a bool is true or false: write `bool`, without None")
     setting = Setting(
         key=name,
         label=meta.get("title", name.replace("_", " ").capitalize()),
         type=type_,
-        arg=f"--{flag}",
+        arg=f"--{option}",
         required=field.required or bool(meta.get("required")),
         min=getattr(kind, "ge", None),
         max=getattr(kind, "le", None),
         step=meta.get("step"),
         options=_choices(hint) if type_ == "enum" else (),
         mode="flag" if is_flag else None,
-        arg_false=f"--no-{flag}" if is_flag else None,
+        arg_false=f"--no-{option}" if is_flag else None,
     )
     return replace(setting, default=_default(field, setting))
 
@@ -115,10 +115,12 @@ def _choices(hint: Any) -> list[str]:
     """Return the strings of a Literal in the order of their declaration, which msgspec does not preserve."""
     if typing.get_origin(hint) is Literal:
         return list(typing.get_args(hint))
-    return next((choices for argument in typing.get_args(hint) if (choices := _choices(argument))), [])
+    inner = map(_choices, typing.get_args(hint))  # inside Annotated, or a union with None
+    return next(filter(None, inner), [])
 
 
 def _kind(kind: Any, name: str) -> Any:
+    """Return the type of setting for a field's type. Raises TypeError that says what to write instead."""
     form = _KINDS.get(type(kind))
     if form is None:
         what = type(kind).__name__.removesuffix("Type").lower()
@@ -147,6 +149,7 @@ def _default(field: inspect.Field, setting: Setting) -> Value:
 
 
 def _add(parser: argparse.ArgumentParser, setting: Setting) -> None:
+    """Add the setting to the options of the command line."""
     if setting.type == "bool":
         help_ = f"{setting.label} (default: {'on' if setting.default else 'off'})"
         action = argparse.BooleanOptionalAction
@@ -191,6 +194,6 @@ def _joined(arguments: list[str], settings: list[Setting]) -> list[str]:
     joined: list[str] = []
     words = iter(arguments)
     for word in words:
-        value = next(words, None) if word in valued else None
+        value = next(words, None) if word in valued else None  # the next word, which the loop leaves out then
         joined.append(word if value is None else f"{word}={value}")
     return joined

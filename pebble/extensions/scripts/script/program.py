@@ -1,4 +1,4 @@
-"""Runs a function as a program, with a robot and its options: ``run(main)``."""
+"""A function as a program, with a robot and its options: ``run(main)``."""
 
 import inspect
 import logging
@@ -110,18 +110,22 @@ def _describe(
     *,
     drives: bool,
 ) -> None:
+    """Print the form that operators see. ``first``: the options that they see first."""
     settings = [] if options is None else form(options)
     keys = [setting.key for setting in settings]
     unknown = [key for key in first if key not in keys]
-    if unknown or len(first) > MOST_MAIN:
-        wrong = f"there is no option {unknown[0]}" if unknown else f"{len(first)} are more than {MOST_MAIN}"
-        raise TypeError(f"main_options: {wrong}")
-    description = {
-        **{key: value for key, value in {**words, "main": list(first)}.items() if value},
+    if unknown:
+        raise TypeError(f"main_options: there is no option {unknown[0]}")
+    if len(first) > MOST_MAIN:
+        raise TypeError(f"main_options: {len(first)} are more than {MOST_MAIN}")
+    texts = {key: value for key, value in {**words, "main": list(first)}.items() if value}
+    description: dict[str, Any] = {
+        **texts,
         "configs": [setting.entry() for setting in settings],
         "dependencies": [{"file": file, "config": dict(config)} for file, config in needs.items()],
-        **({} if drives else {"drives": False}),
     }
+    if not drives:
+        description["drives"] = False
     sys.stdout.write(msgspec.json.encode(description).decode() + "\n")
 
 
@@ -161,11 +165,11 @@ class _Program:
     def run(self, main: Callable[..., None], config_path: Path, arguments: tuple[msgspec.Struct, ...]) -> None:
         Guard(self._end_on_signal)
         config = load(config_path, lenient=True)  # as the launcher does, which runs the robot
-        local = LocalScripts(config)
-        local.hold()
+        LocalScripts(config).hold()  # until the process ends
         transport = _connected(config, config_path)
-        options: dict[str, Any] = {"name": self._name, "on_ended": self._end_run, "drives": self._drives}
-        robot = self._robot = Robot(config, transport, _numbered(config), **options)
+        robot = self._robot = Robot(
+            config, transport, _numbered(config), name=self._name, on_ended=self._end_run, drives=self._drives
+        )
         try:
             main(robot, *arguments)
         finally:

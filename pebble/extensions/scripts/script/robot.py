@@ -25,7 +25,7 @@ from pebble.contract import (
 from pebble.contract.channels import INCOMING
 from pebble.contract.payloads import Drive
 from pebble.errors import PebbleError
-from pebble.extensions.scripts.script.neighbour import Neighbour, Way
+from pebble.extensions.scripts.script.neighbour import Neighbour, RobotParts
 from pebble.extensions.scripts.script.pictures import Pictures
 from pebble.extensions.scripts.script.wheels import Wheels
 from pebble.runtime.addresses import Addresses
@@ -74,7 +74,9 @@ class _Latest:
             self._arrived[channel] = None
             self._subscribe(channel, lambda value, **_: self._receive(channel, value))
         newest = self._arrived[channel]
-        return None if newest is None or self._clock() - newest.at > max_age else newest.value
+        if newest is None or self._clock() - newest.at > max_age:
+            return None
+        return newest.value
 
     def _receive(self, channel: Channel, value: Any) -> None:
         self._arrived[channel] = _Arrived(value, self._clock())
@@ -139,9 +141,7 @@ class Robot:
     def latest(self, channel: Channel, max_age: float = 1.0) -> Any:
         """Return the newest payload of ``channel`` that arrived within the last ``max_age`` seconds, or None.
 
-        Does not wait.
-
-        The first call subscribes, and mostly returns None.
+        Does not wait. The first call subscribes, and mostly returns None.
         """
         self._check()
         return self._latest.of(channel, max_age)
@@ -202,8 +202,8 @@ class Robot:
             if section is None or not section.enabled or name not in section.listens:
                 raise PebbleError(f'robot.neighbour: {name!r} is not in services.neighbours.listens: add "{name}": []')
             latest = _Latest(partial(self._subscribe_to, name), self._clock)
-            way = Way(self._transport, self._wheels, latest.of, self._check, self._check_drives, self._clock)
-            neighbour = self._neighbours[name] = Neighbour(name, self.config.identity, way)
+            own = RobotParts(self._transport, self._wheels, latest.of, self._check, self._check_drives, self._clock)
+            neighbour = self._neighbours[name] = Neighbour(name, self.config.identity, own)
         return neighbour
 
     def sleep(self, seconds: float) -> None:
@@ -266,7 +266,9 @@ class Robot:
             raise PebbleError("this script only measures, as its run(…, drives=False) says: it commands nothing")
 
     def _check_publish(self, channel: Channel, topic: str) -> None:
-        (self._check_drives if channel.direction == INCOMING else self._check)()
+        self._check()
+        if channel.direction == INCOMING:  # a command, perhaps to another robot
+            self._check_drives()
         check_publish(topic, self._addresses)
 
     def _subscribe(self, channel: Channel, handler: Callable[..., None]) -> None:

@@ -1,4 +1,4 @@
-"""Sends a script's drive commands on the robot's local transport, and tells whether they have an effect."""
+"""The wheels of a robot for its script: commands on the local transport, and whether they have an effect."""
 
 import logging
 import threading
@@ -37,10 +37,10 @@ class Wheels:
     ) -> None:
         self.estop = RobotEstop(addresses.base)
         self._transport, self._address, self._clock, self._on_ended = transport, addresses[DRIVE], clock, on_ended
-        self._lock = threading.Lock()
-        self._changed = threading.Event()
+        self._lock = threading.Lock()  # guards the sender
+        self._changed = threading.Event()  # the thread has something to do
         self._thread: threading.Thread | None = None
-        self._over = False
+        self._over = False  # the script has ended
         self._robot = addresses.base.rpartition("/")[2]
         self._reported: str | None = None  # why commands had no effect, as logged last; None: nothing was
         for channel in (ESTOP_STATE, CAPABILITIES):  # direct: what is retained has arrived when this returns
@@ -58,7 +58,7 @@ class Wheels:
             now = self._clock()
             self._sender.owners(self.estop.states, now)
             obeyed = self._sender.drive(wanted, now)
-            self._watch()
+            self._start_thread()
             if self._sender.due is not None:
                 self._changed.set()
             refusal = self._sender.refusal(now) or ("" if obeyed else "there is no connection")
@@ -70,7 +70,7 @@ class Wheels:
         with self._lock:
             now = self._clock()
             self._sender.owners(self.estop.states, now)
-            self._watch()
+            self._start_thread()
             return self._sender.drive_another(now)
 
     @property
@@ -94,9 +94,9 @@ class Wheels:
                 self._lock.release()
         self._changed.set()
 
-    def _watch(self) -> None:
+    def _start_thread(self) -> None:
         if self._thread is None:
-            self._thread = threading.Thread(target=self._tick, name="pebble-drive", daemon=True)
+            self._thread = threading.Thread(target=self._run_thread, name="pebble-drive", daemon=True)
             self._thread.start()
 
     def _report(self, refusal: str) -> None:
@@ -111,9 +111,10 @@ class Wheels:
 
     @property
     def _barred(self) -> int:
+        """Return the newest run that an owner has barred."""
         return newest(state.last_barred for state in self.estop.states.values())
 
-    def _tick(self) -> None:
+    def _run_thread(self) -> None:
         """Publish the command that waits for its turn, and notice the end of the run, while the script is busy."""
         while not self._over:
             with self._lock:

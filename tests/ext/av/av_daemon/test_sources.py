@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -176,8 +175,7 @@ class TestAlsa:
         self, alsa_microphone: Open, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         sound = Speech(16_000).samples(0, 320 * 15)[:, 0].tobytes()
-        program = SimpleNamespace(read=lambda: sound, close=lambda: None)
-        monkeypatch.setattr(alsa, "CaptureProgram", lambda *_, **__: program)
+        monkeypatch.setattr(alsa.AlsaMicrophone, "read", lambda _self: sound)
         capture = alsa_microphone().grab()
         assert (capture.data, capture.skipped) == (sound[-640:], 14)
 

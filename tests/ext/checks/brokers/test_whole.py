@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,13 +16,6 @@ from tests.commands.conftest import run as run
 from tests.ext.checks.brokers.document import BROKERS, DOCUMENT, columns, judged, marks
 from tests.support import Broker, further, until
 from tests.transports.received import Received
-
-
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
-    broker = Broker(tmp_path_factory.mktemp("broker"))
-    yield broker
-    broker.stop()
 
 
 @pytest.mark.alone  # mosquitto's own delays are measured
@@ -61,8 +53,8 @@ def test_doctor_finds_whether_robots_can_use_a_broker(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_what_it_retains_is_removed_when_it_is_interrupted(number: signal.Signals, plain: Broker) -> None:
-    settings, seen = MqttSettings(host="127.0.0.1", port=plain.port, as_published=True), Received()
+def test_what_it_retains_is_removed_when_it_is_interrupted(number: signal.Signals, broker: Broker) -> None:
+    settings, seen = MqttSettings(host="127.0.0.1", port=broker.port, as_published=True), Received()
 
     def retained() -> dict[str, bytes]:
         newest = {one.topic: one.payload for one in [*seen.messages] if one.retain_requested}
@@ -70,7 +62,7 @@ def test_what_it_retains_is_removed_when_it_is_interrupted(number: signal.Signal
 
     with MqttTransport("watcher", settings) as watcher:
         watcher.subscribe("pebble/doctor/#", seen, echo=False)
-        with running("doctor", "--broker", f"mqtt://127.0.0.1:{plain.port}", stdout=subprocess.DEVNULL) as process:
+        with running("doctor", "--broker", f"mqtt://127.0.0.1:{broker.port}", stdout=subprocess.DEVNULL) as process:
             assert until(lambda: len(retained()) > 50, 60)
             process.send_signal(number)
             assert process.wait(30) == 130
@@ -89,6 +81,6 @@ def test_what_it_retains_is_removed_when_it_is_interrupted(number: signal.Signal
         (["doctor", "--broker", "mqtt://127.0.0.1:1", "robot.json"], "leave out the config file"),
     ],
 )
-def test_what_cannot_be_judged_is_one_clear_line(arguments: list[str], words: str, plain: Broker, run: Run) -> None:
-    assert run(*(one.replace("PORT", str(plain.port)) for one in arguments), columns=200) != 0
+def test_what_cannot_be_judged_is_one_clear_line(arguments: list[str], words: str, broker: Broker, run: Run) -> None:
+    assert run(*(one.replace("PORT", str(broker.port)) for one in arguments), columns=200) != 0
     assert [words in line for line in (run.err or run.out).splitlines()][:1] == [True], run.out + run.err

@@ -58,17 +58,6 @@ def test_a_robot_that_a_person_has_taken_is_left_alone_until_the_step_after(
     assert [one for one in operator.completed if one.ended > taken > one.began] == []
 
 
-def test_a_persons_stop_is_left_to_the_person(robot: RecordingRobot, operator: Operator) -> None:
-    robot.stop(by="anna")
-    assert until(lambda: operator.activity.endswith("; goob is stopped by anna"))
-    operator.begin()
-    assert not until(robot.drives, 1.0)
-    latch = robot.motors.owners[0].latch
-    assert latch.reset(latch.boot, latch.count, 0, 0)
-    robot.publish_states()
-    assert until(robot.drives, START_S)
-
-
 def test_a_robot_with_scripts_draws_its_trail_from_the_first_drive_on(
     robot: RecordingRobot, operator: Operator
 ) -> None:

@@ -12,9 +12,9 @@ from typing import Any, Final, Literal
 from pebble.extensions.lab.simulation.micropython.answers import name_answer, time_answer
 from pebble.extensions.lab.simulation.micropython.clock import Clock
 from pebble.extensions.lab.simulation.micropython.faults import failure
-from pebble.extensions.lab.simulation.micropython.modules.servers import Address
 from pebble.extensions.lab.simulation.micropython.modules.sockets import (
     MAX_SOCKETS,
+    Address,
     BoardSocket,
     numeric,
     socket_module,

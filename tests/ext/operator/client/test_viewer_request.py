@@ -94,8 +94,6 @@ def test_it_is_repeated_while_nothing_comes_and_changed_at_once() -> None:
     assert sent_until(one, 5.0, [(2.0, CAMERA, b"a picture")]) == [UP, ON, ON]
     one.want("h264", 5.0)
     assert sent_until(one, 5.1, at=5.0) == [H264]
-    one.leave()
-    assert one.end() == []
 
 
 def test_what_is_not_offered_is_an_error() -> None:

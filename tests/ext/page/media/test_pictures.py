@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from pebble.extensions.media.decode import VideoDecoder
-from pebble.extensions.media.picture_header import read_header
 from pebble.extensions.operator.client.media_request.queue import NO_FRAME
 from pebble.extensions.page.media import rescue
 from tests.ext.page.media.robots import (
@@ -32,11 +31,6 @@ PLAIN = EVERYTHING - {"h264"}
 @pytest.fixture
 def robot() -> PictureRobot:
     return PictureRobot()
-
-
-def encoding_of(payload: bytes) -> str | None:
-    header = read_header(payload)
-    return header and header.encoding
 
 
 # -- forwarding

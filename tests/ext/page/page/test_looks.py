@@ -6,7 +6,7 @@ import pytest
 from playwright.sync_api import Browser
 
 from tests.ext.page.canned import CannedServer
-from tests.ext.page.looks import LOOKS, MOST_BYTES, STORED, check, taken
+from tests.ext.page.looks import LOOKS, check, taken
 
 pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
 
@@ -14,8 +14,3 @@ pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
 @pytest.mark.parametrize("name", LOOKS)
 def test_a_state_looks_as_it_is_stored(server: CannedServer, browser: Browser, name: str) -> None:
     check(name, taken(server, browser, LOOKS[name]))
-
-
-def test_there_is_one_picture_for_each_state_and_they_are_small() -> None:
-    assert {path.stem for path in STORED.iterdir()} == set(LOOKS)
-    assert sum(path.stat().st_size for path in STORED.iterdir()) <= MOST_BYTES

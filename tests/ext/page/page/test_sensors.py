@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import re
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -59,13 +58,6 @@ def inked(opened: Tab, canvas: str, ink: str) -> Any:
     return like(seen(place), tuple(int(colour[at : at + 2], 16) for at in (1, 3, 5)))
 
 
-def trail(opened: Tab) -> tuple[int, int]:
-    """Return how much of the map is drawn: all, and around its middle."""
-    drawn = inked(opened, "[data-test=map]", "--accent")
-    height, width = (size // 2 for size in drawn.shape)
-    return int(drawn.sum()), int(drawn[height - 12 : height + 12, width - 12 : width + 12].sum())
-
-
 # -- plots and map
 
 
@@ -85,16 +77,6 @@ def test_plots_are_drawn_where_the_language_has_a_name_that_browsers_do_not_know
         opened.test("plot-battery").scroll_into_view_if_needed()
         assert opened.until("document.querySelector('[data-test=plot-battery] canvas') !== null")
         assert opened.complaints() == []
-
-
-def test_the_map_has_the_trail_and_the_component_in_its_middle(sensors: Tab) -> None:
-    assert sensors.until(lambda: trail(sensors)[0] > 300)
-    assert trail(sensors)[1] > 30
-    words = sensors.test("map-pose").inner_text()
-    assert re.fullmatch(r"x -?\d\.\d\d m · y -?\d\.\d\d m · heading -?\d+°", words)
-    sensors.test("map-clear").click()
-    assert sensors.until(lambda: trail(sensors)[0] < 250)
-    assert trail(sensors)[1] > 30
 
 
 # -- over the picture

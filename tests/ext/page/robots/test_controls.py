@@ -9,7 +9,7 @@ from playwright.sync_api import Browser, Locator
 
 from tests.ext.page.browser import tab
 from tests.ext.page.canned import CannedServer
-from tests.ext.page.console import FORWARD, KEYS, Console, Wire, console, pad
+from tests.ext.page.console import KEYS, Console, Wire, console
 from tests.ext.page.stage import Stage
 from tests.ext.page.states import STATES
 
@@ -92,29 +92,6 @@ def test_stop_all_latches_every_robot_and_each_is_reset_by_itself(stage: Stage, 
     assert at_lamp.press_anew()
     at_lamp.reset("benjr")
     assert at_lamp.tab.until(lambda: not wire.latched("benjr"), 3)
-
-
-def test_a_gamepad_drives_and_its_buttons_stop(at_lamp: Console, wire: Wire) -> None:
-    def drives() -> bool:
-        """Show it in neutral, then pushed."""
-
-        def neutral() -> None:
-            at_lamp.pads(pad())
-            at_lamp.page.wait_for_timeout(120)
-
-        neutral()
-        return at_lamp.persists(lambda: at_lamp.pads(pad(z=1)), lambda: at_lamp.wheels == FORWARD, neutral)
-
-    assert drives()
-    at_lamp.pads(pad(0, 1, 0))
-    assert at_lamp.rests()
-    assert at_lamp.stays_at_rest()
-    assert not wire.latched("minilamp")
-    assert drives()
-    at_lamp.pads(pad(0, 1, 8, 9))
-    assert at_lamp.tab.until(lambda: wire.latched("minilamp"), 2)
-    assert at_lamp.rests()
-    assert at_lamp.because("stopped", within=2)  # else the next test would not see what it has to reset
 
 
 # -- control

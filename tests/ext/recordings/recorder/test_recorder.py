@@ -87,21 +87,13 @@ def running(tmp_path: Path) -> Iterator[Running]:
     one.stop()
 
 
-class TestOneFile:
-    @pytest.fixture
-    def file(self, tmp_path: Path) -> OpenFile:
-        return OpenFile(Folder(tmp_path), STATE, 1, {})
-
-    def test_time_never_goes_back(self, file: OpenFile, tmp_path: Path) -> None:
-        """A message that another thread has brought late bears the time of the one before it."""
-        for at_ns in (30, 20, 40):
-            file.add(item(b"1"), at_ns)
-        file.finish()
-        assert [message.log_ns for message in recorded(tmp_path)] == [30, 30, 40]
-
-
-def item(payload: bytes) -> Item:
-    return Item(1, ONLINE, payload, 1, False, "")
+def test_time_never_goes_back_in_a_file(tmp_path: Path) -> None:
+    """A message that another thread has brought late bears the time of the one before it."""
+    file = OpenFile(Folder(tmp_path), STATE, 1, {})
+    for at_ns in (30, 20, 40):
+        file.add(Item(1, ONLINE, b"1", 1, False, ""), at_ns)
+    file.finish()
+    assert [message.log_ns for message in recorded(tmp_path)] == [30, 30, 40]
 
 
 def fails(_self: Any, _data: memoryview) -> int | None:
@@ -495,8 +487,8 @@ class TestClock:
 _CHILD = """
 import sys, time
 from pathlib import Path
-from pebble.recordings.recorder.recorder import Recorder
-from pebble.recordings.recorder.settings import Options
+from pebble.extensions.recordings.recorder.recorder import Recorder
+from pebble.extensions.recordings.recorder.settings import Options
 recorder = Recorder(Path(sys.argv[1]), Options(free_bytes=0))
 recorder.start()
 number = 0

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from pebble.extensions.media.decode import VideoDecoder
-from pebble.extensions.recordings.files.recorded import Recorded
+from pebble.extensions.recordings.files.recorded import Recorded, finished_path
 from pebble.extensions.recordings.library import files, merged
-from pebble.extensions.recordings.recorder.folder import Folder, finished_path
+from pebble.extensions.recordings.recorder.folder import Folder
 from pebble.extensions.recordings.recorder.lane import CARRIED, Item, OpenFile
 from pebble.extensions.recordings.seek.archive import Archive
 from pebble.extensions.recordings.seek.days import Days

@@ -64,9 +64,14 @@ class FakeProcesses:
 
 
 class Bench:
-    """The service with ``scripts``, and a client that sees and sends what operators and motor owners do."""
+    """The service with ``scripts``, and a client that sees and sends what operators and motor owners do.
 
-    def __init__(self, folder: Path, scripts: Mapping[str, Script], *, named: bool = False, **section: Any) -> None:
+    Without ``scripts`` it lists those of its folders.
+    """
+
+    def __init__(
+        self, folder: Path, scripts: Mapping[str, Script] | None, *, named: bool = False, **section: Any
+    ) -> None:
         network = LocalNetwork("memory", folder)
         config = network.config(folder, MOTORS, autonomy_manager={"enabled": True, **section})
         if named:

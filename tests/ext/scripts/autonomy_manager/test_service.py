@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from pebble.extensions.operator.client.forms import Setting
 from pebble.extensions.scripts.runs import SUPERSEDED
+from pebble.services.autonomy_manager.catalogue import Catalogue
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN
 from pebble.services.autonomy_manager.script import Dependency, Script
 from tests.ext.scripts.autonomy_manager.fake_children import Bench, FakeChild
@@ -177,6 +179,7 @@ def test_an_end_stops_the_wheels_and_nothing_is_started_again(bench: Bench, code
     walk = bench.start("walk")
     walk.end(code)
     assert bench.becomes(**{**IDLE, "error": error})
+    assert "stopped" not in bench.status
     bench.advance(0.11)
     bench.advance(0.2)
     bench.advance(60)
@@ -396,6 +399,46 @@ def test_where_names_are_checked_only_who_has_control_starts_a_script(tmp_path: 
         bench.quiet()
         bench.command({"action": "start", "file": "eyes", "by": "otto"})
         assert until(lambda: bench.children.all[-1].signals == [TERM])
+    finally:
+        bench.close()
+
+
+@pytest.mark.parametrize(
+    ("between", "status"),
+    [
+        (lambda bench: None, {"running": True, "file": "walk"}),
+        (lambda bench: bench.command({"action": "stop"}), {"running": False, "error": None}),
+        (lambda bench: bench.drive(z=0.5), {"running": False, "error": None}),
+        (lambda bench: bench.owner(latched=True, count=1), {"running": False, "error": None}),
+        (
+            lambda bench: bench.advance(3.01),
+            {"error": "Unknown autonomy file: walk: scripts are still being listed, try again"},
+        ),
+    ],
+    ids=["nothing", "a stop", "a person drives", "an emergency stop", "three seconds"],
+)
+def test_a_start_waits_until_its_script_is_listed_unless_something_comes_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, between: Callable[[Bench], None], status: dict[str, Any]
+) -> None:
+    lists = threading.Event()
+
+    def scan(_catalogue: Catalogue, found: Callable[[dict[str, Script]], None]) -> None:
+        assert lists.wait(5)
+        found(SCRIPTS)
+
+    monkeypatch.setattr(Catalogue, "scan", scan)
+    bench = Bench(tmp_path, None)
+    try:
+        bench.owner()
+        bench.command({"action": "start", "file": "walk"})
+        bench.quiet()
+        between(bench)
+        bench.quiet()
+        lists.set()
+        assert until(lambda: bench.world.newest_raw("autonomy-files"))
+        bench.advance(0.11)
+        assert bench.becomes(**status)
+        assert len(bench.children.all) == bool(status.get("running"))
     finally:
         bench.close()
 

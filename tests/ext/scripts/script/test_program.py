@@ -16,7 +16,7 @@ from pebble.extensions.scripts.script import EXIT_ENDED
 from tests.commands.command_line import config_file
 from tests.ext.scripts.script.conftest import BOTH
 from tests.ext.scripts.script.station import Station
-from tests.support import Child, gone, until
+from tests.support import Child, until
 
 AT_ONCE_S = 0.25  # a few milliseconds, but not on a busy machine
 
@@ -166,17 +166,3 @@ def test_describe_with_anything_else_starts_nothing(tmp_path: Path) -> None:
     command = [sys.executable, str(script), "--describe", "--config", str(config)]
     found = ended(Child(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True))
     assert found == (2, "walk.py: --describe goes alone: it prints the form and starts nothing (see --help)\n")
-
-
-def test_without_a_connection_nothing_has_an_effect() -> None:
-    station = Station("mqtt")
-    assert station.broker is not None
-    try:
-        script = station.driven("while robot.drive(z=0.5): robot.sleep(0.02)\nprint('refused')\nrobot.sleep(60)")
-        station.broker.stop()
-        assert script.stdout is not None
-        assert any(line == "refused\n" for line in script.stdout)
-        script.terminate()
-        assert until(lambda: gone(script.pid))
-    finally:
-        station.close()

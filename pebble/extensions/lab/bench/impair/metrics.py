@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import msgspec
@@ -18,10 +17,9 @@ from pebble.extensions.lab.bench.results import Cell, percentile, round_cell
 from pebble.extensions.lab.simulation.trace import Entry
 
 DELIVERED, ON_TIME, SOUND = "audio delivered", "audio within 1 s", "audio latency"
-FPS, FROZEN, PICTURES, DRIVE = "video rate", "video frozen", "video latency", "drive"
+FPS, DRIVE = "video rate", "drive"
 
 ON_TIME_MS = 1000  # older sound is useless in a conversation
-FROZEN_S = 1.0  # a picture shown for longer counts as frozen
 
 
 class Plan(msgspec.Struct, kw_only=True):
@@ -37,7 +35,7 @@ class Plan(msgspec.Struct, kw_only=True):
 
 
 class Arrival(NamedTuple):
-    """A received message; ``sent_ns``: the time of sending, or of the capture of a picture or a first sample."""
+    """A received message; ``sent_ns``: the time of sending, or of the capture of the first sample of sound."""
 
     sent_ns: int
     arrived_ns: int
@@ -82,14 +80,6 @@ class Heard(msgspec.Struct):
     on_time_percent: float
 
 
-class Seen(msgspec.Struct):
-    """The pictures of a window that could be decoded: their latencies, their rate, and how long they stood still."""
-
-    ms: list[float]
-    fps: float
-    frozen_s: float
-
-
 class Report(msgspec.Struct, kw_only=True, omit_defaults=True):
     """A line from the operator: the answer to a request; after a trial, the measurements.
 
@@ -99,12 +89,13 @@ class Report(msgspec.Struct, kw_only=True, omit_defaults=True):
     problem: str | None = None
     commands: list[Command] = []
     heard: Heard | None = None
-    seen: Seen | None = None
+    fps: float = 0.0  # decoded pictures per second
 
 
 def heard(sounds: Iterable[Arrival], window: Window) -> Heard:
     """Return the figures of a window's sound. A packet that came twice counts once."""
-    packets = [packet for packet in {sound.number: sound for sound in sounds}.values() if window.overlap_s(packet) > 0]
+    by_number = {sound.number: sound for sound in sounds}
+    packets = [packet for packet in by_number.values() if window.overlap_s(packet) > 0]
 
     def percent(within_ms: float) -> float:
         arrived_s = sum(window.overlap_s(packet) for packet in packets if packet.ms <= within_ms)
@@ -113,39 +104,33 @@ def heard(sounds: Iterable[Arrival], window: Window) -> Heard:
     return Heard([packet.ms for packet in packets], percent(math.inf), percent(ON_TIME_MS))
 
 
-def seen(pictures: Iterable[Arrival], window: Window) -> Seen:
-    """Return the figures of a window's pictures. Those that arrived outside of the window do not count."""
-    inside = [picture for picture in pictures if window.began_ns <= picture.arrived_ns < window.ended_ns]
-    moments = [window.began_ns, *sorted(picture.arrived_ns for picture in inside), window.ended_ns]
-    gaps_s = [(after - before) / 1e9 for before, after in pairwise(moments)]
-    frozen_s = sum((gap for gap in gaps_s if gap > FROZEN_S), 0.0)
-    return Seen([picture.ms for picture in inside], len(inside) / window.seconds, frozen_s)
+def fps(pictures_ns: Iterable[int], window: Window) -> float:
+    """Return the rate of the pictures that arrived in a window."""
+    return sum(window.began_ns <= arrived_ns < window.ended_ns for arrived_ns in pictures_ns) / window.seconds
 
 
 def driven_ms(commands: Sequence[Command], entries: Sequence[Entry]) -> list[float]:
-    """Return the time that each command, or a newer one that overtook it, took to reach the MCU.
+    """Return the time until each command, or a newer one that overtook it, reached the MCU, in ms.
 
-    Lost ones are left out.
+    Commands after which nothing reached it are left out.
     """
-    arrived = arrivals(entries)
-    driven, soonest = [], math.inf
+    arrived_ns = arrivals(entries)
+    driven, soonest_ns = [], math.inf  # the first arrival of the command or of a newer one
     for command in reversed(commands):
-        soonest = min(soonest, arrived.get((command.left, command.right), math.inf))
-        if soonest < math.inf:
-            driven.append((soonest - command.sent_ns) / 1e6)
+        soonest_ns = min(soonest_ns, arrived_ns.get((command.left, command.right), math.inf))
+        if soonest_ns < math.inf:
+            driven.append((soonest_ns - command.sent_ns) / 1e6)
     return driven[::-1]
 
 
 def cells_of(subject: str, trial: str, report: Report, entries: Sequence[Entry]) -> Iterator[Cell]:
     """Yield the results of a subject in one trial; ``entries`` are from its MCU."""
     params = {"trial": trial}
-    if report.heard is not None and report.seen is not None:
+    if report.heard is not None:
         yield round_cell(subject, DELIVERED, "%", [report.heard.delivered_percent], params)
         yield round_cell(subject, ON_TIME, "%", [report.heard.on_time_percent], params)
         yield round_cell(subject, SOUND, "ms", report.heard.ms, params)
-        yield round_cell(subject, FPS, "1/s", [report.seen.fps], params)
-        yield round_cell(subject, FROZEN, "s", [report.seen.frozen_s], params)
-        yield round_cell(subject, PICTURES, "ms", report.seen.ms, params)
+        yield round_cell(subject, FPS, "1/s", [report.fps], params)
     yield round_cell(subject, DRIVE, "ms", driven_ms(report.commands, entries), params, sent=len(report.commands))
 
 

@@ -23,7 +23,7 @@ from pebble.contract.payloads import Heartbeat as Online
 from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.lab.bench.bridge_operator import wheels
 from pebble.extensions.lab.bench.clients import all_ready, drive_of
-from pebble.extensions.lab.bench.impair.metrics import Arrival, Command, Plan, Report, Window, heard, seen
+from pebble.extensions.lab.bench.impair.metrics import Arrival, Command, Plan, Report, Window, fps, heard
 from pebble.extensions.lab.bench.usage import wall_clock_ahead_ns
 from pebble.extensions.lab.rig.scripted_operator import ScriptedOperator, paced
 from pebble.extensions.lab.rig.worker_end import answer, serve_on_thread
@@ -42,20 +42,19 @@ _FRESH_MS, _FRESH_HEARTBEATS, _STARTUP_S = 500, 3, 20.0
 
 
 class MediaSubscriber(MediaReceiver):
-    """A record of the arrivals of pictures and sound packets."""
+    """A record of the arrivals of pictures (monotonic ns) and of sound packets."""
 
     def __init__(self, transport: Transport, base: str) -> None:
-        self.seen: list[Arrival] = []
-        self.received: list[Arrival] = []
+        self.pictures_ns: list[int] = []
+        self.packets: list[Arrival] = []
         super().__init__(transport, base)
 
-    def on_picture(self, picture: Decoded) -> None:
-        if picture.captured_ms is not None:  # as in all of our robots' pictures
-            self.seen.append(Arrival(monotonic_ns(picture.captured_ms), time.monotonic_ns()))
+    def on_picture(self, _picture: Decoded) -> None:
+        self.pictures_ns.append(time.monotonic_ns())
 
     def on_sound(self, received: ReceivedSound) -> None:
         now, seconds = time.monotonic_ns(), len(received.samples) / received.rate
-        self.received.append(Arrival(monotonic_ns(received.captured_ms), now, seconds, received.sequence))
+        self.packets.append(Arrival(monotonic_ns(received.captured_ms), now, seconds, received.sequence))
 
 
 class TrialOperator:
@@ -93,6 +92,7 @@ class TrialOperator:
         return Report()
 
     def run_trial(self) -> Report:
+        """Drive, watch and listen as planned; return what was measured."""
         plan = self._plan
         self._commands.clear()
         enough = threading.Event()
@@ -108,8 +108,8 @@ class TrialOperator:
             _pause(plan.grace_s, listener.poll)
         driver.join()
         self._over_at = time.monotonic()
-        sound, video = heard(listener.received, listened), seen(viewer.seen, viewed)
-        return Report(commands=self._commands, heard=sound, seen=video)
+        sound, video_fps = heard(listener.packets, listened), fps(viewer.pictures_ns, viewed)
+        return Report(commands=self._commands, heard=sound, fps=video_fps)
 
     # -- phases
 
@@ -118,15 +118,15 @@ class TrialOperator:
         subscriber = MediaSubscriber(self._media, self._base)
         subscriber.wait_for_capabilities(_KNOWN_S)
         subscriber.request(medium, encoding)
-        _wait(lambda: bool(subscriber.seen or subscriber.received), _FIRST_S, subscriber.poll)
+        _wait(lambda: bool(subscriber.pictures_ns or subscriber.packets), _FIRST_S, subscriber.poll)
         return closing(subscriber)
 
     def _is_fresh(self) -> bool:
+        """True if the newest heartbeats came in time, and lately: no message from before waits any more."""
         newest = self._heartbeats[-_FRESH_HEARTBEATS:]
-        since_ns = time.monotonic_ns() - 2_000_000 * _FRESH_MS
-        return len(newest) == _FRESH_HEARTBEATS and all(
-            heartbeat.ms < _FRESH_MS and heartbeat.arrived_ns > since_ns for heartbeat in newest
-        )
+        since_ns = time.monotonic_ns() - 2 * _FRESH_MS * 1_000_000
+        fresh = [heartbeat for heartbeat in newest if heartbeat.ms < _FRESH_MS and heartbeat.arrived_ns > since_ns]
+        return len(fresh) == _FRESH_HEARTBEATS
 
     # -- the driver's thread
 
@@ -159,7 +159,7 @@ class TrialOperator:
 
 
 def _wait(condition: Callable[[], bool], seconds: float, meanwhile: Callable[[], None] = lambda: None) -> bool:
-    """Wait for ``condition``, at most ``seconds``, calling ``meanwhile`` now and then; return whether it was met."""
+    """Wait for ``condition``, at most ``seconds``, calling ``meanwhile`` now and then; return True if it is met."""
     end = time.monotonic() + seconds
     while not (met := condition()) and (remaining_s := end - time.monotonic()) > 0:
         time.sleep(min(remaining_s, _POLL_S))
@@ -180,10 +180,11 @@ def monotonic_ns(epoch_ms: int) -> int:
 
 
 def main(host: str, port: str, base: str, plan: str) -> None:
+    """Run the operator until standard input closes. The arguments are those of the command line."""
     lines: queue.SimpleQueue[str] = queue.SimpleQueue()
     serve_on_thread(lines.put, lambda: os._exit(0))  # also during a trial
     operator = TrialOperator(host, int(port), base, msgspec.json.decode(plan, type=Plan))
-    act = operator.open
+    act = operator.open  # its report is the first one, before any line
     while True:
         try:
             report = act()

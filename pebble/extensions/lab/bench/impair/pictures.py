@@ -9,7 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from pebble.extensions.lab.bench.impair import metrics
-from pebble.extensions.lab.bench.plots import Style, around, guide, legend, log_axis, panels, styles
+from pebble.extensions.lab.bench.plots import Style, guide, legend, log_axis, log_limits, panels, styles
 from pebble.extensions.lab.bench.results import Cell
 from pebble.extensions.lab.bench.show import Picture
 
@@ -70,14 +70,15 @@ def _draw_trials(cells: Sequence[Cell], title: str, shown_panels: Sequence[Panel
     names = list(dict.fromkeys(str(cell.params["trial"]) for cell in cells))
     style_of = styles([cell.variant for cell in cells])
     drawn_values = [
-        _lines(axes, cells, names, style_of, panel) for axes, panel in zip(all_axes, shown_panels, strict=True)
+        _draw_lines(axes, cells, names, style_of, panel) for axes, panel in zip(all_axes, shown_panels, strict=True)
     ]
-    of_panels = zip(shown_panels, drawn_values, strict=True)
-    log_limits = around([value for panel, values in of_panels if panel.log for value in values])
+    log_values = []
+    for panel, values in zip(shown_panels, drawn_values, strict=True):
+        log_values += values if panel.log else []
     for axes, panel, values in zip(all_axes, shown_panels, drawn_values, strict=True):
         top = max([*values, 1.0])
         if panel.log:
-            log_axis(axes, "y", panel.label, *log_limits)
+            log_axis(axes, "y", panel.label, *log_limits(log_values))
         else:
             axes.set(ylabel=panel.label, ylim=(-0.04 * top, 1.1 * top))
         axes.set_xlim(-0.6, len(names) - 0.4)
@@ -88,24 +89,27 @@ def _draw_trials(cells: Sequence[Cell], title: str, shown_panels: Sequence[Panel
     return figure
 
 
-def _lines(
+def _draw_lines(
     axes: Axes, cells: Sequence[Cell], names: Sequence[str], style_of: Mapping[str, Style], panel: Panel
 ) -> list[float]:
     """Draw one line per subject, and the references; return all values."""
-    value_of = {
-        (cell.variant, str(cell.params["trial"])): value
-        for cell in cells
-        if cell.measure == panel.measure and math.isfinite(value := cell.percentile(panel.percent))
-    }
+    value_of = {}  # by subject and trial
+    for cell in cells:
+        value = cell.percentile(panel.percent)
+        if cell.measure == panel.measure and math.isfinite(value):
+            value_of[cell.variant, str(cell.params["trial"])] = value
     for number, (subject, style) in enumerate(style_of.items()):
-        beside = 0.06 * (number - (len(style_of) - 1) / 2)  # keeps equal values visible
+        shift = 0.06 * (number - (len(style_of) - 1) / 2)  # keeps equal values of several subjects visible
         values = [value_of.get((subject, trial), math.nan) for trial in names]
-        axes.plot([at + beside for at in range(len(names))], values, linewidth=1.2, **style)
+        axes.plot([at + shift for at in range(len(names))], values, linewidth=1.2, **style)
     crosses = {names.index(trial): value for trial, value in panel.crosses.items() if trial in names}
     axes.plot([*crosses], [*crosses.values()], zorder=5, **_CROSS)
     if panel.best is not None:
         guide(axes, panel.best, f"paper:\nat best\n~{panel.best:g} %")
-    for at, word in ((names.index(trial), word) for trial, word in panel.words.items() if trial in names):
+    for trial, word in panel.words.items():
+        if trial not in names:
+            continue
+        at = names.index(trial)
         axes.axvspan(at - 0.5, at + 0.5, color="#f2efe6", zorder=0)
         axes.annotate(f"paper:\n{word}", (at, 1.0), xycoords=("data", "axes fraction"), fontsize=8, color="#555",
                       ha="center", va="bottom")  # fmt: skip

@@ -26,8 +26,8 @@ from pebble.extensions.lab.bench.impair.metrics import Plan, Report, cells_of, v
 from pebble.extensions.lab.bench.impair.network import REMOTE_HOST, Condition, NamespaceNetwork, why_no_namespaces
 from pebble.extensions.lab.bench.impair.pictures import over_trials
 from pebble.extensions.lab.bench.results import STAND_IN, Cell, Results, begin, grouped
-from pebble.extensions.lab.bench.rounds import Progress, in_turn, measure_rounds, paired
-from pebble.extensions.lab.bench.show import RATIOS, Shown, digits, plain_table
+from pebble.extensions.lab.bench.rounds import Progress, in_turn, measure_rounds
+from pebble.extensions.lab.bench.show import Shown, digits, plain_table
 from pebble.extensions.lab.rig.processes import BROKERS, Processes, Program, Worker
 from pebble.extensions.lab.rig.robot import BASE, MEDIA, Config, Robot
 
@@ -101,7 +101,7 @@ def run(settings: Settings, console: Console) -> Shown:
 def shown(results: Results, window_s: float) -> Shown:
     """Return the tables and charts of the results."""
     caption = f"windows of {window_s:g} s; “original”: this program with the original's encodings"
-    return Shown(results, [table(results.cells), transports(results)], over_trials(results.cells, caption))
+    return Shown(results, [table(results.cells)], over_trials(results.cells, caption))
 
 
 # -- the robots, as processes
@@ -149,10 +149,8 @@ def start(subject: str, settings: Settings, processes: Processes) -> ImpairedRob
     folder.mkdir()
     network = processes.add(NamespaceNetwork(subject), BROKERS)
     remote = processes.broker("remote broker", folder=folder, host=REMOTE_HOST, wrap=network.on_remote)
-    robot = Robot(
-        processes, transport, (REMOTE_HOST, remote.port), folder=folder, services=SERVICES, reports=None,
-        wrap=network.on_robot,
-    )  # fmt: skip
+    address = (REMOTE_HOST, remote.port)
+    robot = Robot(processes, transport, address, folder=folder, services=SERVICES, wrap=network.on_robot)
     robot.prepare()
     robot.launch()
     video, audio = FORMS[form]
@@ -174,27 +172,27 @@ def measure(settings: Settings, progress: Progress, ended: list[str]) -> Iterato
     """
     progress("starting the robots")
     with Processes() as processes:
-        every = [start(subject, settings, processes) for subject in SUBJECTS if subject in settings.subjects]
-        yield from _trials(settings, every, progress, ended)
+        robots = [start(subject, settings, processes) for subject in SUBJECTS if subject in settings.subjects]
+        yield from _trials(settings, robots, progress, ended)
 
 
-def _trials(settings: Settings, every: Sequence[ImpairedRobot], progress: Progress, ended: list[str]) -> list[Cell]:
+def _trials(settings: Settings, robots: Sequence[ImpairedRobot], progress: Progress, ended: list[str]) -> list[Cell]:
     """Return the results of all trials. Robots of one form run at the same time, to limit the load."""
     cells: list[Cell] = []
-    together = grouped(every, lambda robot: robot.subject.partition(" ")[2])
-    with ThreadPoolExecutor(len(every), thread_name_prefix="subject") as pool:
+    by_form = grouped(robots, lambda robot: robot.subject.partition(" ")[2])
+    with ThreadPoolExecutor(len(robots), thread_name_prefix="subject") as pool:
         try:
-            list(pool.map(ImpairedRobot.report, every))
+            list(pool.map(ImpairedRobot.report, robots))  # the first one: the robot is ready
             for number, condition in enumerate(trial for trial in CONDITIONS if trial.name in settings.trials):
-                for robots_ in in_turn(list(together.values()), number):
-                    progress(f"{condition.name}: {', '.join(robot.subject for robot in robots_)}")
-                    cells += chain(*pool.map(ImpairedRobot.trial, robots_, [condition] * len(robots_)))
+                for of_form in in_turn(list(by_form.values()), number):
+                    progress(f"{condition.name}: {', '.join(robot.subject for robot in of_form)}")
+                    cells += chain(*pool.map(ImpairedRobot.trial, of_form, [condition] * len(of_form)))
         except PebbleError as error:
             if not cells:
                 raise
             ended.append(f"The trials ended early: {error}")
         finally:
-            for robot in every:
+            for robot in robots:
                 robot.operator.ask_to_end()  # unblocks threads that wait for it
     return cells
 
@@ -202,15 +200,12 @@ def _trials(settings: Settings, every: Sequence[ImpairedRobot], progress: Progre
 # -- the tables
 
 _STAND_IN: Final = f"original: its encodings, sent by this program; a {STAND_IN} for the original itself."
-_KINDS: Final = ("zenoh", "mqtt")
-_COMPARED: Final = {"drive p50": metrics.DRIVE, "sound p50": metrics.SOUND, "video p50": metrics.PICTURES}
-#: Each with its measure, of which this percentile is shown.
+#: Each column's measure, and the percentile that is shown.
 _COLUMNS: Final[tuple[tuple[str, str, int], ...]] = (
     ("audio\n%", metrics.DELIVERED, 50),
     ("in 1 s\n%", metrics.ON_TIME, 50),
     ("p95\nms", metrics.SOUND, 95),
     ("video\nfps", metrics.FPS, 50),
-    ("frozen\ns", metrics.FROZEN, 50),
     ("drive\np95 ms", metrics.DRIVE, 95),
 )
 
@@ -224,21 +219,4 @@ def table(cells: Sequence[Cell]) -> Table:
             measured = {cell.measure: cell for cell in of_subject}
             values = (digits(value_of(measured[measure], percent)) for _, measure, percent in _COLUMNS)
             grid.add_row("" if number else trial, subject, *values)
-    return grid
-
-
-def transports(results: Results) -> Table:
-    """Return a comparison of Zenoh with MQTT inside the robot; trials count as rounds, as both ran at once."""
-    title = "Zenoh to MQTT inside the robot, medians over the trials"
-    grid = plain_table(title, ["form", *_COMPARED], caption=f"{_STAND_IN} {RATIOS}")
-    for form in FORMS:
-        intervals = []
-        for measure in _COMPARED.values():
-            samples = []  # of each kind, by trial
-            for kind in _KINDS:
-                cells = [results.find(f"{kind} {form}", measure, trial=trial) for trial in TRIALS]
-                samples.append([cell.samples if cell else [] for cell in cells])
-            zenoh, mqtt = samples
-            intervals.append(str(paired(zenoh, mqtt)))
-        grid.add_row(form, *intervals)
     return grid

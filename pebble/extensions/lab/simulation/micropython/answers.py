@@ -18,16 +18,16 @@ def name_answer(query: bytes, addresses_of: Callable[[str], str | Sequence[str] 
         kind, class_ = struct.unpack_from("!HH", query, end)
     except (IndexError, struct.error, UnicodeDecodeError):
         return None
-    if len(query) < 12 or query[2] & 0x80 or kind != _A or class_ & 0x7FFF != _IN:  # the top bit: mDNS, by unicast
+    is_query = len(query) >= 12 and not query[2] & 0x80
+    if not is_query or kind != _A or class_ & 0x7FFF != _IN:  # the top bit of the class: mDNS, by unicast
         return None
     addresses = addresses_of(name)
     question = query[12 : end + 4]
     if addresses is None:
         return query[:2] + struct.pack("!HHHHH", _ANSWER | NO_SUCH_NAME, 1, 0, 0, 0) + question
     head = struct.pack("!HHHIH", 0xC00C, _A, _IN, _TTL_S, 4)
-    records = [
-        head + socket.inet_aton(address) for address in ([addresses] if isinstance(addresses, str) else addresses)
-    ]
+    listed = [addresses] if isinstance(addresses, str) else addresses
+    records = [head + socket.inet_aton(address) for address in listed]
     return query[:2] + struct.pack("!HHHHH", _ANSWER, 1, len(records), 0, 0) + question + b"".join(records)
 
 

@@ -15,7 +15,8 @@ from pebble.extensions.lab.simulation.micropython.faults import WouldHang
 from pebble.extensions.lab.simulation.micropython.files import Files
 from pebble.extensions.lab.simulation.micropython.i2c import Bus
 from pebble.extensions.lab.simulation.micropython.loader import FirmwareModules
-from pebble.extensions.lab.simulation.micropython.modules import machine, select, system
+from pebble.extensions.lab.simulation.micropython.modules import machine, system
+from pebble.extensions.lab.simulation.micropython.modules.streams import select_module
 from pebble.extensions.lab.simulation.micropython.modules.timing import BoardTime
 from pebble.extensions.lab.simulation.micropython.pins import Level, PinName, Pins, Volts
 from pebble.extensions.lab.simulation.micropython.ports import OF_ROBOT, SAMD21, Port
@@ -140,7 +141,7 @@ class Board:
             "micropython": system.micropython_module(self),
             "os": system.os_module(self),
             "random": system.random_module(self),
-            "select": select.module(),
+            "select": select_module(),
             "sys": system.sys_module(self),
             "time": self.time.module(),
             **(self.network.modules() if self.network is not None else {}),

@@ -53,23 +53,24 @@ class PwmTimers:
 
     def __init__(self) -> None:
         self._started: set[int] = set()  # a timer stays started when its last signal ends
-        self._shown: dict[tuple[int, int], str] = {}
-        self._of_pin: dict[str, tuple[int, int]] = {}
+        self._pin_of: dict[tuple[int, int], str] = {}  # by timer and channel
+        self._channel_of: dict[str, tuple[int, int]] = {}  # by pin: timer and channel
 
     def take(self, pin: str) -> None:
         """Assign the channel that MicroPython assigns: that of a timer not yet started, else of the first timer."""
-        if pin in self._of_pin:
+        if pin in self._channel_of:
             return
         possible = _TIMERS.get(pin, ())
         if not possible:
             raise ValueError(f"not a PWM Pin: {pin}")
-        timer, output = next((pair for pair in possible if pair[0] not in self._started), possible[0])
+        unused = [(timer, output) for timer, output in possible if timer not in self._started]
+        timer, output = unused[0] if unused else possible[0]
         channel = timer, output % _CHANNELS[timer]
-        if channel in self._shown:
-            raise SharedPwm(f"{pin} and {self._shown[channel]} are both on channel {channel[1]} of TCC{timer}")
+        if channel in self._pin_of:
+            raise SharedPwm(f"{pin} and {self._pin_of[channel]} are both on channel {channel[1]} of TCC{timer}")
         self._started.add(timer)
-        self._shown[channel], self._of_pin[pin] = pin, channel
+        self._pin_of[channel], self._channel_of[pin] = pin, channel
 
     def free(self, pin: str) -> None:
-        if pin in self._of_pin:
-            del self._shown[self._of_pin.pop(pin)]
+        if pin in self._channel_of:
+            del self._pin_of[self._channel_of.pop(pin)]

@@ -33,7 +33,7 @@ class Watchdog:
         self._fed_at = self._clock.now()
 
     def left(self) -> float:
-        """Return the seconds until it resets the board."""
+        """Return the seconds until the watchdog resets the board."""
         if self.timeout_ms is None:
             return math.inf
         return max(0.0, self._fed_at + self.timeout_ms / 1000 - self._clock.now())
@@ -54,8 +54,8 @@ class SoftTimers:
     def __init__(self, clock: Clock) -> None:
         self.on_wait: Callable[[], None] = lambda: None
         self._clock = clock
-        self._due: dict[Any, float] = {}
-        self._busy = False
+        self._due: dict[Any, float] = {}  # by timer
+        self._busy = False  # a timer's function runs, which may wait as well
 
     @property
     def running(self) -> bool:

@@ -93,9 +93,9 @@ class LockstepRobot:
         self._world, self._camera = world, camera
         self._renderer: Renderer | None = None  # made for the first picture: not every test has OpenCV to load
         self._now = 0.0
-        self._output = b""
+        self._output = b""  # of the MCU, not yet read
         self._samples: deque[Sample] = deque(maxlen=_SAMPLES)
-        self._pictures = 0  # due until the last one that was taken
+        self._newest_picture = 0  # the number of the picture that was returned last
 
     @property
     def pose(self) -> RobotPose:
@@ -128,11 +128,11 @@ class LockstepRobot:
 
     def picture(self) -> Picture | None:
         """Return the newest picture, unless it was returned before. It is rendered only when asked for."""
-        due = int(self._now * self._camera.fps + 1e-6)
-        if due == self._pictures:
+        number = int(self._now * self._camera.fps + 1e-6)
+        if number == self._newest_picture:
             return None
-        self._pictures = due
-        at = due / self._camera.fps - self._world.camera.latency_ms / 1000
+        self._newest_picture = number
+        at = number / self._camera.fps - self._world.camera.latency_ms / 1000
         pixels = np.empty((self._camera.height, self._camera.width, 3), np.uint8)
         if self._renderer is None:
             self._renderer = Renderer(self._world, self.name, self._camera.width, self._camera.height)

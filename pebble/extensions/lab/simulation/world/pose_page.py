@@ -39,6 +39,7 @@ class PosePage:
     """The writer of the page. Raises DeviceError if another program runs this world, or the page cannot be made."""
 
     def __init__(self, path: Path, names: Iterable[str]) -> None:
+        """Lock the world for this program, and write an empty page."""
         self._path, self._new, self._start_ns = path, path.with_suffix(".new"), time.monotonic_ns()
         self._samples: dict[str, deque[Sample]] = {name: deque(maxlen=_SAMPLES) for name in names}
         try:

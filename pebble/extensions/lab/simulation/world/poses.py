@@ -1,4 +1,4 @@
-"""The poses of a robot in the last second, and interpolated between them."""
+"""The poses of a robot in the last second; those in between are interpolated."""
 
 import math
 from bisect import bisect_right
@@ -33,10 +33,12 @@ class Track:
 
     def at(self, ns: int) -> RobotPose:
         """Return the pose at ``ns``, interpolated; for a time outside of the samples the oldest or newest."""
-        after = bisect_right(self.samples, ns, key=lambda sample: sample.ns)
-        if after in (0, len(self.samples)):
-            return self.samples[max(0, after - 1)].pose
-        (start, earlier), (end, later) = self.samples[after - 1], self.samples[after]
+        next_index = bisect_right(self.samples, ns, key=lambda sample: sample.ns)
+        if next_index == 0:
+            return self.samples[0].pose
+        if next_index == len(self.samples):
+            return self.newest.pose
+        (start, earlier), (end, later) = self.samples[next_index - 1], self.samples[next_index]
         part = (ns - start) / (end - start)
         turn = math.remainder(later.heading - earlier.heading, math.tau)
         return RobotPose(

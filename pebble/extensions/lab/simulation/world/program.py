@@ -6,7 +6,6 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +14,7 @@ import msgspec
 
 from pebble.errors import DeviceError
 from pebble.extensions.lab.simulation.mcu import actions
-from pebble.extensions.lab.simulation.motion import Pose, RobotMotion
+from pebble.extensions.lab.simulation.motion import Pose
 from pebble.extensions.lab.simulation.pty import PtyMcu
 from pebble.extensions.lab.simulation.world.pose_page import PERIOD_S, PosePage, page_path
 from pebble.extensions.lab.simulation.world.poses import RobotPose
@@ -46,10 +45,13 @@ def run(file: Path, folder: Path | None = None, *, trace: Path | None = None, co
     with ExitStack() as stack:
         page = _page(path, world)
         stack.callback(page.close)
-        floor = Floor(world)
-        motions = {name: motion_of(world, name, floor) for name in world.robots}
-        mcus = {name: stack.enter_context(mcu) for name, mcu in _mcus(world, motions, folder, trace).items()}
-        imus = {name: stack.enter_context(imu) for name, imu in _imus(world, motions, folder).items()}
+        floor, mcus, imus = Floor(world), Mcus(), Mcus()
+        for name, place in world.robots.items():
+            motion, trace_file = motion_of(world, name, floor), trace_path(trace, name) if trace else None
+            mcu = PtyMcu(place.kind, port_path(folder, name), trace=trace_file, motion=motion)
+            mcus[name] = stack.enter_context(mcu)
+            if place.imu:  # it only reads the motion, which the motor MCU's thread advances
+                imus[name] = stack.enter_context(PtyMcu("goob_imu", imu_port_path(folder, name), motion=motion))
         print(_introduction(path, mcus, imus), flush=True)  # noqa: T201
         if control:
             threading.Thread(target=_run_commands, args=(mcus, end), name="pebble-world control", daemon=True).start()
@@ -77,27 +79,6 @@ def _page(path: Path, world: World) -> PosePage:
         return PosePage(page_path(path), world.robots)
     except DeviceError as error:
         raise DeviceError(f"{path}: {error}") from None
-
-
-def _mcus(world: World, motions: Mapping[str, RobotMotion], folder: Path, trace: Path | None) -> Mcus:
-    return {
-        name: PtyMcu(
-            place.kind,
-            port_path(folder, name),
-            trace=trace_path(trace, name) if trace else None,
-            motion=motions[name],
-        )
-        for name, place in world.robots.items()
-    }
-
-
-def _imus(world: World, motions: Mapping[str, RobotMotion], folder: Path) -> Mcus:
-    """Return the inertial sensors' MCUs. They only read the motion; the motor MCU's thread advances it."""
-    return {
-        name: PtyMcu("goob_imu", imu_port_path(folder, name), motion=motions[name])
-        for name, place in world.robots.items()
-        if place.imu
-    }
 
 
 def _publish_poses(page: PosePage, mcus: Mcus, end: EndSignal) -> None:
@@ -129,6 +110,7 @@ def _serial(mcu: PtyMcu) -> dict[str, Any]:
 
 
 def _run_commands(mcus: Mcus, end: EndSignal) -> None:
+    """Execute the lines of standard input; when it closes, request the end of the program."""
     for line in sys.stdin:
         if problem := _command(mcus, line.split()):
             sys.stderr.write(f"{line.strip()!r}: {problem}\n")

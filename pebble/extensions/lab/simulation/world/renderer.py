@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pebble.extensions.lab.simulation.world.poses import RobotPose, Track
 from pebble.extensions.lab.simulation.world.surfaces import Image, Surface, Surfaces
-from pebble.extensions.lab.simulation.world.world_file import World
+from pebble.extensions.lab.simulation.world.world_file import Room, World
 from pebble.extensions.media.scene import noise
 
 _NEAR_M: Final = 0.05  # nothing nearer is drawn
@@ -67,7 +67,8 @@ class Renderer:
     def _expose(self, tracks: Mapping[str, Track], ns: int, out: Image) -> None:
         """Draw the average of the scene during the exposure, which ends at ``ns``."""
         exposure_ns = self._lens.motion_blur_ms * 1e6
-        times = [ns - round(exposure_ns * part / (_EXPOSURES - 1)) for part in range(_EXPOSURES if exposure_ns else 1)]
+        count = _EXPOSURES if exposure_ns else 1
+        times = [ns - round(exposure_ns * number / (_EXPOSURES - 1)) for number in range(count)]
         views = [{name: track.at(moment) for name, track in tracks.items()} for moment in times]
         if all(view == views[0] for view in views):
             self.draw(views[0], out)
@@ -86,9 +87,10 @@ class Renderer:
         surfaces = self._surfaces.surfaces(poses, self._me)
         if not surfaces:
             return
-        plan, parts = self._seen(surfaces, me)
-        for index in _back_to_front(plan, [surfaces[number].layer for number in parts], self._columns(plan)):
-            surface = surfaces[parts[index]]
+        plan, numbers = self._seen(surfaces, me)
+        seen = [surfaces[number] for number in numbers]  # the surface of each part in the plan
+        for index in _back_to_front(plan, [surface.layer for surface in seen], self._columns(plan)):
+            surface = seen[index]
             if surface.textures:
                 self._draw_texture(surface, me, plan[index], out)
             else:
@@ -143,24 +145,24 @@ class Renderer:
         self._cv2.fillConvexPoly(out, points, surface.colour, self._cv2.LINE_AA, _SHIFT)
 
     def _draw_texture(self, surface: Surface, me: RobotPose, plan: _Floats, out: Image) -> None:
+        """Draw a surface with its texture, and around its opaque parts what is behind it."""
         columns, rows = self._columns(plan), self._rows(surface, plan)
         x0, x1 = max(0, math.floor(columns[0])), min(self._width, math.ceil(columns[1]) + 1)
         y0, y1 = max(0, math.floor(rows.min())), min(self._height, math.ceil(rows.max()) + 1)
         if x0 >= x1 or y0 >= y1:
             return
         area = (columns[1] - columns[0]) * (rows[:, 1] - rows[:, 0]).mean()
-        area *= self._share(surface, plan)
+        whole_width = math.dist(surface.left, surface.right)
+        area *= whole_width / max(1e-9, math.dist(plan[0], plan[1]))  # of the whole surface, also beside the picture
         fine = [level for level, texture in enumerate(surface.textures) if len(texture) ** 2 >= area]
         level = fine[-1] if fine else 0  # the smallest that is not enlarged
         size = len(surface.textures[level])
-        whole = self._to_camera(np.array((surface.left, surface.right)), me)
-        (ahead, beside), (ahead2, beside2) = whole
-        down = (surface.bottom - surface.top) / size
+        (ahead1, right1), (ahead2, right2) = self._to_camera(np.array((surface.left, surface.right)), me)
         to_space = np.array(  # from pixels of the texture to (right, down, ahead) of the camera
             [
-                [(beside2 - beside) / size, 0.0, beside],
-                [0.0, -down, self._lens.height_m - surface.top],
-                [(ahead2 - ahead) / size, 0.0, ahead],
+                [(right2 - right1) / size, 0.0, right1],
+                [0.0, (surface.top - surface.bottom) / size, self._lens.height_m - surface.top],
+                [(ahead2 - ahead1) / size, 0.0, ahead1],
             ]
         )
         box = (x0, y0, x1, y1)
@@ -172,12 +174,6 @@ class Renderer:
         self._warp(surface.masks[level], to_space, box, mask)
         part = np.s_[y0:y1, x0:x1]
         np.copyto(out[part], drawn[part], where=mask[part][..., None] > 127)
-
-    @staticmethod
-    def _share(surface: Surface, plan: _Floats) -> float:
-        """Return the ratio of the surface's width to that of its part in the plan."""
-        whole = math.dist(surface.left, surface.right)
-        return whole / max(1e-9, math.dist(plan[0], plan[1]))
 
     def _warp(self, texture: Image, to_space: _Floats, box: tuple[int, int, int, int], out: Image) -> None:
         """Draw a texture into the ``box`` of a picture. The middle of its pixels is at .5."""
@@ -215,8 +211,9 @@ def _back_to_front(plan: _Floats, layers: Sequence[int], columns: _Floats) -> li
     undrawn, order = set(range(len(plan))), []
     while undrawn:
         farthest_first = sorted(undrawn, key=lambda index: -distance[index])
-        free = [index for index in farthest_first if not covers[index, farthest_first].any()]
-        order += (chosen := free or farthest_first[:1])
+        # those that hide no part of what is still to be drawn; if each hides another one, the farthest
+        chosen = [index for index in farthest_first if not covers[index, farthest_first].any()] or farthest_first[:1]
+        order += chosen
         undrawn.difference_update(chosen)
     return order
 
@@ -245,17 +242,14 @@ def _floor(world: World) -> tuple[Image, _Floats]:
     """
     import cv2
 
-    room = world.room
-    x, y, wide = (
-        (room.x_min, room.y_min, max(room.x_max - room.x_min, room.y_max - room.y_min)) if room else (-10, -10, 20)
-    )
-    tiles = max(2, min(64, round(wide / _TILE_M)))
-    shades = (
-        120 + 26 * (np.indices((tiles, tiles)).sum(axis=0) % 2) + 20 * noise(7, tiles * tiles).reshape(tiles, tiles)
-    )
+    room = world.room or Room(x_min=-10, x_max=10, y_min=-10, y_max=10)
+    width = max(room.x_max - room.x_min, room.y_max - room.y_min)
+    tiles = max(2, min(64, round(width / _TILE_M)))
+    checkers = np.indices((tiles, tiles)).sum(axis=0) % 2
+    shades = 120 + 26 * checkers + 20 * noise(7, tiles * tiles).reshape(tiles, tiles)
     picture = cv2.resize(shades.astype(np.uint8), (_FLOOR_PX, _FLOOR_PX), interpolation=cv2.INTER_NEAREST)
-    scale = wide / _FLOOR_PX
-    to_world = np.array([[scale, 0.0, x], [0.0, scale, y], [0.0, 0.0, 1.0]])
+    scale = width / _FLOOR_PX
+    to_world = np.array([[scale, 0.0, room.x_min], [0.0, scale, room.y_min], [0.0, 0.0, 1.0]])
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR), np.uint8), to_world
 
 

@@ -66,14 +66,14 @@ class SimulatedRobot(Robot):
         self.log = logging.getLogger(f"pebble.script.{name}")
         self.published: list[tuple[Channel, Any]] = []
         self._addresses = Addresses(self.config)
-        self._last_values: dict[Channel, Callable[[], Any]] = {}
+        self._last_values: dict[Channel, Callable[[], Any]] = {}  # see Robot.publish_at_end
         self._model, self._body = model, self.world.robots[name]
         self._sender = DriveSender(1, self._drive)
-        self._driven_at = float("-inf")
-        self._end_at = float("inf")
-        self._messages: dict[Channel, tuple[Any, float]] = {}
+        self._driven_at = -math.inf  # when the last command was sent; infinite once the watchdog has stopped the wheels
+        self._end_at = math.inf
+        self._messages: dict[Channel, tuple[Any, float]] = {}  # by channel: the newest value, and when it came
         self._handlers: list[tuple[Channel, Handler]] = []
-        self._picture: tuple[Image, float] | None = None
+        self._picture: tuple[Image, float] | None = None  # the newest one, and the time that it shows
         self._calls = 0  # since time has passed
         self._latched = False
 
@@ -126,7 +126,7 @@ class SimulatedRobot(Robot):
 
     def camera(self, *, width: int | None = None, views: bool = False, timeout: float | None = None) -> Iterator[Image]:
         """Yield each picture once. Time passes while there is none."""
-        del width, views, timeout
+        del width, views, timeout  # without effect here
         while True:
             self._pass_step()
             picture = self._body.picture()
@@ -138,12 +138,14 @@ class SimulatedRobot(Robot):
         picture = self._body.picture()
         if picture is not None:
             self._picture = (picture.pixels, picture.at)
-        newest = self._picture
-        return None if newest is None or self.world.now() - newest[1] > max_age else newest[0]
+        if self._picture is None:
+            return None
+        pixels, at = self._picture
+        return pixels if self.world.now() - at <= max_age else None
 
     def latest(self, channel: Channel, max_age: float = 1.0) -> Any:
         self._check()
-        value, at = self._messages.get(channel, (None, float("-inf")))
+        value, at = self._messages.get(channel, (None, -math.inf))
         return value if self.world.now() - at <= max_age else None
 
     def on(self, channel: Channel, handler: Handler) -> None:
@@ -182,6 +184,7 @@ class SimulatedRobot(Robot):
     # -- time
 
     def _check(self) -> None:
+        """Raise Stopped if the script has to end, PebbleError if it waits for time that does not pass."""
         self._calls += 1
         if self._calls > _PATIENCE:
             raise PebbleError("time stands still: wait with robot.sleep(), not with time.sleep()")
@@ -192,13 +195,14 @@ class SimulatedRobot(Robot):
             raise Stopped(EXIT_ENDED)
 
     def _pass_step(self) -> None:
+        """Let a step of time pass; stop the wheels if no command came for too long, as the motor owner does."""
         self._check()
         self._calls = 0
         self.world.step()
         now = self.world.now()
         self._sender.tick(now)
         if now - self._driven_at > _WATCHDOG_S:
-            self._driven_at = float("inf")
+            self._driven_at = math.inf
             self._body.drive(0.0, 0.0)
 
     def _drive(self, command: Drive) -> bool:

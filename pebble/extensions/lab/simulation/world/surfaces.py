@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from itertools import chain
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -47,22 +48,21 @@ class Surfaces:
         self._textures: dict[int, tuple[Image, ...]] = {}
         self._fixed = [
             *(_left_side(wall, index) for index, wall in enumerate(world.room.walls if world.room else ())),
-            *(surface for index, wall in enumerate(world.walls) for surface in _both_sides(wall, index)),
+            *chain(*(_both_sides(wall, index) for index, wall in enumerate(world.walls))),
             *map(_drawn, world.drawings),
             *(self._tag(tag.id, tag.size_m, tag.x, tag.y, tag.z, math.radians(tag.yaw_deg)) for tag in world.tags),
         ]
 
     def surfaces(self, poses: Mapping[str, RobotPose], me: str) -> list[Surface]:
         """Return all surfaces, with robots at these poses, but without the robot ``me``, which does not see itself."""
-        robots = [
-            surface
-            for index, name in enumerate(self._world.robots)
-            if name != me and name in poses
-            for surface in self._robot(name, poses[name], _BODY_COLOURS[index % len(_BODY_COLOURS)])
-        ]
-        return self._fixed + robots
+        surfaces = list(self._fixed)
+        for index, name in enumerate(self._world.robots):
+            if name != me and name in poses:
+                surfaces += self._robot(name, poses[name], _BODY_COLOURS[index % len(_BODY_COLOURS)])
+        return surfaces
 
     def _robot(self, name: str, pose: RobotPose, colour: Colour) -> list[Surface]:
+        """Return the four sides of a robot's box, each with its tag if it has one."""
         place = self._world.robots[name]
         half, top = place.radius_m * _SIDE / 2, self._world.camera.height_m + _ABOVE_LENS_M
         surfaces = []

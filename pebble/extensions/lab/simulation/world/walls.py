@@ -33,7 +33,8 @@ class Floor:
         """Move a robot as far as the way is free; return its pose then, with the heading of ``end``."""
         with self._lock:
             before = self._clearance_mm(name, start.x_mm, start.y_mm)
-            part = 1.0 if self._free(name, start, end, 1.0, before) else self._contact(name, start, end, before)
+            is_free = self._free(name, start, end, 1.0, before)
+            part = 1.0 if is_free else self._free_part(name, start, end, before)
             x_mm, y_mm = _between(start, end, part)
             self._poses[name] = Pose(x_mm, y_mm, end.heading_rad)
             return self._poses[name]
@@ -42,8 +43,8 @@ class Floor:
         with self._lock:
             self._poses[name] = pose
 
-    def _contact(self, name: str, start: Pose, end: Pose, before: float) -> float:
-        """Return how much of the move is free, 0 to 1."""
+    def _free_part(self, name: str, start: Pose, end: Pose, before: float) -> float:
+        """Return how much of the move is free, 0 to 1, by halving. ``before``: the clearance at its start."""
         free, blocked = 0.0, 1.0
         for _ in range(_HALVINGS):
             middle = (free + blocked) / 2
@@ -54,7 +55,7 @@ class Floor:
         return free
 
     def _free(self, name: str, start: Pose, end: Pose, part: float, before: float) -> bool:
-        """True if the robot overlaps nothing after this part of the move, or less than it does now."""
+        """True if the robot overlaps nothing after this part of the move, or not more than at its start."""
         after = self._clearance_mm(name, *_between(start, end, part))
         return after >= min(0.0, before) - _ROUNDING_MM
 

@@ -4,7 +4,7 @@ from collections.abc import Collection, Sequence
 from typing import Any, Final, Literal, NamedTuple
 
 from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel
-from pebble.extensions.operator.client.robot_topics import PLACES, names
+from pebble.extensions.operator.client.robot_topics import PLACES, names, section_of
 
 Medium = Literal["video", "audio"]
 
@@ -21,8 +21,8 @@ BEST_FIRST: Final[dict[Medium, tuple[str, ...]]] = {"video": ("h264", "pbvd", "j
 class Words(NamedTuple):
     """The words for a medium in messages to people."""
 
-    lacking: str
-    fixed: str
+    lacking: str  # the robot does not have it
+    fixed: str  # the robot has it, and takes no requests for it
     name: str
 
 
@@ -37,9 +37,10 @@ def offered(capabilities: dict[str, Any], medium: Medium) -> tuple[str, ...]:
 
     Empty for robots that list none; requests to them name no encoding.
     """
-    section = capabilities.get(medium)
-    listed = section.get("encodings") if isinstance(section, dict) else None
-    return tuple(name for name in listed if isinstance(name, str)) if isinstance(listed, list) else ()
+    listed = section_of(capabilities, medium).get("encodings")
+    if not isinstance(listed, list):
+        return ()
+    return tuple(name for name in listed if isinstance(name, str))
 
 
 def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
@@ -49,8 +50,8 @@ def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
     """
     if not capabilities:
         return "it has published no capabilities yet"
-    section, words = capabilities.get(medium), WORDS[medium]
-    if not isinstance(section, dict) or section.get("available") is not True:
+    section, words = section_of(capabilities, medium), WORDS[medium]
+    if section.get("available") is not True:
         return words.lacking
     if section.get("controls") is not True:
         return words.fixed

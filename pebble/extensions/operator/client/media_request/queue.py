@@ -2,7 +2,8 @@
 
 A page acknowledges each frame when it has drawn it, and few frames are under way at a time: otherwise a slow connection
 would show what happened seconds ago. A difference is of no use without everything before it since the last key frame,
-so if one is left out, all are until the next key frame.
+so if one is left out, all are until the next key frame. A page that cannot use the robot's own pictures gets the rescue
+stream instead: small JPEGs that the server makes of them.
 """
 
 from collections import deque
@@ -39,26 +40,23 @@ class Frame:
 
 
 class ViewerQueue:
-    """The frames that wait for one page, and those sent and not yet acknowledged.
-
-    They are the robot's own pictures or, if the page cannot use them, those of the rescue stream.
-    """
+    """The frames of either stream that wait for one page, and those sent and not yet acknowledged."""
 
     def __init__(self, can: frozenset[str], now: float) -> None:
         self.can = can
-        self.rescued = False
+        self.rescued = False  # it gets the rescue stream
         self.new = True  # it has received no picture, and no key frame was requested for it
         self.waiting = True  # for a key frame
         self.overflowed = False  # waiting because the page is too slow
-        self.window = WINDOW
+        self.window = WINDOW  # so many frames may be under way
         self.ack_s = 0.0  # how long the last frame took to be drawn and acknowledged
         self.late_acks = 0  # in a row; of frames that were under way together one counts
-        self._late_at = float("-inf")  # the newest of them
+        self._late_at = float("-inf")  # when the newest of them came
         self._queue: deque[Frame] = deque()
-        self._under_way: dict[int, tuple[float, Frame]] = {}
-        self._undecodable: set[str] = set()
+        self._under_way: dict[int, tuple[float, Frame]] = {}  # by number: when it was sent, and the frame
+        self._undecodable: set[str] = set()  # encodings that the page could not decode after all
         self._waiting_since = now
-        self._retry_at = 0.0
+        self._retry_at = 0.0  # when a rescued page gets the robot's own pictures again
 
     def offer(self, frame: Frame) -> None:
         """Queue a frame, or skip it."""
@@ -215,9 +213,9 @@ def assess(viewers: Collection[ViewerQueue], encoding: str, now: float, *, can_r
         if can_rescue and not viewer.rescued and (viewer.is_thin or not viewer.decodes(encoding)):
             viewer.rescue(now)
     direct = [viewer for viewer in viewers if not viewer.rescued and viewer.decodes(encoding)]
-    patience = 0.0 if encoding == "h264" else _JPEG_PATIENCE_S
-    waiting = [viewer for viewer in direct if viewer.waiting and viewer.waiting_s(now) >= patience]
-    most_wait = 0 < len(direct) <= 2 * len(waiting)
+    patience_s = 0.0 if encoding == "h264" else _JPEG_PATIENCE_S
+    waiting = [viewer for viewer in direct if viewer.waiting and viewer.waiting_s(now) >= patience_s]
+    most_wait = bool(direct) and 2 * len(waiting) >= len(direct)
     if most_wait or encoding != "h264":
         return most_wait
     for viewer in waiting:

@@ -30,8 +30,8 @@ class ViewerRequest:
 
     def __init__(self, base: str, medium: Medium, capabilities: dict[str, Any], *, shares: bool = False) -> None:
         self._shares = shares
-        self.sent: deque[bytes] = deque(maxlen=_SENT)  # own requests: what else arrives on their topic is of others
-        self._others: MediaRequest | None = None  # what others request; None: nothing, as far as is known
+        self.sent: deque[bytes] = deque(maxlen=_SENT)  # this client's requests, which come back on their topic
+        self._others: MediaRequest | None = None  # what other clients request; None: nothing, as far as is known
         self.settled = False  # it was sent, or nothing has to be: else call :meth:`tick` often
         topics = (topic_of(base, capabilities, channel) for channel in CHANNELS[medium])
         self.media_topic, self.control_topic, self.flag_topic = topics
@@ -40,16 +40,23 @@ class ViewerRequest:
         _, self._control, self._flag = CHANNELS[medium]
         self._encoding: str | None = None
         self._is_up: bool | None = None  # the flag; None: not known
-        self._raised = self._requested = False
+        self._raised = self._requested = False  # by this client
         self._began_at = self._sent_at = self._received_at = self._keyframe_at = float("-inf")
 
-    def want(self, encoding: str | None, now: float) -> None:
-        """Request the medium in ``encoding``, or as configured. Raises PebbleError if the robot does not offer it."""
+    def check(self, encoding: str | None) -> None:
+        """Raise PebbleError if the robot does not offer the medium in ``encoding``, or (None) at all."""
         if not (self.section.get("available") and self.section.get("controls")):
             raise PebbleError(f"{self._base} offers no {self._medium}")
         listed = self._encodings()
         if encoding is not None and listed and encoding not in listed:
             raise PebbleError(f"{self._base} cannot send {self._medium} as {encoding}, only as {', '.join(listed)}")
+
+    def want(self, encoding: str | None, now: float) -> None:
+        """Request the medium in ``encoding``, or as configured, with the next ticks. Raises PebbleError.
+
+        Call it once the topics are subscribed to: :meth:`tick` waits from now on for payloads that come in any case.
+        """
+        self.check(encoding)
         self._encoding, self._began_at, self.settled = encoding, now, False
 
     def receive(self, message: Message, now: float) -> bool:
@@ -64,8 +71,8 @@ class ViewerRequest:
             self._is_up = bool(message.payload) and bool(codec.decode(self._flag, message.payload))
         except PayloadError:  # a malformed flag counts as lowered
             self._is_up = False
-        self._raised = self._raised and self._is_up  # one that was lowered is another operator's to raise
-        self._others = self._others if self._is_up else None
+        if not self._is_up:  # another client has lowered it, which ends all requests
+            self._raised, self._others = False, None
         return False
 
     def _receive_request(self, message: Message) -> None:
@@ -87,7 +94,7 @@ class ViewerRequest:
             is_quiet = now - max(self._sent_at, self._received_at) > _REPEAT_S
             return [self._ask(now)] if is_quiet else []
         if self._shares and not self._requested and self._others is None and self._received_at > float("-inf"):
-            self._others = MediaRequest(enabled=True)  # that was not seen
+            self._others = MediaRequest(enabled=True)  # whose request was not seen
         if self._others is not None or (self._encoding is None and self._received_at > float("-inf")):
             self.settled, self._sent_at = True, now  # another operator has requested it: change nothing
             return []
@@ -105,34 +112,33 @@ class ViewerRequest:
             return _JOIN_S
         if self._is_up is None:
             return _FLAG_S
-        return _SLOW_S[self._medium] if self._shares and self._is_up and not self._requested else 0.0
+        may_be_running = self._shares and self._is_up and not self._requested
+        return _SLOW_S[self._medium] if may_be_running else 0.0
 
     def keyframe(self, encoding: str | None, now: float) -> list[Message]:
         """Request a key frame in the encoding that arrives, at most once a second."""
         if now - self._keyframe_at < _KEYFRAME_S:
             return []
         self._keyframe_at = now
-        offered = encoding if encoding in self._encodings() else None
-        return [self._message(MediaRequest(enabled=True, encoding=offered, keyframe=True))]
-
-    def leave(self) -> None:
-        """Leave the medium running for another operator who has requested it too."""
-        self._requested = self._raised = False
+        listed = encoding if encoding in self._encodings() else None
+        return [self._message(MediaRequest(enabled=True, encoding=listed, keyframe=True))]
 
     def end(self) -> list[Message]:
-        """Withdraw the request, and clear the flag if it was clear before, unless others use the medium."""
-        if self._others is not None:
-            self.leave()
-        messages = [self._message(MediaRequest(enabled=False))] if self._requested else []
-        messages += [self._flag_message(up=False)] if self._raised else []
-        self.leave()
+        """Withdraw the request, and lower the flag if this client has raised it, unless others use the medium."""
+        messages: list[Message] = []
+        if self._requested and self._others is None:
+            messages.append(self._message(MediaRequest(enabled=False)))
+        if self._raised and self._others is None:
+            messages.append(self._flag_message(up=False))
+        self._requested = self._raised = False
         return messages
 
     def _encodings(self) -> tuple[str, ...]:
         return offered({self._medium: self.section}, self._medium)
 
     def _ask(self, now: float) -> Message:
-        if self._others is not None:  # they have gone without a word, or come back and want what they had
+        """Return the request, for the encoding of others if there were any: they may come back and want it."""
+        if self._others is not None:
             self._encoding, self._others = self._others.encoding, None
         self._sent_at, self._requested = now, True
         return self._message(MediaRequest(enabled=True, encoding=self._encoding))

@@ -35,14 +35,14 @@ class SharedRequest:
         self.ref, self.medium = ref, medium
         self.problem = ""  # why it is not requested
         self.encoding: str | None = None  # as requested; None: as configured, or nothing is requested
-        self.waits = ""  # why the robot, which knows of it, sends nothing for now: nothing is repeated
-        self.requested_at = float("-inf")
+        self.waits = ""  # why the robot holds the medium back for now; the request is not repeated meanwhile
+        self.requested_at = float("-inf")  # in its present encoding
         self._broker, self._receive = broker, receive
         self._request: ViewerRequest | None = None
         self._topics: list[str | None] = []  # that the capabilities named at the request
         self._subscriptions: list[Subscription] = []
         self._wanted = self._closing = False
-        self._wanted_at = float("-inf")  # the last time
+        self._wanted_at = float("-inf")  # when it was wanted last
         self._wakeup = asyncio.Event()
 
     def want(self, wanted: bool) -> None:
@@ -142,7 +142,7 @@ class SharedRequest:
             await self._broker.unsubscribe(subscription)
 
     def _is_over(self) -> bool:
-        """True if the request was withdrawn while the broker was connected; otherwise the robot would go on sending."""
+        """True if the medium was not wanted for a while, and the robot can be told so; else it would go on sending."""
         idle = not self._wanted and time.monotonic() - self._wanted_at >= LINGER_S
         return idle and (self._broker.connected or self._request is None)
 

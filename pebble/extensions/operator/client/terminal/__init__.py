@@ -1,1 +1,1 @@
-"""Drives one robot with the keys of a terminal."""
+"""The terminal as an input of keys, for driving a robot with them."""

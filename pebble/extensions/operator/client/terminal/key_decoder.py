@@ -36,14 +36,18 @@ class KeyDecoder:
     def feed(self, data: bytes, now: float) -> list[str]:
         """Return the keys in ``data``, in order: a printable character in lower case, or one of the names above."""
         keys: list[str] = []
-        if self._waiting and now >= self._since + ALONE_S:  # for the rest of a sequence, in vain
-            keys, self._waiting = [ESCAPE] * (self._waiting == b"\x1b"), b""
+        if self._waiting and now >= self._since + ALONE_S:  # the rest of a sequence has not come
+            if self._waiting == b"\x1b":
+                keys.append(ESCAPE)
+            self._waiting = b""
         data, at = self._waiting + data, 0
         while (key := _KEY.match(data, at)) is not None:
             keys += _names(key[0])
             at = key.end()
-        if data[at:] != self._waiting:
-            self._waiting, self._since = data[at:] if len(data) - at <= _LONGEST else data[at : at + 2], now
+        incomplete = data[at:]
+        if incomplete != self._waiting:
+            self._waiting = incomplete if len(incomplete) <= _LONGEST else incomplete[:2]
+            self._since = now
         return keys
 
 

@@ -38,8 +38,8 @@ class Terminal:
 
         tty.setcbreak(self._fd, self._termios.TCSAFLUSH)
         mode = self._termios.tcgetattr(self._fd)
-        mode[0] &= ~self._termios.IXON
-        mode[6][self._termios.VSUSP] = b"\0"
+        mode[0] &= ~self._termios.IXON  # of the input flags: Ctrl-S
+        mode[6][self._termios.VSUSP] = b"\0"  # of the special characters: Ctrl-Z
         self._termios.tcsetattr(self._fd, self._termios.TCSANOW, mode)
         _write(_HIDE_CURSOR)
 
@@ -54,8 +54,8 @@ class Terminal:
         data, is_gone, due = b"", False, self._decoder.due
         wait_s = seconds if due is None else min(seconds, due - time.monotonic())
         try:
-            is_ready = bool(select.select([self._fd], [], [], max(0.0, wait_s))[0])
-            if is_ready and not self.ended:
+            readable, _, _ = select.select([self._fd], [], [], max(0.0, wait_s))
+            if readable and not self.ended:
                 data = os.read(self._fd, _READ)
                 is_gone = not data
         except OSError:  # EIO: its other end was closed, or this process is in the background for good
@@ -63,7 +63,8 @@ class Terminal:
         if is_gone:
             self.ended = self.ended or "the terminal is gone"
         keys = self._decoder.feed(data, time.monotonic())
-        self.ended = END if END in keys else self.ended
+        if END in keys:
+            self.ended = END
         return keys
 
     def show(self, status: Callable[[], str], *, at_once: bool) -> None:

@@ -21,19 +21,19 @@ def main(robot: Robot, options: FollowSettings) -> None:
     robot.publish_at_end(APRILTAG_DATA, lambda: tag_data(options.tag_id, None, (0, 0), time.time()))
     tags: list[Tag] = []
     tag: Tag | None = None
-    last_tag, due = None, time.monotonic()
+    seen, due = None, time.monotonic()
     while True:
         now = time.monotonic()
-        newest = robot.latest(APRILTAG_LOCATIONS, options.tag_timeout_s)
+        locations = robot.latest(APRILTAG_LOCATIONS, options.tag_timeout_s)
         pose = pose_of(robot.latest(WHEEL_ODOMETRY, POSE_AGE_S))
-        if newest is not last_tag:
-            last_tag = newest
-            tags = tags_in(newest, options.tag_id, geometry) if newest else []
+        if locations is not seen:  # of another picture
+            seen = locations
+            tags = tags_in(locations, options.tag_id, geometry) if locations else []
             tag = largest(tags, options.tag_id)
             follower.see(now, tag and tag.place, pose)
         command = follower.step(now, pose)
         robot.drive(command.x, command.z)
-        size = (newest.frame_width, newest.frame_height) if newest else (0, 0)
+        size = (locations.frame_width, locations.frame_height) if locations else (0, 0)
         robot.publish(APRILTAG_DATA, tag_data(options.tag_id, tag, size, time.time(), len(tags)))
         due = max(due + 1 / options.control_rate_hz, now)
         robot.sleep(due - time.monotonic())

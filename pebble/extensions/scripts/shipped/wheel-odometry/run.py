@@ -59,9 +59,10 @@ def main(robot: Robot, options: OdometrySettings) -> None:
         try:
             method, value, now = inputs.get(timeout=0.05)
             method(value, now)
-            silent_at = None if method is touched else silent_at
+            if method is touched:
+                silent_at = None
         except queue.Empty:
-            robot.sleep(0)  # ends when it should
+            robot.sleep(0)  # raises Stopped when the script must end
             now = time.monotonic()
         if silent_at is not None and now >= silent_at:
             silent_at = None
@@ -94,11 +95,15 @@ def tune_state(robot: Robot) -> dict[str, float]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         robot.log.warning("%s: %s; the geometry counts", TUNE_STATE, error)
         return {}
-    if wrong := [key for key in values if key.endswith("_mm_per_event")]:
+    step_lengths = [key for key in values if key.endswith("_mm_per_event")]
+    if step_lengths:
         text = "%s: %s: not used, they are 0.5 to 0.6 of the truth: the program that wrote them counts steps twice"
-        robot.log.warning(text, TUNE_STATE, " and ".join(wrong))
-    numbers = {key: float(v) for key, v in values.items() if isinstance(v, int | float) and math.isfinite(v) and v > 0}
-    return {key: number for key, number in numbers.items() if key not in wrong}
+        robot.log.warning(text, TUNE_STATE, " and ".join(step_lengths))
+    numbers: dict[str, float] = {}
+    for key, value in values.items():
+        if key not in step_lengths and isinstance(value, int | float) and math.isfinite(value) and value > 0:
+            numbers[key] = float(value)
+    return numbers
 
 
 if __name__ == "__main__":

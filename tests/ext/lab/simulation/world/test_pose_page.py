@@ -17,8 +17,8 @@ from tests.support import Child, until
 BUSY = """
 import sys
 from pathlib import Path
-from pebble.simulation.world.pose_page import PosePage
-from pebble.simulation.world.poses import RobotPose
+from pebble.extensions.lab.simulation.world.pose_page import PosePage
+from pebble.extensions.lab.simulation.world.poses import RobotPose
 page = PosePage(Path(sys.argv[1]), ["goob", "fred"])
 ns = 0
 while True:

@@ -110,10 +110,7 @@ class Machine(SimpleNamespace):
     """The module ``machine``. Its classes belong to this board, and are made at first use: a class takes 3 KB."""
 
     def __init__(self, board: Board) -> None:
-        super().__init__(
-            unique_id=lambda: board.uid,
-            reset=_reset,
-        )
+        super().__init__(reset=_reset)
         self._board = board
 
     def __getattr__(self, name: str) -> type:

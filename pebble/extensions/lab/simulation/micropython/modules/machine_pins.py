@@ -36,19 +36,23 @@ class SimulatedPin:
 
     def init(self, mode: int = IN, pull: int | None = None, *, value: int | None = None) -> None:
         self._mode, self._pull = mode, pull
-        if value is not None or mode == self.IN:
-            self._board.pins.put(self.name, float(bool(value)) if mode != self.IN else 0.0)
+        if mode == self.IN:
+            self._board.pins.put(self.name, 0.0)
+        elif value is not None:
+            self._board.pins.put(self.name, float(bool(value)))
 
     def value(self, value: int | None = None) -> int | None:
+        """Set the level of an output; without ``value`` return the level of the pin."""
         if value is not None:
             if self._mode != self.IN:
                 self._board.pins.put(self.name, float(bool(value)))
             return None
-        driven = self._board.pins.driven(self.name)
-        if driven is None:
-            high = self._pull == self.PULL_UP if self._mode == self.IN else self._board.pins.level(self.name) > 0.0
-            return int(high)
-        return int(driven)
+        driven = self._board.pins.driven(self.name)  # from outside
+        if driven is not None:
+            return int(driven)
+        if self._mode == self.IN:
+            return int(self._pull == self.PULL_UP)
+        return int(self._board.pins.level(self.name) > 0.0)
 
 
 def _name(board: Board, pin: SimulatedPin | PinName) -> PinName:
@@ -63,22 +67,22 @@ class SimulatedPwm:
     def __init__(self, dest: SimulatedPin | PinName, *, freq: int, duty_u16: int = 0) -> None:
         if freq <= 0:
             raise ValueError("freq must be positive")
-        self._pin, self._shown = _name(self._board, dest), False
+        self._pin, self._has_channel = _name(self._board, dest), False
         self.duty_u16(duty_u16)
 
     def duty_u16(self, duty: int) -> None:
         if not 0 <= duty <= _FULL_U16:
             raise ValueError("duty_u16 must be 0..65535")
-        if not self._shown:
+        if not self._has_channel:
             self._board.take_pwm(self._pin)
-            self._shown = True
+            self._has_channel = True
         self._board.pins.put(self._pin, duty / _FULL_U16)
 
     def deinit(self) -> None:
         """Make the pin an ordinary one, and low. Setting the duty cycle restarts the signal."""
         self._board.pins.put(self._pin, 0.0)
         self._board.free_pwm(self._pin)
-        self._shown = False
+        self._has_channel = False
 
 
 class SimulatedAdc:

@@ -1,4 +1,4 @@
-"""The network of a simulated board: real, non-blocking TCP of this machine behind a simulated Wi-Fi."""
+"""The network of a simulated board: real, non-blocking TCP of this machine behind a simulated Wi-Fi, and servers."""
 
 from __future__ import annotations
 
@@ -6,27 +6,56 @@ import errno
 import select
 import socket
 import ssl
+import time
 from collections import deque
+from contextlib import suppress
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Final
 
+from pebble.extensions.lab.simulation.micropython.answers import name_answer, time_answer
 from pebble.extensions.lab.simulation.micropython.clock import Clock
 from pebble.extensions.lab.simulation.micropython.faults import WouldHang, failure
-from pebble.extensions.lab.simulation.micropython.modules.servers import Address, Servers
 from pebble.extensions.lab.simulation.micropython.modules.streams import POLLERR, POLLHUP, POLLIN, POLLOUT, Stream
 from pebble.extensions.lab.simulation.micropython.modules.tls import as_on_a_board, ssl_module
-from pebble.extensions.lab.simulation.micropython.modules.wlan import Platform, Radio, network_module
+from pebble.extensions.lab.simulation.micropython.modules.wlan import ADDRESS, Platform, Radio, network_module
 
+Address = tuple[str, int]
+
+TIME_HOST: Final = "pool.ntp.org"
+_TIME_ADDRESS: Final = "10.0.0.123"
+_NAME_SERVERS: Final = ((ADDRESS[3], 53), ("224.0.0.251", 5353))  # RFC 6762: the second for names that end in .local
+_MOST = 16  # addresses in an answer, which has 512 bytes at most (RFC 1035, 2.3.4)
 _LATER = (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
 MAX_SOCKETS = 5  # TCP connections of the ESP8266's lwIP; the ESP32 has a few more
 
 _CONSTANTS = {name: int(getattr(socket, name)) for name in ("AF_INET", "SOCK_STREAM", "SOCK_DGRAM")}
 
 
+class Servers:
+    """The name server and the time server. A name has the addresses that this machine's resolver returns."""
+
+    def __init__(self) -> None:
+        self._addresses: dict[str, list[str]] = {TIME_HOST: [_TIME_ADDRESS]}  # by name
+
+    def answer(self, request: bytes, place: Address) -> bytes | None:
+        """Return the answer to a packet for ``place``; None if nothing answers there."""
+        if place == (_TIME_ADDRESS, 123):
+            return time_answer(request, time.time())
+        return name_answer(request, self._resolve) if place in _NAME_SERVERS else None
+
+    def _resolve(self, name: str) -> list[str] | None:
+        """Return the addresses of a name; None if there is none at present."""
+        if name not in self._addresses:
+            with suppress(OSError):
+                answers = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_STREAM)
+                self._addresses[name] = list(dict.fromkeys(str(address[4][0]) for address in answers))[:_MOST]
+        return self._addresses.get(name)
+
+
 class HostNetwork:
     """The network of one board.
 
-    The scheduler reads ``new_sockets``, which it then watches, and ``unread``, whether more can be read at once.
+    The program that runs the board watches ``new_sockets``; with ``unread`` more can be read at once.
     """
 
     def __init__(self, clock: Clock, *, platform: Platform = "esp32") -> None:

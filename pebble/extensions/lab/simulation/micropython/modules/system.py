@@ -19,10 +19,7 @@ def sys_module(board: Board) -> SimpleNamespace:
     return SimpleNamespace(
         stdin=Input(console, buffer=stdio_bytes),
         stdout=Output(console, buffer=stdio_bytes),
-        stderr=Output(console, buffer=stdio_bytes),
-        platform=board.port.platform,
         implementation=SimpleNamespace(name="micropython", version=_VERSION, _machine=board.port.board),
-        print_exception=lambda error, _file=None: board.print(repr(error)),
     )
 
 

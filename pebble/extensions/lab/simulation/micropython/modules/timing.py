@@ -15,7 +15,7 @@ _ROUNDING: Final = 1e-6  # ms: 0.57 s are 569.9999999999999 ms
 
 
 class BoardTime:
-    """The module ``time``: ticks since boot on ``clock``, from ``ticks_at_boot_ms``, so tests choose the wrap."""
+    """The module ``time``: ticks since boot on ``clock``. They begin at ``ticks_at_boot_ms``: tests choose the wrap."""
 
     def __init__(self, clock: Clock, pause: Callable[[float], None], ticks_at_boot_ms: int = 0) -> None:
         self._clock, self._pause = clock, pause

@@ -92,7 +92,7 @@ class Wlan:
 
 
 def network_module(radio: Radio) -> SimpleNamespace:
-    """Return the module ``network`` of one board, with ``radio`` as its station. Its own access point is never used."""
+    """Return the module ``network`` of one board, with ``radio`` as its station. A board is no access point."""
     interfaces = {Wlan.IF_STA: Wlan(radio), Wlan.IF_AP: Wlan(Radio(lambda: 0.0, radio.platform))}
 
     def wlan(interface: int = Wlan.IF_STA) -> Wlan:
