@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from pebble.config import load, parse
+from pebble.config import parse
 from pebble.config.raw import deep_merge
 from pebble.config.rules.doors import warning_of_open
 from pebble.errors import ConfigError
-from tests.support import ROOT
+from tests.kit.configs import at
 
 REMOTE, UPLINK = "services.mqtt_bridge.remote_mqtt", "services.mqtt_bridge.remote"
 MIRROR, PAGE, DRIVE = "transport.mqtt_mirror", "web_interface.mqtt", "services.serial_mcu_bridge.topics.drive_values"
@@ -23,12 +23,6 @@ GOOD: dict[str, Any] = {
     "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "broker.lab", **LOGIN}}},
 }
 MQTT: dict[str, Any] = {"transport": {"kind": "mqtt"}}
-
-
-def at(path: str, value: Any) -> dict[str, Any]:
-    for key in reversed(path.split(".")):
-        value = {key: value}
-    return value
 
 
 def problems(level: str, *changes: dict[str, Any]) -> list[str]:
@@ -150,12 +144,6 @@ def test_a_robot_that_asks_for_no_name_is_warned_of_once(change: dict[str, Any],
     warning = warning_of_open(parse(deep_merge(GOOD, change), folder=Path("/nowhere"), env={}))
     expected = f'security.level is "open": whoever may publish by {where} drives this robot (docs/ext/fleet.md)'
     assert warning == {True: expected, False: ""}[bool(where)]
-
-
-def test_the_demo_and_simulations_are_not_warned() -> None:
-    loopback = deep_merge(GOOD, at(REMOTE, {"host": "127.0.0.1", "port": 41883, "tls": {}}))
-    assert warning_of_open(parse(loopback, folder=Path("/nowhere"), env={})) == ""
-    assert warning_of_open(load(ROOT / "configs" / "goob.json", env={})) != ""
 
 
 @pytest.mark.parametrize(

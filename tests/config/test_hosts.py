@@ -6,12 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from pebble.config import Config, parse
+from pebble.config import parse
 from pebble.config.hosts import HostError, broker_host, endpoint, name_of_page
+from pebble.config.raw import deep_merge
 from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.fleet.certificates import init
 from pebble.extensions.operator.client.url import settings_of
 from pebble.services.video_stream.config import VideoStream
+from tests.kit.configs import at
 
 
 @pytest.mark.parametrize(
@@ -62,17 +64,13 @@ BAD = "mqtts://rover:s3cr3t@broker.example:8883"
         ("web_interface.names", [BAD]),
         ("transport.listen", ["tls/rover:s3cr3t@0.0.0.0:7447"]),
         ("transport.connect", ["tcp/broker:s3cr3t"]),
-        ("services.mqtt_bridge.remote.connect", ["tls/mqtt://b:1"]),
+        ("services.mqtt_bridge.remote", {"kind": "zenoh", "connect": ["tls/mqtt://b:1"]}),
     ],
 )  # fmt: skip
 def test_every_key_that_names_a_host_reads_it_so(place: str, value: object) -> None:
-    raw: dict[str, object] = {"robot": {"id": "rover"}, "transport": {"kind": "zenoh"}}
-    section, keys = raw, place.split(".")
-    for key in keys[:-1]:
-        section = section.setdefault(key, {"kind": "zenoh"} if key == "remote" else {})  # type: ignore[assignment]
-    section[keys[-1]] = value
+    raw = {"robot": {"id": "rover"}, "transport": {"kind": "zenoh"}}
     with pytest.raises(ConfigError) as caught:
-        parse(raw, folder=Path("/"), env={})
+        parse(deep_merge(raw, at(place, value)), folder=Path("/"), env={})
     assert str(caught.value).startswith(place)
     assert "s3cr3t" not in str(caught.value)
 
@@ -111,17 +109,10 @@ def test_the_address_of_a_stream(url: str, public: str, warned: str) -> None:
     assert bool(warned) == bool(config.warnings)
 
 
-def _parse(raw: object) -> Config:
-    return parse(raw, folder=Path("/"), env={})
-
-
 @pytest.mark.parametrize("hosts", [["a"], ["a", "b:1884"], ["mqtt://ann:s3cr3t@b"]])
 @pytest.mark.parametrize("section", ["services.mqtt_bridge.remote_mqtt", "local_mqtt", "web_interface.mqtt"])
 def test_a_list_of_brokers_is_one_error_that_says_so(section: str, hosts: list[str]) -> None:
-    raw: dict[str, object] = {"hosts": hosts}
-    for key in reversed(section.split(".")):
-        raw = {key: raw} | ({"enabled": True} if key == "remote_mqtt" else {})
     with pytest.raises(ConfigError) as caught:
-        _parse({"robot": {"id": "r"}, **raw})
+        parse({"robot": {"id": "r"}, **at(section, {"hosts": hosts})}, folder=Path("/"), env={})
     (problem,) = caught.value.problems
     assert problem.startswith(f"{section}: hosts is no key any more: write host, a name that has")

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from msgspec import UNSET
 from msgspec.structs import replace
 
 from pebble import contract as c
@@ -148,6 +147,7 @@ REFUSALS: dict[Channel, list[bytes]] = {
     ],
     c.AUTONOMY_COMMAND: NO_SWITCH,
     c.OUTLET_COMMAND: [b'{"on": "false"}', b'{"on": 1}', b'{"on": null}', b"{}", b"true"],
+    c.ESTOP: [b""],
     c.ESTOP_RESET: [b"", b"{}", b'{"boot": "a"}', b'{"boot": 1, "count": 1}', b'{"boot": "a", "count": true}'],
     c.CONTROL: [
         *(b"{}", b'{"id": ""}', b'{"id": "3f2a91c"}', b'{"id": "3f2a91c0\\n"}', b'{"id": 1}', b'{"id": "3f2a91cg"}'),
@@ -171,41 +171,28 @@ def test_a_boolean_control_has_three_forms(channel: Channel, value: bool, form: 
     assert codec.decode(channel, form.format(json.dumps(value)).encode()) is value
 
 
-def test_a_name_that_is_no_utf8_is_written_with_its_codes() -> None:
-    state = SoundboardStatus(playing=True, timestamp=1.5, file="caf\udce9 ö.wav")
-    assert json.loads(codec.encode(c.SOUNDBOARD_STATUS, state))["file"] == "caf\\udce9 ö.wav"
-
-
 # -- drive values
 
 
-def test_absent_fields_are_not_written() -> None:
-    assert codec.encode(c.DRIVE, Drive(z=0.5)) == b'{"x":0.0,"z":0.5,"y":0.0}'
-    signed = codec.encode(c.DRIVE, Drive(x=-0.25, z=0.625, source="autonomy", run=1_000_000, valid_ms=400))
-    assert signed == b'{"x":-0.25,"z":0.625,"y":0.0,"source":"autonomy","run":1000000,"valid_ms":400}'
-    assert len(b"pebble/robots/minilamp/incoming/drive-values" + signed) < 256  # a sketch's buffer
-
-
 @pytest.mark.parametrize(
-    "wrong",
+    ("key", "fields"),
     [
-        *('"source": 5', '"source": ["autonomy"]', '"source": {"a": 1}', '"source": true'),
-        *('"run": "17"', '"run": 1.5', '"run": true', '"run": 0', '"run": -1', '"run": 1073741824'),
-        *('"valid_ms": "400"', '"valid_ms": -1', '"valid_ms": true', '"valid_ms": 1e300', f'"valid_ms": {10**300}'),
+        *(("source", f'"source": {wrong}') for wrong in ("5", '["autonomy"]', '{"a": 1}', "true")),
+        ("run", '"source": "autonomy"'),
+        *(
+            ("run", f'"source": "autonomy", "run": {wrong}')
+            for wrong in ('"17"', "1.5", "true", "0", "-1", "1073741824")
+        ),
+        *(("valid_ms", f'"valid_ms": {wrong}') for wrong in ("0", "0.5")),
+        *(
+            ("valid_ms", f'"source": "autonomy", "run": 17, "valid_ms": {wrong}')
+            for wrong in ('"400"', "-1", "true", "1e300", 10**300)
+        ),
     ],
 )
-def test_a_wrong_field_refuses_a_command_that_moves_and_never_a_stop(wrong: str) -> None:
-    key = wrong.split('"')[1]
-    rest = "" if key == "source" else ', "source": "autonomy"'
-    rest += ', "run": 17' if key == "valid_ms" else ""
-    assert key in refused(c.DRIVE, f'{{"z": 0.5, {wrong}{rest}}}'.encode())
-    assert not codec.decode(c.DRIVE, f'{{"z": 0, {wrong}{rest}}}'.encode()).moves
-
-
-def test_a_scripts_command_without_its_run_and_one_that_is_valid_for_no_time_move_nothing() -> None:
-    assert "run" in refused(c.DRIVE, b'{"z": 0.5, "source": "autonomy"}')
-    assert "valid_ms" in refused(c.DRIVE, b'{"z": 0.5, "valid_ms": 0}')
-    assert "valid_ms" in refused(c.DRIVE, b'{"z": 0.5, "valid_ms": 0.5}')
+def test_a_wrong_field_refuses_a_command_that_moves_and_never_a_stop(key: str, fields: str) -> None:
+    assert key in refused(c.DRIVE, f'{{"z": 0.5, {fields}}}'.encode())
+    assert not codec.decode(c.DRIVE, f'{{"z": 0, {fields}}}'.encode()).moves
 
 
 VECTORS = json.loads((Path(__file__).parents[1] / "vectors" / "commands.json").read_text())  # boards read the same
@@ -280,33 +267,28 @@ def test_bytes_without_a_payload_are_neither_empty_nor_a_bridges_probe(raw: byte
         (b'{"x":"0,5","z":0.5}', "", "x is '0,5', which is no number: it counts as 0"),
         (b'{"x":true}', "", "x is a boolean"),
         (b'{"x":"' + b"9!" * 30_000 + b'"}', "", "x is '9!9!"),
+        *(
+            (raw, None, "")
+            for raw in (b'{"x":0}', b'{"z":0.5}', b'{"y":0}', b'{"\\u0078":0}', b'{"x":null}', b'{"z":"0"}')
+        ),
     ],
 )
-def test_a_drive_command_that_may_not_mean_what_it_does_is_remarked_upon(raw: bytes, sender: str, words: str) -> None:
+def test_a_drive_command_that_may_not_mean_what_it_does_is_remarked_upon(
+    raw: bytes, sender: str | None, words: str
+) -> None:
+    """A command that names an axis, and numbers, needs no remark."""
     remarks: list[tuple[Channel, str, str]] = []
     command = codec.decode(c.DRIVE, raw, lambda *remark: remarks.append(remark))
     assert not command.moves or command == Drive(z=0.5)
-    assert [remark[:2] for remark in remarks] == [(c.DRIVE, sender)]
-    assert words in remarks[0][2]
-    assert len(remarks[0][2]) < 300
-    assert remarks[0][2].isprintable()
-
-
-@pytest.mark.parametrize("raw", [b'{"x":0}', b'{"z":0.5}', b'{"y":0}', b'{"\\u0078":0}', b'{"x":null}', b'{"z":"0"}'])
-def test_a_command_that_names_an_axis_needs_no_remark(raw: bytes) -> None:
-    codec.decode(c.DRIVE, raw, lambda *remark: pytest.fail(str(remark)))
+    assert [remark[:2] for remark in remarks] == ([] if sender is None else [(c.DRIVE, sender)])
+    for _, _, text in remarks:
+        assert words in text
+        assert len(text) < 300
+        assert text.isprintable()
 
 
 def test_a_long_string_of_digits_costs_no_time() -> None:
     assert not codec.decode(c.DRIVE, b'{"x": "' + b"1" * 60_000 + b'!"}').moves
-
-
-# -- other commands
-
-
-def test_a_soundboard_command_that_does_not_repeat_has_no_such_field() -> None:
-    assert b"repeat" not in codec.encode(c.SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file="a.wav"))
-    assert b'"repeat":2' in codec.encode(c.SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file="a", repeat=2))
 
 
 # -- limits that hold for every command
@@ -336,26 +318,24 @@ def test_invalid_json_is_refused_even_in_keys_that_are_not_read(channel: Channel
     assert refused(channel, raw).startswith(channel.metric)
 
 
-@pytest.mark.parametrize("raw", [*UNREADABLE, b"stop", b"null", b"[]", b"true", b"x" * 100_000])
-def test_an_unreadable_stop_has_no_name(raw: bytes) -> None:
-    assert codec.decode(c.ESTOP, raw).stop is UNSET
+#: A stop, and what it means: one that cannot be read, or whose name is none, has none.
+STOPS: list[tuple[bytes, EstopCommand]] = [
+    *((raw, EstopCommand()) for raw in (*UNREADABLE, b"stop", b"x" * 100_000)),
+    *((raw, EstopCommand(by="", why="")) for raw in (b"null", b"[]", b"true")),
+    *(
+        (json.dumps({"stop": name, "by": "eve"}).encode(), EstopCommand(by="eve", why=""))
+        for name in ("", "stop", "c9a9f10c", "c9a9f10cc9a9f10g", "c9a9f10cc9a9f10c0", 5, None, ["c9a9f10cc9a9f10c"])
+    ),
+    (
+        json.dumps({"value": {"stop": "c9a9f10cc9a9f10c", "by": "e\x1b[2J" + "e" * 99, "why": 'w"' * 50}}).encode(),
+        EstopCommand(stop="c9a9f10cc9a9f10c", by=("e?[2J" + "e" * 99)[:32], why="w?" * 20),
+    ),
+]
 
 
-@pytest.mark.parametrize(
-    "name", ["", "stop", "c9a9f10c", "c9a9f10cc9a9f10g", "c9a9f10cc9a9f10c0", 5, None, ["c9a9f10cc9a9f10c"]]
-)
-def test_a_stop_with_an_invalid_name_has_none(name: object) -> None:
-    assert codec.decode(c.ESTOP, json.dumps({"stop": name, "by": "eve"}).encode()) == EstopCommand(by="eve", why="")
-
-
-def test_a_stop_has_a_name_and_short_plain_texts() -> None:
-    named = {"stop": "c9a9f10cc9a9f10c", "by": "eve\x1b[2J" + "e" * 100, "why": 'w"' * 50}
-    stop = codec.decode(c.ESTOP, json.dumps({"value": named}).encode())
-    assert stop == EstopCommand(stop="c9a9f10cc9a9f10c", by=("eve?[2J" + "e" * 100)[:32], why="w?" * 20)
-
-
-def test_an_empty_payload_is_no_stop() -> None:
-    assert "empty" in refused(c.ESTOP, b"")
+@pytest.mark.parametrize(("raw", "stop"), STOPS)
+def test_any_payload_is_a_stop(raw: bytes, stop: EstopCommand) -> None:
+    assert codec.decode(c.ESTOP, raw) == stop
 
 
 @pytest.mark.parametrize(
@@ -394,13 +374,31 @@ def test_messages_of_a_robot_may_be_larger() -> None:
 # -- what we say
 
 
-def test_encoding_spells_the_wire_form() -> None:
-    assert json.loads(codec.encode(c.MQTT_VIDEO, True)) == {"value": True}
-    assert codec.encode(c.AUDIO, bytearray(b"PBAT")) == b"PBAT"
-    assert json.loads(codec.encode(c.ONLINE, Heartbeat(t=1710969600123))) == {"t": 1710969600123}
-    assert json.loads(codec.encode(c.ONLINE, Heartbeat(t=1, online=False))) == {"t": 1, "online": False}
-    assert json.loads(codec.encode(c.CHARGING_LEVEL, ChargingLevel(value=7.4))) == {"value": 7.4, "unit": "v"}
-    assert json.loads(codec.encode(c.DRIVE, Drive(x=0.5))) == {"x": 0.5, "z": 0.0, "y": 0.0}
+SIGNED = Drive(x=-0.25, z=0.625, source="autonomy", run=1_000_000, valid_ms=400)
+#: What is sent: absent fields are not written, and a name that is no UTF-8 is written with its codes.
+ENCODED: list[tuple[Channel, Any, bytes]] = [
+    (c.MQTT_VIDEO, True, b'{"value":true}'),
+    (c.AUDIO, bytearray(b"PBAT"), b"PBAT"),
+    (c.ONLINE, Heartbeat(t=1710969600123), b'{"t":1710969600123}'),
+    (c.ONLINE, Heartbeat(t=1, online=False), b'{"t":1,"online":false}'),
+    (c.CHARGING_LEVEL, ChargingLevel(value=7.4), b'{"value":7.4,"unit":"v"}'),
+    (c.DRIVE, Drive(z=0.5), b'{"x":0.0,"z":0.5,"y":0.0}'),
+    (c.DRIVE, SIGNED, b'{"x":-0.25,"z":0.625,"y":0.0,"source":"autonomy","run":1000000,"valid_ms":400}'),
+    (c.SOUNDBOARD_COMMAND, SoundboardCommand(file="a"), b'{"action":null,"enabled":null,"file":"a"}'),
+    (c.SOUNDBOARD_COMMAND, SoundboardCommand(repeat=2), b'{"action":null,"enabled":null,"file":null,"repeat":2}'),
+    (c.OUTLET_COMMAND, OutletCommand(on=True), b'{"on":true}'),
+]
+
+
+@pytest.mark.parametrize(("channel", "value", "raw"), ENCODED)
+def test_encoding_spells_the_wire_form(channel: Channel, value: Any, raw: bytes) -> None:
+    assert codec.encode(channel, value) == raw
+
+
+def test_what_is_sent_is_short_and_utf_8() -> None:
+    assert len(b"pebble/robots/minilamp/incoming/drive-values" + codec.encode(c.DRIVE, SIGNED)) < 256, "for a sketch"
+    state = SoundboardStatus(playing=True, timestamp=1.5, file="caf\udce9 ö.wav")
+    assert json.loads(codec.encode(c.SOUNDBOARD_STATUS, state))["file"] == "caf\\udce9 ö.wav"
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
@@ -408,9 +406,6 @@ def test_nothing_that_is_no_number_can_be_published(number: float) -> None:
     for make in (lambda: Drive(x=number), lambda: ChargingLevel(value=number), lambda: LightsFlash(period=number)):
         with pytest.raises(ValueError, match="finite"):
             make()
-
-
-# -- stamps
 
 
 # -- against an independent reading of the contract

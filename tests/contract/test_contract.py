@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib
-import pkgutil
 import re
 from collections.abc import Iterator
 from itertools import pairwise
@@ -13,13 +11,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-import pebble.services
 from pebble import contract as c
-from pebble.contract import CHANNELS, DRIVE, ESTOP_STATE, INCOMING, OUTGOING, Channel, Kind, channel_of, payloads
+from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, Kind, channel_of, payloads
 from pebble.contract.identity import Identity, parse_topic
 from pebble.contract.payloads import Payload
-from pebble.service import Service
-from tests.kit.robot import handled
 from tests.support import ROOT
 
 BASE = "pebble/robots/goob"
@@ -140,14 +135,10 @@ def test_a_channel_is_well_formed(channel: Channel) -> None:
     assert re.fullmatch(r"([a-z0-9-]+|{[a-z]+})(/([a-z0-9-]+|{[a-z]+}))*", channel.metric)
     assert channel.doc.endswith(".")
     assert channel.default_qos in (0, 1)
+    assert channel.default_retain == (channel.kind in (Kind.STATE, Kind.FLAG))
     assert channel.rate_hz >= 0
     assert channel.payload in (bool, bytes) or issubclass(channel.payload, Payload)
     assert channel.synonym_of is None or channel_of(f"{channel.direction}/{channel.synonym_of}") is not None
-
-
-@each_channel
-def test_only_state_and_flags_are_retained(channel: Channel) -> None:
-    assert channel.default_retain == (channel.kind in (Kind.STATE, Kind.FLAG))
 
 
 @each_channel
@@ -179,44 +170,6 @@ def test_every_payload_is_frozen_and_has_a_schema() -> None:
         msgspec.json.schema(kind)
 
 
-# -- used by services as declared
-
-
-def services() -> list[type[Service]]:
-    for module in pkgutil.walk_packages(pebble.services.__path__, "pebble.services."):
-        if not module.name.endswith("__main__"):
-            importlib.import_module(module.name)
-    found, queue = [], [Service]
-    while queue:
-        children = queue.pop().__subclasses__()
-        queue += children
-        found += [child for child in children if child.__module__.startswith("pebble.services.")]
-    return found
-
-
-#: A manager of scripts stops the wheels as the scripts do, and reads whether a motor owner is stopped. Scripts of other
-#: robots drive through a program of this one. Home Assistant is told what the robot offers.
-AGAINST_THE_DIRECTION = {
-    ("autonomy_manager", DRIVE),
-    ("autonomy_manager", ESTOP_STATE),
-    ("neighbours", DRIVE),
-    ("homeassistant", c.CAPABILITIES),
-    ("homeassistant", c.CHARGING_LEVEL),
-}
-
-
-def test_services_publish_what_goes_out_and_handle_what_comes_in() -> None:
-    found = services()
-    assert {"serial_mcu_bridge"} <= {service.name for service in found if hasattr(service, "name")}
-    for service in found:
-        name = getattr(service, "name", "")
-        incoming = [channel for channel in service.publishes if channel.direction != OUTGOING]
-        assert [channel.suffix for channel in incoming if (name, channel) not in AGAINST_THE_DIRECTION] == [], service
-        received = [channel for channel in handled(service) if channel.remote]  # others pass between our own programs
-        outgoing = [channel for channel in received if channel.direction != INCOMING]
-        assert [channel.suffix for channel in outgoing if (name, channel) not in AGAINST_THE_DIRECTION] == [], service
-
-
 # -- and spelled nowhere else
 
 # Metrics that are ordinary words ("audio", "logs") say nothing by themselves; these do.
@@ -225,10 +178,9 @@ SPELLED = re.compile(r"(^|/)(incoming|outgoing)/[\w{+#]")
 
 
 def code_files() -> list[Path]:
-    folders = [ROOT / "pebble", ROOT / "services", ROOT / "transports", ROOT / "simulation", ROOT / "bench"]
-    # The second names scripts of the original after their topics, the third operations of the page; the others try
-    # topics at a broker, also some that the contract does not have.
-    excepted = ("channels.py", "builtin_forms.py", "messages.py", "attempts.py", "fleet/check.py")
+    folders = [ROOT / "pebble", ROOT / "services", ROOT / "transports"]
+    # The second names operations of the page; the last one tries topics at a broker, also some that do not exist.
+    excepted = ("channels.py", "messages.py", "fleet/check.py")
     return sorted(path for folder in folders for path in folder.rglob("*.py") if not str(path).endswith(excepted))
 
 

@@ -236,9 +236,15 @@ class TestOneBroker:
         assert len(bridge.local.on(DRIVE)) >= 15
 
     def test_a_way_that_comes_later_and_goes_again(self, bridge: World) -> None:
-        """Probes find it as if another bridge had begun to join the two brokers, without a reconnect."""
+        """Probes find it as if another bridge had begun to join the two brokers, without a reconnect.
+
+        Then the bridge subscribes anew: retained stops that this brings do not pass.
+        """
         do(bridge, "start")
         assert bridge.running[0].gate is Gate.OPEN
+        for client in (bridge.local, bridge.remote):
+            client.publish(STOP, b'{"stop":"00000000000000a1"}', retain=True)
+        bridge.local.publish(MIRROR_FLAG, TRUE, retain=True)
         joint = bridge.remote.transport.subscribe(
             f"{BASE}/outgoing/#", lambda m: bridge.local.transport.publish(m.topic, m.payload, qos=m.qos), echo=False,
             direct=True,
@@ -248,6 +254,7 @@ class TestOneBroker:
         joint.close()
         bridge.run(40)
         assert bridge.running[0].gate is Gate.OPEN
+        assert (len(bridge.local.on(STOP)), len(bridge.remote.on(STOP))) == (1, 0)
 
 
 def heartbeat(age_s: float = 0.0, **more: Any) -> bytes:

@@ -78,6 +78,10 @@ def test_states_are_published_again_on_the_next_connection(connected: ConnectedA
     connected.transport.find()
     assert until(lambda: len(connected.sent("status")) > before)
     assert connected.sent("status")[-1] == 2
+    connected.state(7)
+    connected.pipe.close()
+    connected.join()
+    assert connected.sent("status")[-1] == 7, "it ends with the launcher"
 
 
 def test_records_are_published_only_once(connected: ConnectedAnnouncer) -> None:
@@ -101,10 +105,3 @@ def test_a_failure_to_publish_does_not_end_it(
         assert until(lambda: [record.args for record in caplog.records] == [("logs", 1), ("status", 1)])
     connected.record(3)
     assert becomes(lambda: connected.sent("logs"), [3])
-
-
-def test_it_ends_with_the_launcher(connected: ConnectedAnnouncer) -> None:
-    connected.state(7)
-    connected.pipe.close()
-    connected.join()
-    assert connected.sent("status")[-1] == 7

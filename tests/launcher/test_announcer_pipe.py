@@ -65,7 +65,7 @@ def connection() -> Iterator[Connection]:
     connection.close()
 
 
-def test_a_message_arrives_as_it_was(connection: Connection) -> None:
+def test_messages_arrive_as_they_were_and_then_the_end_of_the_pipe(connection: Connection) -> None:
     connection.connect()
     assert connection.next() == Envelope("will", WILL)
     sent = Message("a/b", b"\x00\xff", QoS.LATEST)
@@ -74,6 +74,8 @@ def test_a_message_arrives_as_it_was(connection: Connection) -> None:
     assert envelope == Envelope("record", sent)
     assert envelope is not None
     assert isinstance(envelope.message.qos, QoS)
+    connection.pipe.close()
+    assert connection.next() is None
 
 
 def test_a_new_announcer_receives_the_will_and_the_present_states_first(connection: Connection) -> None:
@@ -98,24 +100,12 @@ def test_records_that_cannot_be_sent_are_counted(connection: Connection) -> None
     assert connection.pipe.dropped == 3
 
 
-def test_the_launcher_does_not_wait_for_an_announcer_that_does_not_read(connection: Connection) -> None:
-    connection.connect()
-    assert 50 < connection.fill() < 5000
-
-
 def test_states_are_not_lost_to_a_flood_of_records(connection: Connection) -> None:
     connection.connect()
-    connection.fill()
+    assert 50 < connection.fill() < 5000, "the launcher does not wait for an announcer that does not read"
     connection.pipe.state(Message("a", b"old"))
     connection.pipe.state(Message("a", b"new"))
     connection.received()
     received: list[tuple[str, bytes]] = []
     assert connection.reactor.run_until(lambda: bool(received.extend(connection.received()) or received), 5)
     assert received == [("state", b"new")]
-
-
-def test_the_announcer_reads_the_end_of_the_pipe(connection: Connection) -> None:
-    connection.connect()
-    connection.pipe.close()
-    assert connection.next() == Envelope("will", WILL)
-    assert connection.next() is None

@@ -8,9 +8,11 @@ from typing import Any
 import pytest
 
 from pebble.config import parse
+from pebble.config.raw import deep_merge
 from pebble.contract import CHANNELS
 from pebble.launcher.capabilities import capabilities
 from pebble.runtime.addresses import Addresses
+from tests.kit import configs
 
 BASE = "pebble/robots/rover"
 MOTOR = {"enabled": True, "serial": {"port": "/dev/ttyACM0"}}
@@ -242,15 +244,11 @@ def test_picture_size_and_rate(publisher: Any, captured: Any, expected: tuple[in
 
 
 def test_a_renamed_channel_is_advertised_under_its_new_name() -> None:
-    services: dict[str, Any] = {}
+    renamed: dict[str, Any] = {}
     expected = json.dumps(of())
     for channel in CHANNELS:
         if channel.override is not None:
-            _, *folders, key = channel.override.split(".")
-            section = services
-            for folder in folders:
-                section = section.setdefault(folder, {})
-            section[key] = f"site/{channel.suffix}"
+            renamed = deep_merge(renamed, configs.at(channel.override, f"site/{channel.suffix}"))
             expected = expected.replace(f'"{BASE}/{channel.suffix}"', f'"site/{channel.suffix}"')
-    assert of(**services) == json.loads(expected)
+    assert of(**renamed["services"]) == json.loads(expected)
     assert expected.count('"site/') == 24

@@ -107,9 +107,8 @@ def test_the_age_of_what_was_received_is_not_published_by_itself() -> None:
     assert counts == [1, 2, 2, 2, 2, 3, 4]
 
 
-def test_unknown_names_are_ignored_and_robots_without_motors_are_not_assessed() -> None:
+def test_unknown_names_are_ignored() -> None:
     robot = Assessed()
     robot.receive("other", Mcu("ready", 0))
     robot.receive(BRIDGE, Reach("other", True))
     assert (robot.mcus, robot.changes) == ({}, 0)
-    assert Driveable({"a:imu": "imu"}, [], [BRIDGE], lambda: None).assessment({}) is None

@@ -15,11 +15,7 @@ from typing import Any
 
 import pytest
 
-from pebble.config import Config, load, parse
-from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
-from pebble.errors import ConfigError
-from pebble.extension import Stage
-from pebble.launcher.launcher import Launcher
+from pebble.config import Config, parse
 from pebble.launcher.programs import programs, shared_modules
 from pebble.launcher.run_lock import RunLock
 from tests.fakes.seccomp import CALLS
@@ -29,10 +25,11 @@ from tests.support import ROOT, gone, until
 # -- starting
 
 
-def test_children_start_in_order_and_their_readiness_is_published(launch: Launch) -> None:
-    robot = launch(("hub", "good", LOCAL_TRANSPORT), ("serial", "good", DEVICE), ("bridge", "good", CONNECTION))
-    assert robot.ready("hub", "serial", "bridge")
-    pids = [robot.events(name, "start")[0] for name in ("hub", "serial", "bridge")]
+def test_children_start_in_order_and_stop_one_stage_after_the_other_and_nothing_is_left(launch: Launch) -> None:
+    stages = {"hub": LOCAL_TRANSPORT, "serial": DEVICE, "bridge": CONNECTION}
+    robot, names = launch(*((name, "good", stage) for name, stage in stages.items())), tuple(stages)
+    assert robot.ready(*names)
+    pids = [robot.events(name, "start")[0] for name in names]
     assert pids == sorted(pids)
     for pid in pids:
         assert b"hush" not in Path(f"/proc/{pid}/cmdline").read_bytes()
@@ -43,6 +40,16 @@ def test_children_start_in_order_and_their_readiness_is_published(launch: Launch
     assert message["payload"]["schema"] == "pebble-capabilities/v1"
     assert message["payload"]["value"]["transport"] == {"kind": "mqtt"}
     assert (message["qos"], message["retain"]) == (1, True)
+    assert robot.stop() == 0
+    stopped = [line.split()[0] for line in lines_of(robot.journal) if line.split()[1] == "stop"]
+    assert stopped == ["bridge", "serial", "hub"]
+    assert all(gone(pid) for pid in pids)
+    expected = {"hub": "ready", "serial": "stopped", "bridge": "stopped", "announcer": "ready"}
+    assert robot.states() == expected, "who carries the news, and who tells it, can only be alive"
+    (will,) = robot.published("status", "will")
+    states = {name: one["state"] for name, one in will["payload"]["value"]["services"].items()}
+    assert states == dict.fromkeys(expected, "stopped")
+    assert will["retain"]
 
 
 def test_switched_off_messages_are_not_published(launch: Launch) -> None:
@@ -62,23 +69,18 @@ def test_a_stop_signal_while_starting_starts_no_further_child(launch: Launch) ->
     assert robot.stderr().count("spawned a child") == 1
 
 
-def test_microcontroller_robots_are_refused(tmp_path: Path) -> None:
-    config = tmp_path / "lamp.json"
-    config.write_text('{"robot": {"id": "lamp", "platform": "esp32"}}')
-    with pytest.raises(ConfigError, match="esp32 runs on its own MCU"):
-        Launcher(load(config))
-
-
 # -- keeping alive
 
 
-def test_a_killed_child_is_started_again_at_once(launch: Launch) -> None:
-    robot = launch(("serial", "good", DEVICE), ("bridge", "good", CONNECTION), restart_delay_seconds=600)
+def test_a_killed_child_is_started_again_at_once_with_the_config_of_its_launcher(launch: Launch) -> None:
+    robot = launch(("serial", "configured", DEVICE), ("bridge", "good", CONNECTION), restart_delay_seconds=600)
     assert robot.ready("serial", "bridge")
+    robot.config.write_text('{"robot": {"id": "another"}, "transport": {"kin')
     os.kill(robot.events("serial", "start")[0], signal.SIGKILL)
     assert until(lambda: len(robot.events("serial", "ready")) == 2, 20), "only the second restart may wait"
     again = {"state": "ready", "restarts": 1, "last_exit": "signal 9", "restarts_per_minute": 1}
     assert until(lambda: robot.services()["serial"] == again)
+    assert len(robot.events("serial", f"config:{BASE}")) == 2
     assert len(robot.events("bridge", "start")) == 1
 
 
@@ -101,15 +103,6 @@ def test_a_robot_runs_where_a_system_call_is_denied(launch: Launch, call: str, e
     assert robot.stop() == 0
     assert robot.stderr().count("is denied") == len(named)
     assert all(text in robot.stderr() for text in named)
-
-
-def test_a_child_that_starts_again_gets_the_config_of_its_launcher(launch: Launch) -> None:
-    robot = launch(("serial", "configured", DEVICE))
-    assert robot.ready("serial")
-    robot.config.write_text('{"robot": {"id": "another"}, "transport": {"kin')
-    os.kill(robot.events("serial", "start")[0], signal.SIGKILL)
-    assert until(lambda: len(robot.events("serial", "ready")) == 2, 20)
-    assert len(robot.events("serial", f"config:{BASE}")) == 2
 
 
 def test_a_crash_loop_is_visible_and_not_hot(launch: Launch) -> None:
@@ -194,17 +187,12 @@ def test_supervision_does_not_wait_for_a_transport(launch: Launch, trouble: str)
 # -- a forked process
 
 
-def test_a_child_finds_what_a_fresh_interpreter_would(launch: Launch) -> None:
-    robot = launch(("serial", "curious", DEVICE))
-    assert robot.ready("serial")
+def test_a_child_finds_what_a_fresh_interpreter_would_and_has_a_name(launch: Launch) -> None:
+    robot = launch(("serial_mcu_bridge:arm", "curious", DEVICE))
+    assert robot.ready("serial_mcu_bridge:arm", "announcer")
     output = [line.split()[1] for line in lines_of(robot.journal)]
     assert output[:4] == ["fds:0=null,1=pipe,2=pipe,3=pipe", "mask:", "handler:SIG_DFL", "group:True"]
-
-
-def test_children_have_names(launch: Launch) -> None:
-    robot = launch(("serial_mcu_bridge:arm", "good", DEVICE), ("hub", "good", LOCAL_TRANSPORT))
-    assert robot.ready("serial_mcu_bridge:arm", "hub", "announcer")
-    assert sorted(robot.children()) == ["announcer", "hub", "serial_mcu_brid"]
+    assert sorted(robot.children()) == ["announcer", "serial_mcu_brid"]
 
 
 @pytest.mark.parametrize(
@@ -248,22 +236,6 @@ def test_a_program_that_cannot_be_imported_is_its_own_trouble(launch: Launch) ->
 
 
 # -- stopping
-
-
-def test_stages_stop_one_after_the_other_and_nothing_is_left(launch: Launch) -> None:
-    robot = launch(("hub", "good", LOCAL_TRANSPORT), ("serial", "good", DEVICE), ("bridge", "good", CONNECTION))
-    assert robot.ready("hub", "serial", "bridge")
-    pids = [robot.events(name, "start")[0] for name in ("hub", "serial", "bridge")]
-    assert robot.stop() == 0
-    stopped = [line.split()[0] for line in lines_of(robot.journal) if line.split()[1] == "stop"]
-    assert stopped == ["bridge", "serial", "hub"]
-    assert all(gone(pid) for pid in pids)
-    expected = {"hub": "ready", "serial": "stopped", "bridge": "stopped", "announcer": "ready"}
-    assert robot.states() == expected, "who carries the news, and who tells it, can only be alive"
-    (will,) = robot.published("status", "will")
-    states = {name: one["state"] for name, one in will["payload"]["value"]["services"].items()}
-    assert states == dict.fromkeys(expected, "stopped")
-    assert will["retain"]
 
 
 def test_a_program_that_does_not_stop_is_killed_and_takes_no_time_from_others(launch: Launch) -> None:
@@ -372,22 +344,6 @@ TABLES: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "a page": ({"web_handler": ON}, MQTT, "announcer web_handler"),
     "no page": ({"web_handler": OFF}, MQTT, "announcer"),
 }
-#: Of a program: its service or module, arguments and stage, whether it may request others, and is imported beforehand.
-PROGRAMS: dict[str, tuple[str, tuple[str, ...], Stage, bool, bool]] = {
-    "zenoh_hub": ("pebble.launcher.announcer", ("None",), Stage.LOCAL_TRANSPORT, False, True),
-    "serial_mcu_bridge:arm": (SERIAL_PROTOCOLS["goob_base_v1"].service, ("None", "arm"), Stage.DEVICE, False, True),
-    "mqtt_bridge": ("pebble.services.mqtt_bridge.service:MqttBridge", ("None",), Stage.CONNECTION, True, True),
-    "av_daemon": ("pebble.services.av_daemon.service:AvDaemon", ("None",), Stage.DEVICE, False, False),
-    "camera_publisher": (
-        "pebble.services.camera_publisher.service:CameraPublisher",
-        ("None",),
-        Stage.CONNECTION,
-        False,
-        False,
-    ),
-    "video_stream": ("pebble.services.video_stream.service:VideoStream", ("None",), Stage.CONNECTION, False, True),
-    "web_handler": ("pebble.extensions.page.run", ("None",), Stage.CONNECTION, False, False),
-}
 
 
 def _parsed(services: dict[str, Any], transport: dict[str, Any] = MQTT) -> Config:
@@ -400,38 +356,6 @@ def test_a_robot_has_the_programs_of_its_config(
     services: dict[str, Any], transport: dict[str, Any], names: str
 ) -> None:
     assert ["+" * one.on_demand + one.name for one in programs(_parsed(services, transport))] == names.split()
-
-
-def test_a_program_is_started_as_the_table_says() -> None:
-    services = {"serial_mcu_bridge": LINES, "mqtt_bridge": UPLINK, "av_daemon": ON, "video_stream": STREAM}
-    table = {one.name: one for one in programs(_parsed({**services, "web_handler": ON}, ZENOH))}
-    for name, row in PROGRAMS.items():
-        program = table[name]
-        assert (program.module, program.arguments, program.stage, program.may_request, program.preloaded) == row
-
-
-MEDIA_MODULES = {"pebble.extensions.media.frames", "pebble.extensions.media.sound"}
-
-
-@pytest.mark.parametrize(
-    ("services", "transport", "kinds", "media"),
-    [
-        ({}, MQTT, {"mqtt"}, set()),
-        ({}, {"kind": "zenoh"}, {"zenoh"}, set()),
-        ({}, {"kind": "zenoh", "mqtt_mirror": {}}, {"zenoh", "mqtt"}, set()),
-        ({"mqtt_bridge": UPLINK}, {"kind": "zenoh"}, {"zenoh", "mqtt"}, set()),
-        ({}, {"kind": "somebodys", "settings": {}}, set(), set()),
-        ({"mqtt_bridge": UPLINK, "video_stream": STREAM}, MQTT, {"mqtt"}, set()),
-        ({"mqtt_bridge": UPLINK, "av_daemon": ON}, MQTT, {"mqtt"}, MEDIA_MODULES),
-    ],
-)
-def test_modules_that_several_programs_share_are_known_beforehand(
-    services: dict[str, Any], transport: dict[str, Any], kinds: set[str], media: set[str]
-) -> None:
-    expected = {f"pebble.transports.{kind}.transport" for kind in kinds} | media
-    config = _parsed(services, transport)
-    shared = {*shared_modules(config, programs(config))}
-    assert {name for name in shared if name.endswith(".transport") or name in MEDIA_MODULES} == expected
 
 
 #: Of a robot with a camera, a text protocol on its serial line, and the security level `open`.

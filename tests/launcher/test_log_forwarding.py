@@ -8,7 +8,7 @@ import pytest
 
 from pebble.contract.payloads import LogRecord
 from pebble.launcher import log_forwarding
-from pebble.launcher.log_forwarding import LevelReader, LogForwarder, NonBlockingWriter, OwnRecords, cut, text_of
+from pebble.launcher.log_forwarding import LevelReader, LogForwarder, NonBlockingWriter, OwnRecords, text_of
 
 
 class Forwarded:
@@ -38,24 +38,24 @@ def forwarded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Forwarded]:
     made.close()
 
 
-def test_a_childs_line_is_written_and_published_under_its_name(forwarded: Forwarded) -> None:
-    forwarded.forwarder.child_line("mqtt_bridge", 42, "12:00:00 [ERROR] far away")
-    (record,) = forwarded.records
-    assert (record.level, record.service, record.message) == ("ERROR", "mqtt_bridge", "[mqtt_bridge] far away")
-    assert (record.pid, record.logger) == (42, "root")
-    assert record.t > 1_600_000_000_000
-    assert forwarded.written().endswith("[ERROR] [mqtt_bridge] far away\n")
-
-
-def test_lines_below_the_least_level_are_not_published(forwarded: Forwarded) -> None:
-    forwarded.forwarder.child_line("mqtt_bridge", 42, "12:00:00 [INFO] routine")
-    assert forwarded.records == []
-    assert "routine" in forwarded.written()
-
-
-def test_a_message_is_cut_with_its_name_counted(forwarded: Forwarded) -> None:
-    forwarded.forwarder.child_line("x", 1, "12:00:00 [ERROR] " + "y" * 3000)
-    assert forwarded.records[0].message == "[x] " + "y" * 2041 + "..."
+@pytest.mark.parametrize(
+    ("line", "published", "message"),
+    [
+        ("[ERROR] far away", True, "[x] far away"),
+        ("[ERROR] " + "y" * 2044, True, "[x] " + "y" * 2044),
+        ("[ERROR] " + "y" * 2045, True, "[x] " + "y" * 2041 + "..."),
+        ("[INFO] routine", True, None),  # below the least level
+        ("[ERROR] broken pipe", False, None),  # of the process that publishes
+    ],
+)
+def test_a_childs_line_is_written_and_published_under_its_name(
+    forwarded: Forwarded, line: str, published: bool, message: str | None
+) -> None:
+    forwarded.forwarder.child_line("x", 42, f"12:00:00 {line}", published=published)
+    assert line.split()[1] in forwarded.written()
+    found = [(record.level, record.service, record.message, record.pid) for record in forwarded.records]
+    assert found == ([] if message is None else [("ERROR", "x", message, 42)])
+    assert all(record.t > 1_600_000_000_000 and record.logger == "root" for record in forwarded.records)
 
 
 def test_children_do_not_share_a_traceback(forwarded: Forwarded) -> None:
@@ -92,35 +92,18 @@ def test_the_launchers_own_records_go_the_same_way(forwarded: Forwarded) -> None
         log.info("quiet")
         log.debug("not even written")
         log.log(35, "between the levels")
+        log.warning("it broke", exc_info=ValueError("seven"))
     log.warning("after the end")
-    assert [(record.level, record.message) for record in forwarded.records] == [
-        ("WARNING", "[launcher] child x ended"),
-        ("WARNING", "[launcher] between the levels"),
+    assert [record.message.partition("\n")[0] for record in forwarded.records] == [
+        *("[launcher] child x ended", "[launcher] between the levels", "[launcher] it broke")
     ]
-    assert (forwarded.records[0].pid, forwarded.records[0].logger) == (
-        os.getpid(),
-        "pebble.launcher.process_supervisor",
-    )
+    record = forwarded.records[0]
+    assert (record.level, record.pid, record.logger) == ("WARNING", os.getpid(), log.name)
     written = forwarded.written()
     assert "[INFO] [launcher] quiet" in written
+    assert "[WARNING] [launcher] ValueError: seven" in written
     assert "not even" not in written
     assert "after the end" not in written
-
-
-def test_an_exception_is_one_record_and_several_lines(forwarded: Forwarded) -> None:
-    try:
-        raise ValueError("seven")
-    except ValueError:
-        with OwnRecords(forwarded.forwarder, "INFO"):
-            logging.getLogger("pebble.launcher.process_supervisor").exception("it broke")
-    assert len(forwarded.records) == 1
-    assert "[ERROR] [launcher] ValueError: seven" in forwarded.written()
-
-
-def test_lines_about_publishing_are_not_published(forwarded: Forwarded) -> None:
-    forwarded.forwarder.child_line("announcer", 42, "12:00:00 [ERROR] broken pipe", published=False)
-    assert forwarded.records == []
-    assert "broken pipe" in forwarded.written()
 
 
 def test_writing_never_waits_for_a_reader() -> None:
@@ -200,8 +183,3 @@ LINES = {
 def test_the_levels_of_several_lines(lines: tuple[tuple[str, str], ...]) -> None:
     reader = LevelReader()
     assert [(line, reader.read(line)[0][0]) for line, _ in lines] == [*lines]
-
-
-def test_cut() -> None:
-    assert cut("x" * 64, 64) == "x" * 64
-    assert cut("x" * 65, 64) == "x" * 61 + "..."

@@ -11,7 +11,7 @@ def crash(policy: RestartPolicy, at: float, ran_for: float = 0.0) -> float:
     return policy.exited(at + ran_for, "exit code 1")
 
 
-def test_a_life_without_trouble() -> None:
+def test_a_start_after_a_requested_end_is_no_restart() -> None:
     policy = RestartPolicy()
     assert (policy.state, policy.restarts, policy.last_exit, policy.first_attempt_done) == ("init", 0, None, False)
     policy.started(0.0)
@@ -20,20 +20,23 @@ def test_a_life_without_trouble() -> None:
     assert (policy.state, policy.first_attempt_done) == ("ready", True)
     policy.stopped("exit code 0")
     assert (policy.state, policy.restarts, policy.last_exit) == ("stopped", 0, "exit code 0")
+    policy.started(10.0)
+    assert (policy.state, policy.restarts, policy.last_exit) == ("init", 0, "exit code 0")
+    crash(policy, 11.0)
+    policy.stopped(None)
+    assert (policy.state, policy.restarts, policy.last_exit) == ("stopped", 1, "exit code 1"), "of what ran last"
 
 
-def test_the_first_restart_is_immediate_and_later_ones_wait_longer() -> None:
-    policy, now, waits = RestartPolicy(2.0), 0.0, []
-    for _ in range(9):
+@pytest.mark.parametrize(
+    ("delay_s", "expected"), [(2.0, [0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0, 10.0]), (0.4, [0.0, 0.1, 0.2])]
+)
+def test_the_first_restart_is_immediate_and_later_ones_wait_longer(delay_s: float, expected: list[float]) -> None:
+    policy, now, waits = RestartPolicy(delay_s), 0.0, []
+    for _ in expected:
         waits.append(crash(policy, now, ran_for=20.0))  # slow enough not to be a crash loop
         now += 20.0 + waits[-1]
-    assert waits == [0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0, 10.0]
+    assert waits == pytest.approx(expected)
     assert policy.state == "restarting"
-
-
-def test_the_configured_delay_scales_the_waits() -> None:
-    policy = RestartPolicy(0.4)
-    assert [crash(policy, now, ran_for=20.0) for now in (0.0, 30.0, 60.0)] == pytest.approx([0.0, 0.1, 0.2])
 
 
 def test_five_exits_within_a_minute_are_a_crash_loop_that_is_retried_slowly() -> None:
@@ -71,25 +74,6 @@ def test_silence_makes_it_stuck_later_at_the_start_than_afterwards() -> None:
     assert policy.stuck_at == 105.0 + ALIVE_LIMIT_S
     policy.exited(106.0, "signal 9")
     assert policy.stuck_at == float("inf")
-
-
-def test_stopping_one_that_does_not_run_keeps_its_last_exit() -> None:
-    policy = RestartPolicy()
-    crash(policy, 0.0)
-    policy.stopped(None)
-    assert (policy.state, policy.last_exit) == ("stopped", "exit code 1")
-
-
-def test_started_anew_after_it_was_asked_to_stop_is_no_restart() -> None:
-    policy = RestartPolicy()
-    policy.started(0.0)
-    policy.ready(0.5)
-    policy.stopped("exit code 0")
-    policy.started(10.0)
-    assert (policy.state, policy.restarts, policy.last_exit) == ("init", 0, "exit code 0")
-    policy.exited(11.0, "signal 9")
-    policy.started(11.0)
-    assert policy.restarts == 1
 
 
 def test_a_program_rests_between_two_starts() -> None:

@@ -15,16 +15,25 @@ from pebble.launcher.run_lock import RunLock
 from tests.support import refused
 
 
-def test_the_folder_is_made_for_this_user_alone(tmp_path: Path) -> None:
-    with RunLock(tmp_path / "a" / "b", "x/y/z", tmp_path / "state.lock") as lock:
-        assert (tmp_path / "a" / "b").stat().st_mode & 0o777 == 0o700
+@pytest.mark.parametrize("mode", [None, 0o755])
+def test_the_folder_is_for_this_user_alone(tmp_path: Path, mode: int | None) -> None:
+    run = tmp_path / "a" / "b"
+    if mode is not None:
+        run.mkdir(mode, parents=True)
+    with RunLock(run, "x/y/z", tmp_path / "state.lock") as lock:
+        assert run.stat().st_mode & 0o777 == 0o700
         assert lock.path.read_text() == f"{os.getpid()}\nx/y/z\n"
 
 
-def test_an_open_folder_of_ours_is_closed(tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir(mode=0o755)
-    with RunLock(tmp_path / "run", "x/y/z", tmp_path / "state.lock"):
-        assert (tmp_path / "run").stat().st_mode & 0o777 == 0o700
+def test_what_is_not_ours_to_lock_or_to_close_is_named(tmp_path: Path) -> None:
+    (tmp_path / "lock" / LAUNCHER_LOCK).mkdir(parents=True)
+    with pytest.raises(PebbleError, match=f"{LAUNCHER_LOCK} cannot be locked: Is a directory; remove it"):
+        RunLock(tmp_path / "lock", "x/y/z", tmp_path / "state.lock").take()
+    (run := tmp_path / "run").mkdir()
+    run.chmod(0o1777)
+    with pytest.raises(PebbleError, match="others may write there, name a folder of this user"):
+        RunLock(run, "x/y/z", tmp_path / "state.lock").take()
+    assert run.stat().st_mode & 0o7777 == 0o1777
 
 
 def test_a_second_lock_names_the_holder(tmp_path: Path) -> None:
@@ -60,20 +69,6 @@ def test_a_full_disk_does_not_keep_a_robot_from_starting(tmp_path: Path, monkeyp
     unknown = pytest.raises(PebbleError, match=r"x/y/z already runs: process \(unknown\) holds")
     with RunLock(tmp_path, "x/y/z", tmp_path / "state.lock"), unknown:
         RunLock(tmp_path, "x/y/z", tmp_path / "state.lock").take()
-
-
-def test_another_thing_in_the_place_of_the_lock_is_named(tmp_path: Path) -> None:
-    (tmp_path / LAUNCHER_LOCK).mkdir()
-    with pytest.raises(PebbleError, match=f"{LAUNCHER_LOCK} cannot be locked: Is a directory; remove it"):
-        RunLock(tmp_path, "x/y/z", tmp_path / "state.lock").take()
-
-
-def test_a_folder_for_everybody_is_not_closed(tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run").chmod(0o1777)
-    with pytest.raises(PebbleError, match="others may write there, name a folder of this user"):
-        RunLock(tmp_path / "run", "x/y/z", tmp_path / "state.lock").take()
-    assert (tmp_path / "run").stat().st_mode & 0o7777 == 0o1777
 
 
 @pytest.mark.parametrize("remove", [lambda run: shutil.rmtree(run), lambda run: (run / LAUNCHER_LOCK).unlink()])

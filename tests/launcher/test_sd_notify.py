@@ -9,12 +9,9 @@ import pytest
 from pebble.launcher.sd_notify import SystemdNotifier
 
 
-@pytest.fixture(params=["path", "abstract"])
-def address(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    return {"path": str(tmp_path / "notify"), "abstract": f"@pebble-test-{os.getpid()}"}[request.param]
-
-
-def test_notifications_arrive(address: str) -> None:
+@pytest.mark.parametrize("address", ["{tmp_path}/notify", "@pebble-test-{pid}"])
+def test_notifications_arrive(address: str, tmp_path: Path) -> None:
+    address = address.format(tmp_path=tmp_path, pid=os.getpid())
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(address.replace("@", "\0"))
         systemd.settimeout(10)
@@ -25,11 +22,7 @@ def test_notifications_arrive(address: str) -> None:
         notifier.stopping()
         received = [systemd.recv(100).decode() for _ in range(4)]
     assert received == ["READY=1", "STATUS=3 of 4 ready", "WATCHDOG=1", "STOPPING=1"]
-
-
-@pytest.mark.parametrize("environment", [{}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "/nowhere/at/all"}])
-def test_without_systemd_nothing_happens(environment: dict[str, str]) -> None:
-    SystemdNotifier(environment).ready()
+    SystemdNotifier({"NOTIFY_SOCKET": "/nowhere/at/all"}).ready()
 
 
 @pytest.mark.parametrize(

@@ -15,21 +15,17 @@ from tests.support import ROOT
 _STARTS = ("Popen", "run", "check_call", "check_output", "call")
 
 
-def test_a_withheld_variable_is_empty_also_for_who_asks_for_no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("UPLINK", "topsecret")
+def test_the_launchers_variables_are_left_out_withheld_ones_are_empty_and_later_ones_win(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, value in (("UPLINK", "topsecret"), ("PEBBLE_NOTIFY_FD", "3"), ("MARK", "inherited")):
+        monkeypatch.setenv(name, value)
     withhold(["UPLINK", "NOT_SET"])
-    assert child_environment()["UPLINK"] == ""
+    variables = child_environment({"MARK": "first"}, {"MARK": "second"})
+    assert (variables["MARK"], variables["UPLINK"], variables["PATH"]) == ("second", "", os.environ["PATH"])
+    assert "PEBBLE_NOTIFY_FD" not in variables
     assert subprocess.run(["printenv", "UPLINK"], capture_output=True, check=True).stdout == b"\n"
     assert "NOT_SET" not in os.environ
-
-
-def test_the_launchers_variables_are_left_out_and_later_ones_win(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PEBBLE_NOTIFY_FD", "3")
-    monkeypatch.setenv("MARK", "inherited")
-    variables = child_environment({"MARK": "first"}, {"MARK": "second"})
-    assert variables["MARK"] == "second"
-    assert "PEBBLE_NOTIFY_FD" not in variables
-    assert variables["PATH"] == os.environ["PATH"]
 
 
 def test_every_service_that_starts_a_program_chooses_its_environment() -> None:

@@ -174,18 +174,6 @@ def test_beyond_the_room_eight_senders_wait_and_what_others_send_is_dropped(capl
     assert done[0] == 0
 
 
-def test_it_waits_for_a_task_and_for_no_longer_than_it_should() -> None:
-    intake, done = Intake(), list[int]()
-    task = intake.take(0.01)
-    assert task is not None
-    task()
-    threading.Timer(0.05, partial(intake.put, partial(done.append, 1))).start()
-    task = intake.take(20)
-    assert task is not None
-    task()
-    assert done == [1]
-
-
 @pytest.mark.parametrize(("waits_s", "works"), [(3.0, True), (0.0, False)])
 def test_a_query_that_no_one_waits_for_any_more_is_not_answered(
     monkeypatch: pytest.MonkeyPatch, waits_s: float, works: bool

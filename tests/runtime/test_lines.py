@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,45 +24,28 @@ def test_lines_come_out_however_the_stream_is_cut(lines: list[bytes], cuts: rand
     assert splitter.discarded_lines == 0
 
 
-def test_a_line_without_end_costs_no_memory_and_is_counted() -> None:
-    splitter = LineSplitter(10)
-    assert splitter.feed(b"good\n" + b"x" * 8) == [b"good"]
-    for _ in range(1000):
-        assert splitter.feed(b"x" * 8) == []
-    assert splitter.feed(b"end\nT a0=1\n") == [b"T a0=1"]
-    assert splitter.discarded_lines == 1
-
-
-def test_a_long_line_within_one_chunk_takes_only_itself_along() -> None:
-    splitter = LineSplitter(10)
-    assert splitter.feed(b"a\n" + b"x" * 11 + b"\nb\n") == [b"a", b"b"]
-    assert splitter.discarded_lines == 1
-
-
-def test_a_reset_forgets_half_a_line() -> None:
+def test_half_a_line_is_the_rest_and_is_forgotten_by_a_reset() -> None:
     splitter = LineSplitter()
+    assert splitter.feed(b"one\ntw") == [b"one"]
+    assert (splitter.rest(), splitter.rest()) == (b"tw", b"")
     splitter.feed(b"C chg=1 v=")
     splitter.reset()
     assert splitter.feed(b"7.4\n") == [b"7.4"]
 
 
-def test_lines_arrive_in_pieces_and_the_unfinished_one_at_the_end() -> None:
-    splitter = LineSplitter()
-    assert splitter.feed(b"one\ntw") == [b"one"]
-    assert splitter.feed(b"o\r\n\n  three  \nfo") == [b"two\r", b"", b"  three  "]
-    assert splitter.rest() == b"fo"
-    assert splitter.rest() == b""
+#: Whether long lines are truncated, what is fed to a splitter of 10 bytes, its lines, and how many it has discarded.
+STREAMS: dict[str, tuple[bool, list[bytes], list[bytes], int]] = {
+    "in pieces": (False, [b"one\ntw", b"o\r\n\n  three  \n"], [b"one", b"two\r", b"", b"  three  "], 0),
+    "exactly the limit": (True, [b"x" * 10, b"\nnext\n"], [b"x" * 10, b"next"], 0),
+    "without end": (False, [b"good\n" + b"x" * 8, *[b"x" * 8] * 1000, b"end\nnext\n"], [b"good", b"next"], 1),
+    "too long within a chunk": (False, [b"a\n" + b"x" * 11 + b"\nb\n"], [b"a", b"b"], 1),
+    "without end, truncated": (True, [*[b"x" * 7] * 100, b"xx\nnext\n"], [b"x" * 10, b"next"], 1),
+    "too long within a chunk, truncated": (True, [b"y" * 20 + b"\nnext\n"], [b"y" * 10, b"next"], 1),
+}
 
 
-def test_a_truncated_line_is_returned_once_and_its_rest_is_discarded() -> None:
-    splitter = LineSplitter(100, truncate=True)
-    assert [line for _ in range(100) for line in splitter.feed(b"x" * 10)] == [b"x" * 100]
-    assert splitter.feed(b"xx\nnext\n") == [b"next"]
-    assert splitter.feed(b"y" * 200 + b"\nnext\n") == [b"y" * 100, b"next"]
-
-
-def test_exactly_the_limit_is_not_too_long() -> None:
-    splitter = LineSplitter(100, truncate=True)
-    assert splitter.feed(b"x" * 100) == []
-    assert splitter.feed(b"\nnext\n") == [b"x" * 100, b"next"]
-    assert splitter.discarded_lines == 0
+@pytest.mark.parametrize(("truncate", "chunks", "lines", "discarded"), STREAMS.values(), ids=STREAMS)
+def test_long_lines_cost_no_memory(truncate: bool, chunks: list[bytes], lines: list[bytes], discarded: int) -> None:
+    splitter = LineSplitter(10, truncate=truncate)
+    assert [line for chunk in chunks for line in splitter.feed(chunk)] == lines
+    assert splitter.discarded_lines == discarded

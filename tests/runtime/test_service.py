@@ -311,12 +311,6 @@ def run_when_idle(service: Service, job: Callable[[], None]) -> bool:
     return until(lambda: service.run_if_idle(job))
 
 
-def test_an_idle_service_works_on_the_thread_that_brings_the_work(idle: Robot) -> None:
-    ran: list[int] = []
-    assert run_when_idle(idle.service, lambda: ran.append(threading.get_ident()))
-    assert ran == [threading.get_ident()]
-
-
 def test_a_service_that_works_or_hangs_takes_no_work_of_other_threads(idle: Robot) -> None:
     ran: list[str] = []
     idle.service.go_on.clear()
@@ -328,16 +322,16 @@ def test_a_service_that_works_or_hangs_takes_no_work_of_other_threads(idle: Robo
     assert ran == ["visitor"]
 
 
-def test_work_of_another_thread_goes_before_nothing_that_waits(idle: Robot) -> None:
-    order: list[str] = []
+def test_work_of_another_thread_goes_before_nothing_that_waits_and_runs_on_that_thread(idle: Robot) -> None:
+    order: list[str | int] = []
 
     def first() -> None:
         idle.service.post(lambda: order.append("posted"))
-        order.append("first")
+        order.append(threading.get_ident())
 
     assert run_when_idle(idle.service, first)
     assert run_when_idle(idle.service, lambda: order.append("second"))
-    assert order == ["first", "posted", "second"]
+    assert order == [threading.get_ident(), "posted", "second"]
 
 
 def test_a_timer_that_another_thread_sets_wakes_the_services_own(idle: Robot) -> None:
@@ -357,11 +351,7 @@ def test_work_of_another_thread_that_fails_ends_the_service_and_not_that_thread(
     assert run_when_idle(idle.service, fail)
     assert until(lambda: str(idle.error) == "it failed")
     assert idle.service.transport.state is State.CLOSED
-
-
-def test_a_service_that_has_ended_takes_no_work(idle: Robot) -> None:
-    idle.end()
-    assert not idle.service.run_if_idle(lambda: None)
+    assert not idle.service.run_if_idle(lambda: None), "it has ended"
 
 
 # -- receiving
@@ -379,32 +369,23 @@ def test_of_several_waiting_drive_commands_only_the_newest_is_handled(running: R
     assert running.saw(0.01, 0.99, "reboot True")
 
 
-def test_a_steering_command_that_waited_too_long_is_dropped(running: Robot) -> None:
+@pytest.mark.parametrize("suspended", [False, True])
+def test_a_steering_command_that_waited_too_long_is_dropped(
+    running: Robot, monkeypatch: pytest.MonkeyPatch, suspended: bool
+) -> None:
+    """Also while the machine was suspended, in the inbox or before; the service's own clock may have stood still."""
+    now = clock.since_boot
     running.keep_busy(SOUND, '{"action": "play", "file": "a"}', "a")
     running.publish(DRIVE_TOPIC, '{"x": 0.5}')
     running.publish(SOUND, '{"action": "play", "file": "b"}')
     assert until(lambda: running.service.transport.counters["delivered"] == 3)
-    running.ahead_s = 0.6
+    running.ahead_s = 0.0 if suspended else 0.6
+    monkeypatch.setattr(clock, "since_boot", lambda: now() + 0.6 * suspended)
     running.service.go_on.set()
     assert running.saw("a", "b")
     running.publish(DRIVE_TOPIC, '{"x": 0.25}')
     assert running.saw("a", "b", 0.25)
     assert running.service.counters["late"] == 1
-
-
-def test_a_command_that_waited_while_the_machine_was_suspended_is_dropped(
-    running: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A message waits in the inbox or before; the service's own clock may have stood still meanwhile."""
-    now = clock.since_boot
-    running.keep_busy(SOUND, '{"action": "play", "file": "a"}', "a")
-    running.publish(DRIVE_TOPIC, '{"x": 0.5}')
-    assert until(lambda: running.service.transport.counters["delivered"] == 2)
-    monkeypatch.setattr(clock, "since_boot", lambda: now() + 3600)
-    running.service.go_on.set()
-    assert until(lambda: running.service.counters["late"] == 1)
-    running.publish(DRIVE_TOPIC, '{"x": 0.25}')
-    assert running.saw("a", 0.25)
 
 
 def test_a_flood_of_commands_that_wait_does_not_push_out_the_one_that_ends_something(running: Robot) -> None:
@@ -420,29 +401,20 @@ def test_a_flood_of_commands_that_wait_does_not_push_out_the_one_that_ends_somet
 
 @pytest.mark.parametrize(
     ("topic", "payload"),
-    [
-        (DRIVE_TOPIC, '{"x": 1}'),
-        (REBOOT_TOPIC, "true"),
-        (SOUND, '{"action": "play", "file": "a"}'),
-    ],
+    [(DRIVE_TOPIC, '{"x": 1}'), (REBOOT_TOPIC, "true"), (SOUND, '{"action": "play", "file": "a"}')],
 )
-def test_retained_commands_are_refused_and_live_ones_are_not(robot: Robot, topic: str, payload: str) -> None:
+def test_retained_commands_are_refused_and_live_ones_and_switches_are_not(
+    robot: Robot, topic: str, payload: str
+) -> None:
     robot.operator.open()
     robot.publish(topic, payload, retain=True)
-    robot.operator.close()
-    robot.start()
-    assert until(lambda: robot.service.counters["stale"] == 1)
-    assert robot.service.seen == []
-    robot.publish(topic, payload)
-    assert until(lambda: len(robot.service.seen) == 1)
-
-
-def test_a_retained_flag_is_the_last_position_of_a_switch(robot: Robot) -> None:
-    robot.operator.open()
     robot.publish(f"{BASE}/incoming/flags/mqtt-video", '{"value": true}', retain=True)
     robot.operator.close()
     robot.start()
-    assert robot.saw(True)
+    assert until(lambda: robot.service.counters["stale"] == 1)
+    assert robot.saw(True), "the last position of a switch"
+    robot.publish(topic, payload)
+    assert until(lambda: len(robot.service.seen) == 2)
 
 
 def test_a_malformed_message_is_counted_logged_once_and_replaces_nothing(
@@ -492,33 +464,22 @@ def test_delivery_follows_the_channel(running: Robot) -> None:
     running.on_service_thread(lambda: running.service.publish(CHARGING_STATUS, charging(True)))
     running.on_service_thread(lambda: running.service.publish(TOUCH_SENSORS, touch))
     assert until(lambda: len(running.received) == 2)
-    state, stream = running.received
-    assert (state.topic, state.payload, state.qos, state.retain_requested) == (
-        CHARGING_TOPIC,
-        b'{"value":true}',
-        QoS.DELIVERED,
-        True,
-    )
-    assert (stream.topic, stream.qos, stream.retain_requested) == (
-        f"{BASE}/outgoing/touch-sensors",
-        QoS.DELIVERED,
-        False,
-    )
+    assert [(message.topic, message.qos, message.retain_requested) for message in running.received] == [
+        (CHARGING_TOPIC, QoS.DELIVERED, True),
+        (f"{BASE}/outgoing/touch-sensors", QoS.DELIVERED, False),
+    ]
+    assert running.received[0].payload == b'{"value":true}'
 
 
-def test_the_handler_of_a_pattern_receives_the_names_in_the_topic(running: Robot) -> None:
-    running.publish(MEDIA_REPORT.topic(BASE, program="camera_publisher"), '{"running": true}')
-    running.publish(MEDIA_REPORT.topic(BASE, program="audio_receiver"), '{"running": false}')
-    assert running.saw(("camera_publisher", True), ("audio_receiver", False))
-
-
-def test_a_pattern_without_its_name_is_refused_and_counted(running: Robot, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_handler_of_a_pattern_receives_the_names_in_the_topic(
+    running: Robot, caplog: pytest.LogCaptureFixture
+) -> None:
     for _ in range(3):
         running.publish(f"{BASE}/outgoing/media-report/", '{"running": true}', retain=True)
     running.publish(MEDIA_REPORT.topic(BASE, program="camera_publisher"), '{"running": true}')
-    assert running.saw(("camera_publisher", True))
-    assert running.service.counters["refused"] == 3
-    assert running.service.counters["handler_errors"] == 0
+    running.publish(MEDIA_REPORT.topic(BASE, program="audio_receiver"), '{"running": false}')
+    assert running.saw(("camera_publisher", True), ("audio_receiver", False))
+    assert (running.service.counters["refused"], running.service.counters["handler_errors"]) == (3, 0)
     assert len([record for record in caplog.records if record.message.endswith("media-report/' (1 so far)")]) == 1
 
 

@@ -121,13 +121,17 @@ def test_a_state_that_is_sent_only_once_is_not_lost(rig: SerialRig) -> None:
 # -- commands
 
 
-def test_a_command_reaches_the_mcu(rig: SerialRig) -> None:
-    mcu, _ = rig.up(LAMP)
+def test_a_command_reaches_the_mcu_and_a_retained_one_is_refused(rig: SerialRig) -> None:
+    mcu, retained = rig.mcu(LAMP), {"level": 1, "on": False}
+    for metric in ("mcu/lamp-1/lamp", "lights/lamp"):
+        rig.world.command(metric, retained, retain=True)
+    running = rig.bridge()
+    rig.described("lamp-1")
+    assert until(lambda: running.service.counters["stale"] == 2)
     rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
     rig.world.command("lights/lamp", {"value": {"level": 40, "on": True}})
-    assert until(lambda: len(mcu.commands()) == 2)
+    assert mcu.obeyed(2) == [(1, b"\x50\x01")] * 2
     for command in mcu.commands():
-        assert (command.interface, command.payload) == (1, b"\x50\x01")
         assert command.ms == pytest.approx(time.time() * 1000 % 2**32, abs=5000)
 
 
@@ -178,17 +182,6 @@ def test_without_the_key_a_board_takes_no_groups(memory_rig: SerialRig) -> None:
     memory_rig.world.command("group", GOOD)
     memory_rig.world.command("mcu/hs105-sta/o4_set", {"on": True, "group": True})
     assert mcu.obeyed() == [(7, b"\1")]
-
-
-def test_a_retained_command_is_refused(rig: SerialRig) -> None:
-    mcu = rig.mcu(LAMP)
-    rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True}, retain=True)
-    rig.world.command("lights/lamp", {"level": 40, "on": True}, retain=True)
-    running = rig.bridge()
-    rig.described("lamp-1")
-    assert until(lambda: running.service.counters["stale"] == 2)
-    rig.world.command("lights/lamp", {"level": 1, "on": False})
-    assert mcu.obeyed() == [(1, b"\2\0")]
 
 
 def test_answers_are_logged(memory_rig: SerialRig, caplog: pytest.LogCaptureFixture) -> None:

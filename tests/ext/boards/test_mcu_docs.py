@@ -13,16 +13,13 @@ from tests.support import ROOT
 DOCUMENT = "".join((ROOT / "docs/ext" / name).read_text() for name in ("boards.md", "serial-protocol.md"))
 
 
-def test_the_example_is_a_valid_manifest() -> None:
+def test_the_examples_are_a_valid_manifest_and_valid_frames() -> None:
     (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)
     names: dict[str, Any] = {}
     exec(code, names)
     assert manifest.parse_hello(names["HELLO"]).device_uid == "lamp-1"
     described = manifest.parse_describe(names["DESCRIBE"])
     assert set(claims(described.payload()).granted) == {"incoming/lights/lamp", "outgoing/lights/lamp"}
-
-
-def test_the_example_frames_are_valid() -> None:
     request, command = (bytes.fromhex(found) for found in re.findall(r"`((?:[0-9a-f]{2} ){9,}00)`", DOCUMENT))
     assert frame.decode(request[:-1]).type is frame.Type.DESCRIBE_REQ
     assert frame.decode(command[:-1]) == frame.Frame(frame.Type.CMD, b"\x01", 3, 1)

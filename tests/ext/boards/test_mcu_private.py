@@ -142,6 +142,3 @@ def test_memory_is_bounded() -> None:
         topics.admit(local_only(uid=f"spy-{number}"))
     slow = [Message(f"{OUT}/mcu/spy-{number}/slow", b"{}") for number in range(300)]
     assert sum(len(topics.admit(message)) for message in slow) == 256, "MCUs"
-
-
-# -- with real bridges

@@ -4,26 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
-from pebble.extension import part
-from pebble.services.serial_mcu_bridge.devices.described_bridge import DescribedBridge
-from pebble.services.serial_mcu_bridge.imu.bridge import ImuBridge
-from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.boards.mcu_wire import STATION
 from tests.kit.board import ScriptedMcu
 from tests.kit.robot import ProgramRobot
 from tests.support import Broker, until
-
-
-@pytest.mark.parametrize(
-    ("protocol", "service"),
-    [("goob_base_v1", MotorBridge), ("pebble_serial_v1", DescribedBridge), ("imu_mpu6050_v1", ImuBridge)],
-)
-def test_a_protocol_has_its_service(protocol: str, service: type) -> None:
-    assert part(SERIAL_PROTOCOLS[protocol].service) is service
 
 
 def test_a_terminated_process_withdraws_its_device(local: Broker, tmp_path: Path) -> None:

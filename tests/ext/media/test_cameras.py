@@ -88,15 +88,10 @@ def test_no_such_robot_is_one_clear_sentence(env: dict[str, str]) -> None:
         camera("fred", width=0)
 
 
-def test_a_robot_without_a_picture_raises_after_the_timeout(env: dict[str, str]) -> None:
-    folder = default_run_folder("pebble/robots/goob", env)
-    folder.mkdir(parents=True)
+def test_a_robot_without_a_picture_raises_after_the_timeout_and_closing_ends_the_iteration(env: dict[str, str]) -> None:
+    default_run_folder("pebble/robots/goob", env).mkdir(parents=True)
     with pytest.raises(PebbleError, match=r"no picture for 0\.1 s"):
         next(camera("goob", env=env, timeout=0.1))
-
-
-def test_closing_ends_the_iteration(env: dict[str, str]) -> None:
-    default_run_folder("pebble/robots/goob", env).mkdir(parents=True)
     pictures = camera("goob", env=env)
     threading.Timer(0.1, pictures.close).start()
     assert list(pictures) == []

@@ -100,6 +100,19 @@ def test_raw_jpeg_is_a_key_frame_without_number_and_time() -> None:
     assert decoder.feed(jpeg + b"\0\0") is not None  # some cameras fill their buffers up
 
 
+def test_numbers_wrap_after_32_bits_and_a_turn_asked_for_in_the_picture_is_ignored() -> None:
+    jpeg = cv2.imencode(".jpg", picture(0))[1].tobytes()
+    flat = cv2.imencode(".jpg", np.full((48, 64, 3), 128, np.uint8))[1].tobytes()
+    packets = [
+        Picture(PictureKind.JPEG, (1 << 32) - 1, T0, jpeg).pack(),
+        Picture(PictureKind.DELTA_JPEG, 0, T0 + 5, flat).pack(),
+    ]
+    assert frames(VideoDecoder(), packets) == [(1 << 32) - 1, 0]
+    exif = b"Exif\0\0II*\0" + struct.pack("<IHHHII", 8, 1, 0x0112, 3, 1, 6) + bytes(4)
+    turned = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
+    assert np.array_equal(decode_jpeg(turned), decode_jpeg(jpeg))
+
+
 def test_the_picture_belongs_to_the_caller() -> None:
     spoilt, untouched = VideoDecoder(), VideoDecoder()
     for packet in stream("pbvd"):
@@ -108,17 +121,6 @@ def test_the_picture_belongs_to_the_caller() -> None:
         assert other is not None
         assert np.array_equal(one.picture, other.picture)
         one.picture[:] = 0
-
-
-def test_numbers_wrap_after_32_bits() -> None:
-    jpeg = cv2.imencode(".jpg", picture(0))[1].tobytes()
-    flat = cv2.imencode(".jpg", np.full((48, 64, 3), 128, np.uint8))[1].tobytes()
-    decoder = VideoDecoder()
-    packets = [
-        Picture(PictureKind.JPEG, (1 << 32) - 1, T0, jpeg).pack(),
-        Picture(PictureKind.DELTA_JPEG, 0, T0 + 5, flat).pack(),
-    ]
-    assert frames(decoder, packets) == [(1 << 32) - 1, 0]
 
 
 @pytest.mark.parametrize(
@@ -196,11 +198,3 @@ def test_every_jpeg_a_camera_may_send(options: list[int]) -> None:
     assert decode_jpeg(jpeg).shape == (121, 161, 3)
     grey = cv2.imencode(".jpg", picture(0)[:, :, 0], options[:2])[1].tobytes()
     assert decode_jpeg(grey).shape == (48, 64, 3)
-
-
-def test_a_turn_asked_for_in_the_picture_is_ignored() -> None:
-    jpeg = cv2.imencode(".jpg", picture(0))[1].tobytes()
-    tiff = b"II*\0" + struct.pack("<IHHHII", 8, 1, 0x0112, 3, 1, 6) + bytes(4)
-    exif = b"Exif\0\0" + tiff
-    turned = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
-    assert np.array_equal(decode_jpeg(turned), decode_jpeg(jpeg))

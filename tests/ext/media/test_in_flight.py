@@ -22,10 +22,7 @@ def test_messages_are_acknowledged_in_order() -> None:
     messages.sent(600, 2.0)
     messages.clear()
     assert messages.age_s(3.0) == 0, "a lost connection loses its messages"
-
-
-def test_only_so_many_are_remembered() -> None:
     messages = InFlight(slack=0, limit=2)
     for number in range(3):
         messages.sent(100, float(number))
-    assert messages.age_s(3.0) == 2.0
+    assert messages.age_s(3.0) == 2.0, "only so many are remembered"

@@ -89,11 +89,20 @@ def on_time(count: int, *, first: int = 0, **more: Any) -> list[tuple[float, byt
 
 @pytest.mark.parametrize("seed", range(5))
 def test_jitter_below_the_target_is_inaudible(seed: int) -> None:
+    """Also where numbers wrap to 1, and where packets come twice or in another order."""
     randoms = random.Random(seed)
-    arrivals = [(at + randoms.uniform(0, 0.039), raw) for at, raw in on_time(500)]
-    played = play(JitterBuffer(concealment_ms=0), arrivals)
+    numbers = [*range(LAST - 199, LAST + 1), *range(1, 301)]
+    arrivals = [
+        (0.02 * index + randoms.uniform(0, 0.039), packet(index, sequence=number))
+        for index, number in enumerate(numbers)
+        for _ in range(randoms.choice((1, 1, 2)))
+    ]
+    buffer = JitterBuffer(concealment_ms=0)
+    played = play(buffer, arrivals)
     assert played.real == list(range(500))
     assert played.stutters == 0
+    assert buffer.counters["duplicates"] + buffer.counters["late"] == len(arrivals) - 500
+    assert buffer.counters["lost"] == buffer.counters["restarts"] == 0
 
 
 def recorded_sound() -> list[tuple[float, bytes]]:
@@ -124,15 +133,6 @@ def test_jitter_above_the_target_is_learnt() -> None:
     assert sum(at > 20 for at in late) <= sum(at < 20 for at in late)
     assert len(set(played.real)) > 1900
     assert buffer.counters["overflow"] == 0
-
-
-def test_reordered_and_repeated_packets() -> None:
-    arrivals = on_time(100)
-    shuffled = [(at, arrivals[index ^ 1][1]) for index, (at, _) in enumerate(arrivals)]
-    buffer = JitterBuffer()
-    played = play(buffer, [*shuffled, *((at + 0.005, raw) for at, raw in shuffled)])
-    assert played.real == list(range(100))
-    assert buffer.counters["duplicates"] + buffer.counters["late"] == 100
 
 
 # -- gaps
@@ -206,14 +206,6 @@ def test_a_restarted_sender_whose_clock_tells_nothing_is_played_soon(before: int
     assert play(JitterBuffer(), [*first, *again]).real == [*range(50), *range(54, 80)]
 
 
-def test_numbers_wrap_to_1() -> None:
-    numbers = [LAST - 2, LAST - 1, LAST, 1, 2, 3]
-    arrivals = [(0.02 * index, packet(index, sequence=number)) for index, number in enumerate(numbers)]
-    buffer = JitterBuffer()
-    assert play(buffer, arrivals).real == [0, 1, 2, 3, 4, 5]
-    assert buffer.counters["lost"] == buffer.counters["restarts"] == 0
-
-
 @pytest.mark.parametrize(
     ("sequence", "of", "expected"), [(2, 1, 1), (1, 2, -1), (1, LAST, 1), (LAST, 1, -1), (5, 5, 0), (1, LAST - 1, 2)]
 )
@@ -230,16 +222,6 @@ def test_a_change_of_format_keeps_its_place() -> None:
 
 
 # -- too much
-
-
-def test_more_than_the_limit_never_waits_and_the_oldest_goes() -> None:
-    buffer = JitterBuffer(limit=10, concealment_ms=0)
-    for index in range(100):
-        buffer.put(packet(index), 0.0)
-    assert len(buffer) == 10
-    assert buffer.counters["overflow"] == 90
-    played = play(buffer, [])
-    assert played.real == list(range(90, 100))
 
 
 def test_the_limit_counts_while_playing_too() -> None:
@@ -359,10 +341,3 @@ def test_hostile_packets() -> None:
     counted = storm(1, 3000).counters.snapshot()
     assert counted["refused"] > 300
     assert counted["packets"] > 300
-
-
-def test_exactly_one_packet_too_many_is_left_out() -> None:
-    buffer = JitterBuffer(target_ms=40)
-    played = play(buffer, [(max(0.0, 0.02 * (index - 1) - 0.005), packet(index)) for index in range(100)])
-    assert buffer.counters["skipped"] == 1
-    assert len(played.real) == 99

@@ -34,8 +34,3 @@ def test_what_is_no_sound_is_refused(tmp_path: Path, ending: str, content: bytes
     path.write_bytes(content)
     with pytest.raises(PebbleError, match="a"):
         samples(path)
-
-
-def test_a_missing_file(tmp_path: Path) -> None:
-    with pytest.raises((OSError, PebbleError), match="No such file"):
-        samples(tmp_path / "a.mp3")

@@ -56,8 +56,3 @@ def test_the_hub_of_the_lan_is_no_other_one(more: dict[str, Any], connect: str, 
     raw = deep_merge({"services": {"neighbours": {"enabled": True, "lan": {"connect": [connect]}}}}, more)
     with pytest.raises(ConfigError, match=why):
         parse({"robot": {"id": "goob"}, **raw}, folder=Path("/"), env={})
-
-
-def test_nothing_is_granted_unless_it_is_written() -> None:
-    found = read({"shares": ["sensors/imu", "mood"]})
-    assert (found.commanded, found.listens, found.lan.lease_ms) == ({}, {}, 500)

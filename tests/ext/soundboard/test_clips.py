@@ -17,11 +17,6 @@ def put(folder: Path, *names: str) -> None:
         path.touch()
 
 
-def test_names_are_sorted_without_regard_to_case(tmp_path: Path) -> None:
-    put(tmp_path, "b.wav", "A.WAV", "c/B.wav", "C.wav", "a.txt", ".wav.bak")
-    assert Clips(tmp_path).scan() == ["A.WAV", "b.wav", "C.wav", "c/B.wav"]
-
-
 def test_everything_that_is_listed_is_found(tmp_path: Path) -> None:
     put(tmp_path, "a b.wav", "~.wav", "~nobody.wav", "ä ö\u00a0ü.wav", "line\nbreak.wav", "d/e/f.wav", "x.mp3", "y.ogg")
     (tmp_path / "link.wav").symlink_to("d/e/f.wav")
@@ -34,23 +29,28 @@ def test_everything_that_is_listed_is_found(tmp_path: Path) -> None:
 
 def test_what_leads_outside_is_neither_listed_nor_found(tmp_path: Path) -> None:
     inside, outside = tmp_path / "sounds", tmp_path / "sounds-other"
-    put(inside, "a.wav")
+    put(inside, "a.wav", "text.txt")
     put(outside, "b.wav")
     (inside / "b.wav").symlink_to(outside / "b.wav")
     (inside / "other").symlink_to(outside)
+    (inside / "circle.wav").symlink_to("circle.wav")
+    (inside / "folder.wav").mkdir()
     clips = Clips(inside)
     assert clips.scan() == ["a.wav"]
-    for name in ("b.wav", "other/b.wav", "../sounds-other/b.wav", "a.wav/../../sounds-other/b.wav"):
+    names = ["b.wav", "other/b.wav", "../sounds-other/b.wav", "a.wav/../../sounds-other/b.wav", str(outside / "b.wav")]
+    for name in (*names, "circle.wav", "folder.wav", "text.txt", "~nobody/a.wav"):
         assert clips.find(name) is None, name
-    assert clips.find(str(outside / "b.wav")) is None
 
 
-def test_the_folder_may_be_a_link(tmp_path: Path) -> None:
-    put(tmp_path / "real", "a.wav")
+def test_the_folder_may_be_a_link_and_a_name_a_way_around(tmp_path: Path) -> None:
+    put(tmp_path / "real", "a.wav", "sub/b.wav")
     (tmp_path / "link").symlink_to("real")
     clips = Clips(tmp_path / "link")
-    assert clips.scan() == ["a.wav"]
-    assert clips.find(str(tmp_path / "link" / "a.wav")) is not None
+    assert clips.scan() == ["a.wav", "sub/b.wav"]
+    for name in (str(tmp_path / "link" / "a.wav"), "sub/../a.wav"):
+        clip = clips.find(name)
+        assert clip is not None
+        assert clip.name == "a.wav"
 
 
 def test_the_list_is_bounded_and_what_is_not_listed_can_be_played(tmp_path: Path) -> None:
@@ -85,10 +85,12 @@ def test_what_cannot_be_read_or_named_is_left_out_and_reported(tmp_path: Path) -
     assert clips.problem == ""
 
 
-def test_other_formats_are_clips_where_they_can_be_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    put(tmp_path, "a.wav", "b.mp3", "c.OGG", "d.flac", "e.m3u")
-    assert Clips(tmp_path).scan() == ["a.wav", "b.mp3", "c.OGG", "d.flac"]
+def test_names_are_sorted_without_regard_to_case_and_are_those_of_what_can_be_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put(tmp_path, "b.wav", "A.WAV", "c/B.wav", "C.wav", "a.txt", ".wav.bak", "d.mp3", "e.OGG", "f.flac", "g.m3u")
+    assert Clips(tmp_path).scan() == ["A.WAV", "b.wav", "C.wav", "c/B.wav", "d.mp3", "e.OGG", "f.flac"]
     monkeypatch.setattr("pebble.extensions.media.pyav.find_spec", lambda _name: None)
     clips = Clips(tmp_path)
-    assert clips.scan() == ["a.wav"]
-    assert clips.find("b.mp3") is None
+    assert clips.scan() == ["A.WAV", "b.wav", "C.wav", "c/B.wav"]
+    assert clips.find("d.mp3") is None

@@ -113,7 +113,7 @@ class Rig:
         self.name, self.robot = service, robot or f"r{next(_numbers)}"
         self.base = f"pebble/robots/{self.robot}"
         self.ends: dict[Side, End] = {LOCAL: local, REMOTE: remote}
-        self._config = self._parse(local.section, remote.section, section)
+        self.config = self._parse(local.section, remote.section, section)
         self._clients: list[Client] = []
         self._running: Running | None = None
         self.service: ForwardingService
@@ -140,7 +140,7 @@ class Rig:
 
     def start(self, *, ready: bool = True) -> ForwardingService:
         made = SERVICES[self.name]
-        self.service = made(self._config, local_transport(self._config, made.client_name, as_published=True))
+        self.service = made(self.config, local_transport(self.config, made.client_name, as_published=True))
         self._running = Running(self.service)
         if ready:
             self.wait_ready()

@@ -13,20 +13,12 @@ import pytest
 
 from pebble.forwarding.routing import Drop
 from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Rig, ZenohEnd
-from tests.forwarding.links.test_table import (
-    AUDIO_FLAG,
-    DRIVE,
-    FALSE,
-    PRESS,
-    STOP,
-    TRUE,
-    VIDEO_FLAG,
-)
 from tests.services.mqtt_bridge.bridge_rig import Client, Quiet
 from tests.support import AmqttBroker, cases, until
 
-LIGHTS, STATUS = "incoming/lights-solid", "outgoing/status"
-MOVE = b'{"z": 0.5}'
+STOP, DRIVE, STATUS = "incoming/estop", "incoming/drive-values", "outgoing/status"
+VIDEO_FLAG, AUDIO_FLAG = "incoming/flags/mqtt-video", "incoming/flags/mqtt-audio"
+TRUE, FALSE, PRESS = b'{"value": true}', b'{"value": false}', b'{"stop": "00000000000000a1", "by": "test"}'
 Make = Callable[..., Rig]
 
 

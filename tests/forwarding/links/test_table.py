@@ -9,68 +9,39 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from zlib import crc32
 
 import pytest
 
-from pebble.contract import Kind
-from pebble.forwarding.side import Gate
-from pebble.transports import Message, State
+from pebble.forwarding.routing import MIRROR, TABLE_A1, Forward, route
+from pebble.forwarding.subjects import Subjects
+from pebble.transports import Message, QoS, State
 from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Rig, Side, ZenohEnd
 from tests.services.mqtt_bridge.bridge_rig import Quiet
 from tests.support import Broker, until
-from tests.tcp_proxy import TcpProxy
 
-STOP, RESET, DRIVE = "incoming/estop", "incoming/estop-reset", "incoming/drive-values"
-VIDEO_FLAG, AUDIO_FLAG = "incoming/flags/mqtt-video", "incoming/flags/mqtt-audio"
-MIRROR_FLAG = "incoming/flags/remote-mirror"
+STOP = "incoming/estop"
 LATEST_S = 20.0  # for what comes at once on a machine with nothing else to do
-TRUE, FALSE, PRESS = b'{"value": true}', b'{"value": false}', b'{"stop": "00000000000000a1", "by": "test"}'
+TRUE, PRESS = b'{"value": true}', b'{"stop": "00000000000000a1", "by": "test"}'
 
-#: Topics of the contract by the side that publishes on them, and their kinds.
-KNOWN: Final[dict[Side, dict[str, Kind]]] = {
-    LOCAL: {
-        "outgoing/navigation-goal": Kind.STATE,
-        "outgoing/wheel-odometry": Kind.STREAM,
-        "outgoing/sensors/imu-fast": Kind.STREAM,
-        "outgoing/media-report/one": Kind.EVENT,
-        DRIVE: Kind.COMMAND,
-        VIDEO_FLAG: Kind.FLAG,
-        "incoming/flags/reboot": Kind.ACTION,
-    },
-    REMOTE: {
-        "outgoing/diagnostics": Kind.STATE,
-        "outgoing/apriltag-data": Kind.STREAM,
-        "outgoing/media-report/two": Kind.EVENT,
-        "incoming/lights-solid": Kind.COMMAND,
-        STOP: Kind.COMMAND,
-        RESET: Kind.COMMAND,
-        AUDIO_FLAG: Kind.FLAG,
-        "incoming/flags/git-pull": Kind.ACTION,
-    },
+#: Topics by the side that publishes on them, within and outside of the contract.
+TOPICS: Final[dict[Side, tuple[str, ...]]] = {
+    LOCAL: (
+        *("outgoing/navigation-goal", "outgoing/wheel-odometry", "outgoing/sensors/imu-fast", "outgoing/weather/local"),
+        *("outgoing/media-report/one", "incoming/drive-values", "incoming/dance/local"),
+        *("incoming/flags/mqtt-video", "incoming/flags/reboot", "incoming/flags/party-local"),
+    ),
+    REMOTE: (
+        *("outgoing/diagnostics", "outgoing/apriltag-data", "outgoing/media-report/two", "outgoing/weather/remote"),
+        *("incoming/lights-solid", STOP, "incoming/estop-reset", "incoming/dance/remote"),
+        *("incoming/flags/mqtt-audio", "incoming/flags/git-pull", "incoming/flags/party-remote"),
+    ),
 }
-#: Topics outside of the contract.
-UNKNOWN: Final[dict[Side, dict[str, Kind]]] = {
-    side: {
-        f"outgoing/weather/{side.value}": Kind.EVENT,
-        f"incoming/dance/{side.value}": Kind.COMMAND,
-        f"incoming/flags/party-{side.value}": Kind.FLAG,
-    }
-    for side in Side
-}
-PASSES: Final = {
-    "mirror": dict.fromkeys(Side, frozenset(Kind)),
-    "bridge": {
-        LOCAL: {Kind.STATE, Kind.EVENT, Kind.STREAM, Kind.FLAG, Kind.ACTION},
-        REMOTE: {Kind.COMMAND, Kind.FLAG, Kind.ACTION},
-    },
-}
-STAYS: Final = {"mirror": (), "bridge": ("outgoing/sensors/imu-fast", "outgoing/media-report/one")}
+RULES: Final = {"bridge": TABLE_A1, "mirror": MIRROR}
 LINKS: dict[str, tuple[str, Callable[[Path], End], Callable[[Path], End]]] = {
     "bridge on 3.1.1": ("bridge", MqttEnd, MqttEnd),
     "mirror on 5": ("mirror", ZenohEnd, partial(MqttEnd, protocol="5")),
@@ -81,26 +52,13 @@ LINKS: dict[str, tuple[str, Callable[[Path], End], Callable[[Path], End]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """One cell of the table: a message on ``topic``, published by ``side``."""
 
     side: Side
     topic: str
-    kind: Kind
     retain: bool
     qos: int
-
-    @property
-    def known(self) -> bool:
-        return self.topic in KNOWN[self.side]
-
-    def passes(self, service: str) -> bool:
-        """Commands and actions that ask to be retained are stale, but a live stop is one."""
-        once = self.kind in (Kind.COMMAND, Kind.ACTION) and self.topic != STOP
-        return (
-            self.kind in PASSES[service][self.side] and self.topic not in STAYS[service] and not (once and self.retain)
-        )
 
     def payload(self, situation: str) -> bytes:
         """A stop has a name: the bridge gives one to others, and so changes their bytes."""
@@ -108,17 +66,11 @@ class Cell:
         stop = f'{{"stop":"{crc32(text.encode()):016x}","why":"{text}"}}'
         return (stop if self.topic == STOP else text).encode()
 
-    def arrives(self, situation: str) -> tuple[bytes, int, bool]:
-        """Same bytes; flags of the contract are always retained; to the robot with the channel's QoS at least."""
-        to_robot = self.known and self.topic.startswith("incoming/")
-        retained = (self.retain and self.topic != STOP) or (self.known and self.kind is Kind.FLAG)
-        return self.payload(situation), 1 if to_robot else self.qos, retained
-
 
 TABLE: Final = [
-    Cell(side, topic, kind, retain, qos)
+    Cell(side, topic, retain, qos)
     for side in Side
-    for (topic, kind), retain, qos in product((KNOWN[side] | UNKNOWN[side]).items(), (False, True), (0, 1))
+    for topic, retain, qos in product(TOPICS[side], (False, True), (0, 1))
 ]
 Arrived = dict[str, list[tuple[bytes, int, bool]]]
 
@@ -138,11 +90,20 @@ class TableRig(Rig):
                 came.setdefault(message.topic.removeprefix(f"{self.base}/"), []).append(_shape(message))
         return came
 
+    def forward(self, cell: Cell) -> Forward | None:
+        """Return how a cell passes, by the table of the service. A live stop that asks to be retained is one."""
+        topic, retain = f"{self.base}/{cell.topic}", cell.retain and cell.topic != STOP
+        subject = Subjects(self.config)[topic]
+        message = Message(topic, b"{}", QoS(cell.qos), retain_requested=retain)
+        found = route(RULES[self.name], cell.side, subject, message, mirroring=False)
+        return found if isinstance(found, Forward) else None
+
     def expected(self, situation: str) -> Arrived:
         due: Arrived = {}
         for cell in TABLE:
-            if cell.passes(self.name):
-                due.setdefault(cell.topic, []).append(cell.arrives(situation))
+            if (forward := self.forward(cell)) is not None:
+                shape = cell.payload(situation), int(forward.qos), forward.retain
+                due.setdefault(cell.topic, []).append(shape)
         return due
 
     def crosses_once(self, situation: str) -> None:
@@ -154,15 +115,14 @@ class TableRig(Rig):
         Quiet(*self.clients.values()).wait(0.1)
         assert _by_quality(self.arrived(situation)) == _by_quality(due)
         for side in Side:
-            cells = [cell for cell in TABLE if cell.side is side.other and cell.passes(self.name)]
-            newest = {cell.topic: cell.payload(situation) for cell in cells if cell.arrives(situation)[2]}
+            arrive = [(topic, *shape) for topic in TOPICS[side.other] for shape in due.get(topic, ())]
+            newest = {topic: payload for topic, payload, _, retain in arrive if retain}
             found = partial(self.retained_of_others, side)
             assert until(lambda found=found, newest=newest: found() == newest, LATEST_S), found()  # type: ignore[misc]
 
     def retained_of_others(self, side: Side) -> dict[str, bytes]:
         """What a late subscriber finds on ``side`` of what the other side has published."""
-        others = KNOWN[side.other] | UNKNOWN[side.other]
-        return {topic: payload for topic, payload in self.retained(side).items() if topic in others}
+        return {topic: payload for topic, payload in self.retained(side).items() if topic in TOPICS[side.other]}
 
 
 def _shape(message: Message) -> tuple[bytes, int, bool]:
@@ -207,7 +167,7 @@ def over(*names: Any) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("ends", names, indirect=True)
 
 
-FIRST, SECOND, _, *FURTHER = LINKS
+FIRST, _, _, *FURTHER = LINKS
 MARKS = {name: [pytest.mark.thorough] for name in FURTHER}
 each_link = over(*(pytest.param(name, marks=MARKS.get(name, ())) for name in LINKS))
 
@@ -225,25 +185,12 @@ def test_both_sides_are_there(rig: TableRig) -> None:
 
 
 @contextmanager
-def slow(rig: Rig, delay_s: float) -> Iterator[None]:
-    """The way to the operators' broker is so meanwhile."""
-    link = link_of(rig)
-    as_usual, link.delay_s = link.delay_s, delay_s
+def slow(end: End, delay_s: float) -> Iterator[None]:
+    """The way to this broker is so meanwhile."""
+    assert isinstance(end, MqttEnd)
+    as_usual, end.link.delay_s = end.link.delay_s, delay_s
     yield
-    link.delay_s = as_usual
-
-
-def link_of(rig: Rig) -> TcpProxy:
-    end = rig.ends[REMOTE]
-    assert isinstance(end, MqttEnd)
-    return end.link
-
-
-def broker_of(rig: Rig) -> Broker:
-    end = rig.ends[REMOTE]
-    assert isinstance(end, MqttEnd)
-    assert isinstance(end.broker, Broker)
-    return end.broker
+    end.link.delay_s = as_usual
 
 
 @over(FIRST)
@@ -254,7 +201,7 @@ class TestBridge:
         for number in range(others):
             rig.remote.publish(f"incoming/flags/f{number}", TRUE, retain=True)
         rig.remote.publish(STOP, b"old", retain=True)
-        with slow(rig, 0.1):
+        with slow(rig.ends[REMOTE], 0.1):
             rig.start(ready=False)
 
             def arrived() -> int:
@@ -267,29 +214,14 @@ class TestBridge:
             rig.remote.publish(STOP, PRESS)
             assert until(lambda: rig.local.payloads(STOP) == [PRESS])
 
-    def test_a_stop_that_a_new_subscription_brings_does_not_pass(self, rig: TableRig) -> None:
-        """After the gate was shut the bridge subscribes anew, on connections that have been up for long."""
-        bridge = rig.start()
-        for client in (rig.local, rig.remote):
-            client.publish(STOP, PRESS, retain=True)
-        rig.local.publish(MIRROR_FLAG, TRUE, retain=True)
-        assert until(lambda: rig.local.on(STOP) and bridge.status.mirroring)
-        bridge.forwarder.shut()
-        bridge.post(bridge.found_one_broker)
-        bridge.post(partial(bridge.check_again, bridge.status.epoch))
-        assert until(lambda: rig.gate is Gate.OPEN and REMOTE in bridge.status.subscribed)
-        rig.after_all(REMOTE)
-        rig.after_all(LOCAL)
-        assert rig.local.payloads(STOP) == [PRESS]  # the live one
-        assert not rig.remote.on(STOP)
-
     def test_a_frozen_remote_broker_does_not_delay_local_traffic(
         self, make: Callable[..., TableRig], tmp_path: Path
     ) -> None:
         code = f"open({str(tmp_path / 'ran')!r}, 'w')"
         rig = make(git_pull_control={"command": [sys.executable, "-c", code]})
         rig.start()
-        other, broker = rig.client(LOCAL), broker_of(rig)
+        other, broker = rig.client(LOCAL), rig.ends[REMOTE].broker
+        assert isinstance(broker, Broker)
         broker.freeze()
         for number in range(400):  # together fewer than the 1000 that mosquitto holds for a slow reader
             rig.local.publish("outgoing/status", b"%d " % number + bytes(2000), retain=True)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import sys
-import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,8 +12,7 @@ import pytest
 
 from pebble.config import SystemControl
 from pebble.contract import CHANNELS, GIT_PULL, REBOOT, Kind
-from pebble.services.mqtt_bridge.requests.actions import ACTIONS, Action, Row, system_actions
-from tests.services.mqtt_bridge.bridge_rig import make_config
+from pebble.services.mqtt_bridge.requests.actions import ACTIONS, Action, Row
 from tests.support import Clock, until
 
 PYTHON = (sys.executable, "-c")
@@ -117,18 +114,3 @@ def test_a_command_that_cannot_run_is_one_line_that_does_not_quote_it(
     assert [action.request() for _ in range(5)] == [False] * 5
     assert caplog.text.count(why) == 1
     assert "TOKEN" not in caplog.text
-
-
-@pytest.mark.parametrize("command", [(sys.executable, "-c", "input()"), ("/no/such/program",)])
-def test_a_flood_of_requests_is_a_few_lines_of_the_log(
-    command: tuple[str, ...], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.DEBUG)
-    controls = {row.section: {"command": list(command), "cwd": str(tmp_path)} for row in ACTIONS}
-    actions = system_actions(make_config(**controls).services.mqtt_bridge, tmp_path, time.monotonic)
-    threads, before = threading.active_count(), time.monotonic()
-    for _ in range(40):
-        for row in ACTIONS:
-            actions[row.channel].request()
-    assert until(lambda: threading.active_count() == threads)
-    assert len(caplog.records) <= 10 * max(1.0, time.monotonic() - before)

@@ -44,6 +44,8 @@ def test_states_are_published_when_they_change_and_not_more_than_four_times_a_se
     assert len(states) == 6  # the newest as soon as it may be, and that control is free again
     assert states[4].by == "mia999"
     assert (states[5].key, now) == ("", pytest.approx(103.0, abs=0.3))
+    control.repeat_state(now + 5)
+    assert states[6:] == [control.state()] == [states[5]]
     assert caplog.messages == [f"mia{number} has control" for number in range(5)]
 
 
@@ -57,14 +59,6 @@ def test_a_state_is_short() -> None:
     assert states[-1].asks == "z" * 40
     assert len(raw) <= 300
     assert codec.decode(CONTROL_STATE, raw) == states[-1]
-
-
-def test_a_state_is_repeated() -> None:
-    states: list[ControlState] = []
-    control = Control(Security(), states.append, 0.0)
-    control.note(0.0)
-    control.repeat_state(5.0)
-    assert states == [control.state()] * 2
 
 
 # -- a service, an MCU and operators

@@ -85,7 +85,9 @@ def test_the_newest_number_never_goes_back(path: Path, memory: HallMemory) -> No
     assert seen == sorted(seen)
 
 
-def test_numbers_go_on_where_the_last_writer_ended(path: Path, memory: HallMemory) -> None:
+def test_numbers_go_on_where_the_last_writer_ended_and_a_removed_one_is_made_again_within_a_second(
+    path: Path, memory: HallMemory
+) -> None:
     fill(memory, 100)
     reader = HallReader(path.name)
     memory.close()
@@ -93,18 +95,10 @@ def test_numbers_go_on_where_the_last_writer_ended(path: Path, memory: HallMemor
     again = HallMemory(f"/{path.name}", SLOTS)
     fill(again, 5)
     assert [sample.number for sample in reader.read()] == [101, 102, 103, 104, 105]
-    again.close()
-
-
-def test_one_that_a_reader_has_removed_is_made_again_within_a_second(path: Path, memory: HallMemory) -> None:
-    fill(memory, 10)
     path.unlink()
-    memory.write(2 * SECOND, (1, 2, 3), None)
-    assert HallReader(path.name).newest == 11
-
-
-def other_size(path: Path) -> object:
-    return path.write_bytes(bytes(100))
+    again.write(2 * SECOND, (1, 2, 3), None)
+    assert HallReader(path.name).newest == 106
+    again.close()
 
 
 def second_writer(path: Path) -> object:
@@ -113,14 +107,10 @@ def second_writer(path: Path) -> object:
     return other
 
 
-def link(path: Path) -> object:
-    return path.symlink_to("/etc/passwd")
-
-
 REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
-    "another size": (other_size, "has 100 bytes, and 64 slots need 2072"),
+    "another size": (lambda path: path.write_bytes(bytes(100)), "has 100 bytes, and 64 slots need 2072"),
     "another writer": (second_writer, "is written by another process"),
-    "a link": (link, "Too many levels of symbolic links"),
+    "a link": (lambda path: path.symlink_to("/etc/passwd"), "Too many levels of symbolic links"),
 }
 
 

@@ -157,28 +157,21 @@ def test_which_request_waits(arrived: list[tuple[ControlRequest, bool]], waiting
     assert [(one.request.ends(), one.over) for one in inbox.take().requests] == waiting
 
 
-def test_the_newest_turn_of_each_owner_waits_and_is_taken_once() -> None:
-    inbox = empty()
+def test_the_newest_turn_of_each_owner_and_the_newest_vouched_time_wait_and_are_taken_once() -> None:
+    inbox, vouched = empty(), ControlVouched(begin=1, end=3)
     arm, tail = ControlTurn(boot="b", turn=2), ControlTurn(boot="b", turn=1)
     assert inbox.put_turn("arm", ControlTurn(boot="b", turn=1))
     assert not inbox.put_turn("tail", tail)
     assert not inbox.put_turn("arm", arm)
+    assert not inbox.put_vouched(ControlVouched(begin=1, end=2))
+    assert not inbox.put_vouched(vouched)
     assert not inbox.put_drive(ZERO, 0.0)
-    assert sorted(inbox.take().turns, key=str) == [("arm", arm), ("tail", tail)]
-    assert inbox.take().turns == []
-    assert inbox.put_drive(ZERO, 0.0)
+    batch = inbox.take()
+    assert (sorted(batch.turns, key=str), batch.vouched) == ([("arm", arm), ("tail", tail)], vouched)
+    batch = inbox.take()
+    assert (batch.turns, batch.vouched) == ([], None)
+    assert inbox.put_vouched(vouched)
     assert not inbox.put_turn("arm", arm)
-
-
-def test_the_newest_time_that_the_bridge_vouches_for_waits_and_is_taken_once() -> None:
-    inbox = empty()
-    newest = ControlVouched(begin=1, end=3)
-    assert inbox.put_vouched(ControlVouched(begin=1, end=2))
-    assert not inbox.put_vouched(newest)
-    assert not inbox.put_drive(ZERO, 0.0)
-    assert inbox.take().vouched == newest
-    assert inbox.take().vouched is None
-    assert inbox.put_drive(ZERO, 0.0)
 
 
 @pytest.mark.parametrize(("states", "lost"), [

@@ -271,14 +271,6 @@ def test_a_barred_run_is_published_and_stays_barred_after_a_restart(rig: Rig, pa
     assert again.guard.judge(structs.replace(SCRIPT, run=8), again.now) == 0.75
 
 
-@pytest.mark.parametrize(("after_s", "barred"), [(0.3995, 7), (0.4005, 6)])
-def test_a_persons_zero_bars_a_script_that_moves(rig: Rig, after_s: float, barred: int) -> None:
-    rig.guard.judge(Drive(z=0.5, source="autonomy", run=7, valid_ms=400), rig.now)
-    rig.advance(after_s)
-    rig.guard.judge(Drive(), rig.now)
-    assert rig.guard.barred == barred
-
-
 def test_a_person_who_was_lost_bars_the_run_at_the_end_of_the_hold_without_any_further_command(rig: Rig) -> None:
     assert rig.guard.judge(SCRIPT, rig.now) == 0.75
     assert rig.guard.judge(Drive(z=1, valid_ms=400), rig.now) == 0.4

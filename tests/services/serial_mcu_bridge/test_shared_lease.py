@@ -171,6 +171,3 @@ def test_where_names_are_checked_the_account_of_the_holder_counts_at_all() -> No
     for by, moves in (("page-1", True), ("ann", False), ("", False)):
         assert (first.moves(key, by), second.moves(key, by)) == (moves, moves)
     assert second.control.holds(Drive(z=0.5, key=key, by="page-1/bob"))
-
-
-# -- one alone

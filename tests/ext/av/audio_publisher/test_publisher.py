@@ -24,16 +24,17 @@ SOUND = FrameInfo(format="s16le", rate=16_000, channels=1, captured_ms=1)
 
 
 class Stuck(Transport):
-    """Accepts everything, and confirms none of it."""
+    """Accepts everything, and confirms all but the newest packets, ``behind`` of them."""
 
-    def __init__(self) -> None:
+    def __init__(self, behind: int) -> None:
         super().__init__("stuck")
-        self.accepted = 0
+        self.behind = behind
         self.packets: list[bytes] = []
 
     @property
     def outgoing(self) -> Outgoing:
-        return Outgoing(waiting=self.accepted)
+        unconfirmed = self.packets[max(0, len(self.packets) - self.behind) :]
+        return Outgoing(waiting=sum(len(packet) + 60 for packet in unconfirmed))
 
     def _open(self, timeout: float) -> None:
         self._set_state(State.CONNECTED)
@@ -41,23 +42,12 @@ class Stuck(Transport):
     def _close(self, will: Message | None) -> None: ...
 
     def _send(self, message: Message, urgent: bool) -> bool:
-        self.accepted += len(message.payload) + 60
         self.packets.append(message.payload)
         return True
 
     def _declare(self, subscription: Subscription) -> None: ...
 
     def _undeclare(self, subscription: Subscription) -> None: ...
-
-
-class Behind(Stuck):
-    """Confirms everything but the newest packets, ``behind`` of them."""
-
-    behind = 0
-
-    @property
-    def outgoing(self) -> Outgoing:
-        return Outgoing(waiting=sum(len(packet) + 60 for packet in self.packets[len(self.packets) - self.behind :]))
 
 
 Make = Callable[..., AudioPublisher]
@@ -78,7 +68,7 @@ def make(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Make:
 
 @pytest.mark.parametrize(("encoding", "most_s"), [("pcm", 0.2), ("opus", 0.5)])
 def test_sound_waits_for_so_long_and_then_the_newest_is_dropped(make: Make, encoding: str, most_s: float) -> None:
-    publisher = make(Stuck(), encoding=encoding, bundle=1)
+    publisher = make(Stuck(1000), encoding=encoding, bundle=1)
     number = 0
     while not publisher.counters["dropped"] and number < 100:
         publisher.take(SOUND, CHUNK, number * CHUNK_S)
@@ -88,7 +78,7 @@ def test_sound_waits_for_so_long_and_then_the_newest_is_dropped(make: Make, enco
 
 
 def test_sound_gets_larger_and_smaller_and_none_is_lost(make: Make) -> None:
-    publisher = make(transport := Behind(), encoding="opus", bundle=2)
+    publisher = make(transport := Stuck(0), encoding="opus", bundle=2)
     steps = []
     for number in range(1, 300):
         transport.behind = 7 if number > 150 else 0
@@ -105,7 +95,7 @@ def test_sound_gets_larger_and_smaller_and_none_is_lost(make: Make) -> None:
 
 @pytest.mark.parametrize(("profile", "rest_s"), [("thin", 2.6), ("wide", 0.0)])
 def test_on_a_thin_link_a_slow_packet_is_followed_by_a_rest(make: Make, profile: str, rest_s: float) -> None:
-    publisher = make(transport := Behind(), encoding="opus", bundle=1, profile=profile)
+    publisher = make(transport := Stuck(0), encoding="opus", bundle=1, profile=profile)
     sent_at = []
     for number in range(250):
         before, now = len(transport.packets), number * CHUNK_S

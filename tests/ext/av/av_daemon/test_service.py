@@ -104,16 +104,6 @@ def test_it_publishes_the_status_of_other_programs(running: Robot) -> None:
     assert "x" not in running.status
 
 
-def test_a_report_of_no_program_ends_nothing(running: Robot) -> None:
-    assert until(lambda: running.status)
-    running.report("", b'{"running": true}', retain=True)
-    running.report("after", MediaReport(running=True))
-    assert until(lambda: "after" in running.status)
-    assert running.daemon.poll() is None
-    assert "" not in running.status
-    running.report("", b"", retain=True)
-
-
 def test_numbers_alone_are_published_rarely_and_everything_else_soon(robot: Robot) -> None:
     def sent(kbits: int, **more: Any) -> None:
         doing = f"h264 640x480, {kbits} kbit/s"

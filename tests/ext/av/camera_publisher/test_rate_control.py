@@ -100,12 +100,6 @@ def test_on_a_thin_link_a_slow_picture_is_followed_by_a_rest(kbits: float, delay
     assert run.worst_age(0) < 20_000 / (kbits * KILOBIT)  # the first one is small, too
 
 
-def test_a_good_link_that_may_be_thin_gets_everything_soon() -> None:
-    run = Run(lambda _now: 8000, thin=True).run(30)
-    assert run.level_at(15) == 0
-    assert run.rate(15, 30) == pytest.approx(10, rel=0.02)
-
-
 @pytest.mark.parametrize("kbits", [256, 512])
 def test_the_rate_is_the_last_to_go(kbits: int) -> None:
     run = Run(lambda _now: kbits).run(60)
@@ -113,11 +107,12 @@ def test_the_rate_is_the_last_to_go(kbits: int) -> None:
     assert 0 < run.level_at(30) < 7
 
 
-@pytest.mark.parametrize(("kbits", "delay_s"), [(2000, 0.01), (20_000, 0.4)])
-def test_a_good_link_gets_everything_and_a_long_way_is_not_a_slow_link(kbits: int, delay_s: float) -> None:
-    run = Run(lambda _now: kbits, delay_s=delay_s).run(60)
-    assert not run.levels
-    assert run.rate(2, 60) == pytest.approx(10, rel=0.02)
+@pytest.mark.parametrize(("kbits", "delay_s", "thin"), [(2000, 0.01, False), (20_000, 0.4, False), (8000, 0.01, True)])
+def test_a_good_link_gets_everything_and_a_long_way_is_not_a_slow_link(kbits: int, delay_s: float, thin: bool) -> None:
+    run = Run(lambda _now: kbits, delay_s=delay_s, thin=thin).run(60)
+    assert bool(run.levels) is thin
+    assert run.level_at(15) == 0
+    assert run.rate(15, 60) == pytest.approx(10, rel=0.02)
 
 
 @pytest.mark.parametrize("beacon_s", some([0.0666, 0.05, 0.1024, 0.09], 2))
@@ -134,29 +129,23 @@ def test_a_slow_link_is_noticed_behind_confirmations_that_are_held_back(kbits: i
     assert run.worst_age(5) < 0.8
 
 
-def test_a_link_that_recovers_gets_everything_back() -> None:
-    run = Run(lambda now: 128 if now < 20 else 4000).run(120)
-    assert run.level_at(19) >= 3
-    assert run.level_at(119) == 0
-    assert run.rate(100, 120) == pytest.approx(10, rel=0.02)
-
-
-def test_a_link_that_breaks_down_is_answered_at_once() -> None:
-    run = Run(lambda now: 2000 if now < 20 else 128).run(60)
+def test_a_link_that_breaks_down_is_answered_at_once_and_gets_everything_back_when_it_recovers() -> None:
+    run = Run(lambda now: 128 if 20 < now < 60 else 4000).run(200)
     assert run.worst_age(0, 20) < 0.3
     assert run.worst_age(20) < 1.6
     assert run.worst_age(23) < 0.9
+    assert run.level_at(59) >= 3
+    assert run.level_at(199) == 0
+    assert run.rate(180, 200) == pytest.approx(10, rel=0.02)
+    words = [str(step) for step in STEPS]
+    assert words[:4] == ["", "quality 3/4", "quality 1/2", "quality 1/2, size 3/4"]
+    assert words[-1] == "quality 1/2, size 1/4, rate 1/8"
+    assert all(before.cost > after.cost for before, after in pairwise(STEPS))
 
 
 def test_a_steady_link_is_not_probed_all_the_time() -> None:
     run = Run(lambda _now: 300).run(cases(160, 300))
     assert len([at for at, _ in run.levels if at > 60]) <= cases(7, 16)
-
-
-def test_what_is_reduced_has_words() -> None:
-    assert [str(step) for step in STEPS[:4]] == ["", "quality 3/4", "quality 1/2", "quality 1/2, size 3/4"]
-    assert str(STEPS[-1]) == "quality 1/2, size 1/4, rate 1/8"
-    assert all(before.cost > after.cost for before, after in pairwise(STEPS))
 
 
 def test_frames_sent_before_a_change_do_not_count() -> None:

@@ -109,10 +109,6 @@ class FramesNet:
         """Those of our segments that are still in shared memory."""
         return {name for name in self.segments if (SHM / Path(name).name).exists()}
 
-    def written(self) -> int:
-        """Return how many frames all writers together have sent, killed ones too."""
-        return sum(int.from_bytes(tally.read_bytes(), "little") for tally in self.folder.glob("tally-*"))
-
     def close(self) -> None:
         for peer in self._peers:
             if peer.running:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import json
-import mmap
 import os
 import resource
 import sys
@@ -50,7 +49,7 @@ def main(role: str, folder: str, options: str) -> None:
     worker.start()
     report("up")
     for _ in sys.stdin:
-        report(json.dumps(peer.report() | _memory()))
+        report(json.dumps(peer.report()))
     peer.stop()
     worker.join(5)
 
@@ -86,14 +85,12 @@ class Writer:
         self._options = options
         self._ended = threading.Event()
         self._frame = np.zeros(options.size, np.uint8)
-        self._tally = Tally(folder / f"tally-{os.getpid()}")
         self._writer = FrameWriter(folder, "camera", capacity=options.size, slots=options.slots).open()
 
     def run(self) -> None:
         number, due = 0, time.monotonic()
         while not self._ended.is_set() and not 0 < self._options.limit <= number:
             number += self._write(number + 1)
-            self._tally.note(number)
             due += 1 / self._options.rate
             if (pause := due - time.monotonic()) > 0:
                 time.sleep(pause)
@@ -159,24 +156,6 @@ class Reader:
 
     def stop(self) -> None:
         self._reader.close()
-
-
-class Tally:
-    """A number in a file that outlives a SIGKILL."""
-
-    def __init__(self, path: Path) -> None:
-        path.write_bytes(bytes(8))
-        with path.open("r+b") as file:
-            self._memory = mmap.mmap(file.fileno(), 8)
-
-    def note(self, number: int) -> None:
-        ctypes.c_uint64.from_buffer(self._memory).value = number
-
-
-def _memory() -> dict[str, Any]:
-    """kB, as in /proc."""
-    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-    return {"rss": int(status["VmRSS"].split()[0])}
 
 
 if __name__ == "__main__":
