@@ -40,7 +40,7 @@ class Places:
 
     @cached_property
     def slot_state(self) -> Path:
-        """Folder of ``trial``, ``refused`` and ``sequence``, for ``pebble-slot`` and updates."""
+        """Folder of what ``pebble-slot`` notes of updates: one on trial, one that was refused, the newest installed."""
         return self.root / "var/lib/pebble-update"
 
     @cached_property

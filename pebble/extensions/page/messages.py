@@ -266,7 +266,7 @@ class State(_ToPage, frozen=True, kw_only=True, tag="state"):
 
 
 class Logs(_ToPage, frozen=True, kw_only=True, tag="logs"):
-    """Log lines of the watched component, if it asked for them. ``first`` is the number of the first one.
+    """Log lines of the component that the page has open, if the page asked for them. ``first``: the first one's number.
 
     A missing number belongs to a dropped line. Numbers count within one ``origin``.
     """

@@ -29,15 +29,15 @@ _FLAGS_METRIC = "web/flags"
 STEP_S = 1.0  # between two changes of what is received of one component: capabilities may change without end
 
 
-class _Carried(NamedTuple):
-    """The component and channel of a topic whose own name does not tell them."""
+class _Meaning(NamedTuple):
+    """The component and channel of a topic, for one whose own name does not tell them."""
 
     ref: str
     channel: c.Channel
 
 
 #: Filters to subscribe to; None: the topics below them tell component and channel by their names.
-_Filters = dict[str, _Carried | None]
+_Filters = dict[str, _Meaning | None]
 
 #: Channels for which capabilities may name a topic that is subscribed to, besides overlays and flags.
 _NAMED = [
@@ -144,15 +144,15 @@ class OpenComponents:
         """Return the callback for messages of a subscription of this component."""
 
         def take(message: Message, now: float) -> None:
-            carried = self._wanted.get(ref, {}).get(filter_)
+            meaning = self._wanted.get(ref, {}).get(filter_)
             aliases_before = self._robots.aliases(ref)
-            if carried is None:
+            if meaning is None:
                 self._robots.receive(message, now)
-            elif carried.channel.kind is c.Kind.FLAG:
-                self._receive_flag(ref, carried.channel, message)
+            elif meaning.channel.kind is c.Kind.FLAG:
+                self._receive_flag(ref, meaning.channel, message)
             else:
-                self._robots.receive_as(carried.ref, carried.channel.metric, message, now, carried.channel)
-            if self._robots.aliases(ref) != aliases_before:
+                self._robots.receive_as(meaning.ref, meaning.channel.metric, message, now, meaning.channel)
+            if self._robots.aliases(ref) != aliases_before:  # it was a manifest, with other topics to subscribe to
                 self.update(ref)
 
         return take
@@ -177,9 +177,9 @@ class OpenComponents:
             self._add(filters, ref, channel)
         for metric in self._robots.aliases(ref):
             alias = c.Channel(metric=metric, kind=c.Kind.STREAM, payload=AnyObject)
-            filters.setdefault(f"{ref}/{Direction.OUTGOING}/{metric}", _Carried(ref, alias))
+            filters.setdefault(f"{ref}/{Direction.OUTGOING}/{metric}", _Meaning(ref, alias))
         for flag in FLAGS.values():
-            filters[self._robots.topic(ref, flag)] = _Carried(ref, flag)
+            filters[self._robots.topic(ref, flag)] = _Meaning(ref, flag)
         source = self._robots.sources.get(ref, ref)
         filters.setdefault(c.VIDEO_OVERLAYS.filter(source), None)
         self._add(filters, source, c.VIDEO_OVERLAYS)
@@ -189,4 +189,4 @@ class OpenComponents:
         """Add the topic of a channel, if the component's capabilities name another than the contract's."""
         topic = self._robots.topic(ref, channel)
         if topic != channel.topic(ref):
-            filters.setdefault(topic, _Carried(ref, channel))
+            filters.setdefault(topic, _Meaning(ref, channel))

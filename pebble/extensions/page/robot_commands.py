@@ -65,8 +65,9 @@ def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
         offer = _outlet_offer(capabilities, op.outlet)
     else:
         offer = section_of(capabilities, section)
-    kind = key.removesuffix("_topic")  # lights that do not flash: {"solid": true, "flash": false}
-    if all(offer.get(name) is not False for name in ("available", "controls", kind)):
+    # the third key is for one kind of command: lights that do not flash have {"solid": true, "flash": false}
+    refusing_keys = ("available", "controls", key.removesuffix("_topic"))
+    if not any(offer.get(refusing_key) is False for refusing_key in refusing_keys):
         return ""
     name, metric = op.ref.rpartition("/")[2], command.channel.metric.format(**command.names)
     return f"{name} takes no {metric} commands"
@@ -106,7 +107,7 @@ def _action_topic(op: m.ActionOp, channel: Channel, capabilities: dict[str, Any]
 
 
 def _sections(op: m.ActionOp) -> list[str]:
-    """Return the commands in the capabilities, in all spellings that the original page accepts."""
+    """Return the names that the section about this action may have; the original page accepts all of them."""
     names = (op.name.replace("-", "_"), op.name)
     return [f"system.{name}" for name in names] + list(names)
 

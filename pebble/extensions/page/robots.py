@@ -56,7 +56,7 @@ class Component:
         self.refreshed_at = float("-inf")
 
     def lists(self, metric: str) -> bool:
-        """True if this is the state of a motor owner that its capabilities list."""
+        """True if ``metric`` is the state of a motor owner, and the component's capabilities list that owner."""
         states, owners = (c.ESTOP_STATE, c.CONTROL_STATE), self.robot.estop.owners
         return metric in [state.metric.format(owner=owner) for state in states for owner in owners]
 
@@ -226,11 +226,12 @@ class Robots:
             return
         if not message.payload:
             self._remove_value(component, metric)
-        trimmed = codec.trim(message.payload)  # as pages get it as it is
+        trimmed = codec.trim(message.payload)  # pages get it unchanged, inside a JSON message
         if trimmed != message.payload:
             message = msgspec.structs.replace(message, payload=trimmed)
-        if not message.payload or self._store(component, metric, channel, message, now):
-            self._interpret(component, metric, channel, message, now)
+        if message.payload and not self._store(component, metric, channel, message, now):
+            return
+        self._interpret(component, metric, channel, message, now)
 
     def forget(self, ref: str) -> None:
         """Remove a component, if it is there. It comes back with its next message."""
@@ -247,23 +248,24 @@ class Robots:
     def refresh(self, now: float) -> None:
         """Send values that change with time. Call this every 0.25 s.
 
-        Whether a component is online is sent at once. Ages are sent for open components, and for at most a third of the
-        others, so that no page has to draw all of them at once, and a thousand robots cause no flood.
+        Whether a component is online is sent at once. Ages are sent each second for open components. The others take
+        turns, at most a third of them at once and _REFRESHES_PER_S a second, so that a thousand robots cause no flood.
         """
         due: list[Component] = []
         opened = {interest.watched for interest in self.interests}
-        every_s = max(_REFRESH_S, len(self.components) / _REFRESHES_PER_S)
+        turn_s = max(_REFRESH_S, len(self.components) / _REFRESHES_PER_S)
         for component in self.components.values():
-            age_s = now - component.refreshed_at
-            changed = component.robot.online(now) is not component.sent_online or age_s == float("inf")
-            ages = component.robot.live or component.sent_online is not None
-            if changed or (ages and age_s >= _REFRESH_S and component.ref in opened):
+            waited_s = now - component.refreshed_at
+            changed = component.robot.online(now) is not component.sent_online or waited_s == float("inf")
+            has_ages = component.robot.live or component.sent_online is not None
+            is_open = component.ref in opened
+            if changed or (has_ages and is_open and waited_s >= _REFRESH_S):
                 self._refresh(component, now)
-            elif ages and age_s >= every_s:
+            elif has_ages and waited_s >= turn_s:
                 due.append(component)
         due.sort(key=lambda component: component.refreshed_at)
-        third = 1 + min(len(self.components), _REFRESHES_PER_S) // 3
-        for component in due[:third]:
+        at_once = 1 + min(len(self.components), _REFRESHES_PER_S) // 3
+        for component in due[:at_once]:
             self._refresh(component, now)
 
     def _refresh(self, component: Component, now: float) -> None:
@@ -273,7 +275,7 @@ class Robots:
             self._mark(component.ref, c.ONLINE.metric)
 
     def _add(self, ref: str) -> Component | None:
-        """Add a component; None if there is no place. In a full table a wanted robot gets that of the newest other."""
+        """Add a component; None if the table is full. For a wanted robot the newest one that is not kept is removed."""
         if len(self.components) >= MAX_COMPONENTS:
             if not self.omitted:
                 log.warning("more than %d components at this broker: give it accounts", MAX_COMPONENTS)

@@ -60,7 +60,7 @@ async def _report_start(
     """Call ``on_ready`` with the address once the server accepts connections."""
     while not server.started:
         await asyncio.sleep(0.02)
-    listener.listen(_WAITING)  # asyncio lets as many wait as it accepts at once
+    listener.listen(_WAITING)  # asyncio has called it with _ACCEPT: its backlog means both
     if on_ready is not None:
         on_ready(url)
 

@@ -181,9 +181,9 @@ def _readable(kind: Any, entries: object) -> list[Any]:
 
 
 def _media(payload: Any) -> Any:
-    """Return the reports if all are valid.
+    """Return the programs' reports if all are valid.
 
-    Each is checked separately, as msgspec would build a dict's decoder at each call.
+    Each is checked separately, because for the type of the whole dict msgspec would build a decoder at each call.
     """
     reports = _inner(payload)
     return reports if isinstance(reports, dict) and all(_is(_Medium, report) for report in reports.values()) else {}

@@ -35,7 +35,7 @@ class _PressedStop:
 
     sender: StopSender
     ref: str  # the robot; "": all
-    user: str | None  # who has pressed it; None: several people, one after another
+    user: str | None  # who has pressed it and may end it; None: several people have, one after another, and none may
     pressed_at: float
     is_over: bool = False  # it sends nothing more. Noted, as to ask a thousand robots at each heartbeat is slow
 
@@ -80,11 +80,11 @@ class Stops:
         named, bases = [ref] if ref else None, [robot.base for robot in robots]
         sender = StopSender(name, by=by, why=why, now=now, robots=named, known=bases, own_only=True)
         older = self._by_ref.get(ref)
-        is_only_user = older is None or older.is_over or older.user == user
+        pressed_by_others = older is not None and not older.is_over and older.user != user
         if older is not None:
             self._remove(older)
         self._make_room(now)
-        stop = _PressedStop(sender, ref, user if is_only_user else None, now)
+        stop = _PressedStop(sender, ref, None if pressed_by_others else user, now)
         self._stops[name] = self._by_ref[ref] = stop
         for robot in robots:
             for message in robot.remembered.values():

@@ -134,10 +134,10 @@ class ControlClient:
         if self.held:  # free: it has ended, or the motor owner was started again
             self._asked_at = self._answered_at = self._due_at = now
         self.held, self.decided = False, ""
-        if state.asks_id:  # of this client, or of another, for whose turn this one waits
+        if state.asks_id:  # the robot answers: it asks the holder, for this client or for one before it
             self._answered_at = now
         has_another_owner = any(owner.id == self.id for owner in self.robot.states)
-        if state.id and has_another_owner:  # the other client gets the rest of the robot
+        if state.id and has_another_owner:  # leave it to the client that has the deciding owner
             self._out = [self._message(CONTROL, want="release")]
             self._due_at = max(self._due_at, now + APART * self._pace_of().control_s)
 

@@ -133,8 +133,7 @@ def words(
 def person(by: str, *, login: bool = True) -> str:
     """Return the sender ``by`` in words for people.
 
-    ``local`` is a user without a login, perhaps with a device. ``login``: this server requires logins, so that user is
-    at another one.
+    ``local``, which a device may follow, is a user of a server without logins: of this server if ``login`` is False.
     """
     if by.partition(" ")[0] != "local":
         return by

@@ -148,15 +148,19 @@ class RobotStop:
         if not self.estop.receive(message):
             return
         if self.estop.has_capabilities and not had_capabilities:
-            self.next, self._names_due = now, self.estop.named  # its topics may be others
+            self.next, self._names_due = now, self.estop.named  # send at once: they may name other topics
         for owner in self.estop.owners:
             if self._lists_it(owner):
                 self._boots[owner] = self.estop.states[owner].boot
+        self._update_progress(now)
+
+    def _update_progress(self, now: float) -> None:
+        """Note whether the robot's owners hold the stop now, and whether they would after a power cut."""
         if self.confirmed_s is None:
             if self.estop.owners and self.estop.available and not (self.unconfirmed or self.estop.zeros):
                 self.confirmed_s = now - self._began
-        elif (self._order.hold or not self._settled) and self.unconfirmed:
-            self.confirmed_s, self._settled = None, False  # it has restarted, and saved nothing
+        elif self.unconfirmed and (self._order.hold or not self._settled):
+            self.confirmed_s, self._settled = None, False  # an owner has restarted, and had not saved the stop
             if self._order.hold:
                 self._began = now
             self.next = max(now, self._sent_at + REPEAT_S)
@@ -175,14 +179,16 @@ class RobotStop:
         if now < self.next or not self.sending or (was_sent and not again):
             return []
         self._sent_at, self.next, self._names_due = now, now + REPEAT_S, False
-        messages = []
-        if not self.estop.old:
-            messages.append(_message(ESTOP, ESTOP.topic(self.estop.base), self._order.payload))
-        if (self.estop.old or self.estop.zeros) and not self._script_ended:
+        estop, messages = self.estop, []
+        if not estop.old:
+            messages.append(_message(ESTOP, ESTOP.topic(estop.base), self._order.payload))
+        cannot_latch = estop.old or bool(estop.zeros)
+        if cannot_latch and not self._script_ended:  # else the script would drive on between two zeros
             self._script_ended = True
-            messages.append(_message(AUTONOMY_COMMAND, self.estop.script_topic, _END_SCRIPT))
-        topics = dict.fromkeys((self.estop.drive_topic, *self.estop.zeros))
-        messages += [_message(DRIVE, topic, _ZERO) for topic in topics]
+            messages.append(_message(AUTONOMY_COMMAND, estop.script_topic, _END_SCRIPT))
+        # every robot gets zeros: it may have no emergency stop, or its broker may refuse it
+        drive_topics = dict.fromkeys((estop.drive_topic, *estop.zeros))
+        messages += [_message(DRIVE, topic, _ZERO) for topic in drive_topics]
         if self._order.own_only:
             return [message for message in messages if _is_incoming(message.topic, self.estop.base)]
         return messages
@@ -201,7 +207,7 @@ class RobotStop:
         return state is not None and self._order.name in state.recent
 
     def _has_taken_it(self, owner: str) -> bool:
-        """True if the owner's state has shown this stop, even if it shows a later one, and no restart since."""
+        """True if the owner has listed this stop since its last start, even if it lists only later ones by now."""
         state = self.estop.states.get(owner)
         return state is not None and self._boots.get(owner) == state.boot
 
@@ -230,8 +236,8 @@ class StopSender:
     ) -> None:
         """Prepare the stop. ``name``: of :func:`new_name`; ``robots``: base topics, None: all that publish anything.
 
-        ``known``: with all robots, those to stop even if they have published nothing. ``own_only``: use topics named by
-        capabilities only if they are the robot's own. Neither list is truncated.
+        ``known``: in a stop of all, robots that get it even if they publish nothing. ``known`` and ``robots`` may be
+        more than MAX_ROBOTS. ``own_only``: as in :class:`Order`.
         """
         if not is_name(name):
             raise ValueError(f"{name!r} is not 16 hex digits")

@@ -50,8 +50,8 @@ def pace_of(link: LinkState | None) -> Pace:
     if link is None or link.level == "wide":
         return WIDE
     level = LEVELS[link.level]
-    # at least _LEAST_VALID commands while one is valid, at most as many as on a wide link
-    hz = min(max(link.drive_hz, 1000 * _LEAST_VALID / level.valid_ms), LEVELS["wide"].drive_hz)
+    least_hz = 1000 * _LEAST_VALID / level.valid_ms  # at a lower rate the robot may halt between two commands
+    hz = min(max(link.drive_hz, least_hz), LEVELS["wide"].drive_hz)
     step_s = 1 / hz - _EARLY_S
     # after a long queue a command would come too late: send few until the queue is gone
     if link.drive_hz < level.drive_hz and link.queue_ms > _USELESS_MS:

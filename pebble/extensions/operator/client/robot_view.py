@@ -187,14 +187,14 @@ class RobotView:
                 self.parked = self.parked and codec.decode(c.DRIVE, message.payload).moves
 
     def _keep_for_late_stop(self, message: Message) -> None:
-        """Keep the message for a stop that begins later.
+        """Keep the topic's newest message, as an emergency stop that begins later starts with all of them.
 
-        States of unlisted owners never displace capabilities.
+        Capabilities have a place even after MAX_REMEMBERED states of owners.
         """
-        topics = (*self.remembered, c.CAPABILITIES.topic(self.base))
+        has_place = message.topic in self.remembered or message.topic == c.CAPABILITIES.topic(self.base)
         if not message.payload:
             self.remembered.pop(message.topic, None)
-        elif len(self.remembered) < MAX_REMEMBERED or message.topic in topics:
+        elif has_place or len(self.remembered) < MAX_REMEMBERED:
             self.remembered[message.topic] = message
 
     # -- what is assumed

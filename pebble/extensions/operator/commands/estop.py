@@ -149,7 +149,8 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
                         "" if transport.state is State.CONNECTED else transport.problem or "no connection"
                     )
                     report.update(time.monotonic())
-                subscribing.join(_ANSWER_S)  # a status tells whether the motors obey, and may come after it
+                # by the robot's status the report says whether the motors obey: it may come after the confirmation
+                subscribing.join(_ANSWER_S)
                 wait_for(lambda: second.state is State.CONNECTED, _ANSWER_S)
                 _receive(listener, sender, _ON_ITS_WAY_S)
         except KeyboardInterrupt:

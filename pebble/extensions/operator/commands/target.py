@@ -34,8 +34,8 @@ _CREDENTIALS = (_option("password_file", PasswordFile), _option("ca_cert", CaCer
 def with_target(*, program: str = "tool", robot: bool = False) -> Callable[[Callable[..., int]], Callable[..., int]]:
     """Decorate a command with the options that select where to connect; it gets them as ``target``.
 
-    They replace this parameter; the password and the certificate authority come last. ``robot``: add an option --robot,
-    for a command without an argument that is a robot.
+    In the help they stand in the place of ``target``, but for those of password and certificate, which come last.
+    ``program``: part of the client id. ``robot``: add --robot, for a command that has no argument for the robot.
     """
     options = (*_CONNECTION, *(_ROBOT if robot else ()), *_REMOTE)
 

@@ -26,7 +26,7 @@ def schemas() -> dict[str, Any]:
     json_channels = [channel for channel in CHANNELS if channel.payload is not bytes]
     structs = list(dict.fromkeys(channel.payload for channel in json_channels if channel.payload is not bool))
     (offers, *roots), definitions = msgspec.json.schema_components([CapabilitiesValue, *structs], ref_template=_REF)
-    definitions[Capabilities.__name__]["properties"]["value"] = offers
+    definitions[Capabilities.__name__]["properties"]["value"] = offers  # the struct itself has any object there
     for struct in (Drive, LightsSolid, LightsFlash):
         for field in definitions[struct.__name__]["properties"].values():
             if field["type"] == "number":

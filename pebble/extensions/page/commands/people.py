@@ -51,7 +51,7 @@ def audit(
     config: _ConfigOption = None,
     people: PeopleOption = None,
 ) -> int:
-    """Print who did what to which robot, the newest last. A row with a number stands for so many more of its minute.
+    """Print who did what to which robot, the newest last. A row with × 9 stands for nine more like it in one minute.
 
     \b
         pebble web audit --limit 200

@@ -240,7 +240,7 @@ class DrivenRobot:
         commands: list[Command] = []
         for tab, wish in list(self._wishes.items()):
             commands += self._follow_wish(tab, wish, now)
-        if self.client is None and self.keeps:  # this server has given control, and now only the robot may
+        if self.client is None and self.keeps:  # it decides now itself: control that this server has given is void
             commands += self._on(Event.LOST, now)
         self._changed.add(self.ref)
         return commands

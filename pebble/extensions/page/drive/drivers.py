@@ -123,9 +123,9 @@ class Drivers:
         return bool(commands) and commands[0].drive.moves, ""
 
     def accompany(self, tab: Tab, ref: str, channel: Channel, message: Message) -> bool:
-        """Keep lights for the next drive command, if this page's gesture moves the robot; else return False: send them.
+        """Keep lights for the next drive command, if this page's gesture moves the robot; return False if not.
 
-        Lights and command share a message, so the robot must list both as members of a group.
+        The caller then sends them. Both go in one message, a group: the robot must list their metrics as ``groups``.
         """
         groups = self._robots.capabilities(ref).get("groups")
         takes_group = isinstance(groups, list) and DRIVE.metric in groups and channel.metric in groups

@@ -38,7 +38,7 @@ class Refusals:
         return why
 
     def nameless(self, robot: RobotView) -> str:
-        """Return why a component that takes only commands with a name takes none of this server; empty if it does."""
+        """Return the problem with this server's account, if the robot requires one in topics; empty if none."""
         return why_not(robot.name, self._broker.names.account) if robot.named else ""
 
     def of_op(self, op: m.RobotOp) -> str:

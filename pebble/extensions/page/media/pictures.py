@@ -44,10 +44,10 @@ class MediaHub(Streams[PictureStream]):
         )
 
     async def snapshot(self, ref: str) -> tuple[bytes, float] | None:
-        """Return a JPEG of the newest key frame, or the last one of a camera that is off, with its time (monotonic).
+        """Return the camera's newest key frame as JPEG, however old, with its time (monotonic); None without one.
 
-        It starts no camera, and never waits: from a camera that is on for others, it fetches a picture for the next
-        call.
+        It starts no camera, and never waits: if the camera is on and the key frame is old, a new one is fetched for the
+        next call.
         """
         reports = self._robots.value(ref, MEDIA_STATUS.metric)
         is_on = reports is not None and msgspec.json.decode(reports).get("camera_publisher", {}).get("running", False)

@@ -217,11 +217,13 @@ class PlayedRobot:
 
     def _flush(self, now: float) -> None:
         """Send changed values and log lines, and a few times a second the position."""
-        if now - self._flushed_at < _FLUSH_S or self.player.restores:
+        if now - self._flushed_at < _FLUSH_S or self.player.restores:  # the state after a seek goes into one message
             return
         self._flushed_at = now
-        position_ms, rests = self.player.position_ns / 1e6, self.player.paused and not self._is_new
-        if rests != self._rested or (not rests and now - self._played_at >= _PLAYED_S):
+        position_ms = self.player.position_ns / 1e6
+        rests = self.player.paused and not self._is_new  # after a seek even a paused player has something to show
+        is_position_due = not rests and now - self._played_at >= _PLAYED_S
+        if is_position_due or rests != self._rested:
             self._rested = rests
             self._show()
         if not rests and now - self._liveness_at >= _LIVENESS_S and self._robot.live:
@@ -253,14 +255,14 @@ class PlayedRobot:
         self._values[metric] = msgspec.Raw(payload), received * 1e3
 
     def _take_medium(self, message: Recorded) -> None:
-        """Send sound that is played at its speed, and every picture; those that are not shown only for the decoder."""
+        """Send sound if it is played at normal speed, and each picture: to be shown, or only decoded for later ones."""
         payload, at_ms, now = message.payload, message.log_ns / 1e6, time.monotonic()
         if not is_picture(payload):
             if self.player.speed == 1 and not self.player.paused:
                 self._link.write_medium(SOUND, at_ms, payload)
             return
-        if self._picture is not None and message.log_ns <= self._picture.log_ns:  # one of those that lead to it
-            is_shown = message is self._picture
+        if self._picture is not None and message.log_ns <= self._picture.log_ns:
+            is_shown = message is self._picture  # after a seek only the picture at that time is shown
         else:
             is_shown = now - self._pictured_at >= _PICTURE_S
         if is_shown:

@@ -100,7 +100,7 @@ class ViewerQueue:
             self._late_at = now
 
     def forget_lateness(self, now: float) -> None:
-        """Forget that frames were late, because later frames come in another way."""
+        """Forget that frames were late, because the page gets frames of the other stream from now on."""
         self.late_acks, self._late_at = 0, now
 
     def wait_for_keyframe(self) -> None:

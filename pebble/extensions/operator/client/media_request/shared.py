@@ -105,21 +105,23 @@ class SharedRequest:
             send(self._broker.transport, self._request.keyframe(encoding, time.monotonic()))
 
     async def _follow(self, capabilities: dict[str, Any], encoding: str | None) -> None:
+        """Request the medium in this encoding, or repeat the request; withdraw it if that fails."""
         topics = [named_topic(self.ref, capabilities, channel) for channel in CHANNELS[self.medium]]
         request = self._request
         try:
             if request is None or topics != self._topics:
                 await self._withdraw()
-                request, self._topics = ViewerRequest(self.ref, self.medium, capabilities, shares=True), topics
-                self._request = request
+                request = self._request = ViewerRequest(self.ref, self.medium, capabilities, shares=True)
+                self._topics = topics
                 for topic in (request.control_topic, request.flag_topic, request.media_topic):
                     self._subscriptions.append(await self._broker.subscribe(topic, self._take))
             request.section = capabilities[self.medium]
-            if encoding != self.encoding or self.requested_at == float("-inf"):
+            is_first = self.requested_at == float("-inf")
+            if is_first or encoding != self.encoding:
                 self.encoding, self.requested_at = encoding, time.monotonic()
                 request.want(encoding, self.requested_at)
             send(self._broker.transport, request.tick(time.monotonic()))
-            while not request.settled:
+            while not request.settled:  # it first waits for payloads that come without a request
                 await asyncio.sleep(_STEP_S)
                 send(self._broker.transport, request.tick(time.monotonic()))
         except PebbleError:
@@ -147,7 +149,7 @@ class SharedRequest:
         return idle and (self._broker.connected or self._request is None)
 
     async def _pause(self, began: float) -> None:
-        """Pause until the next step; after a wake, only until 0.1 s after the last one."""
+        """Pause until 0.5 s after the last step ``began``; if a wake comes, only until 0.1 s after that."""
         await asyncio.sleep(max(0.0, began + TICK_S / 5 - time.monotonic()))
         with contextlib.suppress(TimeoutError):  # wait_for of Python 3.11 loses a cancellation that meets a wakeup
             async with asyncio.timeout(max(0.001, began + TICK_S - time.monotonic())):
