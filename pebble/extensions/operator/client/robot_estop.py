@@ -76,7 +76,10 @@ class RobotEstop:
 
     @property
     def missing_control(self) -> list[str]:
-        """Return the topics of missing control states of the listed owners, if the robot publishes control."""
+        """Return the topics of the control states that are missing, if the robot publishes control.
+
+        The owners are those whose stop state is missing: a broker that keeps back one of the two keeps back both.
+        """
         owners = [owner for owner in self.owners if owner not in self._states] if self.keeps_control else []
         return [CONTROL_STATE.topic(self.base, owner=owner) for owner in owners]
 
