@@ -69,10 +69,10 @@ def _allowed(field: FieldInfo) -> str:
         return " A list."
     if get_origin(kind) is dict:
         return " An object."
-    has_limits = any(set(meta.extra or ()) - {"parse"} for meta in metas)
+    has_limits = any(set(meta.extra or ()) - {"parse"} for meta in metas)  # "parse" is a function, no words
     if kind in (bool, str) and not has_limits:
         return ""
-    text = expected(kind, metas).partition(":")[0]  # the rules of topics are in the text above
+    text = expected(kind, metas).partition(":")[0]  # of "a topic: 1 to 250 …" the first two words
     return f" {text[:1].upper()}{text[1:]}."
 
 

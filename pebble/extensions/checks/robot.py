@@ -146,7 +146,8 @@ def brokers(config: Config) -> Iterator[CheckResult]:
         if (mqtt := sections.get(section)) is None:
             continue
         is_remote = section == "remote_mqtt"
-        answer_s = LEVELS[link.slowest if is_remote else "wide"].answer_s
+        level_of_link = link.slowest if is_remote else "wide"  # only operators may be behind a slow link
+        answer_s = LEVELS[level_of_link].answer_s
         settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="doctor")
         results = list(broker(name, settings, level, max(TIMEOUT_S, answer_s)))
         yield from results

@@ -80,7 +80,7 @@ def passwords_text(passwords: Mapping[str, Hashed]) -> str:
 
 
 def passwords_in(text: str) -> dict[str, Hashed]:
-    """Return the hashed passwords in such a text, by account. Raises ValueError for any other line."""
+    """Return the hashed passwords in the text of a file `passwords`, by account. Raises ValueError for other lines."""
     passwords = {}
     for line in filter(None, map(str.strip, text.splitlines())):
         name, _, rest = line.partition(":")

@@ -99,7 +99,7 @@ def _moved(message: Message, topic: str, payload: bytes) -> Message:
 
 
 def _doubted(payload: bytes) -> bytes:
-    """Return a stop without an account with its claimed sender marked; unchanged if it cannot be read."""
+    """Mark the claimed sender of a stop as unchecked; return the payload unchanged if none can be read in it."""
     fields = _object(payload)
     body = {} if fields is None else _body(fields)
     claim = body.get("by")

@@ -167,7 +167,7 @@ def right_of(channel: Channel) -> str:
 
 def conflict(roles: Sequence[str]) -> str:
     """Return why these roles cannot be combined in one account; empty if they can."""
-    for role in roles or ("",):
+    for role in roles or ("",):  # an account without roles is refused as one with the role ""
         if role not in _RIGHTS:
             return f"{role!r} is no role: use {', '.join(ROLES)}"
     if len(set(roles)) == 1 or set(roles) == _BOTH:

@@ -10,8 +10,8 @@ from pebble.errors import PebbleError
 
 log = logging.getLogger(__name__)
 
-WINDOW_S = 60.0  # rows that are alike within it are one, and a second one with the number of the others
-DIFFERENT, OF_STRANGERS = 300, 100  # rows within it that differ; what is beyond is counted by its kind
+WINDOW_S = 60.0  # of similar rows within it two are stored: the first, and the newest with the number of copies
+DIFFERENT, OF_STRANGERS = 300, 100  # different rows within it; those beyond are counted by their kind
 WAITING = 1000  # rows that are not stored yet
 _ROUND_S = 10.0  # between two looks at what was counted, and two tries at a disk that takes nothing
 _END_S = 3.0  # longest wait for the last rows
@@ -68,7 +68,7 @@ class RowWriter:
         self._wake.set()
 
     def _end_window(self, now: float) -> None:
-        """For each row that was counted, queue its newest copy with the number of copies; begin a new window."""
+        """Begin a new window; queue, for each row with copies that were only counted, the newest and their number."""
         for row, count in self._counts.values():
             if count:
                 self._put({**row, "count": count})

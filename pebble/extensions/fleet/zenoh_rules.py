@@ -40,14 +40,15 @@ def zenoh_text(fleet: Fleet) -> bytes:
 def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
     """Return an account's filters for wills and retained messages.
 
-    A robot may retain what it publishes, and leave its will there. Others may retain flags without an account's name.
+    A robot may retain all that it may publish, and leave a will on its outgoing topics. Others may retain flags
+    without an account's name.
     """
     writes = [rule.filter for rule in held if rule.access == "write"]
     is_robot = ProgramRole.ROBOT in account.roles
     wills = [f"{base}/{OUTGOING}/#" for base in account.bases if is_robot]
-    whole = [filter_ for filter_ in writes if is_robot and filter_.endswith("/#")]
+    all_topics = [filter_ for filter_ in writes if is_robot and filter_.endswith("/#")]
     flags = [filter_ for filter_ in writes if filter_.endswith(_FLAGS)]
-    return HubAccount(tuple(wills), tuple(dict.fromkeys((*wills, *whole, *flags))))
+    return HubAccount(tuple(wills), tuple(dict.fromkeys((*wills, *all_topics, *flags))))
 
 
 def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: bool) -> Iterator[Grant]:

@@ -60,7 +60,7 @@ class Resampler:
         fed = np.concatenate((self._tail, samples.astype(np.float32)))
         windows = len(fed) - self._taps + 1
         count = max(0, ceil((windows * self._up - self._at) / self._down))
-        # Of each output sample: whole input samples choose the window, the fraction of one chooses the filter's phase.
+        # In units of 1/_up input sample: the whole input samples choose the window, the rest the phase of the filter.
         positions = self._at + self._down * np.arange(count, dtype=np.int64)
         phases = positions % self._up * len(self._filter) // self._up
         views = np.lib.stride_tricks.sliding_window_view(fed, self._taps, axis=0)[positions // self._up]

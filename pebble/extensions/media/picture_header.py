@@ -57,7 +57,7 @@ def follows(last: PictureHeader | None, header: PictureHeader) -> bool:
     if last is None or last.encoding != header.encoding or header.frame != _after(last):
         return False
     if last.captured_ms is None or header.captured_ms is None:
-        return last.captured_ms == header.captured_ms
+        return last.captured_ms == header.captured_ms  # a sender stamps all its pictures or none
     return 0 <= header.captured_ms - last.captured_ms <= _LONGEST_STEP_MS
 
 

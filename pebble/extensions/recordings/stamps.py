@@ -100,7 +100,7 @@ def _unit(stamp: float) -> int:
 
 
 def _can_move(ns: int, by_ns: int) -> bool:
-    """True if a stamp counts from 1970, and is still one after it was moved."""
+    """True if a stamp counts from 1970, and moving it does not leave the range of a clock."""
     return ns >= CLOCK_FROM_NS and 0 < ns + by_ns <= _LATEST_NS
 
 
@@ -114,6 +114,6 @@ def _shifted_json(payload: bytes, by_ns: int) -> bytes:
         stamp = plain.get(name)
         if not isinstance(stamp, int | float) or isinstance(stamp, bool) or not _can_move(_in_ns(stamp), by_ns):
             continue
-        unit = _unit(stamp)  # a whole number stays one
+        unit = _unit(stamp)  # an int stays an int
         moved[name] = stamp + (by_ns / unit if isinstance(stamp, float) else by_ns // unit)
     return msgspec.json.encode(plain | moved) if moved else payload

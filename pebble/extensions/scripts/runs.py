@@ -155,7 +155,8 @@ def _from_clock(wall_clock: Callable[[], float]) -> int:
 def _above(barred: int, *used: int) -> int:
     """Return the number after the newest of ``barred`` and ``used``.
 
-    Numbers so far ahead of ``barred`` that their successor would count as older than it are left out.
+    The numbers go round: one that is half of them ahead of ``barred`` counts as older, so a used number is left out if
+    the next one would.
     """
     base = barred or newest(used)
     steps_ahead = [(run - base) & LAST_RUN for run in used if run and newer(following(run), base)]

@@ -57,12 +57,13 @@ def attempt(settings: MqttSettings, *, login: bool, timeout_s: float = TIMEOUT_S
     except OSError as error:
         return LoginAttempt(problem=error.strerror or str(error))
     answered = LoginAttempt()
-    failures: dict[str, str] = {}  # by address
+    failures: dict[str, str] = {}  # by address and ":", as `described` prints them
     for address in addresses:
         began = time.monotonic()
         try:
             trial = BrokerTrial(settings, address, "", patience_s=timeout_s)
-            expires = _expiry(trial.peer().sock)
+            connected = trial.peer()
+            expires = _expiry(connected.sock)
         except TransportError as error:
             code = getattr(error, "code", None)
             if code is None:
@@ -73,7 +74,9 @@ def attempt(settings: MqttSettings, *, login: bool, timeout_s: float = TIMEOUT_S
         answered = LoginAttempt(code=0, took_ms=1000 * (time.monotonic() - began), expires=expires, address=address)
         trial.close()
         break
-    return replace(answered, problem=described(failures) if len(addresses) > 1 else "".join(failures.values()))
+    if len(addresses) > 1:
+        return replace(answered, problem=described(failures))
+    return replace(answered, problem="".join(failures.values()))
 
 
 def _expiry(sock: object) -> float | None:

@@ -135,8 +135,8 @@ class Peer(packets.Listener):
         """Read what has arrived, and write what is waiting."""
         client = self._client
         try:
-            while len(self.received) < _MOST and client.receive():
-                while client.read(_AT_ONCE) and self._bytes < _MOST_BYTES:
+            while len(self.received) < _MOST and client.receive():  # takes bytes out of the socket
+                while client.read(_AT_ONCE) and self._bytes < _MOST_BYTES:  # handles the packets in them
                     pass
                 if self._bytes >= _MOST_BYTES:
                     self.problem = f"it sends without end: more than {_MOST_BYTES:,} bytes"

@@ -232,7 +232,7 @@ def _lines(config: Config, service: str) -> list[TopicLine]:
 
 
 def _is_of(channel: Channel, service: str) -> bool:
-    """True if the channel belongs to the service, whose name begins the config path that renames the channel."""
+    """True if the service publishes or receives the channel: its section of the config has the key that renames it."""
     path = channel.override or ""
     if service in _MEDIA:
         return path == f"services.mqtt_bridge.media.{_MEDIA[service]}.topic"

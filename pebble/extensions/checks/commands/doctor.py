@@ -54,7 +54,7 @@ def doctor(
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
 ) -> int:
-    """Check that this machine is ready for the robot, or with --broker what robots have of a broker.
+    """Check that this machine is ready for the robot, or with --broker that a broker is fit for robots.
 
     Each problem is printed with the command that fixes it. Exits 1 if a check fails, but not for warnings.
 

@@ -336,7 +336,7 @@ def _unreadable(robot: Observer, _name: str) -> CheckResult:
     if not robot.answers(lambda: all(count > before.get(owner, 0) for owner, count in _counts(robot).items())):
         fix = "whatever arrives on incoming/estop is a stop, if not empty"
         return failed("a stop that is no JSON does nothing", fix)
-    robot.look(robot.patience_s)  # at named it is sent with a name and without, and counts twice
+    robot.look(robot.patience_s)  # at level named it was sent with a name and without: wait for both
     return ok("what cannot be read stops, too")
 
 

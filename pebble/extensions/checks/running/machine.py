@@ -90,7 +90,7 @@ def clock(_robot: RobotUnderTest) -> CheckResult:
 
 
 def disk(robot: RobotUnderTest) -> CheckResult:
-    """Check that the disk has room for stops, people and the audit."""
+    """Check that the disk has room for what the state directory holds: stops, the people's accounts, the audit."""
     folder = Path(os.path.normpath(robot.config.state_dir()))  # a config may name it by ../..
     existing = next(place for place in (folder, *folder.parents) if place.exists())
     room = os.statvfs(existing)

@@ -114,7 +114,7 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
     reset of another kind follows, which must be answered: this shows that the silence before was no accident.
     """
     operators = robot.commanding_side
-    if robot.own_side.heartbeats:
+    if robot.own_side.heartbeats:  # which the bridge sends to the operators' broker only
         return skipped("one broker serves both sides: there, what is published to be retained is live at first")
     owner, state = next(iter(robot.view.estop.states.items()), (None, None))
     if owner is None or state is None:
@@ -128,18 +128,18 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
         states = [record for record in operators.of(ESTOP_STATE, began) if record.metric == metric]
         return {record.value.reset_refused for record in states if record.value is not None}
 
-    def leave(payload: bytes) -> None:
+    def publish_retained(payload: bytes) -> None:
         beside.publish(topic, payload, qos=QoS.DELIVERED, retain=True, remember=False)
         robot.wait(lambda: beside.outgoing.waiting == 0, robot.patience_s)
 
     # This connection puts no account into the topic, as nothing is retained on a topic with one.
     with operators.beside("selftest") as (beside, _):
         try:
-            leave(codec.encode(ESTOP_RESET, EstopReset(boot=_NO_BOOT, count=0, by=_WHY)))
+            publish_retained(codec.encode(ESTOP_RESET, EstopReset(boot=_NO_BOOT, count=0, by=_WHY)))
             operators.send(ESTOP_RESET, EstopReset(boot=state.boot, count=state.count + _NO_COUNT, by=_WHY))
             robot.wait(lambda: "count" in refusals(), robot.patience_s)
         finally:
-            leave(b"")
+            publish_retained(b"")  # removes it
     if "boot" in refusals():
         return failed("it read a retained command as if it were sent now", "pebble doctor CONFIG")
     if "count" not in refusals():

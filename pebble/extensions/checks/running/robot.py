@@ -146,7 +146,10 @@ def become_user_of(folder: Path) -> None:
 def reached(
     config: Config, places: Places, by: str, *, patience_s: float = PATIENCE_S, rests_s: float = RESTS_S
 ) -> Iterator[RobotUnderTest]:
-    """Yield a robot, connected on each side that can be reached; disconnect at the end of the block."""
+    """Yield a robot, connected on each side that can be reached; disconnect at the end of the block.
+
+    The arguments are fields of :class:`RobotUnderTest`.
+    """
     robot = RobotUnderTest(config=config, places=places, by=by, patience_s=patience_s, rests_s=rests_s)
     with ExitStack() as stack:
 

@@ -23,7 +23,7 @@ def audit(
 ) -> int:
     """Print who did what to a robot, on its own computer, the newest last. Names with ? are claims.
 
-    A row with a number stands for so many more of its minute. The log is a file of JSON lines, for jq and grep.
+    A row with × 12 stands for 12 more such rows within a minute. The log is a file of JSON lines, for jq and grep.
 
     \b
         pebble fleet audit goob.json

@@ -14,7 +14,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.fleet import applying, certificates, check, folder, pieces, plugin
 from pebble.extensions.fleet.broker_files import new_password
 from pebble.extensions.fleet.commands import lan
-from pebble.extensions.fleet.commands.lan import LATE
+from pebble.extensions.fleet.commands.lan import LAZY_MODULES
 from pebble.extensions.fleet.folder import CONF, ZENOH, Fleet, FleetError, Server
 from pebble.extensions.fleet.people import People, has_user
 from pebble.extensions.fleet.roles import Account, ProgramRole, Role
@@ -89,7 +89,7 @@ def init(
     first, *others = (host_of("--host", text) for text in split_names(host))
     server = Server(host=first, port=port, unencrypted=unencrypted)
     fleet = Fleet(level=_LEVELS[level or "login"], brokers=(server,), plain=bool(plain))
-    with as_owner(place, *LATE, make=True):
+    with as_owner(place, *LAZY_MODULES, make=True):
         applying.make(place, fleet, others=others)
     typer.echo(f"{_shown(place)} has all files of a broker at {server.host}:{server.port}, level {fleet.level}.")
     typer.echo(f"Start it:\n    mosquitto -c {_shown(place / CONF)}")
@@ -331,10 +331,10 @@ def _init_again(place: Path, host: str | None, level: str | None, plain: bool | 
 def _changing(folder_: Path | None, *, any_rules: bool = False) -> Iterator[tuple[Path, Fleet]]:
     """Yield a fleet and its folder, locked for a change. Raises PebbleError.
 
-    ``any_rules``: also a fleet that still uses mosquitto's plugin.
+    ``any_rules``: also a fleet whose rules mosquitto still takes from its plugin, not from files.
     """
     place = _place(folder_)
-    with as_owner(place, *LATE), folder.locked(place):
+    with as_owner(place, *LAZY_MODULES), folder.locked(place):
         fleet = folder.load(place)
         if fleet.rules == "plugin" and not any_rules:
             shown = _shown(place)

@@ -28,8 +28,8 @@ from pebble.runtime.whole_file import write
 
 HUB_FILE, GATEWAY_FILE, ROBOTS = "hub.json", "gateway.json", "robots"
 _LOCK = ".up"
-#: What commands import when they need it.
-LATE = ("pebble.extensions.fleet.authority", "pebble.extensions.fleet.zenoh_rules")
+#: Modules that commands import only when needed; `as_owner` imports them first, as the owner may not read them.
+LAZY_MODULES = ("pebble.extensions.fleet.authority", "pebble.extensions.fleet.zenoh_rules")
 GATEWAY = "lan-gateway"  # the account of the boards' gateway
 _SHARED = ("online",)  # what all receive of each other until their configs say more
 _LOOK_S, _END_S = 0.5, 5.0
@@ -65,7 +65,7 @@ def lan(
     server = Server(host=host_of("--host", host), port=port)
     fleet = _accounts(Fleet(level="login", brokers=(server,), hubs="here"), robots, boards)
     passwords = {name: new_password() for name in fleet.accounts}
-    with as_owner(place, *LATE, make=True):
+    with as_owner(place, *LAZY_MODULES, make=True):
         applying.make(place, fleet, passwords)
         applying.write_zenoh(place, folder.load(place))
         for name in (*robots, *boards):
@@ -87,7 +87,7 @@ def lan(
 
 
 def up(folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the fleet.", show_default=False)]) -> int:
-    """Run on this machine what the folder of a LAN is for, until Ctrl-C: its hub, broker and gateway.
+    """Run the hub of a LAN on this machine, until Ctrl-C; with boards, also the broker and the gateway.
 
     Where they shall run after a restart of the machine, use the units in configs/systemd.
 

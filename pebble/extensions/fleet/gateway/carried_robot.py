@@ -41,7 +41,7 @@ class NamedSubjects(Subjects):
         if not topic.startswith(f"{self._base}/{INCOMING}/{BY}/"):
             return super()._find(topic)
         named = without_name(topic)
-        plain = named.topic if named is not None else stop_topic(topic)
+        plain = named.topic if named is not None else stop_topic(topic)  # a stop passes with an invalid name, too
         subject = None if plain is None else super()._find(plain)
         if subject is None or subject.kind is not Kind.FLAG:
             return subject

@@ -192,7 +192,7 @@ class Gateway:
             for base in waiting[:TOGETHER]
         ]
         for transport in (hub, broker):
-            transport.policy.is_stop = is_stop  # of all robots, not of the newest one
+            transport.policy.is_stop = is_stop  # instead of the newest forwarder's, which knows its own robot
         self._has_begun = True
         self._carried |= {robot.base: robot for robot in robots}
         with self._beginning:
@@ -222,8 +222,9 @@ class Gateway:
         if not payload or address is None or address.identity.is_server:
             return
         base = address.identity.base
-        if message.retain and not (self._hub.as_published and self._differs(base, payload)):
-            return  # it may be an old one
+        may_be_old = message.retain  # with ``as_published`` live heartbeats are marked so, too
+        if may_be_old and not (self._hub.as_published and self._differs(base, payload)):
+            return
         if base in self._heard or len(self._heard) < MAX_ROBOTS:
             self._heard[base] = self._clock()
         else:

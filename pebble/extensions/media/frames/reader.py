@@ -34,12 +34,12 @@ MAPPED_LIMIT = 256 << 20
 class FrameReader:
     """A reader of one stream. It may open before the writer, and continues with every new writer.
 
-    ``views``: frames are views of the writer's memory instead of copies. ``sharing``: False for sound, which comes as
-    bytes anyway, because readiness for shared memory takes Zenoh 8 MB (1.10.2). ``depth``: the most frames that wait,
-    for sound; it must be below the writer's number of slots. One thread reads; any may close.
+    ``views``: frames are views of the writer's memory instead of copies. ``sharing``: frames may come
+    through shared memory; False for sound, which comes as bytes anyway, saves 8 MB in Zenoh (1.10.2). ``depth``: the
+    most frames that wait, for sound; it must be below the writer's number of slots. One thread reads; any may close.
 
     Counters: received; missed (gaps in the numbers: lost, or overtaken by a newer one); skipped (replaced by a newer
-    one before it was read); of those that were read shared (through shared memory), copied (as bytes) and torn
+    one before it was read); of the frames that were read: shared (through shared memory), copied (as bytes), torn
     (overwritten while they were copied); refused (not frames); writers (how many were seen; a restarted one counts
     again); reopened (stopped using shared memory).
     """

@@ -88,7 +88,8 @@ class FrameWriter:
             log.warning("%s", self.problem)
             if not self._has_room():
                 self._retry_at = time.monotonic() + RETRY_S
-        small = self._declare_publisher(session, _DROP)
+        small = self._declare_publisher(session, _DROP)  # for sound, and for references to shared memory
+        # For pictures that are sent as bytes; a writer of sound has none.
         pictures = self._declare_publisher(session, _BLOCK_FIRST) if self._pool_size else small
         self._publishers = small, pictures
         follow = zenoh.handlers.Callback(self._on_reader, indirect=False)

@@ -72,9 +72,9 @@ def record(
     for filter_ in chosen:
         check_filter(filter_)
     recorder = Recorder(into, options, {"filters": " ".join(chosen)})
-    with as_owner(into), suppress(OSError):  # which the recorder meets as well
+    with as_owner(into), suppress(OSError):  # the recorder reports it
         into.mkdir(mode=0o750, parents=True, exist_ok=True)
-    with as_owner(into):  # another user may have been faster
+    with as_owner(into):  # now that the folder exists: another user may have made it
         _run(recorder, Source(recorder, kind, transport, chosen), where, length)
     _print_end(recorder, into)
     return 0

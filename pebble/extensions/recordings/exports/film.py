@@ -45,8 +45,8 @@ def write_film(
 ) -> FilmResult:
     """Write the pictures and the sound of ``robot`` (its base) to ``target``, which ends in .mkv or .mp4.
 
-    The messages are read twice: for the sound, then for the pictures, which take long; ``on_time`` is called with the
-    log time of each, in the first round with 0. If several topics carry
+    The messages are read twice: for the sound, then for the pictures, which take longer. ``on_time`` is called for each
+    with its log time, or for the sound with 0, so that only the pictures count as progress. If several topics carry
     pictures, or sound, the first one counts. The film has the size of its first picture. Raises RecordingError if there
     are no pictures or ``target`` cannot be written; PebbleError without PyAV.
     """

@@ -159,13 +159,13 @@ class RecordingFile:
         expected = 0 if len(chunks) == len(self.chunks) else None  # number of the next message; None: not known
         for chunk in chunks:
             messages, numbers = self._unpacked(chunk, chooses)
-            if numbers is not None and self.statistics is None:
+            if numbers is not None:
                 first, last = numbers
-                if expected is not None:
+                if expected is not None and self.statistics is None:  # without a summary only this gap shows the loss
                     self.damage.missing += max(0, first - expected)
                 expected = last + 1
             elif expected is not None:
-                expected += chunk.messages  # they are counted as damaged
+                expected += chunk.messages  # of a damaged chunk, which is counted already
             yield from messages
 
     def messages(self, chunk: Chunk) -> list[Recorded]:
@@ -292,7 +292,9 @@ class RecordingFile:
 
     def _message_records(self, chunk: Chunk) -> Iterator[tuple[bytes, int, int]]:
         """Yield the data of a chunk with the begin and end of each message; note its channels. Raises DamageError."""
-        data = unpack_chunk(self._read(chunk.at, chunk.length if chunk.length < LARGEST_RECORD else 0))
+        if chunk.length >= LARGEST_RECORD:
+            raise DamageError("a chunk is damaged")
+        data = unpack_chunk(self._read(chunk.at, chunk.length))
         for op, begin, end in records(data):
             if op == Op.MESSAGE:
                 yield data, begin, end

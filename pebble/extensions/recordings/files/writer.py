@@ -103,7 +103,8 @@ class _Output(BufferedIOBase):
     """The file as the package ``mcap`` writes to it: each of its calls is written completely."""
 
     def __init__(self, writer: RecordingWriter, file: File) -> None:
-        self.size = self.messages = 0
+        self.size = 0
+        self.messages = 0  # that are in the file
         self._writer, self._file = writer, file
 
     def write(self, data: bytes) -> int:  # type: ignore[override]
@@ -112,7 +113,7 @@ class _Output(BufferedIOBase):
             taken = self._file.write(unwritten)  # None: nothing
             unwritten = unwritten[taken or 0 :]
         self.size += len(data)
-        if data[:1] == _CHUNK:  # the package writes a chunk in one call, and holds back no message
+        if data[:1] == _CHUNK:  # written in one call, with all messages that were added before
             self.messages = self._writer.messages
         return len(data)
 

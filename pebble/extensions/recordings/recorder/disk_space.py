@@ -40,7 +40,7 @@ def surplus(entries: Iterable[Entry], options: Options, disk: Disk) -> list[Entr
 def outdated(entries: Iterable[Entry], options: Options, now: float) -> Entry | None:
     """Return a file of pictures and sound that is too old, or None.
 
-    Only one at a time, because the clock may have been set wrong.
+    Only one, and the caller asks once a minute: a clock that is set wrong for a while costs few files.
     """
     if not options.keep_media_days:
         return None

@@ -120,7 +120,7 @@ class Reading:
 
 
 class Player:
-    """A player that plays to the end. Inside its calls of ``wait`` it may be paused, moved and stopped."""
+    """A player that plays to the end. The function ``wait``, which it calls often, may pause, move and stop it."""
 
     def __init__(
         self,
@@ -186,14 +186,15 @@ class Player:
     def run(self) -> None:
         """Play to the end or until :meth:`stop`; then stop everything that moves, also after an error."""
         try:
-            self._open(self._since_ns, self._since_ns if self._stays else 0)
+            position_ns = self._since_ns if self._stays else 0  # 0: at the first message
+            self._open(self._since_ns, position_ns)
             if self._reading.next is not None and not self._stays:
                 self._begins_ns = self._reading.next.log_ns
             while not self.ended:
                 self._step()
         finally:
             self._output.halt()
-            if self._output.moves:
+            if self._output.moves:  # a zero could not be published
                 for _ in range(_TRIES):
                     self._wait(_RETRY_S)
                     self._output.halt()

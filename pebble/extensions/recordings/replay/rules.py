@@ -201,11 +201,11 @@ def _rebased(plain: Any, old: str, new: str) -> Any:
     return new + plain.removeprefix(old) if isinstance(plain, str) and plain.startswith(old) else plain
 
 
-def _is_elsewhere(key: str, value: Any, old: str) -> bool:
-    """True if ``value`` of ``key`` is a topic outside the robot's base; a config may have such."""
+def _is_elsewhere(key: str, value: Any, below: str) -> bool:
+    """True if ``value`` of ``key`` is a topic that is not ``below`` the robot's base, as its config may demand."""
     if not isinstance(value, str):
         return False
-    return not value.startswith(old) and (key.endswith("topic") or parse_topic(value) is not None)
+    return not value.startswith(below) and (key.endswith("topic") or parse_topic(value) is not None)
 
 
 def _without_controls(section: Any, *, drives: bool) -> Any:

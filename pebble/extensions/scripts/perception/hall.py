@@ -248,7 +248,7 @@ class HallWheel:
         counts.rad_in_any_direction += abs(added)
 
     def _sign_of_second(self, samples: list[HallSample]) -> int:
-        """Return the sign with which the second sensor shows the commanded directions, 1 or −1; 0 if it shows none."""
+        """Return the factor that lets the second sensor's level agree with the commands: 1 or −1; 0 if neither does."""
         if not self._second.swings or self._second.extrema < 1:
             return 0
         agreed = total = 0.0  # motion in the commanded direction (against it: negative), and in any

@@ -56,7 +56,7 @@ def parse(
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line, and whose options are written out."""
+    """An argument parser whose errors are one line, and which accepts no abbreviated options."""
 
     def __init__(self, *, prog: str, description: str = "") -> None:
         super().__init__(prog=prog, description=description, allow_abbrev=False)
@@ -134,7 +134,7 @@ def _kind(kind: Any, name: str) -> Any:
 
 
 def _default(field: inspect.Field, setting: Setting) -> Value:
-    """Return the default as JSON, so that the same script always has the same form."""
+    """Return the default as JSON. A default_factory is refused: the form would change from start to start."""
     if field.default_factory is not NODEFAULT:
         raise TypeError(f"option {field.name}: its default must be a plain value, not a function")
     if field.default is NODEFAULT or field.default is None:

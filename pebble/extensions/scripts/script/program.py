@@ -202,7 +202,10 @@ def _connected(config: Config, path: Path) -> Transport:
 
 
 def _numbered(config: Config) -> Callable[[int], int]:
-    """Return a function that gives the run's number: the manager's, else one above its argument. Raises ConfigError."""
+    """Return a function that gives this run its number. Raises ConfigError.
+
+    A manager that starts the script has chosen it; else it is a new one, above the function's argument.
+    """
     text = os.environ.get(RUN)
     if text is None:
         return lambda above: next_run(config, above)
