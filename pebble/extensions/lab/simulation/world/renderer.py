@@ -114,10 +114,10 @@ class Renderer:
             (slope * ahead1 + right1, slope * ahead2 + right2),
         ):
             crossing = distance1 / np.where(distance1 == distance2, np.inf, distance1 - distance2)
-            cut_from = np.maximum(share_from, np.where(distance2 > 0, crossing, 1.0))
-            cut_to = np.minimum(share_to, np.where(distance1 > 0, crossing, 0.0))
-            share_from = np.where(distance1 < 0, cut_from, share_from)
-            share_to = np.where(distance2 < 0, cut_to, share_to)
+            # A surface that is outside as a whole enters at its end, and leaves at its start: nothing is between.
+            enters = np.where(distance1 < 0, np.where(distance2 > 0, crossing, 1.0), 0.0)
+            leaves = np.where(distance2 < 0, np.where(distance1 > 0, crossing, 0.0), 1.0)
+            share_from, share_to = np.maximum(share_from, enters), np.minimum(share_to, leaves)
         shown = np.flatnonzero(shows_front & (share_from < share_to))
         start, along = plan[shown, 0], plan[shown, 1] - plan[shown, 0]
         cut = np.stack((start + along * share_from[shown, None], start + along * share_to[shown, None]), axis=1)
