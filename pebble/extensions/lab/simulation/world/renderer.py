@@ -55,7 +55,7 @@ class Renderer:
             size = 2 * math.ceil(2 * lens.blur) + 1
             cv2.GaussianBlur(out, (size, size), lens.blur, dst=out)
         if self._noise is not None:
-            down, right = self._count * 17 % _NOISES, self._count * 29 % _NOISES
+            down, right = self._count * 17 % _NOISES, self._count * 29 % _NOISES  # another part in each picture
             lighter, darker = self._noise[:, down : down + self._height, right : right + self._width]
             cv2.add(out, lighter, dst=out)
             cv2.subtract(out, darker, dst=out)
