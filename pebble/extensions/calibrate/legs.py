@@ -94,20 +94,21 @@ class Legs:
 
     def spin(self, name: str, turns: int) -> Counts:
         """Spin ``turns`` on the spot by the counts, and on to the tag if there is one; negative is clockwise."""
-        mm = abs(turns) * math.pi * self._expected.track_width_mm
+        way_mm = abs(turns) * math.pi * self._expected.track_width_mm  # of each wheel
         side = -math.copysign(1.0, turns)
-        fast_mm = mm if self._finder is None else mm * _BEFORE_TAG
+        fast_mm = way_mm if self._finder is None else way_mm * _BEFORE_TAG
 
         def ends(counts: Counts) -> bool:
             ways = [abs(way) for way in self._way_mm(counts)]
-            _check_way(name, max(ways), mm)
+            _check_way(name, max(ways), way_mm)
             return sum(ways) / 2 >= fast_mm
 
         start = self.look() if self._finder is not None else None
         began = self._counts()
-        self._drive(name, (side * POWER, 0.0), mm / self._mm_s, ends)
+        self._drive(name, (side * POWER, 0.0), way_mm / self._mm_s, ends)
         if start is not None:
-            slow_s = mm / abs(turns) * POWER / _SLOW_POWER / self._mm_s
+            slow_mm_s = self._mm_s * _SLOW_POWER / POWER
+            slow_s = way_mm / abs(turns) / slow_mm_s  # for a whole turn
             late = f"it does not see tag {self._tag_id} again"
             for direction in (side, -side):  # back, if it has rolled past
                 self._drive(name, (direction * _SLOW_POWER, 0.0), slow_s, lambda _: self._is_at(start), late)

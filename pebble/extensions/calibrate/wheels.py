@@ -181,7 +181,7 @@ class _Session:
         return Run(name, counts.left, counts.right, turn_rad)
 
     def _typed(self, sign: int, counts: Counts) -> _Movement:
-        """Return the movement of a straight run: its way is typed, its turn by what is typed or by the gyroscope."""
+        """Return the movement of a straight run: its length as typed, its turn as typed or by the gyroscope."""
         left, right = self._wanted.expected.step_mm
         counted = abs(counts.left * left + counts.right * right) / 2
 

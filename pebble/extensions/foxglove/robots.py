@@ -48,6 +48,7 @@ class Robots:
         self._feeds: dict[tuple[str, Medium], MediaFeed] = {}
         self._by_channel: dict[str, MediaFeed] = {}  # by the topic of a Foxglove channel
         self._tasks: set[asyncio.Task[None]] = set()
+        # By this the broker chooses the topics of requests for media: some robots require an account's name in them.
         broker.is_named = lambda base: base in self.robots and self.robots[base].named
 
     @property
@@ -78,9 +79,9 @@ class Robots:
                 self._by_channel.update(dict.fromkeys(feed.update(), feed))
         at_ns = time.time_ns() - round((time.monotonic() - at) * 1e9)
         self._publish(channel, message, at_ns)
-        if channel is AUTONOMY_STATUS:
-            words = msgspec.json.encode({"words": robot.itself})
-            self._publish(None, Message(f"{message.topic}/words", words, retain=True), at_ns)
+        if channel is AUTONOMY_STATUS:  # also as a sentence for people: that the robot drives by itself
+            sentence = msgspec.json.encode({"words": robot.itself})
+            self._publish(None, Message(f"{message.topic}/words", sentence, retain=True), at_ns)
 
     def wake(self, topic: str, *, subscribed: bool) -> None:
         """Note that a client has subscribed to this channel or unsubscribed."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 BACKLOG, MAX_BYTES = 128, 1 << 20
 #: Of one remembered message, and of all together.
 MAX_REMEMBERED, MAX_REMEMBERED_BYTES = 64 << 10, 32 << 20
-_PAUSE_EVERY, _PAUSE_S = 16, 0.002  # after so many new channels: the SDK ends a client for whom 128 of them wait
+_PAUSE_EVERY, _PAUSE_S = 16, 0.002  # after so many new channels it waits so long
 _HOW: Final = 'pip install "pebble-robot[foxglove]"'
 
 
@@ -102,7 +102,7 @@ class Server:
             spec.topic, schema=schema, message_encoding=spec.encoding, context=self._context
         )
         if len(self._channels) % _PAUSE_EVERY == 0:
-            time.sleep(_PAUSE_S)
+            time.sleep(_PAUSE_S)  # the SDK ends a client for whom 128 new channels wait
 
     def subscribed(self, topic: str) -> bool:
         """True if any client has subscribed to this channel."""

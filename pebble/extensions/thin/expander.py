@@ -42,10 +42,10 @@ class _Robot:
 class Expander:
     """An expander of groups on a connection; its owner calls :meth:`announce` every ANNOUNCE_S.
 
-    If there are several, the one with the smallest id works. Each decides by the announcements that the broker passes
-    on, its own among them: all expanders see these between the same groups, so no group is taken apart twice. A group
-    that comes long after this expander's last announcement has waited, and is dropped. Only streams are published: no
-    state, stop or command of a robot. While two robots claim a short name, neither has it.
+    If there are several, the one with the smallest id works. Each decides by the announcements, its own too, that come
+    from the broker. All get them in one order with the groups, so no group is taken apart twice. A group that comes
+    long after this expander's last announcement has waited, and is dropped. Only streams are published: no state, stop
+    or command of a robot. While two robots claim a short topic, groups there are dropped.
     """
 
     def __init__(self, transport: Transport, clock: Callable[[], float] = time.monotonic, id_: str = "") -> None:
@@ -127,9 +127,8 @@ class Expander:
             if isinstance(wire.dict_id, int) and isinstance(wire.dict, str):
                 others = [entry for entry in robot.dictionaries.items() if entry[0] != wire.dict_id]
                 newest = (wire.dict_id, wire.dict.encode())
-                robot.dictionaries = dict(
-                    [*others[-1:], newest]
-                )  # a new one: _expand reads the old one without the lock
+                # A new object: _expand reads the old one without the lock.
+                robot.dictionaries = dict([*others[-1:], newest])
 
     def _receive_short(self, message: Message) -> None:
         with self._lock:

@@ -113,7 +113,7 @@ class LinkMeter:
         return self._shortest.seconds
 
     def follow(self, answer: Answer | None, now: float) -> None:
-        """Update the level by the newest answer: the same answer counts once, a missing one at every call."""
+        """Update the level by the newest answer, which counts once. A missing one counts again every half second."""
         if answer is None:
             self.lost()
             return
@@ -198,8 +198,8 @@ class Room:
     def takes(self, rank: Rank, size: int, now: float) -> bool:
         """Return True if ``size`` bytes of this rank may be sent now, and note them.
 
-        One message may always be on its way. A message that is larger than the room takes all of it. Higher ranks may
-        use several times the room, so that they find some behind such a message.
+        One message may always be on its way; if it is larger than the room, it fills it. Higher ranks may use several
+        times the room, so they need not wait for such a message of a lower rank.
         """
         fits = not self._waiting or self._waiting + min(size, self._bytes) <= self._bytes * rank
         self._was_full = self._was_full or not fits

@@ -1,7 +1,7 @@
 """A sieve for messages that leave a robot over a thin link: it passes the newest of each stream, as room allows.
 
 Pure: the owner guards it with a lock, and sends what it yields. It never gets stops or other messages *to* the robot,
-nor flags and states that are ``prompt``.
+nor flags and states that must not wait (``prompt``).
 """
 
 from collections.abc import Callable, Iterator
@@ -39,13 +39,13 @@ class Waiting(Struct, frozen=True):
 
 
 class Sieve:
-    """A sieve; ``takes(rank, size)`` returns True if so many bytes are sent now, times are those of ``clock``.
+    """A sieve. ``takes(rank, size)`` returns True, and takes room, if a message of so many bytes may be sent now.
 
-    ``stream_s``: seconds between two messages of a stream, at least. Messages of a stream that newer ones replaced are
-    counted as ``thinned``, and as ``shed`` where there was no room for them.
-    Messages that wait for room go in the order in which they began to wait, states before events before streams: else
-    smaller ones would take the room that a large one needs. After OVERDUE_S a stream has its place among the states,
-    and an event goes before them, so that none waits for ever.
+    ``stream_s``: the least seconds between two messages of a stream. Waiting messages that newer ones replaced are
+    counted as ``thinned`` if there was room, else as ``shed``.
+    States go before events, events before streams; within a rank goes first what has waited longest, or small messages
+    would always take the room that a large one needs. So that none waits for ever, after OVERDUE_S a stream counts as
+    a state, and an event goes before the states.
     """
 
     def __init__(self, takes: Callable[[Rank, int], bool], counters: Counters, clock: Callable[[], float]) -> None:
@@ -93,8 +93,8 @@ class Sieve:
     def due(self, rank: Rank) -> Iterator[Waiting]:
         """Yield the waiting messages of this rank that may be sent now. States wait while an event is overdue."""
         if rank is Rank.STATE and self._event_is_overdue:
-            event_waits, self._event_was_refused = self._event_was_refused, False
-            if event_waits:
+            if self._event_was_refused:  # it still waits, and new states have to wait, too
+                self._event_was_refused = False
                 self._short.add(rank)
                 return
             self._event_since = inf  # the event has gone
@@ -110,7 +110,7 @@ class Sieve:
             del self._waiting[topic]
             yield entry
 
-    def empty(self) -> Iterator[Waiting]:
+    def take_all(self) -> Iterator[Waiting]:
         """Yield all waiting messages, because from now on there is room for all."""
         self._short.clear()
         while self._waiting:

@@ -1,4 +1,7 @@
-"""Sends messages that leave a robot through a sieve, while the link to its remote side is not wide."""
+"""Sends messages that leave a robot through a sieve, while the link to its remote side is not wide.
+
+With an expander behind the remote broker, streams leave in groups instead: one message has the newest of each.
+"""
 
 import threading
 from collections.abc import Iterable
@@ -32,7 +35,7 @@ class Sifter:
             events = self._sides[Side.REMOTE].events
             events.has_room = None if sieve is None else sieve.takes_event
             if former is not None and sieve is None:
-                self._send(former.empty())
+                self._send(former.take_all())
                 events.resume()
 
     def send_waiting(self) -> None:
@@ -52,7 +55,7 @@ class Sifter:
     def _sift(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str
     ) -> Forward | Drop:
-        """Pass a message on, or keep it for a group or in the sieve. The forwarder calls this in place of pass_now."""
+        """Send a message now, or keep it in the sieve or for the next group. Called for each that may be forwarded."""
         if source.side is not Side.LOCAL or subject.prompt:
             if self._groups is not None and subject.channel is EXPANDER:
                 self._groups.heard(message.payload)

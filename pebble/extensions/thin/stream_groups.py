@@ -31,8 +31,9 @@ log = logging.getLogger(__name__)
 class StreamGroups:
     """The newest message of each stream, sent together ``group_hz`` times a second. Any thread adds messages.
 
-    A group is deflated with an earlier one as the dictionary, which is published retained. A short name is used only
-    while an expander says that it hears it: a broker may refuse it, and another robot may have it.
+    Groups are compressed with an earlier group as the dictionary, which is published retained. They may have a short
+    topic (``short`` in the config), only while an expander announces that it hears groups there: a broker may refuse
+    the topic, and another robot may use it.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class StreamGroups:
         self._is_announced = False
 
     def heard(self, raw: bytes) -> None:
-        """Note an expander's announcement. If it does not hear the short name, publish an empty group there."""
+        """Note an expander's announcement. If it does not name our short topic, publish an empty group there."""
         now = self._clock()
         if now - self._heard_at > HEARD_S:
             self._heard_since, self._tries = now, 0

@@ -191,7 +191,7 @@ class ThinUplink(Uplink):
         self._report_shed()
         if self._report.is_due(now) and self._takes(Rank.STATE, _HEARTBEAT_BYTES):
             self._report.publish(now)
-        return self.level.heartbeat_s > 0
+        return self.level.heartbeat_s > 0  # 0: the level sets no period, and the bridge's timer is enough
 
     def note_drive(self, payload: bytes) -> None:
         """Let media wait if a person's command moves the robot and the link is thin."""

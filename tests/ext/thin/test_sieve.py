@@ -111,7 +111,7 @@ class Walk:
     def end(self, *, at_once: bool) -> None:
         """All that waits is sent: the link carries it, or it is wide again."""
         self.ends = at_once
-        for one in self.sieve.empty() if at_once else ():
+        for one in self.sieve.take_all() if at_once else ():
             self.waits_since = {one.message.topic: self.now}
             self.passes(one.message)
         for _ in range(0 if at_once else 300):

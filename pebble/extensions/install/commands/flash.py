@@ -59,19 +59,20 @@ def flash(
         pebble flash goob --port /dev/ttyACM0 --dry-run
         pebble flash minilamp.json --port /dev/ttyACM0 --wifi Lab
     """
-    kind, config = _target(robot, firmware)
+    target, config = _target(robot, firmware)
     if port is None:
         raise PebbleError(f"--port is missing: {ports.hint()}")
     options = FlashOptions(
-        firmware=kind,
+        firmware=target,
         port=port,
         config=config,
-        private=None if kind.is_report else _private(config, kind, wifi, wifi_password_file, dry_run),
+        private=_private(config, target, wifi, wifi_password_file, dry_run) if target.has_wifi else None,
         micropython=micropython,
         verify=verify,
     )
-    for warning in () if config is None or kind.is_report else config.warnings:
-        typer.echo(f"warning: {warning}", err=True)
+    if config is not None and target.has_wifi:
+        for warning in config.warnings:
+            typer.echo(f"warning: {warning}", err=True)
     withhold((WIFI_PASSWORD, *(() if config is None else config.password_variables)))
     if dry_run:
         show_steps(options, Tools(), typer.echo)
@@ -82,11 +83,11 @@ def flash(
 
 
 def _target(robot: str, firmware: str | None) -> tuple[Firmware, Config | None]:
-    """Return the firmware, and the config if one was given; robots with Wi-Fi need one."""
+    """Return the firmware, and the config if one was given; for a robot with Wi-Fi else the one that Pebble has."""
     if robot in FIRMWARE:
-        kind = firmware_named(firmware or robot)
+        target = firmware_named(firmware or robot)
         shipped = Path(str(files("pebble")), "configs", f"{robot}.json")
-        return kind, None if kind.is_report else load(shipped)
+        return target, load(shipped) if target.has_wifi else None
     if not Path(robot).exists():
         raise PebbleError(f"{robot}: neither a file nor one of {', '.join(FIRMWARE)}")
     config = load(Path(robot))

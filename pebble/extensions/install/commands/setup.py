@@ -19,10 +19,10 @@ _From = Annotated[Path | None, typer.Option("--from", help="Make a blank machine
 def setup(answers: _Answers = None, backup: _Backup = None, from_: _From = None) -> int:
     """Make a robot of this machine: config, passwords, broker, certificate, first user, service.
 
-    It asks six questions. Run again it asks with the answers of now, and changes what differs; what was written into
+    It asks six questions. On a robot it offers the present answers, and changes what differs; what was written into
     the config by hand stays.
 
-    A backup has config, people, the stop, certificates, accounts and calibration, but no recordings. It holds
+    A backup has config, people, the emergency stop, certificates, accounts and calibration, but no recordings. It holds
     passwords and private keys, and only its owner can read it; nothing is overwritten. The robot may run meanwhile.
 
     \b
@@ -36,7 +36,7 @@ def setup(answers: _Answers = None, backup: _Backup = None, from_: _From = None)
         return back_up(backup, Places())
     require_packages("pebble setup")
     from pebble.extensions.install.setup.answers import AnswersError
-    from pebble.extensions.install.setup.session import set_up  # of Linux only
+    from pebble.extensions.install.setup.session import set_up  # imports what only Linux has
     from pebble.extensions.install.setup.system import System
 
     try:
@@ -49,7 +49,7 @@ def setup(answers: _Answers = None, backup: _Backup = None, from_: _From = None)
 
 def back_up(file: Path, places: Places) -> int:
     """Write the backup as a tar file, and read it again to check it."""
-    from pebble.extensions.install.setup import backup as backups  # of Linux only
+    from pebble.extensions.install.setup import backup as backups  # imports what only Linux has
 
     if file.exists():
         raise typer.BadParameter(f"{file} exists: name another file, or remove it")

@@ -65,6 +65,11 @@ class Firmware:
     #: Serial port used instead of USB on an image without ``sys.stdin.buffer``, such as the official SAMD21 one.
     fallback_port: str = ""
 
+    @property
+    def has_wifi(self) -> bool:
+        """True if the robot connects to a broker; else a host reads its reports from the serial line."""
+        return self.is_report is None
+
 
 def _lines(beginning: bytes) -> Callable[[bytes], bool]:
     """Return a check for complete lines of goob_base_v1 that begin with ``beginning``."""

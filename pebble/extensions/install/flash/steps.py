@@ -195,7 +195,9 @@ class Steps:
                     self._tools.run(deploy)
                     return "into the ROM file system"
             self._tools.run(copy)
-            return f"as files; {self._board.download} takes less memory" if self._board.variant else ""
+            if self._board.variant:  # MicroPython for this board is also built with a ROM file system
+                return f"as files; {self._board.download} takes less memory"
+            return ""
 
         lines = ("with a ROM file system on the board:", f"$ {build}", f"$ {deploy}", "else:", f"$ {copy}")
         return Step(title="copy the firmware", lines=lines, act=act)
@@ -237,7 +239,7 @@ class Steps:
 
     def _verify(self) -> Step:
         firmware, config, port = self._options.firmware, self._options.config, self._options.port
-        if firmware.is_report is not None:
+        if not firmware.has_wifi:
             return Step(
                 title=f"check: it sends reports on {port}",
                 lines=(f"wait for the first report at {firmware.baud} baud",),

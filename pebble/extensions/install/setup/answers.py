@@ -32,7 +32,8 @@ class AnswersError(PebbleError):
 class Answers(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The user's answers; None: not answered yet.
 
-    ``port`` and ``camera`` may be ``none``, ``broker`` ``here`` (on the robot) or ``none`` (yet).
+    The text ``none`` is an answer: no board (``port``), no ``camera``, or no ``broker`` yet. The broker ``here`` is one
+    on the robot itself.
     """
 
     id: str | None = None

@@ -139,7 +139,9 @@ def no_broker(places: Places) -> str:
         if match is not None:
             line = match[0].strip().split()[0]
             return f"{places.named(file)} has its own `{line}`: remove it, or answer with the name of that broker"
-    if places.root != Path("/") or places.broker.exists() or _runs("mosquitto"):
+    if places.root != Path("/"):  # the folder of another machine, whose ports are not those of this one
+        return ""
+    if places.broker.exists() or _runs("mosquitto"):  # mosquitto itself may have the ports
         return ""
     taken = [port for port in (PLAIN_PORT, PORT) if _is_taken(port)]
     return f"port {taken[0]} is taken by another program: sudo ss -ltnp 'sport = :{taken[0]}' names it" if taken else ""

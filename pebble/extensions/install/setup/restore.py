@@ -22,12 +22,13 @@ from pebble.extensions.operator.places import Places
 from pebble.ownership import read_plain
 from pebble.runtime.as_owner import as_owner
 
+_SHARED = ("root:root", 0o755)  # owner and mode of folders that other programs use, too
 #: What a backup may hold, below the root: who owns it there, and the mode of its folders.
 _PLACES = {
     "etc/pebble": (ROBOTS, 0o750),
     "var/lib/pebble": (ROBOT, 0o700),
     "etc/mosquitto/pebble": (MOSQUITTO, 0o700),
-    "etc/mosquitto": ("root:root", 0o755),
+    "etc/mosquitto": _SHARED,
 }
 _RUNS = ("command", "extensions", "env", "python", "entrypoint")  # keys of programs, and of what these are told
 _SCRIPT = ("/run.py", "/script.json")  # by these a folder is one
@@ -47,7 +48,7 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
     if config not in backup.files:
         raise SetupError(f"{file}: has no {config}: it is no backup of a robot that is installed")
     files[config] = files.pop(config)  # the last one to be written
-    for name in reversed(files):
+    for name in reversed(files):  # the config first: if this is a robot already, the error names it
         if not _place(name):
             raise SetupError(f"the backup would write {name!r}, which is no file of a robot")
         target = places.root / name
@@ -59,12 +60,12 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
     if beyond := [*_beyond(plain(decode(text_of(files[config].content), config), Notes())), *scripts]:
         agree(beyond)
     for place in {_place(name) for name in files}:
-        system.owner(_PLACES[place][0])  # without mosquitto the robot's broker has no owner
+        system.owner(_PLACES[place][0])  # raises if there is no such user, as without mosquitto
     for name, saved in files.items():
         target = places.root / name
         for folder in reversed(target.parents):
             if not folder.exists():
-                owner, mode = _PLACES.get(_place(f"{folder.relative_to(places.root)}/"), _PLACES["etc/mosquitto"])
+                owner, mode = _PLACES.get(_place(f"{folder.relative_to(places.root)}/"), _SHARED)
                 system.make_folder(folder, mode, owner)
         if not places.unfinished.exists() and places.etc.is_dir():
             system.write(places.unfinished, b"")
@@ -72,7 +73,8 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
             owner, _ = _PLACES[_place(name)]
             system.write(target, saved.content, saved.mode & 0o755, owner)
     if (places.broker_folder / FLEET).is_file():
-        with as_owner(places.broker_folder):  # its rules follow from its table, and from nothing else
+        # The broker's rules in the backup may have been changed: they are made anew from its accounts.
+        with as_owner(places.broker_folder):
             own_broker.link(places.broker_folder)
             fleet, passwords = load(places.broker_folder), applying.passwords_of(places.broker_folder)
             applying.write_rules(places.broker_folder, fleet, passwords)

@@ -31,10 +31,11 @@ def set_up(system: System, answers_file: Path | None, backup_file: Path | None) 
     Raises SetupError, and AnswersError before anything is written.
     """
     places = system.places
-    system.owner(ROBOTS)
+    system.owner(ROBOTS)  # raises at once if this is not root, or the user `pebble` is missing
     given, secrets = ({}, Secrets()) if answers_file is None else read_file(answers_file)
     if backup_file is not None:
-        say(f"The files of {restore(system, backup_file, _agree)} are in their places.")
+        name = restore(system, backup_file, _agree)
+        say(f"The files of {name} are in their places.")
     config = load_config(places)
     answers = Answers() if config is None else answers_of(config, places)
     job = Job(system, config, answers, secrets).with_answers(given)

@@ -1,12 +1,12 @@
 """Measures the latency of drive commands to the wheels and of MCU reports to the operator, with whole robots.
 
-A robot of each kind, with a stock broker between it and the operator, and ``stand-in``, two programs of plain paho in
-place of the original; ``C floor``: such two in C (floor.c), which carry commands alone. ``down``: from the operator's
-publish call to the last byte of the command's line at the MCU's pty; ``up``: from the MCU's report to the operator.
-Under ``commands`` robots forward no reports. CPU is that of the process that bridges and of the one that owns the
-serial line, for each command and report that they forwarded. Each round starts fresh robots and drives them in turns of
-a second, backwards every other time. Commands and reports that take longer than a second are lost, and commands that a
-newer one overtook.
+A robot of each kind, with a stock broker between it and the operator; ``stand-in``: two programs of plain paho in
+place of the original Pebble; ``C floor``: two such programs in C (floor.c), which carry commands alone. ``down``: from
+the operator's publish call to the last byte of the command's line at the MCU's pty; ``up``: from the MCU's report to
+the operator. Under ``commands`` robots forward no reports. CPU is that of the process that bridges and of the one that
+owns the serial line, for each command and report that they forwarded. Each round starts fresh robots. One after
+another is driven for a second, its turn; every other time in reverse order. Commands and reports that take longer than
+a second are lost, and commands that a newer one overtook.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ STARTUP_S = 1.0  # for start-up work to finish
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The course of the comparison: ``seconds`` per round and load, in turns of a second."""
+    """The course of the comparison. ``seconds``: how long each robot is driven in a round, with and without reports."""
 
     seconds: float = 12.5
     rounds: int = 20

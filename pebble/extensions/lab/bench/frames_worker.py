@@ -1,9 +1,9 @@
 """The process at either end of a transfer of time-stamped frames, 30 a second.
 
 ``python -m pebble.extensions.lab.bench.frames_worker VARIANT ROLE WHERE SIZE``: ``WHERE`` is a folder for sockets, or a
-broker's port; ``SIZE`` is ``640x480``. One end of GStreamer's is this file in the system's Python, where gi and Gst are
-installed; without arguments it fails if it could not be. So a plain file imports only the standard library, numpy, and
-the other end of a worker.
+broker's port; ``SIZE`` is ``640x480``. For GStreamer this file runs as a plain file in the system's Python, where gi
+and Gst are installed; then it imports only the standard library, numpy and the other end of a worker. Without arguments
+it only loads GStreamer, and fails if that is not installed.
 
 A frame begins with the time at which its pixels were complete (CLOCK_MONOTONIC, ns). A process writes
 ``{"ready": true}``, and answers each line with what it has measured so far.
@@ -263,9 +263,9 @@ def reader(variant: str, where: str, caps: str = "") -> Reader:
 
 
 def main(arguments: list[str]) -> None:
-    if not __package__:
+    if not __package__:  # in the system's Python
         _load_gstreamer()
-    if not arguments:  # only asked whether it could
+    if not arguments:
         return
     variant, role, where, size = arguments
     width, height = map(int, size.split("x"))

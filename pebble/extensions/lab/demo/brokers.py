@@ -44,7 +44,7 @@ async def serve_amqtt(port: int) -> None:
     listeners = {"default": {"type": "tcp", "bind": f"{HOST}:{port}"}}
     plugins = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
     broker = AmqttBroker({"listeners": listeners, "plugins": plugins})
-    broker._subscriptions = _Subscriptions()
+    broker._subscriptions = _Subscriptions()  # in place of a dict, which must not grow during an iteration
     await broker.start()
     await asyncio.Event().wait()
 

@@ -87,8 +87,8 @@ class Demo:
         self._broker_url = f"mqtt://{HOST}:{testbed.broker_port}"
         self._invite()
         testbed.start_robots()
-        if phone is None and self._seconds is None:
-            threading.Thread(target=self._index, name="pebble-demo-index", daemon=True).start()
+        if phone is None and self._seconds is None:  # a page for phones asks for a login; a timed demo has no visitors
+            threading.Thread(target=self._prepare_recordings, name="pebble-demo-index", daemon=True).start()
         self._operator = Operator(testbed.broker_port)
         self._operator.connect()
 
@@ -131,7 +131,7 @@ class Demo:
         if phone is not None:
             phone.show(self._page_url, console)
 
-    def _index(self) -> None:
+    def _prepare_recordings(self) -> None:
         """Request the data that Recordings shows first, now and then, so that the server has it ready for visitors."""
         while not self._ending.wait(_INDEX_S):
             path = f"archive/timeline?day={datetime.now(UTC):%Y-%m-%d}&robot={_GOOB.base}"

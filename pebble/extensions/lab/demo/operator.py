@@ -202,7 +202,7 @@ class Operator:
             self.completed.append(Driven(robot.name, step, wheels_of(drive), began, released, ended))
 
     def _wait(self, seconds: float) -> None:
-        """Wait. Raises EndedEarlyError if the demo ends, or if a person has taken the robot with the script."""
+        """Wait. Raises EndedEarlyError if the demo ends, or if a person has taken the robot that runs a script."""
         if self._stopping.wait(seconds) or (self._scripted is not None and not self._is_free(self._scripted)):
             raise EndedEarlyError
 

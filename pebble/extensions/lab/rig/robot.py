@@ -1,7 +1,7 @@
 """A simulated robot as processes: an MCU on a pty, a local broker if it needs one, the launcher with its services.
 
-Nothing large is imported here: the memory of these processes is measured, and shared libraries divide theirs among all
-processes that map them.
+Nothing large is imported here. Comparisons measure these processes' memory as PSS, in which each process that maps a
+library has a part of it: a library that this process loaded, too, would make the robot's look smaller.
 """
 
 from __future__ import annotations

@@ -96,7 +96,10 @@ class SimulatedMcu:
     # -- time
 
     def _advance(self, now: float, turn_s: float) -> bytes:
-        """Run the loop every ``turn_s`` until just before ``now``; return the board's output."""
+        """Run the loop every ``turn_s`` until just before ``now``; return the board's output.
+
+        After a long pause it runs only until the firmware's deadlines are over, and the output is dropped.
+        """
         output = b""
         behind = now - self._clock.now()
         is_long_pause = behind > _REPLAYED_S

@@ -81,7 +81,7 @@ class Body:
             self._motors = self.forward(*self.outputs())
 
     def outputs(self) -> Pair:
-        """Return the inputs of the left and the right motor driver, −1..1; + is forward for the driver."""
+        """Return what the pins command to the left and the right motor driver, −1..1; + is forward for the driver."""
         return 0.0, 0.0
 
     def forward(self, left: float, right: float) -> Pair:

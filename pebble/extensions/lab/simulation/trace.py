@@ -18,8 +18,8 @@ class Entry:
 
     ``ns`` is time.monotonic_ns() when the line's last byte was received, just before it was written, or when the
     outputs changed. The line of ``motors`` is ``<left> <right>`` with three decimals, -1..1, + = forward of the robot,
-    however its motors are mounted. The line of ``late`` is the number of seconds for which a busy machine kept the MCU
-    from its port until now: what it receives next came at any time since.
+    however its motors are mounted. The line of ``late`` is the number of seconds until now in which a busy machine kept
+    the MCU from reading its port: the lines that follow may have been sent at any time in these seconds.
     """
 
     ns: int

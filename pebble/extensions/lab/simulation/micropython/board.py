@@ -124,7 +124,7 @@ class Board:
             self.watchdog.check()
         self.clock.sleep(min(until - self.clock.now(), self.watchdog.left()))
         self.watchdog.check()
-        self.console.interrupted()
+        self.console.check_interrupt()
 
     def _wait_for_input(self) -> None:
         """Wait while the firmware reads and there is no input: only its timers run."""

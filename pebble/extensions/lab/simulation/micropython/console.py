@@ -51,18 +51,18 @@ class Console:
         """Bytes that the firmware has not read yet."""
         return len(self.typed)
 
-    def interrupted(self) -> None:
+    def check_interrupt(self) -> None:
         """Raise KeyboardInterrupt if Ctrl-C was received. Called wherever the firmware checks its input."""
         if self.is_interrupted:
             self.is_interrupted = False
             raise KeyboardInterrupt
 
     def take(self, count: int) -> bytearray:
-        self.interrupted()
+        self.check_interrupt()
         typed = self.typed
         while len(typed) < count:
             self._wait()
-            self.interrupted()
+            self.check_interrupt()
         chunk = typed[:count]
         del typed[:count]
         return chunk
@@ -93,7 +93,7 @@ class Input:
     def ready(self, mask: int) -> int:
         console = self._console
         if console.is_interrupted:
-            console.interrupted()
+            console.check_interrupt()
         return mask & POLLIN if console.typed else 0
 
     def read(self, count: int) -> Any:

@@ -55,7 +55,7 @@ class Renderer:
             size = 2 * math.ceil(2 * lens.blur) + 1
             cv2.GaussianBlur(out, (size, size), lens.blur, dst=out)
         if self._noise is not None:
-            down, right = self._count * 17 % _NOISES, self._count * 29 % _NOISES
+            down, right = self._count * 17 % _NOISES, self._count * 29 % _NOISES  # another part in each picture
             lighter, darker = self._noise[:, down : down + self._height, right : right + self._width]
             cv2.add(out, lighter, dst=out)
             cv2.subtract(out, darker, dst=out)
@@ -114,10 +114,10 @@ class Renderer:
             (slope * ahead1 + right1, slope * ahead2 + right2),
         ):
             crossing = distance1 / np.where(distance1 == distance2, np.inf, distance1 - distance2)
-            cut_from = np.maximum(share_from, np.where(distance2 > 0, crossing, 1.0))
-            cut_to = np.minimum(share_to, np.where(distance1 > 0, crossing, 0.0))
-            share_from = np.where(distance1 < 0, cut_from, share_from)
-            share_to = np.where(distance2 < 0, cut_to, share_to)
+            # A surface that is outside as a whole enters at its end, and leaves at its start: nothing is between.
+            enters = np.where(distance1 < 0, np.where(distance2 > 0, crossing, 1.0), 0.0)
+            leaves = np.where(distance2 < 0, np.where(distance1 > 0, crossing, 0.0), 1.0)
+            share_from, share_to = np.maximum(share_from, enters), np.minimum(share_to, leaves)
         shown = np.flatnonzero(shows_front & (share_from < share_to))
         start, along = plan[shown, 0], plan[shown, 1] - plan[shown, 0]
         cut = np.stack((start + along * share_from[shown, None], start + along * share_to[shown, None]), axis=1)

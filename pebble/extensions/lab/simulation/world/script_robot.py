@@ -66,7 +66,7 @@ class SimulatedRobot(Robot):
         self.log = logging.getLogger(f"pebble.script.{name}")
         self.published: list[tuple[Channel, Any]] = []
         self._addresses = Addresses(self.config)
-        self._last_values: dict[Channel, Callable[[], Any]] = {}  # see Robot.publish_at_end
+        self._last_values: dict[Channel, Callable[[], Any]] = {}  # by publish_at_end
         self._model, self._body = model, self.world.robots[name]
         self._sender = DriveSender(1, self._drive)
         self._driven_at = -math.inf  # when the last command was sent; infinite once the watchdog has stopped the wheels
@@ -80,7 +80,7 @@ class SimulatedRobot(Robot):
     # -- for tests
 
     def run(self, main: Callable[..., None], *options: Any, seconds: float) -> None:
-        """Run a script for ``seconds``, or until it returns; then stop the wheels."""
+        """Run a script for ``seconds``, or until it returns; then stop the wheels and publish its last values."""
         self._end_at = self.world.now() + seconds
         try:
             main(self, *options)

@@ -55,7 +55,8 @@ class Servers:
 class HostNetwork:
     """The network of one board.
 
-    The program that runs the board watches ``new_sockets``; with ``unread`` more can be read at once.
+    The program that runs the board watches ``new_sockets``. If ``unread`` it runs the next turn at once: the last read
+    was as long as asked, so there may be more.
     """
 
     def __init__(self, clock: Clock, *, platform: Platform = "esp32") -> None:
