@@ -57,7 +57,7 @@ class Control:
         self._waiting: deque[m.ToPage] = deque(maxlen=_WAITING)
         self._why_not = ""  # why this page may not drive at all
         self._logs = LogReader()
-        self._large_due = False  # whether the page has received the last large value
+        self._may_send_large = False  # the page has received the last large value
         self._moved: set[str] = set()  # robots moved since this page has control, for the audit
 
     async def serve(self) -> None:
@@ -180,7 +180,7 @@ class Control:
             case m.Echo():
                 self._tab.clock.echo(op.n, op.t, clock())
                 self._logs.echoed()
-                self._large_due = True
+                self._may_send_large = True
             case m.DriveOp():
                 self._drive(op)
             case m.StopOp():
@@ -369,9 +369,9 @@ class Control:
         # Each page is shown the driver in another way, so the table of robots does not have this value.
         drivers = {(ref, metric) for ref, metric in self._interest.dirty if metric == "web/driver"}
         self._interest.dirty -= drivers
-        changed, has_large = self._server.robots.take(self._interest, now, large=self._large_due)
+        changed, has_large = self._server.robots.take(self._interest, now, large=self._may_send_large)
         if has_large:
-            self._large_due = False
+            self._may_send_large = False
         if self._interest.more:
             self._wake.set()
         values = changed + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)

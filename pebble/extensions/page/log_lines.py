@@ -66,7 +66,7 @@ class LogLines:
 
 
 class LogReader:
-    """A page's position in the lines of the component that it watches. It gets one part at each echo."""
+    """A page's position in the lines of the component that it watches. It gets a part after each answer to a ping."""
 
     def __init__(self) -> None:
         self._on = False  # the page wants lines

@@ -43,13 +43,16 @@ class Echo(_FromPage, frozen=True, kw_only=True, tag="echo"):
 
 
 class Watch(_FromPage, frozen=True, kw_only=True, tag="watch"):
-    """The component whose page is open; "" is none. Its further metrics are sent from now on."""
+    """The component whose page is open; "" is none. Also the metrics that only its page shows are sent then."""
 
     ref: Ref
 
 
 class ReadLogs(_FromPage, frozen=True, kw_only=True, tag="read-logs"):
-    """Begin, or end, to get log lines of the watched component. The page has those of ``origin`` up to ``after``."""
+    """Begin or end the log lines of the watched component. The page has those of ``origin`` up to ``after``.
+
+    ``origin``: as in Logs; ``after``: the number of a line.
+    """
 
     ref: Ref
     on: bool
@@ -229,7 +232,7 @@ class _ToPage(Struct, frozen=True, kw_only=True, tag_field="op"):
 
 
 class Welcome(_ToPage, frozen=True, kw_only=True, tag="welcome"):
-    """The answer to Hello. ``rights``: the person's, of those named in roles.py; ``named_rights``: at level named."""
+    """The answer to Hello. ``rights``: what the person may do; ``named_rights``: what on robots at level ``named``."""
 
     server: str
     version: str

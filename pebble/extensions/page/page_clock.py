@@ -1,7 +1,7 @@
 """Limits of the age of one page's messages, from pings that the page echoes. Pure: times are passed in.
 
 The page's clock has an unknown offset. An echo carries the page's time at some moment between the sending of the ping
-and the arrival of the echo, which limits the offset on both sides: so a constant delay counts as well.
+and the arrival of the echo, which limits the offset on both sides. So the age includes a delay that never changes.
 """
 
 from collections import deque

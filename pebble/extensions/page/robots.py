@@ -175,7 +175,7 @@ class Robots:
         interest.dirty |= set(self._fleet_values()) | set(self._server)
 
     def watch(self, interest: Interest, ref: str) -> None:
-        """Send this page further metrics of ``ref``."""
+        """Send this page all metrics of ``ref``."""
         interest.watched = ref
         component = self.components.get(ref)
         if component is not None:

@@ -126,6 +126,7 @@ class Server:
         self._send(self.stops.receive(message, clock()))
         if ref not in self.robots.components:
             return
+        # a heartbeat changes nothing about stops that is shown already
         if address.metric != ONLINE.metric or self.robots.value(ref, _ESTOP_METRIC) is None:
             self.stops.changed.add(ref)
         if channel_of(f"outgoing/{address.metric}") in (CAPABILITIES, CONTROL_STATE):

@@ -68,6 +68,7 @@ class SilentBoards:
             if ref in self._robots.components:
                 self._robots.set_server_metric(ref, _METRIC, m.BoardView(silent=False))
         for ref, component in silent.items():
+            # once anything was omitted, a robot may look silent whose capabilities found no room
             may_be_board = ref.split("/")[1] == "robots" and not self._robots.omitted
             if ref not in self._boards and may_be_board and component.robot.online(now):
                 self._boards[ref] = _Board(now)
@@ -118,8 +119,9 @@ class SilentBoards:
     def _permission(self, ref: str) -> Permission:
         """Return the permission that the config gives or refuses, or else the one that a person has stored."""
         listed = self._listed.get(ref, ListedRobot())
-        if self._refusal(ref):  # the config decides
-            is_allowed = listed.drive and (listed.plain or not self._is_named)
+        if self._refusal(ref):  # no person can change it: the config decides
+            takes_plain_commands = listed.plain or not self._is_named  # without a name in the topic
+            is_allowed = listed.drive and takes_plain_commands
             return Permission("the config", listed.axes) if is_allowed else Permission()
         try:
             return msgspec.json.decode(self._people.get(_SETTING + ref) or "{}", type=Permission)

@@ -95,7 +95,7 @@ class StaticFiles:
         """Return the file ``name``, compressed if the browser accepts that; 404 if there is none.
 
         If the page asks again for a module because one of its imports was lost, it adds a number as query. The query is
-        then added to the module's imports too, except to those that have run since the start.
+        then added to the module's imports too, except to the modules of the page's start: they must not run twice.
         """
         if name not in self.files:
             return PlainTextResponse("not found", 404)

@@ -18,12 +18,13 @@ REPEATS_S = (0.15, 0.45)
 RISK = "A stop cannot latch it, and it may roll on while its Wi-Fi is away."
 PARKED = "A drive command is retained on its topic, and moves it whenever it connects: clear it first"
 
-_LIST = msgspec.json.encode({"subscribes": [DRIVE.suffix]})
+#: The heartbeat of a robot that says that it reads drive commands, and nothing else.
+_DRIVES = msgspec.json.encode({"subscribes": [DRIVE.suffix]})
 
 
 def assumed(base: str, axes: Collection[str], name: str = "") -> dict[str, Any]:
     """Return the assumed capabilities: a name, and driving if there are any ``axes``."""
-    value = announced(base, _LIST) if axes else {}
+    value = announced(base, _DRIVES) if axes else {}
     if axes:
         value["drive"]["axes"] = list(axes)
     if name:

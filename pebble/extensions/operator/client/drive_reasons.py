@@ -133,7 +133,7 @@ def words(
 def person(by: str, *, login: bool = True) -> str:
     """Return the sender ``by`` in words for people.
 
-    ``local``, which a device may follow, is a user of a server without logins: of this server if ``login`` is False.
+    A server without logins calls its user ``local``, and may add the device. ``login`` False: it is this server.
     """
     if by.partition(" ")[0] != "local":
         return by

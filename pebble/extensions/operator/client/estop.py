@@ -157,10 +157,12 @@ class RobotStop:
     def _update_progress(self, now: float) -> None:
         """Note whether the robot's owners hold the stop now, and whether they would after a power cut."""
         if self.confirmed_s is None:
-            if self.estop.owners and self.estop.available and not (self.unconfirmed or self.estop.zeros):
+            can_hold_all = self.estop.owners and self.estop.available and not self.estop.zeros
+            if can_hold_all and not self.unconfirmed:
                 self.confirmed_s = now - self._began
         elif self.unconfirmed and (self._order.hold or not self._settled):
-            self.confirmed_s, self._settled = None, False  # an owner has restarted, and had not saved the stop
+            # an owner has restarted, and had not saved the stop: it is sent again
+            self.confirmed_s, self._settled = None, False
             if self._order.hold:
                 self._began = now
             self.next = max(now, self._sent_at + REPEAT_S)
@@ -249,7 +251,7 @@ class StopSender:
         self._began = self._now = now
         self._ended = False
         self._overflow: set[str] = set()  # robots for which ``robots`` has no room, and that got the stop
-        self._overflow_at = float("-inf")  # since then
+        self._overflow_at = float("-inf")  # when that set was emptied last, so that they get the stop again
         self._overflow_out: list[Message] = []  # stops of such robots, to be sent now
 
     @property
@@ -331,7 +333,10 @@ class StopSender:
         return messages
 
     def _receive_first(self, base: str, message: Message, now: float) -> None:
-        """Handle the first message of a robot that is not in ``robots``."""
+        """Send the stop to a robot that is not in ``robots``, and add it there.
+
+        If there is no room, it gets the stop once in each period of REPEAT_S in which it publishes anything.
+        """
         robot = RobotStop(base, self.order, now)
         robot.receive(message, now)
         if len(self.robots) < MAX_ROBOTS:

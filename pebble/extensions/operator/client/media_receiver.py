@@ -57,7 +57,7 @@ class MediaReceiver:
         """Repeat unanswered requests, and request a missing key frame. Call it a few times a second."""
         now = time.monotonic()
         for request in list(self.requests.values()):
-            if request.settled:
+            if request.settled:  # until then :meth:`request` ticks it
                 send(self._transport, request.tick(now))
         if self._video.wants_keyframe and "video" in self.requests:
             send(self._transport, self.requests["video"].keyframe(self.encoding.get("video"), now))

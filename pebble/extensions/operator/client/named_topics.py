@@ -43,8 +43,8 @@ class NamedTopics:
     def forms(self, message: Message) -> Iterator[Message]:
         """Yield the messages to publish instead of this one. Raises NoNameError.
 
-        A stop is also published unchanged, and first: it needs no account. Nothing is retained on a topic with an
-        account, because the robot itself publishes its flags.
+        A stop needs no account: it is also published unchanged, and first. A zero is, if the client has no account.
+        Nothing is retained on a topic with an account, because the robot itself publishes its flags.
         """
         command = _command(message.topic)
         is_stop = command is not None and command.metric == ESTOP.metric
@@ -53,7 +53,7 @@ class NamedTopics:
         if command is None or not self._is_named(command.identity.base):
             if not is_stop:
                 yield message
-        elif not why_not("", self.account):
+        elif NAME.fullmatch(self.account):
             payload = _without_claim(message.payload, self.account)
             yield Message(with_name(message.topic, self.account), payload, message.qos)
         elif command.metric == DRIVE.metric and not moves(message.payload):
@@ -62,14 +62,17 @@ class NamedTopics:
             raise NoNameError(command.identity.id, self.account)
 
     def signed(self, topic: str, payload: bytes, person: str) -> bytes:
-        """Return the payload with the person for whom this client acts, if the robot adds the account itself."""
+        """Return a command's payload with the person for whom this client acts, if its topic will name the account.
+
+        A payload that names a sender itself is unchanged.
+        """
         command = _command(topic) if person else None
         if command is None or not self._is_named(command.identity.base):
             return payload
         plain = json_object(payload)
         if plain is None:
             return payload
-        body = plain["value"] if isinstance(plain.get("value"), dict) else plain
+        body = plain["value"] if isinstance(plain.get("value"), dict) else plain  # that has the command's fields
         if "by" in body:
             return payload
         body["by"] = person
@@ -93,7 +96,7 @@ def moves(payload: bytes) -> bool:
 
 
 def _without_claim(payload: bytes, account: str) -> bytes:
-    """Return the payload without a sender, as the account alone identifies the sender."""
+    """Return the payload without its sender if that is the account, which the topic names already."""
     if f'"{account}'.encode() not in payload:
         return payload
     command = json_object(payload)

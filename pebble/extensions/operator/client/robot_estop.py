@@ -38,10 +38,10 @@ class RobotEstop:
         self.available = False  # it can be stopped by an emergency stop
         self.keeps_control = False  # it decides itself which person drives it
         self.named = False  # it takes commands only with the name of their sender in the topic
-        self.drives = True  # False: its capabilities exclude drive commands. Readers assume what is missing
+        self.drives = True  # unless its capabilities say that it does not
         self.drive_topic = DRIVE.topic(base)
         self.script_topic = AUTONOMY_COMMAND.topic(base)
-        self.zeros: tuple[str, ...] = ()  # further drive topics, of what no stop can hold
+        self.zeros: tuple[str, ...] = ()  # drive topics of motors that no stop can hold: a stop sends zeros there
         self.owners: tuple[str, ...] = ()  # as its capabilities list them
         self._states: dict[str, EstopState] = {}
         self._capabilities_topic = CAPABILITIES.topic(base)
@@ -107,6 +107,7 @@ class RobotEstop:
         return False
 
     def _receive_capabilities(self, payload: bytes) -> bool:
+        """Store what capabilities say about stops and commands; return False if they are malformed."""
         if len(payload) > _CAPABILITIES_BYTES:
             return False
         try:
@@ -120,9 +121,9 @@ class RobotEstop:
         self.drives = drive.get("available") is not False
         self.drive_topic = self._topic(drive.get("topic"), DRIVE)
         self.script_topic = self._topic(_section(value, "autonomy").get("command_topic"), AUTONOMY_COMMAND)
-        zeros = estop.get("zeros")
-        listed = zeros[:MAX_OWNERS] if isinstance(zeros, list) else ()
-        self.zeros = tuple(dict.fromkeys(self._topic(topic, DRIVE) for topic in listed))
+        listed = estop.get("zeros")
+        topics = listed[:MAX_OWNERS] if isinstance(listed, list) else ()
+        self.zeros = tuple(dict.fromkeys(self._topic(topic, DRIVE) for topic in topics))
         self.has_capabilities = True  # last: other threads may read meanwhile
         return True
 

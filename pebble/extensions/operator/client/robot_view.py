@@ -206,7 +206,7 @@ class RobotView:
 
     @property
     def is_assumed(self) -> bool:
-        """True if the robot's capabilities are assumed by people."""
+        """True if the robot published no capabilities, and people have said what it can do: see :meth:`assume`."""
         return "assumed" in self.capabilities
 
     def assume(self, axes: Collection[str], name: str = "") -> bool:

@@ -128,7 +128,7 @@ def me(account: str | None = None) -> str:
 
 
 def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
-    """Send stops on a connection that receives nothing."""
+    """Send stops, and listen on a second connection, so that what arrives delays none of them."""
     with interrupted_by_signals(), connected(target) as (transport, names):
         robots = None if every else [names.base]
         sender = StopSender(new_name(), by=me(names.account), why=why, now=time.monotonic(), robots=robots, hold=hold)
@@ -161,7 +161,10 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
 
 @contextmanager
 def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
-    """Open a connection for the heartbeats of all robots, for a stop of all; not within a robot."""
+    """Open a connection for the heartbeats of all robots, for a stop of all at a broker; otherwise yield None.
+
+    With a client id from the config there can be only one connection.
+    """
     _, settings, _, _ = resolve(target)
     if not every or not isinstance(settings, MqttSettings) or settings.client_id is not None:
         yield None

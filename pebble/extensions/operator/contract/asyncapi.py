@@ -39,7 +39,7 @@ def document() -> str:
 
 
 def _name(channel: Channel) -> str:
-    """Return a channel's name, such as ``incoming.drive-values``; a family's parameters are its variables."""
+    """Return a channel's name, such as ``incoming.drive-values``; in it ``{uid}`` becomes ``uid``."""
     return channel.suffix.replace("/", ".").translate({ord("{"): None, ord("}"): None})
 
 

@@ -152,8 +152,9 @@ def _settings_of_config(file: Path, options: dict[str, Any], folder: Path | None
     if folder is not None:
         tls = WebTls(certificate=folder / SERVER_CERT, key=folder / SERVER_KEY, ca=folder / CA_CERT)
         web = msgspec.structs.replace(web, tls=tls)
-    allowed = msgspec.structs.replace(web, plain_http=True)  # what is missing is reported with the commands for it
-    settings = settings_or_all_problems(msgspec.structs.replace(config, web_interface=allowed))
+    # A missing certificate is no error yet: the caller reports it, with the commands that make one.
+    lenient = msgspec.structs.replace(web, plain_http=True)
+    settings = settings_or_all_problems(msgspec.structs.replace(config, web_interface=lenient))
     # `pebble web user add ann` does not know the config: its people count until the robot's own page has some.
     shared = default_folder() / PEOPLE
     if settings.login and web.people is None and not has_user(settings.people) and has_user(shared):

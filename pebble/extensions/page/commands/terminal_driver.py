@@ -110,7 +110,7 @@ class TerminalDriver:
         topic, commands, self._out = self.robot.estop.drive_topic, [*self._out, *zeros], []
         messages = [] if self.stop is None else self.stop.tick(now)
         messages += [Message(topic, self.robot.encode(command.drive), command.qos) for command in commands]
-        return messages if problem else messages + requests
+        return messages if problem else messages + requests  # without a connection no robot answers requests
 
     def end(self, now: float, *, leave: bool = False) -> None:
         """End the gesture for good; with ``leave`` also release control. A pause follows before the next gesture."""

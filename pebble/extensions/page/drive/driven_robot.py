@@ -176,8 +176,8 @@ class DrivenRobot:
         self._awaited = ("", float("-inf"))
         return now <= until and self.state is State.FREE and self._held_elsewhere() is None
 
-    def at_rest(self, now: float) -> bool:
-        """True if the robot has nothing that must be remembered."""
+    def may_be_forgotten(self, now: float) -> bool:
+        """True if nothing about the robot must be remembered."""
         return self.state is State.FREE and not self._wishes and not self._repeats and now > self._awaited[1]
 
     def shown(self, tab: Tab, now: float) -> DriverView:
@@ -199,7 +199,7 @@ class DrivenRobot:
     def take(
         self, tab: Tab, now: float, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool
     ) -> list[Command]:
-        """Request control, ``over``: even from its holder; return the commands for a handover at this server.
+        """Request control for a page; ``over``: even from its holder. Return what to publish if this server gives it.
 
         ``granted``, or ``failed`` with the reason, is called with the answer: now, or after the robot's next state.
         """
@@ -327,12 +327,13 @@ class DrivenRobot:
     def _follow_wish(self, tab: Tab, wish: Wish, now: float) -> list[Command]:
         """Note the robot's answer to a page's request, if there is one; return the commands that follow from it."""
         client, robot = wish.client, self._view()
-        if robot is None or not robot.controlled or robot.control is not client.robot:
+        is_same_robot = robot is not None and robot.controlled and robot.control is client.robot
+        if not is_same_robot:
             client.release()  # the robot is gone, or was forgotten and has come back meanwhile
         client.update(now)
         had_control = self.client is client
         commands: list[Command] = []
-        if had_control and client.decided != self._given_key:
+        if had_control and client.decided != self._given_key:  # lost, or given anew, which needs a new gesture
             commands = self._on(Event.LOST, now)
         if client.held and self.client is not client:
             commands += self._give(tab, client, now)
@@ -389,9 +390,8 @@ class DrivenRobot:
         commands = tab.interrupt(op.g, now)  # of another robot that the page moves
         if self._is_assumed:
             self._repeat_zeros(now)
-        if self.tab is not tab or op.final:
-            return [Command(self.ref, FINAL_ZERO), *commands]
-        return [Command(self.ref, self._signed(ZERO)), *commands]  # with the key it is a release by the driver
+        is_release = self.tab is tab and not op.final  # by the driver: a script that was interrupted may resume
+        return [Command(self.ref, self._signed(ZERO) if is_release else FINAL_ZERO), *commands]
 
     def _signed(self, drive: Drive) -> Drive:
         """Return the command with the key of control."""

@@ -157,7 +157,7 @@ class Drivers:
     def tick(self, now: float) -> None:
         for ref, robot in list(self._driven.items()):
             self._publish_due(robot, now)
-            if robot.at_rest(now):
+            if robot.may_be_forgotten(now):
                 del self._driven[ref]
         for ref, lights in list(self._lights.items()):
             if now - lights.grouped_at >= _ALONE_S:

@@ -103,16 +103,17 @@ class Link:
 
 
 class RobotSource:
-    """The messages of one robot in an archive, for a player. ``begins`` gets a time and the picture at that time.
+    """The messages of one robot in an archive, for a player.
 
-    A message received exactly at a time belongs to the state at that time.
+    ``begins`` is called before the state at a time is sent, with that time and the picture then. A message
+    received exactly at a time belongs to the state at that time.
     """
 
     def __init__(self, archive: Archive, ref: str, begins: Callable[[int, Recorded | None], None]) -> None:
         self._archive, self._ref, self._begins = archive, ref, begins
 
     def messages(self, since_ns: int, until_ns: int) -> Iterator[Recorded]:
-        """Yield the messages after ``since_ns``, in steps, until a step reaches ``until_ns``."""
+        """Yield the messages after ``since_ns`` up to the step of a second that contains ``until_ns``."""
         next_ns: int | None = since_ns + 1
         while next_ns is not None and next_ns < until_ns:
             messages = self._archive.messages(self._ref, next_ns, next_ns + _STEP_NS)
@@ -134,12 +135,12 @@ class PlayedRobot:
     """A recorded robot in the form for a page: the output of its player."""
 
     def __init__(self, link: Link, archive: Archive, ref: str, at_ns: int) -> None:
-        self.sent = self.skipped = 0  # as the player wants of an output; they are not counted
-        self.moves = False
+        self.sent = self.skipped = 0  # an output has them; nothing is counted here
+        self.moves = False  # a shown recording moves nothing
         self._newest_ns = at_ns  # of what was sent
         self.player = Player(
             RobotSource(archive, ref, self._begin),
-            lambda _channel: True,
+            lambda _channel: True,  # play all channels
             self,
             now=time.monotonic,
             wait=self._wait,
@@ -149,7 +150,7 @@ class PlayedRobot:
             longest_gap_ns=_GAP_NS,
         )
         self._link, self._ref = link, ref
-        self._replayed = f"{SYSTEM}/{ref.partition('/')[2]}"
+        self._replayed = f"{SYSTEM}/{ref.partition('/')[2]}"  # the base of the topics that pages see
 
     def send(self, message: Recorded, _position_ns: int) -> bool:
         """Send a recorded message, or keep it for the next flush."""

@@ -169,7 +169,7 @@ def test_a_new_viewer_among_others_gets_one_key_frame_and_then_the_rescue_stream
     some = viewers(4)
     new = ViewerQueue(ALL, 1.0)
     assert assess([*some, new], "h264", 1.0, can_rescue=True)
-    new.new = False  # it was requested
+    new.unserved = False  # it was requested
     assert not assess([*some, new], "h264", 1.5, can_rescue=True)
     assert not new.rescued
     assess([*some, new], "h264", 3.0, can_rescue=True)

@@ -45,7 +45,7 @@ class ViewerQueue:
     def __init__(self, can: frozenset[str], now: float) -> None:
         self.can = can
         self.rescued = False  # it gets the rescue stream
-        self.new = True  # it has received no picture, and no key frame was requested for it
+        self.unserved = True  # it has received no picture, and no key frame was requested for it
         self.waiting = True  # for a key frame
         self.overflowed = False  # waiting because the page is too slow
         self.window = WINDOW  # so many frames may be under way
@@ -158,7 +158,7 @@ class ViewerQueue:
         was_waiting = self.waiting
         self.offer(frame)
         if not self.waiting:
-            self.new = False
+            self.unserved = False
         elif not was_waiting:
             self._waiting_since = now
 
@@ -221,4 +221,4 @@ def assess(viewers: Collection[ViewerQueue], encoding: str, now: float, *, can_r
     for viewer in waiting:
         if can_rescue and (viewer.overflowed or viewer.waiting_s(now) > _RESCUE_AFTER_S):
             viewer.rescue(now)
-    return any(viewer.new for viewer in waiting)
+    return any(viewer.unserved for viewer in waiting)

@@ -32,13 +32,13 @@ class ViewerRequest:
         self._shares = shares
         self.sent: deque[bytes] = deque(maxlen=_SENT)  # this client's requests, which come back on their topic
         self._others: MediaRequest | None = None  # what other clients request; None: nothing, as far as is known
-        self.settled = False  # it was sent, or nothing has to be: else call :meth:`tick` often
+        self.settled = False  # it was sent, or need not be sent. Until then call :meth:`tick` often
         topics = (topic_of(base, capabilities, channel) for channel in CHANNELS[medium])
         self.media_topic, self.control_topic, self.flag_topic = topics
         self.section: dict[str, Any] = capabilities.get(medium) or {}  # of the newest capabilities
         self._base, self._medium = base, medium
         _, self._control, self._flag = CHANNELS[medium]
-        self._encoding: str | None = None
+        self._encoding: str | None = None  # as wanted here; None: as configured
         self._is_up: bool | None = None  # the flag; None: not known
         self._raised = self._requested = False  # by this client
         self._began_at = self._sent_at = self._received_at = self._keyframe_at = float("-inf")
@@ -93,10 +93,11 @@ class ViewerRequest:
         if self.settled:
             is_quiet = now - max(self._sent_at, self._received_at) > _REPEAT_S
             return [self._ask(now)] if is_quiet else []
-        if self._shares and not self._requested and self._others is None and self._received_at > float("-inf"):
-            self._others = MediaRequest(enabled=True)  # whose request was not seen
-        if self._others is not None or (self._encoding is None and self._received_at > float("-inf")):
-            self.settled, self._sent_at = True, now  # another operator has requested it: change nothing
+        has_received = self._received_at > float("-inf")  # so the medium is running
+        if has_received and self._shares and not self._requested and self._others is None:
+            self._others = MediaRequest(enabled=True)  # others have requested it before this client listened
+        if self._others is not None or (has_received and self._encoding is None):
+            self.settled, self._sent_at = True, now  # it runs already: change nothing
             return []
         if now < self._began_at + self._waits_s():
             return []
