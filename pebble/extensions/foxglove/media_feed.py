@@ -36,6 +36,7 @@ MAX_WAITING, MAX_WAITING_BYTES = 100, 8 << 20  # payloads received and not yet c
 _AS_CONFIGURED: Final = None  # joins what runs already, in whatever encoding
 _WITHOUT_PYAV: Final[dict[Medium, tuple[str, ...]]] = {"video": ("pbvd", "json"), "audio": ("pcm",)}
 _CHANNEL: Final = {"video": CAMERA, "audio": AUDIO}
+_H264_ENDING: Final = VIDEO[1]  # of the topic of pictures that stay H.264
 
 
 class Waiting(NamedTuple):
@@ -78,7 +79,7 @@ class MediaFeed:
 
     def wake(self, ending: str, *, subscribed: bool) -> None:
         """Note that a client has subscribed to the channel with this end of its topic, or unsubscribed."""
-        self.wants_keyframe = self.wants_keyframe or (subscribed and ending == VIDEO[1])
+        self.wants_keyframe = self.wants_keyframe or (subscribed and ending == _H264_ENDING)
         self._request.want(self._is_wanted())
 
     async def run(self) -> None:
@@ -116,7 +117,7 @@ class MediaFeed:
         Without PyAV it is one that needs no decoding.
         """
         encodings = offered(self._robot.capabilities, self._medium)
-        if self._subscribed(VIDEO[1]) and "h264" in encodings:
+        if self._subscribed(_H264_ENDING) and "h264" in encodings:
             return "h264"
         if pyav.installed():
             return _AS_CONFIGURED
@@ -216,7 +217,7 @@ class MediaFeed:
         if self._medium == "audio":
             return [(self._media.sound, SOUND[1])]
         image = (self._media.image, IMAGE[1])
-        return [(self._media.video, VIDEO[1]), image] if waiting.complete and is_h264(waiting.payload) else [image]
+        return [(self._media.video, _H264_ENDING), image] if waiting.complete and is_h264(waiting.payload) else [image]
 
     def _publish(self, convert: Callable[[str, bytes], Converted | None], waiting: Waiting) -> None:
         try:
