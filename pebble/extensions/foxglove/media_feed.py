@@ -24,6 +24,7 @@ from pebble.extensions.recordings.exports.foxglove_messages import (
     VIDEO,
     Converted,
     Media,
+    MediaChannel,
     Schemas,
     is_h264,
     stamped,
@@ -78,7 +79,7 @@ class MediaFeed:
 
     def wake(self, ending: str, *, subscribed: bool) -> None:
         """Note that a client has subscribed to the channel with this end of its topic, or unsubscribed."""
-        self.wants_keyframe = self.wants_keyframe or (subscribed and ending == VIDEO[1])
+        self.wants_keyframe = self.wants_keyframe or (subscribed and ending == VIDEO.ending)
         self._request.want(self._is_wanted())
 
     async def run(self) -> None:
@@ -116,7 +117,7 @@ class MediaFeed:
         Without PyAV it is one that needs no decoding.
         """
         encodings = offered(self._robot.capabilities, self._medium)
-        if self._subscribed(VIDEO[1]) and "h264" in encodings:
+        if self._subscribed(VIDEO.ending) and "h264" in encodings:
             return "h264"
         if pyav.installed():
             return _AS_CONFIGURED
@@ -137,14 +138,14 @@ class MediaFeed:
 
     # -- requests
 
-    def _kinds(self) -> tuple[tuple[str, str], ...]:
-        """Return the Foxglove channels for this medium: schema, and end of the topic."""
+    def _kinds(self) -> tuple[MediaChannel, ...]:
+        """Return the Foxglove channels for this medium."""
         if self._medium == "audio":
             return (SOUND,)
         return (VIDEO, IMAGE) if "h264" in offered(self._robot.capabilities, "video") else (IMAGE,)
 
     def _is_wanted(self) -> bool:
-        return any(self._subscribed(ending) for _, ending in (VIDEO, IMAGE, SOUND))
+        return any(self._subscribed(channel.ending) for channel in (VIDEO, IMAGE, SOUND))
 
     def _declared(self, schema: str, ending: str) -> str:
         """Declare a channel if it is new; return its topic."""
@@ -180,7 +181,7 @@ class MediaFeed:
             await self._request.request_keyframe(self._arriving)
 
     def _decoder_lacks_keyframe(self) -> bool:
-        return self._subscribed(IMAGE[1]) and self._media.decoder(self._topic).wants_keyframe
+        return self._subscribed(IMAGE.ending) and self._media.decoder(self._topic).wants_keyframe
 
     def _report(self, problem: str) -> None:
         """Show a problem in Foxglove, once."""
@@ -190,7 +191,7 @@ class MediaFeed:
         self._reported = problem
 
     def _why_nothing_is_shown(self) -> str:
-        if self._arriving == "h264" and self._subscribed(IMAGE[1]) and not pyav.installed():
+        if self._arriving == "h264" and self._subscribed(IMAGE.ending) and not pyav.installed():
             return f"h264 {pyav.INSTALL}"
         return self._problem
 
@@ -214,9 +215,9 @@ class MediaFeed:
     def _converters(self, waiting: Waiting) -> list[tuple[Callable[[str, bytes], Converted | None], str]]:
         """Return how this payload is converted for each channel that can show it, with the end of its topic."""
         if self._medium == "audio":
-            return [(self._media.sound, SOUND[1])]
-        image = (self._media.image, IMAGE[1])
-        return [(self._media.video, VIDEO[1]), image] if waiting.complete and is_h264(waiting.payload) else [image]
+            return [(self._media.sound, SOUND.ending)]
+        image = (self._media.image, IMAGE.ending)
+        return [(self._media.video, VIDEO.ending), image] if waiting.complete and is_h264(waiting.payload) else [image]
 
     def _publish(self, convert: Callable[[str, bytes], Converted | None], waiting: Waiting) -> None:
         try:

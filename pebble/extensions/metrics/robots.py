@@ -150,7 +150,7 @@ class Robots:
 
 
 def _named(entries: dict[str, T]) -> dict[str, T]:
-    """Return the entries whose names are valid as labels, of the first 64."""
+    """Return the entries with names that are valid as labels; of more than 64 entries the first 64 count."""
     return {name: entry for name, entry in list(entries.items())[:MOST_NAMES] if _valid_level(name)}
 
 

@@ -114,12 +114,13 @@ class GroupGate:
             parts = [part._replace(member=replace(part.member, payload=part.message.payload)) for part in parts]
             whole = replace(message, payload=encoded(part.member for part in parts))
             outcome = self._forwarder.deliver(source, subject, whole, forward)
-            copies = [(part, copy_of(part.member)) for part in parts] if isinstance(outcome, Forward) else []
+            deliveries = [(part, copy_of(part.member)) for part in parts] if isinstance(outcome, Forward) else []
         else:
-            copies = [(part, part.message.payload) for part in parts if part.member.channel.ends(part.member.value)]
-        for part, payload in copies:
-            if isinstance(part.way, Forward):
-                self._forwarder.deliver(source, part.subject, replace(part.message, payload=payload), part.way)
+            deliveries = [(part, part.message.payload) for part in parts if part.member.channel.ends(part.member.value)]
+        for part, payload in deliveries:
+            if isinstance(part.way, Drop):
+                continue
+            self._forwarder.deliver(source, part.subject, replace(part.message, payload=payload), part.way)
             if part.member.channel is DRIVE:
                 self._note_drive(payload)
         return outcome
@@ -133,8 +134,9 @@ class GroupGate:
         subject = self._subjects[topic]
         assert subject is not None  # noqa: S101 - its metric is that of a channel
         message = replace(message, topic=topic, payload=member.payload)
-        admitted = self._forwarder.admit(source, subject, message, topic, True)
-        way = Drop.STAYS if self._forwarder.stays(topic) else admitted
+        way = self._forwarder.admit(source, subject, message, topic, named=True)
+        if self._forwarder.stays(topic):
+            way = Drop.STAYS
         if isinstance(way, Forward):
             examined = self._forwarder.examine(source, subject, message, way, account)
             if isinstance(examined, Drop):

@@ -184,14 +184,14 @@ class Room:
         self._was_full = False  # since the last poll a message found no room
 
     def poll(self, waiting: int, round_trip_s: float, now: float) -> None:
-        """Note how many bytes are not confirmed. The shortest round trip counts as the mere way there and back."""
+        """Note how many bytes are not confirmed. ``round_trip_s``: the shortest one; what takes longer has waited."""
         self._waiting = waiting
         confirmed = self._in_flight.acknowledge(waiting)
         if self._rate is not None:
             self._bytes = max(_LEAST_BYTES, self._rate * (round_trip_s + _SOON_S))
         elif any(now - sent.at - round_trip_s > _SOON_S + _POLL_S for sent in confirmed):
             self._bytes = max(_LEAST_BYTES, 0.7 * self._bytes)
-        elif self._was_full:
+        elif self._was_full:  # otherwise there was no need for more
             self._bytes = min(_MOST_BYTES, self._bytes + sum(sent.size for sent in confirmed))
         self._was_full = False
 

@@ -21,7 +21,7 @@ OVERDUE_S = 10.0  # a message that has waited for so long gives way no more
 
 
 class Rank(IntEnum):
-    """The rank of a message. The number is how many times the room its messages may fill: streams wait first."""
+    """The rank of a message: at rank N it may fill N times the room of the link, so streams are the first to wait."""
 
     STREAM = 1
     STATE = 2
@@ -53,20 +53,21 @@ class Sieve:
         self._takes, self._counters, self._clock = takes, counters, clock
         self._waiting: dict[str, Waiting] = {}  # by topic, in the order in which they began to wait
         self._sent_at: dict[str, float] = {}  # by the topic of a stream, the oldest first
-        self._short: set[Rank] = set()  # ranks with a message that waits for room
-        self._event_since = inf  # since when an event waits, in the buffer of its side
-        self._event_was_refused = False  # an event found no room, since states were last sent
+        self._ranks_that_wait: set[Rank] = set()  # those with a message that found no room
+        self._event_waits_since = inf  # in the buffer of its side
+        self._event_was_refused = False  # since ``due`` was last called for states
 
     def __len__(self) -> int:
         return len(self._waiting)
 
     def takes_event(self, message: Message) -> bool:
         """Return True if an event may be sent now. False: it stays in its buffer, and its waiting time is noted."""
-        goes_before_states = self._event_is_overdue or Rank.STATE not in self._short
+        goes_before_states = self._event_is_overdue or Rank.STATE not in self._ranks_that_wait
         if goes_before_states and self._takes(Rank.STATE, _size(message)):
-            self._event_since = inf
+            self._event_waits_since = inf
             return True
-        self._event_since, self._event_was_refused = min(self._event_since, self._clock()), True
+        self._event_waits_since = min(self._event_waits_since, self._clock())
+        self._event_was_refused = True
         return False
 
     def keeps(self, subject: Subject, message: Message, forward: Forward) -> bool:
@@ -95,10 +96,10 @@ class Sieve:
         if rank is Rank.STATE and self._event_is_overdue:
             if self._event_was_refused:  # it still waits, and new states have to wait, too
                 self._event_was_refused = False
-                self._short.add(rank)
+                self._ranks_that_wait.add(rank)
                 return
-            self._event_since = inf  # the event has gone
-        self._short.discard(rank)
+            self._event_waits_since = inf  # the event has gone
+        self._ranks_that_wait.discard(rank)
         overdue_since = self._clock() - OVERDUE_S
         for topic, entry in list(self._waiting.items()):
             present_rank = Rank.STATE if entry.since <= overdue_since else entry.rank
@@ -112,13 +113,13 @@ class Sieve:
 
     def take_all(self) -> Iterator[Waiting]:
         """Yield all waiting messages, because from now on there is room for all."""
-        self._short.clear()
+        self._ranks_that_wait.clear()
         while self._waiting:
             yield self._waiting.pop(next(iter(self._waiting)))
 
     @property
     def _event_is_overdue(self) -> bool:
-        return self._clock() - self._event_since >= OVERDUE_S
+        return self._clock() - self._event_waits_since >= OVERDUE_S
 
     def _is_turn(self, rank: Rank, topic: str) -> bool:
         """True if the stream may send again."""
@@ -126,8 +127,8 @@ class Sieve:
 
     def _passes(self, rank: Rank, message: Message) -> bool:
         """True if there is room for the message, and no other message of its rank waits."""
-        if rank in self._short or not self._takes(rank, _size(message)):
-            self._short.add(rank)
+        if rank in self._ranks_that_wait or not self._takes(rank, _size(message)):
+            self._ranks_that_wait.add(rank)
             return False
         return True
 

@@ -51,13 +51,13 @@ class StreamGroups:
         self._short_is_heard, self._tries = False, 0  # by an expander; to be heard there
         self._remote, self._counters, self._clock = remote, counters, clock
         self._hz, self._named = link.group_hz, config.security.named
-        self._known_only = config.security.level != "open"  # brokers let an expander's account publish nothing else
+        self._contract_only = config.security.level != "open"  # brokers let an expander publish no others
         self._lock = threading.Lock()  # guards the messages that wait
         self._waiting: dict[str, bytes] = {}  # by metric
         self._heard_at = self._sent_at = self._learned_at = -inf  # an expander; a group; the dictionary
         self._heard_since = inf  # since when an expander is heard
         self._dict_id, self._dictionary = now_ms() % LAST_DICT + 1, b""  # probably not the number before a restart
-        self._known: frozenset[str] = frozenset()  # metrics in the dictionary
+        self._dictionary_metrics: frozenset[str] = frozenset()
         self._is_announced = False
 
     def heard(self, raw: bytes) -> None:
@@ -79,7 +79,7 @@ class StreamGroups:
     def takes(self, message: Message) -> bool:
         """Keep a message for the next group, and return True. False: send it by itself."""
         metric, payload = message.topic.removeprefix(self._below), message.payload
-        if self._known_only and channel_of(f"{OUTGOING}/{metric}") is None:
+        if self._contract_only and channel_of(f"{OUTGOING}/{metric}") is None:
             return False
         if self._clock() - self._heard_at > HEARD_S or metric == message.topic or len(payload) > _MOST_BYTES:
             return False
@@ -125,10 +125,10 @@ class StreamGroups:
     def _learn(self, text: bytes, metrics: frozenset[str], now: float) -> None:
         """Make a group the dictionary of later groups, if it has streams that the present dictionary lacks."""
         due = max(self._heard_since + _LEARN_S, self._learned_at + _LEARN_AGAIN_S)
-        if now < due or metrics <= self._known:
+        if now < due or metrics <= self._dictionary_metrics:
             return
         self._dict_id, self._dictionary = self._dict_id % LAST_DICT + 1, text
-        self._known, self._learned_at = metrics, now
+        self._dictionary_metrics, self._learned_at = metrics, now
         self._publish_wire()
 
     def _publish_wire(self) -> None:

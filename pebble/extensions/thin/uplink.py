@@ -130,7 +130,7 @@ class ThinUplink(Uplink):
     ) -> None:
         section = config.services.mqtt_bridge
         self._remote, self._forwarder, self._clock = remote, forwarder, clock
-        #: QoS 0 saves acknowledgements of MQTT; Zenoh has none, and may deliver the two in another order.
+        # Heartbeats of QoS 0 save acknowledgements of MQTT. Zenoh has none, and may reorder messages of different QoS.
         self._saves_acks = section.remote is None or section.remote.kind == "mqtt"
         self._heartbeat_s = section.heartbeat.interval_seconds
         self._meter, self._room = LinkMeter(section.link.profile, section.link.kbit), Room(section.link.kbit)
@@ -214,7 +214,7 @@ class ThinUplink(Uplink):
             self._remote.renew_connection("only late commands come over a thin link: those that wait there are dropped")
 
     def _suit(self, now: float) -> None:
-        """Adapt to a change of level, or of whether a queue stands."""
+        """Adapt to a new level, or to a queue that has formed or drained."""
         self._suit_transport()
         stream_hz = (self.level.stream_hz or 0.0) * (_CROWDED_STREAMS if self._meter.crowded else 1)
         self._sieve.stream_s = 1 / stream_hz if stream_hz else 0.0

@@ -89,7 +89,7 @@ def _content(file: Path) -> bytes:
 
 
 def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
-    """Return the backup's files without foreign files, and without mosquitto's, which setup makes itself."""
+    """Return the files to restore, of mosquitto's only the broker's folder: its config and links setup makes."""
     folder = f"{places.broker_folder.relative_to(places.root)}/"
     links = [f"{folder}{name}" for name in own_broker.LINKS]
     broker = str(places.broker.relative_to(places.root))

@@ -52,7 +52,7 @@ class SliceSpec(msgspec.Struct, frozen=True):
 
 
 class Slice(msgspec.Struct, frozen=True):
-    """The results of a slice."""
+    """The results of a slice, the messages that a :class:`SliceSpec` describes."""
 
     sent: int  # counted messages
     latencies_us: list[float]  # of those that were echoed

@@ -84,7 +84,7 @@ def read(reader: Reader) -> None:
 
 
 class ZenohWriter:
-    """A writer that creates frames in the shared segment, as services do."""
+    """A writer that creates frames in the shared memory, as services do."""
 
     def __init__(self, folder: Path, size: int) -> None:
         self._info, self._frame = FrameInfo(format="bgr24"), np.zeros(size, np.uint8)
@@ -105,7 +105,7 @@ class ZenohWriter:
 
 
 class ZenohReader:
-    """A reader whose frames are views of the segment."""
+    """A reader whose frames are views of the shared memory, not copies."""
 
     def __init__(self, folder: Path) -> None:
         self._reader = FrameReader(folder, _STREAM, views=True).open()

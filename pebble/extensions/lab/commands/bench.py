@@ -64,9 +64,9 @@ def bridge(seconds: Seconds = None, quick: Quick = False, output: Output = FOLDE
 
 @app.command()
 def startup(quick: Quick = False, output: Output = FOLDER) -> int:
-    """Return how fast a robot starts: first heartbeat, all services ready, first drive command executed.
+    """Start of a robot: the time to its first heartbeat, to all services ready, to its first drive command executed.
 
-    And how fast a service that connects later receives all retained messages. Every launch is a new simulated robot.
+    Also the time until a service that connects later has all retained messages. Every launch is a new simulated robot.
     Needs mosquitto.
     """
     return _run("startup", quick, output)
@@ -74,7 +74,7 @@ def startup(quick: Quick = False, output: Output = FOLDER) -> int:
 
 @app.command()
 def cost(quick: Quick = False, output: Output = FOLDER) -> int:
-    """Return what a robot costs: memory and CPU of each of its processes.
+    """Cost of a robot: memory and CPU of each of its processes.
 
     Idle, driven 20 times a second, and sending pictures (640x480, 15 per second) and sound to an operator. Whole
     simulated robots; needs mosquitto.
@@ -90,7 +90,7 @@ def frames(variants: Variants = None, seconds: Seconds = None, quick: Quick = Fa
 
 @app.command()
 def scale(quick: Quick = False, output: Output = FOLDER) -> int:
-    """Return what many boards cost a server of the operator page: CPU, memory, latency. Needs mosquitto."""
+    """Cost of many boards for a server of the operator page: CPU, memory, latency. Needs mosquitto."""
     return _run("scale", quick, output)
 
 
@@ -160,7 +160,8 @@ def _chosen(option: str, text: str, available: Collection[str]) -> tuple[str, ..
 def _run(name: str, quick: bool, output: Path, **options: Any) -> int:
     """Run the comparison ``name``, print and write its results; return 0 if they are complete. Raises PebbleError.
 
-    ``options`` replace fields of its Settings, unless they are None. Text names some of the full run's values.
+    ``options`` replace fields of its Settings, unless they are None. A text names values, separated by commas, of
+    those that the field has in a full run.
     """
     from rich.console import Console
 

@@ -106,7 +106,7 @@ class Operator:
         self._step = "discovering robots"  # the present one
         self.visitors = Visitors(NAME)
         self.drivers: dict[str, ScriptedOperator] = {}  # by base topic
-        self._drawing: set[str] = set()  # base topics of robots that have listed the script for their trail
+        self._with_trail: set[str] = set()  # base topics of robots that have listed the script TRAIL
         self._robots: list[RobotView] = []  # that take part in the present step
         self._scripted: RobotView | None = None  # if a person takes it, the present step ends
         self._transport = create("mqtt", NAME, MqttSettings(host="127.0.0.1", port=port))
@@ -159,7 +159,7 @@ class Operator:
         with suppress(PayloadError):
             files = codec.decode(c.AUTONOMY_FILES, message.payload).files if message.payload else []
             if address is not None and any(script.get("file") == TRAIL for script in files):
-                self._drawing.add(address.identity.base)
+                self._with_trail.add(address.identity.base)
 
     def _is_free(self, robot: RobotView) -> bool:
         return self.visitors.free(robot, time.monotonic())
@@ -167,11 +167,11 @@ class Operator:
     # -- the operator's thread
 
     def _run(self, invitation: str) -> None:
-        """Drive round after round, or once before the invitation; at the end of the demo leave the robots at rest."""
+        """Drive round after round; with ``invitation`` one round, then show it. At the end leave the robots at rest."""
         robots = self.discovery.all_robots()
         with suppress(EndedEarlyError):
-            scripted = [robot.base for robot in robots if robot.offers("autonomy")]
-            self._until(lambda: self._drawing.issuperset(scripted), _LISTED_S)
+            with_scripts = [robot.base for robot in robots if robot.offers("autonomy")]
+            self._until(lambda: self._with_trail.issuperset(with_scripts), _LISTED_S)
             while not (invitation and self.rounds):
                 self._show_trails(robots)
                 for step in SCRIPT:
@@ -319,7 +319,7 @@ class Operator:
         A robot that is stopped, or was driven a moment ago, refuses to start a script.
         """
         now = time.monotonic()
-        for robot in [candidate for candidate in robots if candidate.base in self._drawing]:
+        for robot in [candidate for candidate in robots if candidate.base in self._with_trail]:
             runs = robot.autonomy is not None and robot.autonomy.running
             if not runs and not robot.stopped_by and self.visitors.rests(robot, now):
                 self._command(robot, AutonomyCommand(action="start", file=TRAIL))

@@ -61,6 +61,7 @@ class LinuxRobot(Robot):
         self.played = folder / "played"
         self._imu = folder / "imu"  # a serial port
         self.instances: dict[str, Config] = {}
+        # without its real camera and microphone: below are simulated ones
         self._base_config = config | {"services": config["services"] | {"av_daemon": {}}}
         raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
         camera = {"video": {"device": f"{running.room_file}#{name}"}}

@@ -41,7 +41,7 @@ class Body:
         board.pins.before_change = self.before_output_change
 
     def before_output_change(self) -> None:
-        """Advance to the present time before an output of the board changes.
+        """Advance motion and battery to the present time before an output of the board changes.
 
         Several may change in one turn: changes within a millisecond are reported together.
         """
@@ -49,8 +49,8 @@ class Body:
         if self._stale and now == self._changed_at:
             return  # another output changes at the same moment
         if now - self._changed_at > _ONE_TURN_S:
-            self.end_turn()
-        self.advance()
+            self.end_turn()  # reports the changes before this one
+        self.advance()  # with the outputs as they were until now
         self._stale, self._changed_at = True, now
 
     def end_turn(self) -> None:

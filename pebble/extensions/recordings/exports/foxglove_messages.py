@@ -27,14 +27,24 @@ if TYPE_CHECKING:
 
 QUALITY: Final = 85  # of the JPEGs that are made of pictures, 1 to 100
 MOST_CHANNELS: Final = 8192  # of one export; further ones are left out and counted
-#: What media become, and the endings of their topics.
-VIDEO, IMAGE, SOUND = ("CompressedVideo", "video"), ("CompressedImage", "image"), ("RawAudio", "sound")
 
 _LEVELS: Final = {"DEBUG": 1, "INFO": 2, "WARNING": 3, "ERROR": 4, "CRITICAL": 5}  # Foxglove's numbers; 0: unknown
 _LINE_LOOP, _LINE_STRIP = 2, 3  # types of PointsAnnotation
 _YELLOW: Final = {"r": 1.0, "g": 0.85, "b": 0.0, "a": 1.0}
 _THICKNESS, _FONT_SIZE = 2.0, 14.0  # pixels
 _MILLIMETRES: Final = 1000.0
+
+
+class MediaChannel(NamedTuple):
+    """A Foxglove channel for pictures or sound: its schema, and the ending of its topic."""
+
+    schema: str
+    ending: str
+
+
+VIDEO = MediaChannel("CompressedVideo", "video")  # H.264
+IMAGE = MediaChannel("CompressedImage", "image")
+SOUND = MediaChannel("RawAudio", "sound")
 
 
 class Converted(NamedTuple):

@@ -104,9 +104,10 @@ def _bgr(colour: str) -> Colour:
 
 
 def _drawn(drawing: Drawing) -> Surface:
-    """Return the surface of a drawing. Between its shapes it has the first shape's colour, and is masked."""
+    """Return the surface of a drawing. Its masks hide what is between the shapes."""
     import cv2
 
+    # masked parts have a colour, too: in smaller textures it mixes into the edges of the shapes
     picture = np.full((_DRAWING_PX, _DRAWING_PX, 3), _bgr(drawing.shapes[0].colour), np.uint8)
     mask = np.zeros((_DRAWING_PX, _DRAWING_PX), np.uint8)
     for shape in drawing.shapes:
