@@ -71,7 +71,7 @@ def saved():
 def set_clock():
     """Set the clock by the internet: people are shown how old messages are.
 
-    Without it the times of messages count from the start of the board, and it drives as well.
+    The robot drives without it, too, but the times in its messages then count from the start of the board.
     """
     if time.gmtime()[0] < 2024:
         import ntptime

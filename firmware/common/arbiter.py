@@ -33,12 +33,12 @@ class Arbiter:
         self.barred = 0  # runs up to this number
         self._diff = diff
         self._watchdog_ms = watchdog_ms
-        self._newest = 0  # the newest run received: ``barred``, or the one after it
-        self._starting = True
+        self._newest = 0  # the newest run received; all before it are barred
+        self._starting = True  # for HOLD_MS scripts are refused
         self._started = now
         self._held = False  # by a person
         self._held_from = now
-        self._resumes = True  # at the end of the hold: the person's last command was a zero that is not final
+        self._resumes = True  # scripts go on after the hold: the person's last command was a zero, and not final
         self._scripted = False  # the newest admitted command is a script's, and within its deadline
         self._script_from = now
         self._script_ms = 0

@@ -19,8 +19,9 @@ _CAPABILITIES = const(
 def describe(epoch_ms: int, root: bytes, name: str, stops, charging: bytes, axes: bytes, groups: bytes) -> bytes:
     """Return the payload; ``root`` is the base of the topics, ``name`` the robot's name for people, or empty.
 
-    ``stops`` is the `EmergencyStop`. ``charging``: whether it reports that status, in JSON. ``axes``: those besides
-    x and z, likewise. ``groups``: the list of what it takes in a group, with a comma; empty: it takes none.
+    ``stops`` is the `EmergencyStop`. The others are pieces of JSON. ``charging``: whether it reports that status.
+    ``axes``: those besides x and z, such as ``,"y"``. ``groups``: what it takes in a group of commands, such as
+    ``"groups":["drive-values"],``; empty: it takes none.
     """
     can, cannot = b"true", b"false"
     named = b',"name":' + json.dumps(name).encode() if name else b""

@@ -62,19 +62,22 @@ class EmergencyStop:
     # -- in
 
     def stop(self, raw: memoryview | None, by: str, since: int) -> bool:
-        """Latch; return False if this stop is known. None, or what cannot be parsed, is a stop without a name."""
+        """Latch; return False if this stop is known. None, or what cannot be parsed, is a stop without a name.
+
+        ``by``: the account of the sender; "": there is none, and the name in the message is not checked.
+        """
         name = why = ""
+        sender = by
         if raw is not None:
             try:
-                account = by
-                name, by, why = stop_of(self._load(raw, by))
-                if self.names and not account:
-                    by = self.names.claimed(by)
+                name, sender, why = stop_of(self._load(raw, by))
+                if self.names and not by:
+                    sender = self.names.claimed(sender)
             except (ValueError, OverflowError, MemoryError):
                 pass
         self.changed = True
-        new = self.arbiter.stop(name or _random(8), by, why, since)
-        self._unsaved = self._unsaved or self.latch.latched  # again if writing failed
+        new = self.arbiter.stop(name or _random(8), sender, why, since)
+        self._unsaved = self._unsaved or self.latch.latched  # a known stop, too: writing it may have failed
         return new
 
     def _load(self, raw: memoryview, by: str):

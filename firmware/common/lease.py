@@ -17,7 +17,7 @@ class Lease:
         self.key = ""  # "": control is free
         self.holder: tuple = ()  # (): control is free
         self.asker: tuple = ()
-        self.others = False  # in the last 2 s a command without a key moved something, unless it was refused elsewhere
+        self.others = False  # in the last 2 s a command without a key passed here; latch or arbiter may have refused it
         self.changed = True  # since the last state
         self.halts = False  # another client has control, or none: the motors are to be stopped
         self.strangers = strangers

@@ -1,6 +1,7 @@
 """The senders of commands at a broker that checks names. Loaded only there, because it takes memory. Pure.
 
-There topics are subscribed to with the account of the sender, ``by/{account}/{topic}``; the first ones without, too.
+Such a broker passes a command on at ``by/{account}/{topic}``, with the account of its sender. Stops, and what clients
+without an account may send, also come at the topic alone.
 """
 
 from common.latch import fields
@@ -10,18 +11,18 @@ ANY = b"by/+/"
 
 
 def sender(data: memoryview, at: int, stop: int) -> tuple[str, int]:
-    """Return ``(account, place of the topic)`` after the "by/" that ends at ``at``; "": there is no account.
+    """Return the account behind the "by/" that ends at ``at``, and where the topic begins. "": it is no account.
 
     An account is up to 32 of a-z, 0-9, _ and -, and does not begin with a hyphen.
     """
-    first = at  # then the end of the account: a-z, 0-9, - and _
-    while first < stop and (96 < data[first] < 123 or 47 < data[first] < 58 or data[first] in (45, 95)):
-        first += 1
-    if first < stop and data[first] == 47 and at < first <= at + 32 and data[at] != 45:  # a "/" follows; no "-" first
-        return bytes(data[at:first]).decode(), first + 1
-    while first < stop and data[first] != 47:
-        first += 1
-    return "", first + 1
+    end = at
+    while end < stop and (96 < data[end] < 123 or 47 < data[end] < 58 or data[end] in (45, 95)):  # a-z, 0-9, - and _
+        end += 1
+    if end < stop and data[end] == 47 and at < end <= at + 32 and data[at] != 45:  # a "/" follows; no "-" first
+        return bytes(data[at:end]).decode(), end + 1
+    while end < stop and data[end] != 47:
+        end += 1
+    return "", end + 1
 
 
 def sign(body: object, by: str) -> None:
@@ -32,5 +33,5 @@ def sign(body: object, by: str) -> None:
 
 
 def claimed(by: str) -> str:
-    """Return a name that was not checked, in the form that Linux robots show."""
+    """Return a name that was not checked, in the form that Linux robots show: ``ann?``."""
     return by and by[:31].rstrip("?") + "?"

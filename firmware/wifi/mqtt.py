@@ -13,7 +13,8 @@ class Client:
         """Store the arguments. ``incoming``: bytes of the longest packet to read; ``outgoing``: of the output buffer.
 
         ``topics``: the first ``plain`` ones are subscribed to, below ``root``; the first of all is the topic of stops.
-        ``names``: names.py, by which all are subscribed to with the sender's account; None: names are not checked.
+        ``names``: the module names.py if the broker checks names, so that all are subscribed to with the sender's
+        account, too; else None.
         """
         self.data = memoryview(bytearray(incoming))
         self.out = memoryview(bytearray(outgoing))
@@ -23,13 +24,14 @@ class Client:
         self.names = names
         self.topic = -1  # of the publication: its place in ``topics``, -1: it is none of them
         self.by = ""  # the account in its topic; "": there is none
-        self.first = self.last = self.retained = 0  # of the publication
+        self.first = self.last = 0  # the payload is ``data[first:last]``
+        self.retained = 0  # 1: it was retained
         self.restart()
 
     def restart(self) -> None:
         """Discard all state for a new connection."""
         self.waiting = self._at = self._end = self._skip = self._asked = 0
-        self._more: list[bytes | memoryview] = []
+        self._more: list[bytes | memoryview] = []  # what follows ``out``, and has no room in it yet
 
     # -- in
 
@@ -119,7 +121,7 @@ class Client:
             return
         if self.names and data[first : first + 3] == b"by/":  # type: ignore[comparison-overlap]
             self.by, first = self.names.sender(data, first + 3, stop)
-            count = len(topics) if self.by else 1  # behind what is no account a stop has no name, and counts
+            count = len(topics) if self.by else 1  # with an invalid account only a stop counts
         name = data[first:stop]
         while count and name != topics[count - 1]:
             count -= 1
@@ -128,7 +130,7 @@ class Client:
     # -- out
 
     def send(self, first: int, *parts: bytes) -> bool:
-        """Queue a packet of these parts; False if there is no room for it."""
+        """Queue a packet of these parts; False if there is no room now. One longer than ``out`` passes in pieces."""
         length = sum(map(len, parts))
         size = len(self.out)
         if self._more or size - self.waiting < length + 3 <= size:

@@ -20,8 +20,7 @@ from wifi.session import Session
 from wifi.wifi import Wifi
 
 _DRIVE_LIMIT_MS = const(900)  # one second, including a slow turn of the loop
-# Places of the topics, stops first. Where names are checked, the topics without one are the first two, or three if
-# strangers may drive: they may have control, too.
+# Places of the topics, stops first.
 _ESTOP = const(0)
 _DRIVE = const(1)
 _CONTROL = const(2)
@@ -57,7 +56,9 @@ class NetworkRobot:
         topics = b"estop", b"drive-values", b"control", b"control/take", b"estop-reset"
         if hasattr(body, "groups"):
             topics += (b"group",)
-        plain = len(topics) if not names else _DRIVE + 1 if strangers == 2 else _CONTROL + 1
+        plain = len(topics)  # so many are subscribed to without an account
+        if names:  # clients without one may stop, and send zeros; those that may drive may also have control
+            plain = _DRIVE + 1 if strangers == 2 else _CONTROL + 1
         self.session = Session(settings, root, topics, plain, names, wrap, self._take)
         self.stops = EmergencyStop(now, _DRIVE_LIMIT_MS, strangers, names)
         self.deadman = DeadMan(_DRIVE_LIMIT_MS)
@@ -181,7 +182,7 @@ class NetworkRobot:
     # -- out
 
     def _report(self, now: int) -> bool:
-        """Publish capabilities once, then states of the emergency stop, heartbeats and reports.
+        """Publish what is due: capabilities once, then states, heartbeats and reports. True: write it at once.
 
         Nothing while data is unsent: it would be stale.
         """
@@ -200,7 +201,7 @@ class NetworkRobot:
             text = describe(now_ms, session.root, self.name, stops, self.charging, axes, self.groups)
             session.publish(b"capabilities", text, 1)
             stops.changed = stops.lease.changed = True
-            self._due = now
+            self._due = now  # the first heartbeat
         else:
             self._due = add(self._due, _HEARTBEAT_MS)
             if diff(now, self._due) >= 0:  # missed heartbeats are skipped

@@ -52,10 +52,10 @@ class Session:
         self.stuck = False  # whether data waits that could not be written
         self._wrote = 0  # the last write
         self._received = 0  # the last bytes
-        # The last session was silent, for the answer to a ping waited behind what came: so long only stops are
-        # subscribed to, which get through then, and nothing moves.
+        # The last session ended because the answer to a ping waited behind a flood of commands. Until the flood is over
+        # only stops are subscribed to, so that they get through, and nothing moves.
         self._paused = False
-        self._since = 0  # since when
+        self._since = 0  # when this session came online
 
     def step(self, now: int, server: str, clock) -> bool:
         """Return True if packets can be exchanged; ``server`` is the DNS server, "": there is no network.
@@ -123,7 +123,7 @@ class Session:
             count = self._open.read(space) if len(space) else 0
             if count:
                 self._received = now
-            elif len(space) == len(client.data):  # nothing is left from the last turn either
+            elif len(space) == len(client.data):  # and nothing is left from the last turn
                 break
             kind = client.take(count)
             while kind:
@@ -131,18 +131,18 @@ class Session:
                     client.subscribe(1 if self._paused else len(client.topics))
                     self.connection.move("subscribing", now)
                 elif kind == "pong":
-                    self._in_flight = self._behind
+                    self._in_flight = self._behind  # all writes before the ping have arrived
                     self._asked = False
                     self.connection.received(now)
-                elif kind != "subscribed":
-                    self._take(kind, now)
-                else:
+                elif kind == "subscribed":
                     if not self._paused:  # else it is for stops alone, and lists no other topic
                         self._take(kind, now)
                     if self.connection.state != "online":
                         self._in_flight = 0
-                        self._since = self.last = now
+                        self._since = now
                         self.connection.move("online", now)
+                else:
+                    self._take(kind, now)
                 kind = client.take()
             if count < len(space):
                 break

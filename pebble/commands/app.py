@@ -173,7 +173,7 @@ def _run(arguments: list[str]) -> int:
 
 
 class _ErrorHandler(logging.StreamHandler):  # type: ignore[type-arg]  # of the stream of the moment
-    """A handler that writes errors without logins, and imports the formatter with the first error."""
+    """A handler for errors that hides the logins in them. Its formatter is imported with the first error."""
 
     def format(self, record: logging.LogRecord) -> str:
         from pebble.runtime.parent import MaskingFormatter  # of use to errors only

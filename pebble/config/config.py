@@ -194,12 +194,16 @@ def _config(
 
 
 def _extensions(written: Any, folder: Path) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:
-    """Return the extensions of this config, ours and those that the file lists, and the ones that are missing here."""
+    """Return the extensions of this config, ours and those that the file lists, and the ones that are missing here.
+
+    Also registers the serial protocols of those that the file lists.
+    """
     listed = extensions.value_at(written, "extensions")
     entries = listed if isinstance(listed, dict) else {}
     drives = {name: extensions.value_at(entry, "drives") is True for name, entry in entries.items()}
     named, missing = extensions.named(drives, folder, Section)
     installed = (*extensions.ours(), *named)
+    # what the core has, in the form of an extension: no other may add the same
     taken = [*dir(Config), *(f"services.{name}" for name in dir(Services))]  # keys, and names of methods
     protocols = {name: SERIAL_PROTOCOLS[name] for name in OF_CORE}
     core = Extension(name="core", package="Pebble", sections=dict.fromkeys(taken, ""), protocols=protocols)

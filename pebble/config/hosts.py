@@ -51,7 +51,7 @@ def broker_host(text: str) -> str:
 
 
 def name_of_page(text: str) -> str:
-    """Return a host with or without a port, as browsers send it. Raises HostError."""
+    """Return a name under which browsers reach a page, HOST or HOST:PORT, as they send it. Raises HostError."""
     if text.count(":") != 1:
         return host(text)
     address = _only_place(text)

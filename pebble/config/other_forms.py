@@ -25,9 +25,9 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
     """Return the value to use for ``raw``, which this key does not accept; None if it is a mistake.
 
     ``kind`` and ``metas`` are the parts of ``annotation``; ``default`` is that of the key, perhaps NODEFAULT. An empty
-    value, 0 or a mere true means the default, and numbers are brought within their limits; ``exact`` keys accept only
-    0. ``synonyms`` are other names of values, ``circle`` is the number at which a count starts again at 0, and
-    ``unlike`` is the value for any mistake.
+    value, 0 or a mere true means the default, and numbers are brought within their limits. The ``extra`` of ``metas``
+    may say otherwise. ``exact``: only 0 means the default, and no number is changed. ``synonyms``: other names of
+    values. ``circle``: the number at which a count starts again at 0. ``unlike``: the value for any mistake.
     """
     extra = {key: value for meta in metas for key, value in (meta.extra or {}).items()}
     number = _number(raw)

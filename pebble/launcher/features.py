@@ -18,7 +18,7 @@ class Features:
 
     def __init__(self, on_change: Callable[[], None]) -> None:
         self._on_change = on_change
-        self._reports: set[tuple[str, str]] = set()  # program, feature: different from what is expected
+        self._reports: set[tuple[str, str]] = set()  # program, feature: only those that differ from what is expected
 
     @property
     def lacking(self) -> frozenset[str]:
@@ -31,7 +31,7 @@ class Features:
         return self._reported - _EXPECTED
 
     def receive(self, program: str, note: Feature) -> None:
-        """Handle a note of ``program``."""
+        """Handle a note of ``program``: store it only while it differs from what is expected."""
         report = {(program, note.name)}
         is_as_expected = note.has == (note.name in _EXPECTED)
         if is_as_expected:

@@ -258,6 +258,7 @@ class ProcessSupervisor:
         self._on_end()
 
     def _ended_as_asked(self, how: str) -> None:
+        """Handle the end of a child that was released, so that it can be requested again, or stopped for good."""
         was_replaced = self.state is ProgramState.REPLACED
         was_released = was_replaced or self.state is ProgramState.RELEASED
         self.state = ProgramState.IDLE if was_released else ProgramState.STOPPED

@@ -107,10 +107,11 @@ class LevelControl:
         self.level = self._last = last  # which step; 0 is as configured
         self._slow_since: float | None = None
         self._fast_since: float | None = None
-        self._polled_at = self._empty_at = float("-inf")
+        self._polled_at = float("-inf")
+        self._empty_at = float("-inf")  # when nothing waited
         self._changed_at = now
         self._raised_at = float("-inf")
-        self._calm_s = _FIRST_CALM_S
+        self._calm_s = _FIRST_CALM_S  # how long it has to be fast before a step up
 
     def poll(self, age_s: float, now: float) -> bool:
         """Note that the oldest packet has waited for ``age_s``; True if the level changes."""
@@ -120,7 +121,7 @@ class LevelControl:
         self._slow_since = _since(self._slow_since, age_s > _SLOW_S, now)
         if age_s < _EMPTY_S:
             self._empty_at = now
-        is_fast = age_s < _FAST_S or now - self._empty_at < _BEACON_S
+        is_fast = age_s < _FAST_S or now - self._empty_at < _BEACON_S  # waiting for a beacon is not slow
         self._fast_since = _since(self._fast_since, is_fast, now)
         if now - self._changed_at < _PAUSE_S:
             return False

@@ -72,7 +72,10 @@ class _Answer(NamedTuple):
 
 
 class Catalogue:
-    """The scripts in the folders. Used by one thread, because asking a script takes up to 20 s."""
+    """The scripts in the folders. Used by one thread, because asking a script takes up to 20 s.
+
+    Our scripts are those that use ``pebble.script``: they can be asked, by running them with ``--describe``.
+    """
 
     def __init__(self, config: Config, *, asks: bool = True, clock: Callable[[], float] = time.monotonic) -> None:
         """Store the folders. ``asks`` False: list our scripts without running them for their settings."""
@@ -162,7 +165,7 @@ class Catalogue:
         is_current = version_before == version and self._clock() < until
         if is_current or (version_before is not None and not asks):
             return before
-        answer = self._asked(folder, entry, section, asks=asks)
+        answer = self._describe(folder, entry, section, asks=asks)
         if not answer.asked:
             return answer
         if answer.problem and answer.problem != before.problem:
@@ -171,8 +174,11 @@ class Catalogue:
         self._answers[name] = version, answer, self._clock() + _RETRY_S if answer.problem else float("inf")
         return answer
 
-    def _asked(self, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
-        """Return a description from the script's files and, if ``asks`` and it is ours, by running it (up to 20 s)."""
+    def _describe(self, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
+        """Return a script's description: by its files, and if it is one of ours, by its own answer.
+
+        ``asks`` False: do not run it now; the description says if it has still to be asked.
+        """
         described, problem = Description(), ""
         try:
             if folder.parent != _OWN_SCRIPTS:
@@ -191,7 +197,7 @@ class Catalogue:
             if section.python is not None:  # what another Python runs may be written for that
                 return _Answer(described, problem=problem)
             return _Answer(described, problem=str(error), broken=True)
-        if not ours or not self._asks:
+        if not ours or not self._asks:  # this catalogue never runs a script
             return _Answer(described, ours, problem)
         if not asks:
             return _Answer(described, True, problem, asked=False)

@@ -27,7 +27,8 @@ class Description(Struct, frozen=True):
     """A script's description of itself; ``command`` only in a manifest.
 
     ``summary`` says in one sentence what it does; ``main`` are the keys of the settings that operators see first.
-    ``drives`` is False for a script that only measures; it counts only where ``pebble.script`` refuses to drive then.
+    ``drives`` is False for a script that only measures; that counts only in an answer to ``--describe``, because
+    ``pebble.script`` then refuses to drive.
     """
 
     label: str | None = None

@@ -54,15 +54,16 @@ def _fitness(config: Config, script: Script) -> str:
     from pebble.services.autonomy_manager.environment import environment
     from pebble.services.autonomy_manager.interpreter import lacking
 
-    is_asked = not script.own_program and _may_run(config, script)
-    missing = lacking(script.command, script.folder, environment(ours=False)) if is_asked else []
+    is_probed = not script.own_program and _may_run(config, script)
+    missing = lacking(script.command, script.folder, environment(ours=False)) if is_probed else []
     return f"runs with {script.command[0]}" + (f", which lacks {', '.join(missing)}" if missing else "")
 
 
 def _may_run(config: Config, script: Script) -> bool:
-    """True if the script may be run to describe itself: with this machine's Python, without the config's variables.
+    """True if the script's Python may be run, to find which modules it lacks.
 
-    Otherwise a stranger's config could run its own program.
+    It must be this machine's, outside of the config's folder, and the config must set no variables for it: otherwise
+    the check of a config from elsewhere would run a program that came with it.
     """
     from pebble.services.autonomy_manager.environment import local_login
 

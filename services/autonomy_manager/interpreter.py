@@ -91,24 +91,24 @@ def _read(path: Path) -> bytes:
 
 
 def _needs(tree: ast.Module, text: bytes) -> Iterator[str]:
-    """Yield what the script needs of OpenCV and NumPy besides their being installed."""
+    """Yield what the script uses of OpenCV and NumPy that some releases or builds of them lack."""
     if b"shmsrc" in text:
         yield _GSTREAMER
-    if re.search(rb"\bfloat\((?!\s*[\"'\d])|\bmap\(float\b", text):
+    if re.search(rb"\bfloat\((?!\s*[\"'\d])|\bmap\(float\b", text):  # perhaps of an array
         yield _OLD_NUMPY
     if re.search(rb"\bhasattr\(|\bAttributeError\b", text):
-        return  # it looks for itself
-    modules: dict[str, str] = {}  # and their parts, by the names that the script gives them
+        return  # the script itself finds out which names there are
+    full_names: dict[str, str] = {}  # of all that is imported, by the names that the script uses for it
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            modules |= {alias.asname or alias.name.partition(".")[0]: alias.name for alias in node.names}
+            full_names |= {alias.asname or alias.name.partition(".")[0]: alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            modules |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+            full_names |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute):
-            module, _, attribute = ast.unparse(node).partition(".")
-            if modules.get(module, "").partition(".")[0] in _ARRAYS:
-                yield f"{modules[module]}.{attribute}"
+            name, _, attribute = ast.unparse(node).partition(".")
+            if full_names.get(name, "").partition(".")[0] in _ARRAYS:
+                yield f"{full_names[name]}.{attribute}"
 
 
 def _imported(node: ast.stmt) -> list[str]:

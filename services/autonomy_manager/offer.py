@@ -33,7 +33,7 @@ class Offer:
         self._wanted, self._ended = threading.Event(), False
 
     def begin(self) -> bool:
-        """True if :meth:`scan` must be called from now on."""
+        """Begin to list the scripts; return True if :meth:`scan` is to be called now and then, to list them again."""
         if self._fixed:
             self._found(self.scripts)
         else:

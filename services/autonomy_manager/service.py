@@ -174,12 +174,12 @@ class AutonomyManager(Service):
                 self._owners.note_run(drive.run)
         elif drive.source == self.name:
             return
-        elif self._signs or drive.key:
+        elif self._signs or drive.key:  # a person's: the script would sign it, or have no key
             self._person_moves = drive.moves
             self.post(self._person_drives, newest_of="person")
             if not drive.moves and drive.valid_ms == 0:
                 self.post(self._person_stops, newest_of="person stops")
-        else:
+        else:  # an unsigned script's, or a person's
             self._unsigned_moves = drive.moves
 
     def _person_drives(self) -> None:
@@ -248,7 +248,7 @@ class AutonomyManager(Service):
             self.publish(DRIVE, Drive(source=self.name))
 
     def halt_repeatedly(self, run: int) -> None:
-        """Stop the wheels now and again: a command of an ended process may still be in a queue."""
+        """Stop the wheels now and twice more: a command of an ended process may still be in a queue."""
         self.halt(run)
         for seconds in _HALTS_S:
             self.later(seconds, lambda: self.halt(run))

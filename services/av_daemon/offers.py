@@ -29,7 +29,7 @@ def _completed(offer: Any, captured: Any, keys: tuple[str, ...], available: bool
 
 
 def facts(config: Config) -> Facts:
-    """Return the lines about the sockets where programs of the original find pictures and sound."""
+    """Return the lines of the summary about the sockets where programs of the original find pictures and sound."""
     forms = {"video": "pictures", "audio": "sound"}
     sockets = config.section(AvDaemon).sockets().items()
     texts = (f"{forms[name]} at {path}, by examples/gstreamer_sockets.py" for name, path in sockets)

@@ -18,7 +18,8 @@ LOCAL, PERSON = "a script of its own runs", "a person drives it"
 class Visit:
     """The run of another robot here. ``publish`` drives this robot. For one thread; times are of one clock.
 
-    ``begin`` returns why a run cannot begin, ``number`` a number for it; ``local_runs``: a script of this robot runs.
+    ``begin(robot, run)`` returns why a run cannot begin, ``number(barred, received)`` a newer number than these for it,
+    or None while a script of this robot runs; ``local_runs()`` is True then.
     """
 
     def __init__(
@@ -89,9 +90,13 @@ class Visit:
 
     def _starts(self, name: str, run: int, now: float) -> bool:
         """Begin the run if nothing prevents it; True if it drives from now on."""
-        why = self._begin(name, run) or (PERSON if now - self._person_at < HOLD_S else "")
-        barred = newest(state.last_barred for state in self._states.values())
-        number = None if why else self._number(barred, self._received)
+        why = self._begin(name, run)
+        if not why and now - self._person_at < HOLD_S:
+            why = PERSON
+        number = None
+        if not why:
+            barred = newest(state.last_barred for state in self._states.values())
+            number = self._number(barred, self._received)
         if number is None:
             refusal = self._refused.get(name)
             if refusal is None or refusal.run != run:  # of one run the first reason is kept

@@ -137,10 +137,10 @@ class CmdVel:
             self._latched = latched
             self._body, self._until, self._zeros = ZERO, 0.0, ZEROS
             self._out.send(ZERO)
-            self._has_set_lock = True
+            self._has_set_lock = True  # from the first lock on, new subscribers are told the state
             self._send_lock()
             if latched:
-                self._owe(True)  # another thread writes it
+                self._owe(True)  # does not wait for the disk: another thread writes the file
                 self._cancel()
             self._plan(time.monotonic())
 

@@ -56,8 +56,8 @@ from pebble.transports import Message, QoS, Subscription
 CLAIM_S = 0.25  # between publishing claims and using them: another device has objected by then
 _WATCH_S = 0.5
 
-#: Published to check a retained manifest: the process that has the device publishes it again. With a token it is from a
-#: process that has a device of this uid: another one that has warns.
+#: Asks which process has the device of this uid, to check a retained manifest: that process publishes it again. With a
+#: token, the sender has such a device itself, and another process that also has one logs a warning.
 _UID_QUERY = Channel(
     metric=MCU_COMMAND.metric.replace("{name}", RESERVED),
     kind=Kind.COMMAND,
@@ -226,7 +226,7 @@ class DescribedBridge(SerialService):
         self._listen_generic(device, private=False)  # a reader of the manifest may send commands at once
         self.publish(MCU_LOCAL_ONLY, device.local_only, uid=device.uid)
         self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)
-        self.publish(MCU_COMMAND, {"from": self._token}, uid=device.uid, name=RESERVED)  # see _UID_QUERY
+        self.publish(MCU_COMMAND, {"from": self._token}, uid=device.uid, name=RESERVED)  # a _UID_QUERY
         self._listen_generic(device, private=True)  # not before: bridges must know that these stay on the robot
         self.aliases.announce(device)
         self.call_at(self.clock() + CLAIM_S, partial(self.aliases.permit, device))
@@ -278,7 +278,7 @@ class DescribedBridge(SerialService):
     def _command(self, device: Device, route: Route, values: dict[str, Any]) -> None:
         name = route.interface.name
         if self._takes_groups and values.get(groups.MARK) is True:
-            return  # the copy of a group's member
+            return  # a copy for programs that take no groups: here the group itself arrives
         if device is not self.device:
             self._drop_command(name)
             return

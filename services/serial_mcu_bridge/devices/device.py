@@ -109,10 +109,10 @@ class Device:
         if channel in (c.IMU_FAST, c.IMU):
             return Alias(claim, channel, interface.profile)
         new_channel = _channel(interface.channel, interface.kind, payload, retain=interface.retain)
-        # a payload that must stay on the robot names its device, so that the MQTT bridge recognises it
-        is_imu = interface.profile in (imu.MOTION, imu.SUMMARY) and not interface.local_only
-        has_fields = is_imu and imu.fits(interface.profile, {field.name for field in interface.fields})
-        return Alias(claim, new_channel, interface.profile if has_fields else "")
+        # What must stay on the robot keeps the generic body: the MQTT bridge recognises it by the device named in it.
+        may_have_imu_body = interface.profile in (imu.MOTION, imu.SUMMARY) and not interface.local_only
+        has_imu_body = may_have_imu_body and imu.fits(interface.profile, {field.name for field in interface.fields})
+        return Alias(claim, new_channel, interface.profile if has_imu_body else "")
 
     def _renamed(self, interface: Interface) -> Interface:
         """Return ``interface`` with the channel name that the config sets, if it sets a valid one."""

@@ -4,7 +4,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-_OTHER_END = "/ptmx"  # of a pty: who has that is the board, a simulated one
+_PTY_MASTER = "/ptmx"  # the other end of a pty: the process that has it simulates the board
 
 
 def holders(path: str) -> list[str]:
@@ -19,8 +19,8 @@ def holders(path: str) -> list[str]:
             for number in os.listdir(process / "fd"):  # noqa: PTH208 - a Path for each is slow
                 with suppress(OSError):
                     files.add(os.readlink(f"{process}/fd/{number}"))  # noqa: PTH115
-        is_board = any(file.endswith(_OTHER_END) for file in files)
-        if device in files and process.name != str(os.getpid()) and not is_board:
+        is_simulator = any(file.endswith(_PTY_MASTER) for file in files)
+        if device in files and process.name != str(os.getpid()) and not is_simulator:
             with suppress(OSError):
                 name = (process / "comm").read_text(encoding="utf-8", errors="replace").strip()
                 unit = (process / "cgroup").read_text(encoding="utf-8").strip().rpartition("/")[2]

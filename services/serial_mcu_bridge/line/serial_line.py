@@ -45,8 +45,8 @@ class SerialLine:
 
     Every opening sends a line end, because the device may hold half an earlier line, and then the stop as the first
     line. During ``boot_s`` input is discarded; then the stop is sent again, followed by the lines that were added since
-    the opening. Only the newest of each kind waits (:class:`Outbox`); described commands use up to 8 kinds per
-    interface, and 8 for groups of them.
+    the opening. Only the newest of each kind waits (:class:`Outbox`); commands to a self-describing MCU use up to
+    8 kinds per interface, and 8 for groups of commands.
 
     ``on_bytes(chunk)`` and ``on_state(state, problem)`` run on the reading thread and must return at once. ``stop`` is
     the line that stops the motors, empty if there are none; ``drive_timeout_s`` the age at which a drive line expires.
@@ -99,10 +99,11 @@ class SerialLine:
         """Send a drive line now, or after earlier bytes unless a newer one replaces it; False if there is no device.
 
         If it could not be sent for ``valid_s``, or for ``drive_timeout_s``, a stop is sent instead. ``line`` may
-        contain other lines, which share its fate; ``replaces`` is their kind.
+        contain other lines, which share its fate; waiting lines of their kind ``replaces`` are dropped.
         """
         outbox = self.output.outbox
-        return self._hand_over(lambda now: outbox.drive(line, now, valid_s, replaces), line if valid_s > 0 else b"")
+        at_once = line if valid_s > 0 else b""  # else the outbox judges whether it has expired
+        return self._hand_over(lambda now: outbox.drive(line, now, valid_s, replaces), at_once)
 
     def halt(self) -> bool:
         """Send the stop in place of a waiting drive line. False without a device: its opening begins with the stop."""

@@ -95,7 +95,7 @@ class HallMemory:
                 self._number = max(self._number, newest)
             else:
                 _HEADER.pack_into(memory, 0, *form, self._number)
-            if is_new:  # with a descriptor, so that Python follows the link
+            if is_new:  # with src_dir_fd Python follows the link in /proc
                 os.link(f"/proc/self/fd/{descriptor}", self._path, src_dir_fd=descriptor)
         except BaseException:
             os.close(descriptor)
