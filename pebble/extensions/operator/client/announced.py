@@ -5,6 +5,7 @@ from typing import Any
 import msgspec
 
 from pebble import contract as c
+from pebble.contract import codec
 from pebble.contract.capabilities import (
     AudioOffer,
     CapabilitiesValue,
@@ -15,8 +16,6 @@ from pebble.contract.capabilities import (
     SystemOffer,
     VideoOffer,
 )
-from pebble.extensions.operator.client.named_topics import json_object
-from pebble.extensions.operator.client.robot_topics import section_of
 
 _LARGEST = 4096  # bytes of a heartbeat or status that are looked at
 
@@ -29,15 +28,15 @@ def announced(base: str, payload: bytes) -> dict[str, Any]:
     """
     if len(payload) > _LARGEST or b'"subscribes"' not in payload:
         return {}
-    decoded = json_object(payload) or {}
-    subscribes = decoded.get("subscribes")
-    if subscribes is None:  # a status has it inside its value
-        subscribes = section_of(decoded, "value").get("subscribes")
+    decoded = codec.json_object(payload) or {}
+    subscribes, value = decoded.get("subscribes"), decoded.get("value")
+    if subscribes is None and isinstance(value, dict):  # a status has it inside its value
+        subscribes = value.get("subscribes")
     if not isinstance(subscribes, list):
         return {}
     has = {channel for channel in _KNOWN if channel.suffix in subscribes}
-    value: dict[str, Any] = msgspec.to_builtins(_value(base, has)) if has else {}
-    return value
+    capabilities: dict[str, Any] = msgspec.to_builtins(_value(base, has)) if has else {}
+    return capabilities
 
 
 _KNOWN = (

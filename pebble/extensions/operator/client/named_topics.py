@@ -5,7 +5,6 @@ command is published on the topic that its robot reads at present.
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import msgspec
 
@@ -14,8 +13,6 @@ from pebble.contract.identity import Direction, ParsedTopic, parse_topic
 from pebble.contract.names import BY, NAME, with_name
 from pebble.errors import PayloadError, TransportError
 from pebble.transports import Message
-
-_decoder = msgspec.json.Decoder()
 
 
 class NoNameError(TransportError):
@@ -69,7 +66,7 @@ class NamedTopics:
         command = _command(topic) if person else None
         if command is None or not self._is_named(command.identity.base):
             return payload
-        plain = json_object(payload)
+        plain = codec.json_object(payload)
         if plain is None:
             return payload
         body = plain["value"] if isinstance(plain.get("value"), dict) else plain  # that has the command's fields
@@ -99,16 +96,7 @@ def _without_claim(payload: bytes, account: str) -> bytes:
     """Return the payload without its sender if that is the account, which the topic names already."""
     if f'"{account}'.encode() not in payload:
         return payload
-    command = json_object(payload)
+    command = codec.json_object(payload)
     if command is None or str(command.get("by")).partition("@")[0] != account:
         return payload
     return msgspec.json.encode({key: value for key, value in command.items() if key != "by"})
-
-
-def json_object(payload: bytes) -> dict[str, Any] | None:
-    """Return the JSON object in a payload; None if it has none."""
-    try:
-        plain = _decoder.decode(payload)
-    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
-        return None
-    return plain if isinstance(plain, dict) else None
