@@ -246,7 +246,7 @@ def _not_a_number(robot: Observer, _driver: Driver) -> CheckResult:
 def _clamped(robot: Observer, driver: Driver) -> CheckResult:
     began, _ = driver.drive(DRIVES_S / 2, z=9, x=-9)
     wheels = _moving_wheels(robot, began)
-    if wheels is None or not _wheel_reports(robot):  # odometry shows no wheel that is too fast
+    if wheels is None or not _wheel_reports(robot):  # speeds by odometry are good for their signs only
         return _NOT_SHOWN
     if not wheels:
         return failed("x -9, z 9 does not move it", "clamp both axes to -1..1, and obey")
