@@ -114,5 +114,5 @@ def hosts_of(names: Iterable[str]) -> list[str]:
         raise CertificateError("name the addresses by which browsers reach the server: robot-lab.local 192.168.1.20")
     for host in hosts:
         if "%" in host or "_" in host:
-            raise CertificateError(f"{host}: a certificate names no network card and no _, leave out what has one")
+            raise CertificateError(f"{host}: leave it out, a certificate cannot hold names with % or _")
     return hosts

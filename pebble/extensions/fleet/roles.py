@@ -115,8 +115,8 @@ class Rule(NamedTuple):
 class Account(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """An account in `fleet.json`. ``bases``: its own base topic, or those that a gateway carries.
 
-    ``plain``: a robot whose topics have no account names, as it does not know them. ``people``: the database of a page
-    server's people, if it is on this machine.
+    ``plain``: a robot that does not know account names, so the topics of its commands have none. ``people``: the
+    database of a page server's people, if it is on this machine.
     """
 
     roles: tuple[str, ...]
@@ -204,7 +204,10 @@ def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
 
 
 def covered(right: Right, metric: str) -> str:
-    """Return a metric of the contract that a filter of ``extra`` matches although another right writes it."""
+    """Return a metric of the contract that needs another right than this one, but would match ``metric``, a filter.
+
+    Empty if there is none: then :class:`Extra` may grant ``metric`` by this right.
+    """
     for channel in c.CHANNELS:
         if channel.direction == INCOMING and channel not in WRITES[right]:
             declared = re.sub(r"{[^}]*}", "+", channel.metric)

@@ -50,9 +50,10 @@ class RowWriter:
             log.error("audit: %d rows are lost", lost)
 
     def add(self, row: Row, like: Hashable = None, most: int = DIFFERENT) -> None:
-        """Store ``row``; if a similar row was stored in this window, only count it.
+        """Store ``row``; if a similar row was stored in this window of WINDOW_S, only count it.
 
-        ``like``: a key that similar rows share; None: all fields but the time. Beyond ``most`` keys it is the kind.
+        ``like``: a key that similar rows share; None: all fields but the time. Once the window has ``most`` keys, rows
+        with further ones are stored as their kind alone, so that they are similar to each other.
         """
         key = (tuple(row.items())[1:],) if like is None else like  # the row without its time
         now = self._clock()

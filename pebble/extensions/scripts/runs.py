@@ -42,13 +42,16 @@ class LocalScripts:
         self._held: int | None = None
 
     def hold(self) -> None:
-        """Lock the file while a script runs. After a failure the script runs, but no neighbour gets a number."""
+        """Lock the file while a script runs. The script runs even if this fails.
+
+        Where the system refuses the lock, :meth:`none_runs` does not get it either, so neighbours drive nothing.
+        """
         if self._held is None:
             try:
                 self._held = self._open()
                 _lock(self._held, self._path, fcntl.LOCK_SH)
             except (OSError, PebbleError) as error:
-                log.debug("scripts of other robots are not refused: %s", error)
+                log.debug("the lock of local scripts is not held: %s", error)
 
     def release(self) -> None:
         file, self._held = self._held, None
@@ -105,6 +108,7 @@ def next_run(config: Config, barred: int = 0, received: int = 0) -> int:
 
 
 def _next(path: Path, barred: int, wall_clock: Callable[[], float], received: int = 0) -> int:
+    """Store and return the next number, as :func:`next_run` says; ``path`` holds the last one."""
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o600)

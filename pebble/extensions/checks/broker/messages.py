@@ -118,11 +118,12 @@ def refusals(trial: BrokerTrial) -> CheckResult:
     if granted and granted[0] >= REFUSED:
         return ok("it tells which it refuses")
     if not granted:
-        return warn("it answers one that is not allowed by nothing, or hangs up")
+        return warn("it does not answer one that is not allowed, or hangs up")
     writer.publish("x")
     if trial.wait(lambda: reader.received, 1.0):
         return skipped("this account is refused none")
-    if _is_forbidden(trial) is False:
+    may_publish = _is_forbidden(trial) is False  # not None: the broker has accepted a message there
+    if may_publish:
         return warn("it grants them, and then delivers nothing")
     return skipped("it grants them, and nothing comes: this account may not publish there, or may not read")
 

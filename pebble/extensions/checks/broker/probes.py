@@ -91,7 +91,7 @@ def assessment(states: Mapping[str, State]) -> list[str]:
         return [f"robots cannot use it with this account: {', '.join(broken)}"]
     limited = [name for name, state in states.items() if state is State.WARN]
     limits = f", with limits: {', '.join(limited)}" if limited else ""
-    words_of_state = {State.OK: "too", State.SKIPPED: "not at all"}
-    at_rest = words_of_state.get(states.get(_WILDCARDS, State.SKIPPED), "after their next state, or by name")
+    seen = {State.OK: "too", State.WARN: "after their next state, or by name", State.SKIPPED: "not at all"}
+    at_rest = seen[states.get(_WILDCARDS, State.SKIPPED)]  # skipped if nothing is retained
     mirror = "can" if states.get(_BRIDGE_MODE) is State.OK else "cannot"
     return [f"robots can use it{limits}", f"operators see robots at rest {at_rest}", f"a mirror {mirror} use it"]

@@ -45,6 +45,7 @@ def by_wildcard(trial: BrokerTrial) -> CheckResult:
 
 
 def before_pong(trial: BrokerTrial) -> CheckResult:
+    """Check that retained messages come before the answer to a ping that was sent after the subscription."""
     names, reader = _retain_states(trial), trial.peer()
     expected = len(names) if trial.wildcards else _BY_NAME
     filters = ["#"] if trial.wildcards else names[:expected]

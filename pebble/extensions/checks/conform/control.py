@@ -47,7 +47,10 @@ class Driver:
         return self._robot.send(c.CONTROL_TAKE, self.request())
 
     def send(self, z: object = 0, *, key: str | None = None, wrapped: bool = False, **fields: object) -> float:
-        """Send one command; return the time (monotonic). ``key`` replaces its own key; "" sends none."""
+        """Send one command; return the time (monotonic). ``key`` replaces its own key; "" sends none.
+
+        ``wrapped``: within ``{"value": …}``, which robots accept, too.
+        """
         key = self.key if key is None else key
         command = {"x": 0, "z": z, **fields}
         if key:

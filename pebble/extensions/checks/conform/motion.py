@@ -140,13 +140,13 @@ def _driven(test: Callable[[Observer, Driver], CheckResult]) -> Callable[[Observ
 
 
 def _rest(robot: Observer, began: float, last: float, limit_s: float, what: str = "the last command") -> CheckResult:
-    """Wait until the robot must rest and its reports have come; then check that, as :func:`rested` does."""
+    """Wait until the robot must rest and its reports have come; then return what :func:`rested` finds."""
     robot.look(limit_s + LATE_S)
     return rested(robot, began, last, limit_s, what)
 
 
 def rested(robot: Observer, began: float, last: float, limit_s: float, what: str = "the last command") -> CheckResult:
-    """Check that a robot driven from ``began`` to ``last`` was at rest within ``limit_s`` after ``last``."""
+    """Check that a robot driven from ``began`` to ``last`` moved, and rested within ``limit_s`` after ``last``."""
     until = moves_until(robot, began)
     if until is None:
         return _NOT_SHOWN
@@ -225,12 +225,12 @@ def _reset_waits(robot: Observer, driver: Driver) -> CheckResult:
     reset(robot)
     driver.drive(DRIVES_S / 2)
     if robot.view.controlled:
-        driver.send(key=_OTHER_KEY)
+        driver.send(key=_OTHER_KEY)  # a zero
     driver.drive()
     why = "a stick that is held down moves it after a reset"
     outcome = _moved(robot, began, why, "wait for a zero of who has control, or for 0.5 s without commands")
     if outcome.state is State.OK:
-        driver.send()
+        driver.send()  # the zero that ends the wait: now it must move
         outcome = _rest(robot, *driver.drive(), RESTS_S)
     is_free = robot.wait(lambda: not robot.view.latched, ANSWER_S)
     return outcome if is_free else failed("a reset does not end the stop", END_IT)
@@ -246,7 +246,7 @@ def _not_a_number(robot: Observer, _driver: Driver) -> CheckResult:
 def _clamped(robot: Observer, driver: Driver) -> CheckResult:
     began, _ = driver.drive(DRIVES_S / 2, z=9, x=-9)
     wheels = _moving_wheels(robot, began)
-    if wheels is None or not _wheel_reports(robot):  # odometry shows no wheel that is too fast
+    if wheels is None or not _wheel_reports(robot):  # speeds by odometry are good for their signs only
         return _NOT_SHOWN
     if not wheels:
         return failed("x -9, z 9 does not move it", "clamp both axes to -1..1, and obey")

@@ -105,7 +105,7 @@ def add(
     base: Annotated[
         list[str] | None,
         typer.Option(
-            help="Of a robot, unless pebble/robots/NAME; of a neighbour; of a gateway, each that it carries.",
+            help="Base topic of a robot (default: pebble/robots/NAME) or neighbour; each that a gateway carries.",
             metavar="BASE",
         ),
     ] = None,
@@ -133,7 +133,7 @@ def add(
     bases = tuple(base) if base else usual_bases
     database = "" if people is None else str(people.absolute())
     account = Account(roles=role_names, bases=bases, plain=plain, people=database)
-    with _changing(folder_) as (place, fleet):
+    with _locked_fleet(folder_) as (place, fleet):
         if why := folder.refused(fleet, name, account):
             raise FleetError(why)
         if len(fleet.accounts) >= folder.MAX_ACCOUNTS:
@@ -158,7 +158,7 @@ def role_(
     folder_: _Folder = None,
 ) -> int:
     """Change what an account may do; it stays connected."""
-    with _changing(folder_) as (place, fleet):
+    with _locked_fleet(folder_) as (place, fleet):
         account = _account(place, fleet, name)
         changed = replace(account, roles=tuple(dict.fromkeys(split_names(roles))))
         if why := folder.refused(fleet.without(name), name, changed):
@@ -166,48 +166,49 @@ def role_(
         after = replace(fleet, accounts={**fleet.accounts, name: changed})
         how = applying.apply(place, after)
     typer.echo(f"{name} is {', '.join(changed.roles)} now ({how})")
-    return _left(applying.copies(Path(_shown(place)), after))
+    return _print_left(_copies(place, after))
 
 
 def password(name: _Name, folder_: _Folder = None) -> int:
     """Give an account a new password, print it this once, and end its connections."""
-    with _changing(folder_) as (place, fleet):
+    with _locked_fleet(folder_) as (place, fleet):
         _account(place, fleet, name)
         secret = new_password()
         how = applying.apply(place, fleet, {name: secret})
     _print_account(place, fleet, name, secret, how)
-    return _left(applying.copies(Path(_shown(place)), replace(fleet, hubs="none")))  # which know no passwords
+    without_hubs = replace(fleet, hubs="none")  # their rules hold no passwords
+    return _print_left(_copies(place, without_hubs))
 
 
 def remove(name: _Name, folder_: _Folder = None) -> int:
     """Remove an account everywhere, and end its connections; say where it may still get in."""
-    with _changing(folder_) as (place, fleet):
+    with _locked_fleet(folder_) as (place, fleet):
         account = _account(place, fleet, name)
         after = fleet.without(name)
         is_person = not set(account.roles) & set(ProgramRole)
         unfinished = list(_remove_from_pages(fleet, name)) if is_person else []
-        unfinished += applying.copies(Path(_shown(place)), after)
+        unfinished += _copies(place, after)
         try:
             how = applying.apply(place, after)
             typer.echo(f"{name} is removed and disconnected ({how})")
         except FleetError as error:
             unfinished += [*str(error).splitlines(), f"{name} may still get in there: give this command again"]
-    return _left(unfinished)
+    return _print_left(unfinished)
 
 
 def zenoh(
     only_here: Annotated[
-        bool, typer.Option("--only-here", help="All hubs run on this machine and read the file in the folder.")
+        bool, typer.Option("--only-here", help="All hubs run on this machine and read the file there: no copies.")
     ] = False,
     folder_: _Folder = None,
 ) -> int:
-    """Write the same rules for Zenoh hubs, and write them again at each later change.
+    """Write the accounts' rules for Zenoh hubs, too, and write them again at each later change.
 
     \b
         pebble fleet zenoh --only-here
     """
     require_packages("pebble fleet")
-    with _changing(folder_) as (place, fleet):
+    with _locked_fleet(folder_) as (place, fleet):
         after = replace(fleet, hubs="here" if only_here else "elsewhere")
         applying.write_zenoh(place, after)
         folder.save(place, after)
@@ -236,7 +237,7 @@ def certificate(
         pebble fleet certificate goob goob.local 192.168.1.7
     """
     require_packages("pebble fleet")
-    with _changing(folder_) as (place, fleet):
+    with _locked_fleet(folder_) as (place, fleet):
         account = _account(place, fleet, name)
         is_hub = ProgramRole.HUB in account.roles
         if is_hub and not hosts:
@@ -274,7 +275,7 @@ def apply_(folder_: _Folder = None) -> int:
     \b
         pebble fleet apply
     """
-    with _changing(folder_, any_rules=True) as (place, fleet):
+    with _locked_fleet(folder_, any_rules=True) as (place, fleet):
         unfinished = list[str]()
         if fleet.rules == "plugin":
             fleet, unfinished = plugin.convert(place, fleet)
@@ -282,8 +283,8 @@ def apply_(folder_: _Folder = None) -> int:
             unfinished += applying.conf_differences(place, fleet)
         else:
             typer.echo(f"{_shown(place)} knows {len(fleet.accounts)} accounts ({applying.apply(place, fleet)})")
-        unfinished += applying.copies(Path(_shown(place)), fleet)
-    return _left(unfinished)
+        unfinished += _copies(place, fleet)
+    return _print_left(unfinished)
 
 
 def check_(folder_: _Folder = None) -> int:
@@ -293,9 +294,9 @@ def check_(folder_: _Folder = None) -> int:
         pebble fleet check
     """
     require_packages("pebble fleet")
-    with _changing(folder_) as (place, fleet):
+    with _locked_fleet(folder_) as (place, fleet):
         by_hand, rules = check.by_hand(place, fleet), check.of_rules(place, fleet)
-    code = _left(by_hand + rules)
+    code = _print_left(by_hand + rules)
     if rules:
         typer.echo(f"pebble: `pebble fleet apply --folder {_shown(place)}` writes the rules again", err=True)
     if not code:
@@ -316,7 +317,7 @@ def register(app: typer.Typer) -> None:
 def _init_again(place: Path, host: str | None, level: str | None, plain: bool | None) -> int:
     if host is not None:
         raise PebbleError(f"{_shown(place)} is a fleet already, so leave out --host; another host needs another folder")
-    with _changing(place) as (_, fleet):
+    with _locked_fleet(place) as (_, fleet):
         after = replace(
             fleet,
             level=fleet.level if level is None else _LEVELS[level],
@@ -324,12 +325,12 @@ def _init_again(place: Path, host: str | None, level: str | None, plain: bool | 
         )
         how = applying.apply(place, after)
     typer.echo(f"{_shown(place)} has level {after.level}{' and plain topics' if after.plain else ''} ({how})")
-    return _left(applying.copies(Path(_shown(place)), after))
+    return _print_left(_copies(place, after))
 
 
 @contextmanager
-def _changing(folder_: Path | None, *, any_rules: bool = False) -> Iterator[tuple[Path, Fleet]]:
-    """Yield a fleet and its folder, locked for a change. Raises PebbleError.
+def _locked_fleet(folder_: Path | None, *, any_rules: bool = False) -> Iterator[tuple[Path, Fleet]]:
+    """Yield a fleet and its folder, locked against changes by others. Raises PebbleError.
 
     ``any_rules``: also a fleet whose rules mosquitto still takes from its plugin, not from files.
     """
@@ -411,8 +412,13 @@ def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, 
         typer.echo(json.dumps(piece, indent=2))
 
 
-def _left(lines: Iterable[str]) -> int:
-    """Print the places where a change does not apply yet; return the command's exit code."""
+def _copies(place: Path, fleet: Fleet) -> Iterator[str]:
+    """Yield the copies of the rules that are not changed with them, each with what to do."""
+    return applying.copies(Path(_shown(place)), fleet)
+
+
+def _print_left(lines: Iterable[str]) -> int:
+    """Print what is left to do by hand, such as copying the rules; return the exit code: 1 if there is anything."""
     code = 0
     for line in lines:
         typer.echo(f"pebble: {shown(line)}", err=True)

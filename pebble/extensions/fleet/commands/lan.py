@@ -1,4 +1,7 @@
-"""``pebble fleet lan`` and ``pebble fleet up``: where the robots of a LAN meet, from its files to its programs."""
+"""``pebble fleet lan`` and ``pebble fleet up``: where the robots of a LAN meet, from its files to its programs.
+
+At its hub each robot and each board is a *neighbour* of the others, which they may receive from.
+"""
 
 from __future__ import annotations
 
@@ -148,7 +151,10 @@ def _running(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def _accounts(fleet: Fleet, robots: list[str], boards: list[str]) -> Fleet:
-    """Return the fleet with accounts for robots, as neighbours, and for boards at the broker. Raises FleetError."""
+    """Return the fleet with an account for each neighbour at the hub, and for boards and their gateway at the broker.
+
+    Raises FleetError.
+    """
     bases = {name: f"pebble/robots/{name}" for name in (*robots, *boards)}
     for name, times in Counter((*robots, *boards)).items():
         if times > 1:

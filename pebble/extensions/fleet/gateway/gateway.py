@@ -1,8 +1,8 @@
 """The gateway as a program: it carries the robots that it hears at a hub to an MQTT broker, and their commands back.
 
-Where boards are, the broker of a LAN takes the place of the hub. There is one gateway for a LAN; a second one does not
-start. A live emergency stop has a connection of its own, which is subscribed to nothing else, and passes for every
-robot, heard or not. Only while that connection is away, the robot's forwarder passes it as well.
+Boards cannot speak Zenoh: for them, a broker of their LAN takes the place of the hub. There is one gateway for a LAN; a
+second one does not start. A live emergency stop has a connection of its own, which is subscribed to nothing else, and
+passes for every robot, heard or not. Only while that connection is away, the robot's forwarder passes it as well.
 """
 
 import logging

@@ -138,7 +138,7 @@ def _delete_whole(path: Path, *, yes: bool) -> int:
 
 
 def _mend_file(source: Path, target: Path | None) -> int:
-    files([source])
+    files([source])  # raises an error if it is no recording
     if target is None:
         raise PebbleError(f"{source}: name a new file for what can be read: pebble recordings mend {source} OUT")
     if target.exists():

@@ -2,8 +2,8 @@
 
 A line is ``{"timestamp", "topic", "qos", "retain", "payload_size_bytes", "payload_truncated", "payload_b64"}``, and
 ``payload_text`` and ``payload_json`` where the payload is text or JSON. The logger stamps with seconds since 1970 and
-cuts payloads at 8192 bytes unless asked otherwise. We add ``retained``: the logger's subscriptions set ``retain`` for
-messages that are from before them only, ours as they were published.
+cuts payloads at 8192 bytes unless asked otherwise. We add ``retained``: the message is from before the subscription.
+The logger sets ``retain`` for such messages only; here it says that a message was published to be retained.
 """
 
 from collections.abc import Iterable, Iterator

@@ -52,10 +52,9 @@ class Due:
         self._checked: tuple[int, int] | None = None  # both clocks at the last call of suspended_s
 
     def every(self, what: str, seconds: float) -> bool:
-        """True if the task ``what`` is due: at the earliest ``seconds`` after it was due last, or first asked for."""
+        """True if the task ``what`` is due: ``seconds`` have passed since it was due last, or since the start."""
         now = self._boot_ns()
         if now - self._done.get(what, self._began) < seconds * 1e9:
-            self._done.setdefault(what, now)
             return False
         self._done[what] = now
         return True

@@ -23,9 +23,9 @@ _LOSSES: Final = ("too_long", "malformed")  # messages that a transport has drop
 class Source:
     """A connection whose messages are recorded, and whose changes are recorded as events.
 
-    A broker sends only some 1,000 retained messages to a subscription of QoS 1, and does not mark them on a connection
-    that shows how live messages were published. So each connection to a broker has a second one, which fetches the
-    retained messages with QoS 0 and ends.
+    With MQTT 5's retain-as-published it sees which live messages were published to be retained, but could not tell
+    those from older ones. Besides, brokers send only some 1,000 retained messages with QoS 1. So each connection to a
+    broker has a second one, which fetches the retained messages with QoS 0 and ends.
     """
 
     def __init__(self, recorder: Recorder, kind: str, settings: Any, filters: Iterable[str], name: str = "") -> None:
@@ -154,7 +154,7 @@ class _RetainedFetch:
 
     @property
     def failed(self) -> bool:
-        """True if the connection has never lasted long enough."""
+        """True if time is up without a connection, or while retained messages still arrive."""
         now = time.monotonic()
         return now > self._ends_at and now - self._quiet_since <= _QUIET_S
 

@@ -209,7 +209,10 @@ def _is_elsewhere(key: str, value: Any, below: str) -> bool:
 
 
 def _without_controls(section: Any, *, drives: bool) -> Any:
-    """Return the section without its controls, since a recording obeys no command."""
+    """Return the section with ``controls`` false, since a recording obeys no command.
+
+    ``drives``: it is the section ``drive``, which is not even available.
+    """
     if isinstance(section, list):
         return [_without_controls(value, drives=drives) for value in section]
     if not isinstance(section, dict):

@@ -64,7 +64,7 @@ class Archive:
         files = [file for file in files if file.first_ns < at_ns]
         if not files:
             return []
-        file = max(files, key=lambda file_: file_.first_ns)
+        file = max(files, key=lambda file_: file_.first_ns)  # it begins with what was retained before it
         topics = {channel.topic for channel in file.channels.values() if _is_of(channel, robot)}
         newest: dict[str, Recorded] = {}
         for chunk in reversed(_within(file, _channels_of(file, robot), 0, at_ns)):

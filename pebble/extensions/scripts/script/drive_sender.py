@@ -29,8 +29,8 @@ class DriveSender:
     ``publish`` sends one command and returns whether it was accepted. Times are seconds of one monotonic clock. Call
     :meth:`tick` at :attr:`due`. One thread at a time.
 
-    At most MAX_PER_S commands a second are published. Of several that wait for their turn, the newest is. A zero is
-    published at once, in place of all that wait; only repetitions of a published zero take their turn.
+    At most MAX_PER_S commands a second are published; only the newest command waits for its turn. A zero is published
+    at once, in place of the command that waits; only repetitions of a published zero take their turn.
     """
 
     def __init__(self, run: int, publish: Callable[[Drive], bool]) -> None:
