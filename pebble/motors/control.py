@@ -85,7 +85,7 @@ class Control:
         self.lease.vouch(vouched.begin, vouched.end, ms(now))
 
     def doubt(self, now: float) -> None:
-        """Note that messages may be lost here: the bridge vouches only for what it has sent."""
+        """Note that messages may have been lost in this process: no silence until now counts against the holder."""
         self.lease.doubt(ms(now))
 
     def account(self, drive: Drive) -> str | None:

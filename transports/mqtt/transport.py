@@ -220,8 +220,8 @@ class MqttTransport(Transport):
             if self._dialler.addresses.several and not self._dialler.addresses.is_over:
                 continue  # the next address
             pause = min(self.settings.reconnect_max_s, _RETRY_S * 2 ** (failures - 1)) if failures else 0.0
-            if not self._dialler.limits.asks_again:
-                failures = min(failures + 1, 20)
+            if not self._dialler.limits.asks_again:  # else the broker is asked in another way, and has not failed
+                failures = min(failures + 1, 20)  # bounded, because it is an exponent
             stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
 
     def _run_connection(self, run: _Run) -> None:
@@ -357,6 +357,7 @@ class MqttTransport(Transport):
         while not ack.done:
             if stopping.is_set():
                 raise Lost("closed")
+            # The wait begins again while retained messages arrive, and on a thin link with every sign of life.
             since, answer_s = max(asked_at, connection.incoming.age.arriving_at), _ANSWER_S
             if connection.pings.is_thin:
                 since, answer_s = max(since, connection.incoming.answered_at), connection.pings.silence_limit_s
@@ -380,7 +381,7 @@ class MqttTransport(Transport):
 
     def note_answers(self, refused: Mapping[str, bool]) -> None:
         if self._connection is None:
-            return  # to the query of our own retained messages
+            return  # these answer `_find`, which asks before the connection is used
         subscriptions = list(self._subscriptions)
         for filter_, is_refused in refused.items():
             for subscription in subscriptions:

@@ -263,9 +263,11 @@ class ZenohTransport(Transport):
         try:
             if message.retain:
                 self._hub.put(session, message, again=self._own.syncing)
+            # While `syncing`, messages that siblings have received before are sent to the hub again. Only a client's
+            # pending messages are new to others, which it reaches through the hub.
             if not self._own.syncing:
                 self._publishers.put(session, message, urgent)
-            elif self.settings.client and message.topic in self._own.pending:  # others hear it through the hub only
+            elif self.settings.client and message.topic in self._own.pending:
                 self._publishers.put_late(session, message)
         except zenoh.ZError as error:
             log.debug("%s could not send: %s", self.client_id, error)

@@ -38,7 +38,7 @@ class _Paho(paho.Client):
     def _sock_recv(self, bufsize: int) -> bytes:
         if self.begin == len(self.ahead):
             raise BlockingIOError
-        if self._too_long:
+        if self._too_long:  # discard what paho has collected of the packet after its head
             del self._in_packet["packet"][HEAD:]
         data = self.ahead[self.begin : self.begin + bufsize]
         self.begin += len(data)
