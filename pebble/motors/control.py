@@ -42,7 +42,7 @@ class Control:
         """
         self.boot = secrets.token_hex(4)  # of this life of the motor owner
         self._named = security.named
-        strangers = ("drive", "free", "refuse").index(security.unnamed)
+        strangers = ("drive", "free", "refuse").index(security.unnamed)  # as the lease numbers these rules
         self.lease = lease_of(owner, owners, self.boot, ms(now), operator.sub, secrets.token_hex, strangers)
         self.lease.vouched = (ms(now), ms(now)) if bridged else None
         self._turns = Paced(show_turn, _TURNS_PER_S)

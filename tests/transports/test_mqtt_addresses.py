@@ -14,6 +14,7 @@ import pytest
 
 from pebble.transports import MqttSettings, QoS, State, Transport, create
 from pebble.transports.hosts import HANDSHAKE_S, STEADY_S, Address, AddressRound, HostPort
+from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.dialler import Dialler
 from pebble.transports.mqtt.ending import Absent, Lost, Silent
 from tests.fakes.bad_brokers import BEHAVIOURS, mute, serving
@@ -178,7 +179,7 @@ LOSSES = {"lost": Lost, "silent": Silent, "absent": Absent}
     ],
 )
 def test_whether_the_broker_has_ended(events: str, ended: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    now, verdict, dialler = 0.0, True, Dialler("tool", MqttSettings(host="b"), None)
+    now, verdict, dialler = 0.0, True, Dialler("tool", MqttSettings(host="b"), None, Client)
     monkeypatch.setattr("pebble.transports.mqtt.dialler.time", SimpleNamespace(monotonic=lambda: now))
     for event in events.split():
         word, now = event.partition("@")[0], float(event.partition("@")[2])

@@ -219,8 +219,8 @@ class ZenohTransport(Transport):
         """Store our will at the hub, and send messages until it lacks none that it has room for."""
         end = time.monotonic() + HUB_ANSWER_S
         sent: set[str] = set()
-        while (remaining_s := end - time.monotonic()) > 0:  # looked at once: Zenoh refuses what is not positive
-            with self._publishing:  # which takes a moment on a busy machine
+        while (remaining_s := end - time.monotonic()) > 0:  # Zenoh refuses a time limit that is not positive
+            with self._publishing:
                 hello = self._hub.hello()
             lacking = self._hub.greet(session, hello, remaining_s)
             if lacking is None:
