@@ -120,7 +120,7 @@ class StopConnection:
         self._transport, self._filters, self._clock = transport, tuple(filters), clock
         self._pass_on, self._main = pass_on, main
         self._copies = Copies(clock, notices_s)
-        self._failing_since = float("-inf")  # when stops arrived on it last, or it was not needed
+        self._failing_since = float("-inf")  # when it was last subscribed to stops, or not needed
         self._off_until = float("-inf")  # when it is tried again
         self._connected_at = float("inf")
         self._kicks = 0  # how often in a row the main connection was lost for it

@@ -88,7 +88,7 @@ class PahoClient:
 
     def __init__(self, opening: Opening, listener: Listener, *, bridge: bool) -> None:
         client_id, settings, context, will, *_ = opening
-        self.drained, self.hung_up = True, True  # paho does not say how a connection ended on which it wrote
+        self.drained, self.hung_up = True, True  # hung_up: paho does not say why a write has failed
         self._settings, self._context, self._listener = settings, context, listener
         self._modern = settings.protocol == "5"
         protocol = MQTTProtocolVersion.MQTTv5 if self._modern else MQTTProtocolVersion.MQTTv311
