@@ -89,6 +89,7 @@ class SenderClocks(Generic[K]):
                 clock = self._clock_to_use(key, clock, sent, now, late_s)
             if waited_s <= late_s:
                 clock.proved = max(clock.proved, now - sent - waited_s)
+            # By the least difference that a message without delay may have: an age is rather too great than too small.
             age = now - sent - min(clock.least, clock.proved)
             return age if now - clock.began >= _YOUNG_S else max(age, waited_s)
 
@@ -99,7 +100,7 @@ class SenderClocks(Generic[K]):
             return clock is not None and clock.newest - _JUMP_S < sent < clock.newest
 
     def pass_over(self, key: K, sent: float, now: float) -> None:
-        """Note the stamp of a message without judging it. Earlier messages of the sender are late from now on."""
+        """Note the stamp of a message that is not judged, so that :meth:`is_passed` finds the sender's earlier ones."""
         with self._lock:
             clock = self._clocks.get(key)
             if clock is not None and sent - clock.newest < now - clock.received_at + _JUMP_S:

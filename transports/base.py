@@ -371,6 +371,7 @@ class Transport(ABC):
         message = Message(topic, payload, qos if type(qos) is QoS else QoS(qos), retain)
         if (forms := self.policy.forms) is None:
             return self._publish(message, urgent=urgent, remember=remember, shared=shared)
+        # Several messages in place of this one, such as a stop with the sender's name and one without it.
         outcomes = [self._publish(form, urgent=urgent, remember=remember, shared=shared) for form in forms(message)]
         return outcomes[0]
 

@@ -58,7 +58,8 @@ def make_private(run_dir: Path, *, close: bool = False) -> None:
                 f"transport.run_dir {run_dir} is not a folder of this user: "
                 "run this as the user of the robot, or remove what is there"
             )
-        if close and folder.st_mode & 0o077 and not folder.st_mode & stat.S_ISVTX:
+        is_shared = folder.st_mode & stat.S_ISVTX  # the sticky bit: a folder for all users, such as /tmp, stays so
+        if close and folder.st_mode & 0o077 and not is_shared:
             run_dir.chmod(0o700)
         elif folder.st_mode & 0o022:
             raise TransportError(f"transport.run_dir {run_dir}: others may write there, name a folder of this user")
@@ -88,7 +89,7 @@ class FileLock:
 
     @classmethod
     def wait(cls, path: Path) -> FileLock:
-        """Lock a file with a new name; another process may hold it for a moment, to check its owner."""
+        """Lock a file with a new name. Waits while another process checks, for a moment, whether its owner runs."""
         return cls._get(path, fcntl.LOCK_EX)
 
     @classmethod

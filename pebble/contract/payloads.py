@@ -217,7 +217,7 @@ class GatewayHeartbeat(Payload, frozen=True, kw_only=True):
 
 
 class NeighbourRefusal(Payload, frozen=True, kw_only=True):
-    """A run of another robot's script that has no effect, and why."""
+    """A run of another robot's script whose commands this robot refuses, and why."""
 
     run: int
     why: str

@@ -17,8 +17,8 @@ MAX_UNKNOWN_FLAGS = 64  # each is retained on the robot: in its broker or hub, a
 class Admission:
     """Limits on size, and on the number of actions and of messages that the contract does not know.
 
-    Unknown flags that the robot itself has set are always admitted, and count as well: a restarted bridge continues the
-    count.
+    Of unknown flags a limited number is admitted from outside. Those that the robot's side has are always admitted, and
+    counted as well: a restarted bridge so counts again the flags that it had passed on before.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -47,7 +47,7 @@ class Admission:
         if subject.kind is not Kind.FLAG or subject.channel is not None:
             return None
         if not message.payload:  # a removal, which needs no room
-            if side is Side.REMOTE and topic not in self._flags:
+            if side is Side.REMOTE and topic not in self._flags:  # the robot has no such flag
                 return Drop.KNOWN
             self._flags.discard(topic)
         elif side is Side.LOCAL or topic in self._flags or len(self._flags) < MAX_UNKNOWN_FLAGS:

@@ -136,7 +136,7 @@ class Cycles:
             now, due = self._clock(), []
             for side, topic in list(self.closed_ways):
                 way = self._ways[side, topic]
-                if now - way.probed_at < PROBE_PERIOD_S / 2:
+                if now - way.probed_at < PROBE_PERIOD_S / 2:  # probed since the last call: an answer may be coming
                     continue
                 if way.unanswered >= UNANSWERED:
                     self._open(side, topic)
@@ -179,7 +179,7 @@ class Cycles:
         self.closed_ways.add((side, topic))
 
     def _open(self, side: Side, topic: str) -> None:
-        """Note that it comes back no more."""
+        """Note that what is forwarded from ``side`` on ``topic`` comes back no more."""
         self._ways[side, topic].closed = False
         self.closed_ways.discard((side, topic))
         if not self.closed_ways:
@@ -197,8 +197,8 @@ class Cycles:
 def _usual_count(subject: Subject) -> int:
     """Return how many equal messages within 2 s are normal; more of them start a probe.
 
-    An action is probed at once: other programs must expect probes on its topic anyway. On topics of other commands they
-    see a probe only after a repetition.
+    The first message of an action is probed already, before the action can run twice. Other commands are probed only
+    after a repetition, so that other programs seldom see a probe.
     """
     if subject.kind.direction == OUTGOING:
         return STORM

@@ -26,7 +26,7 @@ Step: TypeAlias = Callable[[Side, Subject, Message], str]
 
 
 class Observer:
-    """An observer of messages to the robot, passed and refused. It is made with config and clock before they pass.
+    """An observer of messages to the robot, passed and refused. Its class is called with config and clock at the start.
 
     ``by`` is the sender that the broker has checked, ROBOT, or None where no names are checked.
     """

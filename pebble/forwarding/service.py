@@ -181,7 +181,7 @@ class ForwardingService(Service, ABC):
         def synchronize() -> None:
             if side is Side.REMOTE and self.forwarder.sides[side].window.is_arriving and self.clock() < end:
                 self.call_at(self.clock() + QUIET_S, synchronize)  # more may come
-            elif side is Side.LOCAL or epoch == self.epoch:
+            elif side is Side.LOCAL or epoch == self.epoch:  # the remote side has not been lost meanwhile
                 self.forwarder.retained.synchronize(side)
                 if side is Side.REMOTE or self.rules.leaves_robot:
                     self.forwarder.publisher.probe_commands(*self.probed_sides)

@@ -42,8 +42,9 @@ class SideState:
         self.seen: set[str] = set()  # two-way topics, since we subscribed
         self.restarted = False  # its retained messages come again, and the reconciliation has not been told
         self._clock, self._wins = clock, wins
-        self._lost_at = float("-inf")  # -inf: before the first connection, too
-        self._went_back = False  # until its messages have arrived: its values are older than ours (a loser: may be)
+        self._lost_at = float("-inf")  # when its state was last another than connected; -inf: never
+        # Its retained messages have not arrived, and are older than ours; of the side that does not win: may be older.
+        self._went_back = False
 
     @property
     def connected(self) -> bool:

@@ -42,7 +42,7 @@ class Control:
         """
         self.boot = secrets.token_hex(4)  # of this life of the motor owner
         self._named = security.named
-        strangers = ("drive", "free", "refuse").index(security.unnamed)
+        strangers = ("drive", "free", "refuse").index(security.unnamed)  # as the lease numbers these rules
         self.lease = lease_of(owner, owners, self.boot, ms(now), operator.sub, secrets.token_hex, strangers)
         self.lease.vouched = (ms(now), ms(now)) if bridged else None
         self._turns = Paced(show_turn, _TURNS_PER_S)
@@ -85,7 +85,7 @@ class Control:
         self.lease.vouch(vouched.begin, vouched.end, ms(now))
 
     def doubt(self, now: float) -> None:
-        """Note that messages may be lost here: the bridge vouches only for what it has sent."""
+        """Note that messages may have been lost in this process: no silence until now counts against the holder."""
         self.lease.doubt(ms(now))
 
     def account(self, drive: Drive) -> str | None:

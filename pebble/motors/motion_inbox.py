@@ -170,7 +170,8 @@ def run_of(drive: p.Drive) -> int:
 def _replaced(waiting: list[ReceivedDrive], newest: ReceivedDrive) -> list[ReceivedDrive]:
     """Return the commands that wait when ``newest`` has come: at most a zero and a command after it.
 
-    Two zeros become one zero with the later time, final if either of them is final.
+    Two zeros become one zero with the later time, final if either of them is final. A final zero (``valid_ms`` 0) ends
+    scripts, which another zero only lets wait.
     """
     zeros = [received for received in waiting if not received.drive.moves]
     if newest.drive.moves or not zeros:

@@ -98,10 +98,10 @@ class MotorGuard:
             self._log.log("stop", logging.WARNING, "emergency stop by %s", _described(by, why))
             self._save()
             self._state.changed(now)
-        elif self._latch.by != earlier_by:
+        elif self._latch.by != earlier_by:  # the same stop again, now with a sender that was checked
             self._save()
             self._state.changed(now)
-        elif now >= self._state.last + _REPEAT_S:
+        elif now >= self._state.last + _REPEAT_S:  # the sender may have missed the answer
             self._state.changed(now)
 
     def reset(self, reset: EstopReset, age_s: float, now: float) -> None:

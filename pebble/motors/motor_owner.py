@@ -35,7 +35,8 @@ class MotorOwner(Service, ABC):
     """
 
     publishes: ClassVar[tuple[c.Channel, ...]] = (c.ESTOP_STATE, c.CONTROL_STATE, c.CONTROL_TURN)
-    company: ClassVar[tuple[c.Channel, ...]] = ()  # commands that move nothing, and that it takes in a group
+    #: Commands, such as lights, that it carries out with the drive command of the same group (pebble.contract.groups).
+    company: ClassVar[tuple[c.Channel, ...]] = ()
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -94,9 +95,9 @@ class MotorOwner(Service, ABC):
         """Stop the motors now. This is called again and again while the motors stand still."""
 
     def move_with(self, drive: p.Drive, valid_s: float, company: tuple[groups.Member, ...]) -> None:  # noqa: ARG002
-        """Carry out a drive command, or a zero, and at once the members of its group on channels in :attr:`company`.
+        """Carry out a drive command, or a zero, together with ``company``: other commands of the same group.
 
-        A subclass with such channels overrides this method.
+        A subclass that names channels in :attr:`company` overrides this method.
         """
         self.move(drive, valid_s)
 
@@ -153,7 +154,7 @@ class MotorOwner(Service, ABC):
             self._judge_soon(self._waiting.put_drive(drive, arrived))
 
     def is_copy(self, command: p.Drive | p.LightsSolid) -> bool:
-        """True if ``command`` is the copy of a group's member: this motor owner takes the group itself."""
+        """True if ``command`` is a copy of a command in a group, and this motor owner takes the group itself."""
         return self._takes_groups and command.group is True
 
     def _receive_group(self, message: Message, _value: Any, _names: dict[str, str]) -> None:
@@ -183,14 +184,14 @@ class MotorOwner(Service, ABC):
     def judge(self) -> None:
         """Judge all waiting messages, stops first, because a stop voids the drive commands that wait with it."""
         batch = self._waiting.take()
-        latches = not batch.stops or self._latches  # asked only if there are stops
+        only_halts = bool(batch.stops) and not self._latches
         for stop in batch.stops:
             self._halt()
-            if latches:
-                self._guard.stop(stop, self.clock())
-            else:
+            if only_halts:
                 self.log_limited.warning("unlatched", "a stop only halts: it could not be reset")
                 self._guard.judge(_FINAL_ZERO, self.clock())
+            else:
+                self._guard.stop(stop, self.clock())
         for waiting in batch.resets:
             self._guard.reset(waiting.reset, self.clock() - waiting.at, self.clock())
         for request in batch.requests:
@@ -202,9 +203,9 @@ class MotorOwner(Service, ABC):
         if batch.lost:
             self._control.doubt(self.clock())
         for received in batch.drives:
-            if latches or not (batch.stops and received.drive.moves):
+            if not (only_halts and received.drive.moves):  # after a stop that latches, the guard refuses them
                 self._drive(received)
-        if batch.vouched is not None:  # the drive commands of before it must count first, or be missed
+        if batch.vouched is not None:  # last: the vouched time covers the drive commands above
             self._control.vouch(batch.vouched, self.clock())
         self._arm_guard()
         if self._waiting.dropped:

@@ -87,9 +87,10 @@ class FollowingLease(SharedLease):
             return
         self._followed, self.until = turn, turn.t + FOLLOWS_MS
         if earlier is None or (turn.boot, turn.turn) != (earlier.boot, earlier.turn):
-            self.take((turn.account, turn.id, turn.by, turn.device) if turn.key else (), 0, now)
+            holder = (turn.account, turn.id, turn.by, turn.device) if turn.key else ()
+            self.take(holder, 0, now)  # 0: the lease makes no key of its own
             self.key = turn.key
-        asker = ("", turn.asks_id, turn.asks, "") if turn.asks_id else ()
+        asker = ("", turn.asks_id, turn.asks, "") if turn.asks_id else ()  # a turn has neither its account nor device
         self.changed = self.changed or (asker, turn.others) != (self.asker, self.others)
         self.asker, self.others = asker, turn.others
 

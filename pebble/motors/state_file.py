@@ -81,7 +81,7 @@ class StateFile:
             return Unreadable()
 
     def appeared(self) -> Any:
-        """Return the value of a file that another process wrote, as :meth:`load` does; None if there is none."""
+        """Return what :meth:`load` returns, but only of a file that this process has not written (a late mount)."""
         try:
             return None if self._own is not None and not self._own.replaced else self.load()
         except OSError:

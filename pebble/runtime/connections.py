@@ -155,7 +155,7 @@ def hub_settings(config: Config) -> ZenohSettings:
         lease_ms=transport.lease_ms,
         journal=transport.journal,
         of_robot=True,
-        wills=tuple(
+        wills=tuple(  # a hub knows the rules of the contract's topics, but not the topics that this config renames
             dict.fromkeys(
                 (topic, channel.kind is c.Kind.FLAG)
                 for channel, topic in _renamed(config)

@@ -28,7 +28,7 @@ class Wanted(Struct, frozen=True, tag_field="note", tag="wanted"):
 
 
 class Held(Struct, frozen=True, tag_field="note", tag="held"):
-    """A request to let an on-demand program wait, or its end."""
+    """A request to let an on-demand program wait, or to end the wait."""
 
     program: _Name
     on: bool

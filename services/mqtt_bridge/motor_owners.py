@@ -36,12 +36,11 @@ class MotorOwners:
         for topic, owner in self.topics.items():
             count, count_before = self._messages[topic], self._checked[topic]
             self._checked[topic] = count
-            received_at = self._received_at[topic]
-            if received_at is None or (count > 1 and count != count_before):
+            received_at, is_live = self._received_at[topic], count > 1
+            if received_at is None or (is_live and count != count_before):
                 received_at = self._received_at[topic] = now
-            is_silent = now - received_at >= _MISSED_S
-            if count <= 1 and not is_silent:
-                continue  # nothing new is known
-            reached = not is_silent
+            reached = now - received_at < _MISSED_S
+            if reached and not is_live:
+                continue  # a live message may still come in time
             if reached != self._reported[topic] and self._notifier.reaches(owner, reached):
                 self._reported[topic] = reached

@@ -291,9 +291,9 @@ class MqttBridge(ForwardingService):
         if not self.config.motor_owners:
             return
         gate, counters = self.forwarder.gate, self.forwarder.counters
-        passes = self._same_broker.both_connected and (
-            gate is Gate.SHUT or (gate is Gate.OPEN and bool(self.subscriptions[Side.REMOTE]))
-        )
+        needs_no_bridge = gate is Gate.SHUT  # the two sides are one broker
+        forwards = gate is Gate.OPEN and bool(self.subscriptions[Side.REMOTE])
+        passes = self._same_broker.both_connected and (needs_no_bridge or forwards)
         late, refused = counters[f"{Side.REMOTE.value}: {Drop.LATE.value}"], counters[f"{Side.LOCAL.value}: refused"]
         # Any change of these may mean that a message was lost.
         losses = gate, self.epoch, self._local_changes, refused, late, self.transport.counters["dropped"]

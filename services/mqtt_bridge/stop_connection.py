@@ -69,7 +69,7 @@ class Copies:
             if copy is not None:
                 expected.remove(copy)
                 if way is Way.MAIN:
-                    short = message.payload[:MAX_COMMAND_BYTES]  # a stop as well: it cannot be read
+                    short = message.payload[:MAX_COMMAND_BYTES]  # if it is cut off it is still a stop, without a name
                     self._dropped.append((now, Message(message.topic, short, message.qos)))
                 return True
             if comes_both_ways and not message.retain:  # with the flag it may be an old one, of which there is no copy
@@ -120,7 +120,7 @@ class StopConnection:
         self._transport, self._filters, self._clock = transport, tuple(filters), clock
         self._pass_on, self._main = pass_on, main
         self._copies = Copies(clock, notices_s)
-        self._failing_since = float("-inf")  # when stops arrived on it last, or it was not needed
+        self._failing_since = float("-inf")  # when it was last subscribed to stops, or not needed
         self._off_until = float("-inf")  # when it is tried again
         self._connected_at = float("inf")
         self._kicks = 0  # how often in a row the main connection was lost for it

@@ -25,7 +25,8 @@ class Vouching:
     def check(self, passes: bool, losses: Hashable, now: float) -> ControlVouched:
         """Update and return the vouched time; ``losses`` changes when a message may have been lost here.
 
-        Call it every PERIOD_S. A broker is late if its answer takes longer than a drive command may wait.
+        ``passes``: the broker's messages reach the motor owners now. Call it every PERIOD_S. A broker is late if its
+        answer takes longer than a drive command may wait.
         """
         delivered_s = self._delivered_s()
         if not passes or losses != self._losses or delivered_s is None:

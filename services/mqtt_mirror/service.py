@@ -54,7 +54,8 @@ class MqttMirror(ForwardingService):
         self._probes = Probes()
         self._announced = False  # the bridge has announced a probe since the newest check began
         self._under_way = False  # a probe of the bridge may be under way
-        self._slowest_s = bridge.remote_mqtt.silence_seconds if bridge.remote is None else 0.0  # a probe takes at most
+        # So long a probe is under way at most; 0.0: not known, for a remote side other than `remote_mqtt`.
+        self._slowest_s = bridge.remote_mqtt.silence_seconds if bridge.remote is None else 0.0
         self._requested_at = float("-inf")
         self._is_operators = False  # by the newest check the broker is the operators', not one of the robot's
         self._refused = ""  # why nothing is mirrored, as logged

@@ -222,7 +222,7 @@ class Client:
         the DISCONNECT. So bytes that come until the broker closes it, or for `_ENDING_S`, are read and thrown away.
         """
         self._send(packets.DISCONNECT)
-        if self.waiting:
+        if self.waiting:  # the socket accepts no more: the connection is discarded without DISCONNECT
             return
         if self.socket is not None:
             with suppress(OSError, ValueError):  # it sends nothing more; it has ended

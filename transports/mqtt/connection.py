@@ -257,6 +257,7 @@ class Connection:
                 return False
             if message.qos is QoS.DELIVERED and self.in_flight.unacked >= UNACKED_LIMIT and self._is_full(message):
                 return False
+            # Without QoS 1 nothing is acknowledged: then the bytes that wait are limited.
             if not limits.qos and client.unwritten > _UNWRITTEN and not self._owner.policy.is_stop(message.topic):
                 return False
             if message.retain and limits.retain:
@@ -279,7 +280,7 @@ class Connection:
         return _OVERHEAD + len(message.topic.encode()) + len(message.payload) <= self.max_packet
 
     def _is_full(self, message: Message) -> bool:
-        """True if no message beyond the limit may be sent, or only stops may, and this is none."""
+        """True if ``message`` may not be sent beyond UNACKED_LIMIT, as a stop may while the reserve lasts."""
         beyond = self.in_flight.unacked - UNACKED_LIMIT
         return beyond >= UNACKED_RESERVE or not self._owner.policy.is_stop(message.topic)
 

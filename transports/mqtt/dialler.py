@@ -51,7 +51,7 @@ class Dialler:
 
     def begin(self) -> None:
         """Begin an attempt. Raises Lost if the name of the broker has no address."""
-        self.attempt = None  # a resolver cannot be interrupted
+        self.attempt = None  # none while a name is resolved, which nothing can interrupt
         try:
             address = self.addresses.address()
         except (OSError, ValueError) as error:
@@ -167,12 +167,12 @@ class Dialler:
         return self.loses_large
 
     def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
-        """True if this loss means that the broker has ended.
+        """True if the broker has ended, by this loss and the earlier verdict ``was_ended``.
 
-        A lost connection means it, unless the broker was only silent. After a failed attempt the earlier verdict
-        ``was_ended`` holds, while nothing listens and shortly after; then it is False.
+        The loss of a connection means it, unless the broker was only silent: it may be we who stood still. A failed
+        attempt keeps the verdict while nothing listens there and for `_ENDING_S` after that, and then revokes it.
         """
-        now, was_silent = time.monotonic(), isinstance(lost, Silent)  # after a silence it may be we who stood still
+        now, was_silent = time.monotonic(), isinstance(lost, Silent)
         if connected:
             self._gone_at = now
             return not was_silent

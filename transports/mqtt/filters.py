@@ -30,9 +30,10 @@ def overlap(first: str, second: str) -> bool:
             return True
         if first_level != second_level and "+" not in (first_level, second_level):
             return False
-    longer = max(first_levels, second_levels, key=len)
-    shorter = min(len(first_levels), len(second_levels))
-    return len(first_levels) == len(second_levels) or longer[shorter] == "#"
+    if len(first_levels) == len(second_levels):
+        return True
+    compared = min(len(first_levels), len(second_levels))
+    return max(first_levels, second_levels, key=len)[compared] == "#"  # it matches its parent as well
 
 
 def cover(first: str, second: str) -> str:

@@ -96,8 +96,8 @@ class Incoming:
             now = clock.since_boot()
         if size and self.pings.is_thin:  # any sign of life counts: answers wait behind messages of others
             self.answered_at = clock.since_boot()
-        is_part = size > 0 and self._packets == began_with  # of a message that is longer than what was read
-        if age.has_retained or is_part:
+        is_inside_packet = size > 0 and self._packets == began_with  # bytes came, but no end of a packet
+        if age.has_retained or is_inside_packet:  # then answers come only after these
             age.note_arriving()
         if not self.more:
             age.waiting.empty(age.received_at)
@@ -120,7 +120,7 @@ class Incoming:
         if self.reason:
             client.close()
         self.more = bytes_left > 0 or not client.drained
-        if self.more:
+        if self.more:  # else `read` notes that the socket is empty
             self.age.waiting.read(unread - bytes_left)
         return unread - bytes_left
 
@@ -211,7 +211,7 @@ class Incoming:
         age, retain = self.age, bool(first & RETAIN)
         if retain:
             age.has_retained = True
-        if len(topic) > MAX_BYTES:  # no transport carries it, and much would be remembered of many
+        if len(topic) > MAX_BYTES:  # no transport carries such topics, and their number has no bound
             self.on_too_long(topic, len(topic) + len(payload))
             return
         self._packets += 1

@@ -144,11 +144,11 @@ class InFlightTable:
         self._requests: dict[int, tuple[PendingAck, Sequence[str]]] = {}  # unanswered, with the filters of a SUBSCRIBE
         self.answered: list[PendingAck] = []  # and not completed yet
         self._pings: deque[_Ping] = deque()  # unanswered, oldest first
-        # When the largest message of each topic was written, and its bytes: of those that an answered ping followed,
-        self._accepted: dict[str, tuple[float, int]] = {}
-        self._written: dict[str, tuple[float, int]] = {}  # and of those since the newest ping, if it is larger
+        # By topic: when its largest message was written, and the bytes of that message.
+        self._accepted: dict[str, tuple[float, int]] = {}  # of messages before an answered ping
+        self._written: dict[str, tuple[float, int]] = {}  # of messages since the newest ping, if larger than accepted
         self._ping_number = self._pong_number = 0  # how many were sent, and answered
-        self.lost_bytes = 0  # of the largest message after which the other side was silent until the connection ended
+        self.lost_bytes = 0  # of the largest message that no answer followed until the connection ended
         self._newest_s = 0.0  # how long the newest answer to a ping took
 
     # -- messages
@@ -178,8 +178,8 @@ class InFlightTable:
 
     def sent(self, message: Message, mid: int, now: float) -> None:
         """Note that ``message`` was written with the id ``mid``. Hot."""
-        size, largest = len(message.payload), self._accepted.get(message.topic)
-        if largest is None or size > largest[1]:
+        size, accepted = len(message.payload), self._accepted.get(message.topic)
+        if accepted is None or size > accepted[1]:
             _note(self._written, message.topic, now, size)
         if message.qos is QoS.DELIVERED:
             self._unacked[mid] = (message.topic, now)

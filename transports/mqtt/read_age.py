@@ -12,8 +12,8 @@ from pebble.transports.mqtt.outgoing import present_round_trip_s
 _FAR_S = 1.0  # no round trip of a usable link is longer
 _NOTICED_S = 0.1
 _BACKLOG_S = 0.2  # after a stall, for what others had sent to the broker meanwhile
-_NEAR_S = 0.05  # of a broker further away PUBACKs must show what is lost
-_LOST = 8  # prompt answers in a row
+_NEAR_S = 0.05  # round trip of a near broker; if one is further away, only PUBACKs show that answers were lost
+_LOST = 8  # answers in a row, each right after the newest of several pings, show that earlier ones were lost
 _UPLINK_S = 0.5  # TCP's round trips may be so much longer than usual: more may as well be the way to us
 
 
@@ -100,7 +100,7 @@ class BrokerDelay:
             self._prompt += 1
         else:
             self._prompt = 0
-        if self._prompt >= _LOST:
+        if self._prompt >= _LOST:  # these answers belong to the newest pings: no ping is unanswered
             self._pings.clear()
             self._newest = 0.0
 

@@ -49,7 +49,7 @@ class RefusedTopics:
         self._losses: dict[str, int] = {}  # in a row, by topic
         self.withheld: dict[str, Withheld] = {}
         self._trial: Trial | None = None
-        self._quiet_at = -inf  # no trial before it: only after a time without a loss it shows something
+        self._quiet_at = -inf  # a trial begins after this time, which is QUIET_S after the newest loss
         #: Topics on which the broker takes no messages: why, and when that was last in the log.
         self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)
 
@@ -88,7 +88,8 @@ class RefusedTopics:
         """Note a lost connection. ``written``: bytes by topic before the loss; None if no message was the reason."""
         written, trial, self._trial = written or {}, self._trial, None
         self._quiet_at = now + QUIET_S
-        if trial is not None and [topic for topic in written if not self._is_vital(topic)] == [trial.topic]:
+        ordinary = [topic for topic in written if not self._is_vital(topic)]
+        if trial is not None and ordinary == [trial.topic]:
             self._blame(where, trial.topic, written[trial.topic], now)
             return
         self._losses = {topic: self._losses.get(topic, 0) + 1 for topic in written}
@@ -98,9 +99,9 @@ class RefusedTopics:
             suspects = {topic: size for topic, size in often.items() if not self._is_vital(topic)}
         if len(suspects) == 1:
             self._blame(where, *suspects.popitem(), now)
-        elif suspects:
+        elif suspects:  # any of them: their trials will show which
             self.withheld |= {topic: Withheld(0, now) for topic in suspects if len(self.withheld) < TOPICS}
-        elif all(map(self._is_vital, written)):
+        elif not ordinary:  # only vital ones, which are sent all the same
             for topic, size in often.items():
                 why = f"{_closes(size)}, without which this account cannot run a robot"
                 self.report(where, topic, why, now, logging.ERROR)

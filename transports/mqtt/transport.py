@@ -198,11 +198,7 @@ class MqttTransport(Transport):
             try:
                 self._run_connection(run)
             except Lost as lost:
-                connected = self._state is State.CONNECTED
-                self.was_ended = self._dialler.is_gone(lost, connected=connected, was_ended=self.was_ended)
-                if self._dialler.note_end(lost):
-                    text = "the way there seems to lose large packets (a wrong MTU?): from now on they are small"
-                    log.warning("%s: %s: %s", self.client_id, self._dialler.addresses.where, text)
+                self._note_end(lost)
                 problem = str(lost)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 log.exception("%s: unexpected failure of the connection", self.client_id)
@@ -220,9 +216,17 @@ class MqttTransport(Transport):
             if self._dialler.addresses.several and not self._dialler.addresses.is_over:
                 continue  # the next address
             pause = min(self.settings.reconnect_max_s, _RETRY_S * 2 ** (failures - 1)) if failures else 0.0
-            if not self._dialler.limits.asks_again:
-                failures = min(failures + 1, 20)
+            if not self._dialler.limits.asks_again:  # else the broker is asked in another way, and has not failed
+                failures = min(failures + 1, 20)  # bounded, because it is an exponent
             stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
+
+    def _note_end(self, lost: Lost) -> None:
+        """Note what the end of a connection, or of an attempt, tells about the broker and the way there."""
+        connected = self._state is State.CONNECTED
+        self.was_ended = self._dialler.is_gone(lost, connected=connected, was_ended=self.was_ended)
+        if self._dialler.note_end(lost):
+            text = "the way there seems to lose large packets (a wrong MTU?): from now on they are small"
+            log.warning("%s: %s: %s", self.client_id, self._dialler.addresses.where, text)
 
     def _run_connection(self, run: _Run) -> None:
         """Run one connection from its start to its end. Raises Lost unless `close` has ended it."""
@@ -245,7 +249,7 @@ class MqttTransport(Transport):
             self._keep_unconfirmed(connection)
 
     def _serve(self, connection: Connection, run: _Run) -> None:
-        tried_at = time.monotonic() + _TRIED_S
+        tried_at = time.monotonic() + _TRIED_S  # a connection that ends before that shows no limits
         try:
             self._synchronize(connection, run.stopping)
             if failed := self._dialler.addresses.succeeded():
@@ -357,6 +361,7 @@ class MqttTransport(Transport):
         while not ack.done:
             if stopping.is_set():
                 raise Lost("closed")
+            # The wait begins again while retained messages arrive, and on a thin link with every sign of life.
             since, answer_s = max(asked_at, connection.incoming.age.arriving_at), _ANSWER_S
             if connection.pings.is_thin:
                 since, answer_s = max(since, connection.incoming.answered_at), connection.pings.silence_limit_s
@@ -380,7 +385,7 @@ class MqttTransport(Transport):
 
     def note_answers(self, refused: Mapping[str, bool]) -> None:
         if self._connection is None:
-            return  # to the query of our own retained messages
+            return  # these answer `_find`, which asks before the connection is used
         subscriptions = list(self._subscriptions)
         for filter_, is_refused in refused.items():
             for subscription in subscriptions:

@@ -219,8 +219,8 @@ class ZenohTransport(Transport):
         """Store our will at the hub, and send messages until it lacks none that it has room for."""
         end = time.monotonic() + HUB_ANSWER_S
         sent: set[str] = set()
-        while (remaining_s := end - time.monotonic()) > 0:  # looked at once: Zenoh refuses what is not positive
-            with self._publishing:  # which takes a moment on a busy machine
+        while (remaining_s := end - time.monotonic()) > 0:  # Zenoh refuses a time limit that is not positive
+            with self._publishing:
                 hello = self._hub.hello()
             lacking = self._hub.greet(session, hello, remaining_s)
             if lacking is None:
@@ -263,9 +263,11 @@ class ZenohTransport(Transport):
         try:
             if message.retain:
                 self._hub.put(session, message, again=self._own.syncing)
+            # While `syncing`, messages that siblings have received before are sent to the hub again. Only a client's
+            # pending messages are new to others, which it reaches through the hub.
             if not self._own.syncing:
                 self._publishers.put(session, message, urgent)
-            elif self.settings.client and message.topic in self._own.pending:  # others hear it through the hub only
+            elif self.settings.client and message.topic in self._own.pending:
                 self._publishers.put_late(session, message)
         except zenoh.ZError as error:
             log.debug("%s could not send: %s", self.client_id, error)

@@ -38,7 +38,7 @@ class _Paho(paho.Client):
     def _sock_recv(self, bufsize: int) -> bytes:
         if self.begin == len(self.ahead):
             raise BlockingIOError
-        if self._too_long:
+        if self._too_long:  # discard what paho has collected of the packet after its head
             del self._in_packet["packet"][HEAD:]
         data = self.ahead[self.begin : self.begin + bufsize]
         self.begin += len(data)
@@ -88,7 +88,7 @@ class PahoClient:
 
     def __init__(self, opening: Opening, listener: Listener, *, bridge: bool) -> None:
         client_id, settings, context, will, *_ = opening
-        self.drained, self.hung_up = True, True  # paho does not say how a connection ended on which it wrote
+        self.drained, self.hung_up = True, True  # hung_up: paho does not say why a write has failed
         self._settings, self._context, self._listener = settings, context, listener
         self._modern = settings.protocol == "5"
         protocol = MQTTProtocolVersion.MQTTv5 if self._modern else MQTTProtocolVersion.MQTTv311

@@ -53,7 +53,7 @@ class HubWorker:
         if self._session is not None:
             self.post(self._await_return)
         self._session = session
-        # Its own messages would wait for room in the queue that this thread empties.
+        # Not the hub's own messages: they would wait for room in the queue, which this thread empties.
         retain = direct(lambda sample: self._intake.receive(partial(self._store_retained, sample), len(sample.payload)))
         session.declare_subscriber(wire.RETAINED + "**", retain, allowed_origin=zenoh.Locality.REMOTE)
         session.declare_queryable(wire.RETAINED + "**", direct(partial(self._intake.ask, self._query)), complete=True)
