@@ -52,9 +52,13 @@ class Due:
         self._checked: tuple[int, int] | None = None  # both clocks at the last call of suspended_s
 
     def every(self, what: str, seconds: float) -> bool:
-        """True if the task ``what`` is due: ``seconds`` have passed since it was due last, or since the start."""
+        """True if the task ``what`` is due: ``seconds`` have passed since it was due last, or first asked for.
+
+        If it is first asked for later than ``seconds`` after the start, it is due at once.
+        """
         now = self._boot_ns()
         if now - self._done.get(what, self._began) < seconds * 1e9:
+            self._done.setdefault(what, now)
             return False
         self._done[what] = now
         return True
