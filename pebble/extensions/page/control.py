@@ -297,12 +297,13 @@ class Control:
     def _control(self, op: m.Lease) -> None:
         """Request control of a robot for this page, or release it."""
         server = self._server
-        self._moved.discard(op.ref)
+        self._moved.discard(op.ref)  # the audit notes the next motion again
         if not op.take:
             if server.drivers.release(self._tab, op.ref):
                 self._audit("release", op.ref)
             return
         robot, driven = server.robots.view(op.ref), server.drivers.robot(op.ref)
+        # pages may take from each other what only this server gives
         right = "take" if op.over and driven.keeps else "drive"
         if not self._may(right, op):
             return
@@ -388,7 +389,10 @@ class Control:
         return replace(view, by=by, device=device, asks=person(view.asks, login=login))
 
     async def _send_logs(self) -> None:
-        """Send a part of the log at each echo, so that on a slow connection no more than that delays pings."""
+        """Send the next part of the log, once the page has answered a ping.
+
+        So on a slow connection at most one part is ahead of the next ping, and delays it.
+        """
         ref = self._interest.watched
         log = self._server.robots.logs.get(ref)
         if log is not None and (run := self._logs.take(log)) is not None:

@@ -52,22 +52,26 @@ class StaticFiles:
         for name, content in self.files.items():
             digest.update(f"{name}\0{len(content)}\0".encode() + content)
         self.version = digest.hexdigest()[:12]
-        start = self.files.pop("start.js").strip()
+        start = self.files.pop("start.js").strip()  # browsers run it within the page, as the policy has its hash
         hashed = f"'sha256-{base64.b64encode(hashlib.sha256(start).digest()).decode()}'"
         self._policy = CONTENT_SECURITY_POLICY.replace("script-src", f"script-src {hashed}")
         index = self.files.pop("index.html").replace(_START, start)
         for name, screen in _SCREENS.items():
-            modules = (screen, *self._imported("main.js", screen))
-            links = [b'<link rel="modulepreload" href="{root}static/{version}/%s">' % path.encode() for path in modules]
-            if name in _SHEETS:
-                sheet = _SHEETS[name].encode()
-                links.insert(0, b'<link rel="preload" as="style" href="{root}static/{version}/%s">' % sheet)
-            self.files[name] = index.replace(_MODULES, b"\n".join(links))
+            self.files[name] = index.replace(_MODULES, self._links(name, screen))
         for name in self.files:
             if name.endswith(".html"):
                 self.files[name] = self.files[name].replace(_VERSION, self.version.encode())
-        self._first = {"main.js", *self._imported("main.js")}  # the modules that run at the start
+        self._first = {"main.js", *self._imported("main.js")}  # run at the start of each screen: see answer()
         self._packed = {name: _packed(name, content) for name, content in self.files.items()}
+
+    def _links(self, name: str, screen: str) -> bytes:
+        """Return the links for the page ``name`` to all that its module ``screen`` needs, the style sheet first."""
+        modules = (screen, *self._imported("main.js", screen))
+        links = [b'<link rel="modulepreload" href="{root}static/{version}/%s">' % path.encode() for path in modules]
+        if name in _SHEETS:
+            sheet = _SHEETS[name].encode()
+            links.insert(0, b'<link rel="preload" as="style" href="{root}static/{version}/%s">' % sheet)
+        return b"\n".join(links)
 
     def _imported(self, *names: str) -> list[str]:
         """Return the modules that these import before they run, also indirectly."""

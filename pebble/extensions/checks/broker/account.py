@@ -35,23 +35,21 @@ def robot_account(
 
     No program takes a probe for anything else. One that does not come back within ``answer_s`` counts as lost. Above
     the level ``open``, a probe in the name of another robot must be lost. ``reads``: a further filter that the broker
-    must grant.
+    must grant; with it, the probe must also come back.
     """
     try:
         with reached(settings, "") as trial:
             trial.patience_s = answer_s
             peer = trial.peer(protocol=settings.protocol)
-            granted = peer.subscribe(reads) if reads else b"\0"  # one code for each filter; none without an answer
-            if not granted or granted[0] >= REFUSED:
-                why = "the broker refuses it" if granted else "the broker does not answer its subscription to"
+            if reads and (why := _why_not_granted(peer, reads)):
                 text = f"a page with this account does not hear robots: {why} {reads}"
                 yield failed(text, "pebble fleet check; its role is page", what)
                 return
             topic = BRIDGE_PROBE.topic(base)
             peer.subscribe(topic)
             is_back, refusal = _echo(trial, peer, topic)
-            tells_refusals = settings.protocol == "5"
-            if refusal or (not is_back and (reads or not tells_refusals)):
+            must_come_back = bool(reads) or settings.protocol != "5"  # before MQTT 5 no refusal is told
+            if refusal or (must_come_back and not is_back):
                 why = refusal or "it does not come back (or may this account not read it?)"
                 fix = f"allow it to write and read {topic.rpartition('/')[0]}/# on the broker"
                 yield failed(f"this account may not publish to {topic}: {why}", fix, what)
@@ -69,6 +67,14 @@ def page_account(what: str, settings: MqttSettings, level: SecurityLevel = "open
     """Check that a page server with this account receives what robots publish, and may publish itself."""
     base, states = Identity("pebble", SERVERS, "doctor").base, ONLINE.filter("+/+/+")
     return robot_account(what, settings, base, level=level, reads=states)
+
+
+def _why_not_granted(peer: Peer, filter_: str) -> str:
+    """Subscribe; return why the broker does not grant it, empty if it does."""
+    granted = peer.subscribe(filter_)  # its code; empty without an answer
+    if not granted:
+        return "the broker does not answer its subscription to"
+    return "the broker refuses it" if granted[0] >= REFUSED else ""
 
 
 def _echo(trial: BrokerTrial, peer: Peer, topic: str) -> tuple[bool, str]:

@@ -167,14 +167,14 @@ def held_back(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> Che
 
 def _pair(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> tuple[float, float] | None:
     """Return a message's round trip, and how long after it the next message arrives; None if either is lost."""
-    reader.acknowledge_late()
+    reader.acknowledge_late()  # a quick one would hide the delay
     began, probes = time.monotonic(), [new_probe(number) for number in range(2)]
     for probe in probes:
         writer.publish(topic, probe)
         trial.wait(lambda: False, _APART_S)  # serves the peers meanwhile
     if not trial.wait(lambda: set(probes) <= set(reader.payloads())):
         return None
-    trial.wait(lambda: False, 2 * _HELD_S + trial.round_trip_s)  # the pair is acknowledged then
+    trial.wait(lambda: False, 2 * _HELD_S + trial.round_trip_s)  # then both are acknowledged: the next pair starts anew
     first, second = (message.at for message in reader.received if message.payload in probes)
     return first - began, second - first
 

@@ -266,12 +266,14 @@ def _uplink(config: Config) -> str:
 
 
 def _scripts(config: Config) -> list[tuple[str, str]]:
-    """Return a warning about scripts if other clients share the broker, where no bridge protects the motors."""
+    """Return a warning if others may use the broker of the robot's own processes: they can pose as a script."""
     bridge, shared = config.services.mqtt_bridge, config.transport.mqtt_mirror
     if config.transport.kind == "mqtt":
+        shared = config.local_mqtt
         is_zenoh_uplink = bridge.remote is not None and bridge.remote.kind != "mqtt"
-        is_apart = is_zenoh_uplink or place_of(bridge.remote_mqtt) != place_of(config.local_mqtt)
-        shared = None if bridge.enabled and is_apart else config.local_mqtt
+        is_elsewhere = is_zenoh_uplink or place_of(bridge.remote_mqtt) != place_of(config.local_mqtt)
+        if bridge.enabled and is_elsewhere:
+            shared = None  # operators are at the other end of the bridge
     if shared is None:
         return []
     return [("scripts", f"anybody at broker {shared.host}:{shared.port} may pose as one, or end one")]

@@ -256,7 +256,10 @@ def _counts(robot: Observer) -> dict[str, int]:
 
 
 def reset(robot: Observer, *, boot: str = "", more: int = 0) -> None:
-    """Send a reset to each motor owner, with its ``boot`` or another one, and with its count or ``more``."""
+    """Send each motor owner a reset of its present stop.
+
+    To be refused, it names another ``boot`` than the owner's, or a count that is ``more`` stops ahead.
+    """
     for state in robot.view.estop.states.values():
         robot.send(c.ESTOP_RESET, EstopReset(boot=boot or state.boot, count=state.count + more, by=BY))
 

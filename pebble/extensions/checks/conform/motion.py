@@ -207,14 +207,14 @@ def _steering(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _stop_moving(robot: Observer, driver: Driver) -> CheckResult:
-    """Check that commands after a stop move nothing, also those after a pause."""
+    """Check that commands after a stop move nothing, also those of a new gesture."""
     began, _ = driver.drive()
     stopped_at = time.monotonic()
     stop(robot, secrets.token_hex(8))
     driver.drive()
-    driver.send()
+    driver.send()  # a zero, which ends the gesture
     driver.drive(DRIVES_S / 2)
-    outcome = _rest(robot, began, stopped_at, 0.25, "the stop")
+    outcome = _rest(robot, began, stopped_at, limit_s=0.25, what="the stop")
     return outcome if freed(robot) else failed("a reset does not end the stop", END_IT)
 
 
@@ -272,7 +272,7 @@ def _control_passes(robot: Observer, driver: Driver) -> CheckResult:
     taken_at = second.takes()
     robot.answers(lambda: second.holds)
     driver.drive(key=key)
-    outcome = _rest(robot, began, taken_at, 0.25, "another took control")
+    outcome = _rest(robot, began, taken_at, limit_s=0.25, what="another took control")
     second.leaves()
     return outcome
 

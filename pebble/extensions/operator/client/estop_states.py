@@ -38,7 +38,10 @@ class Reset:
         return {owner: self._refusal(owner) for owner in self.shown if not self._is_free(owner)}
 
     def _has_answered(self, owner: str) -> bool:
-        """True if the owner is free or was stopped again. ``reset_refused`` may be about another reset."""
+        """True if the owner is free or was stopped again.
+
+        A refusal in its state is no answer: it may be about the reset of another client.
+        """
         before, now = self.shown[owner], self.robot.states.get(owner)
         return now is not None and (not now.latched or (now.boot, now.count) != (before.boot, before.count))
 

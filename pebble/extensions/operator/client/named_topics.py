@@ -40,8 +40,8 @@ class NamedTopics:
     def forms(self, message: Message) -> Iterator[Message]:
         """Yield the messages to publish instead of this one. Raises NoNameError.
 
-        A stop needs no account: it is also published unchanged, and first. A zero is, if the client has no account.
-        Nothing is retained on a topic with an account, because the robot itself publishes its flags.
+        A stop needs no account: it is also published unchanged, and first. Without an account, a zero is published
+        unchanged. No message on a topic with an account is retained: the robot itself retains its flags.
         """
         command = _command(message.topic)
         is_stop = command is not None and command.metric == ESTOP.metric

@@ -130,7 +130,9 @@ class RobotView:
         if channel in _FOR_STOPS:
             self._keep_for_late_stop(message)
         if channel in (c.CAPABILITIES, c.ESTOP_STATE):
-            self._receive_stop(channel, message, now)
+            self._update_stop(message, now)
+            if channel is c.CAPABILITIES:
+                self._take_capabilities(message.payload)
         elif channel is c.CONTROL_STATE:
             self.control.receive(message)
         elif channel is c.LINK:
@@ -164,17 +166,19 @@ class RobotView:
             if value and value != self.capabilities:
                 self.capabilities = value
 
-    def _receive_stop(self, channel: c.Channel, message: Message, now: float) -> None:
-        """Handle capabilities, or the state of a motor owner. Empty capabilities remove nothing."""
+    def _update_stop(self, message: Message, now: float) -> None:
+        """Update the emergency stop by the state of a motor owner, or by the list of owners in capabilities."""
         was_latched = self.latched
         self.estop.receive(message)
         if was_latched and not self.latched:
             self.reset_at = now
-        if channel is c.CAPABILITIES:
-            with suppress(PayloadError):
-                published = codec.decode(c.CAPABILITIES, message.payload).value
-                if published or self.is_assumed:
-                    self.capabilities = published
+
+    def _take_capabilities(self, payload: bytes) -> None:
+        """Store the capabilities that the robot publishes. Empty ones replace only assumed ones."""
+        with suppress(PayloadError):
+            published = codec.decode(c.CAPABILITIES, payload).value
+            if published or self.is_assumed:
+                self.capabilities = published
 
     def _note_retained_drive(self, message: Message) -> None:
         """Note whether a drive command that moves the robot is retained.

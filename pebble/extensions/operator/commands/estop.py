@@ -341,6 +341,7 @@ def _reset(target: Target) -> int:
 
 
 def _status(target: Target, *, every: bool) -> int:
+    """Print the stop states of the target's robot or of every robot there, once they have had time to arrive."""
     with connected(target) as (transport, names):
         discovery = Discovery()
 
@@ -351,11 +352,11 @@ def _status(target: Target, *, every: bool) -> int:
         of_robots = (ESTOP_STATE, STATUS, CAPABILITIES)
         for channel in (*of_robots, ONLINE, LINK) if is_remote else of_robots:
             transport.subscribe(channel.filter(names.base), take, direct=True)
-        if not every:
+        if not every:  # some brokers deliver a retained state only if its exact topic is asked for
             wait_for(lambda: any(robot.estop.has_capabilities for robot in discovery.all_robots()), _ANSWER_S)
             transport.ask([topic for robot in discovery.all_robots() for topic in robot.estop.missing])
         if is_remote:
-            began = time.monotonic()
+            began = time.monotonic()  # until each robot has sent a heartbeat, or counts as silent
             wait_for(lambda: not discovery.awaits_heartbeat(time.monotonic() - began), float("inf"))
             wait_for(lambda: not any(robot.live and robot.estop.lacks for robot in discovery.all_robots()), _ANSWER_S)
         robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)

@@ -126,7 +126,7 @@ class DrivenRobot:
         self._wishes: dict[Tab, Wish] = {}
         self._idle_from = float("-inf")  # when control was given, or the last gesture ended
         self._sent_at = self._received_at = float("-inf")  # the last command of the gesture
-        self._repeats: list[float] = []  # when to send a zero again
+        self._repeats: list[float] = []  # when to send the last zero again, in order
         self._awaited = ("", float("-inf"))  # a page, by its token, that had control; and until when
         self.renew_key()
 
@@ -286,7 +286,8 @@ class DrivenRobot:
             commands += self.interrupt(now)
         elif self.state is State.HELD and now - self._idle_from > IDLE_S:
             commands += self._on(Event.ENDED, now)
-        if self._repeats and (late_s := now - self._repeats[0]) >= 0:
+        if self._repeats and self._repeats[0] <= now:
+            late_s = now - self._repeats[0]
             self._repeats = [due for due in self._repeats if due > now]
             if late_s <= SILENCE_S:  # else this process stood still: a newer gesture may have begun elsewhere
                 commands.append(Command(self.ref, FINAL_ZERO))

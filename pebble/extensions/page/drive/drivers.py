@@ -1,4 +1,7 @@
-"""The driven robots of one server: pages' requests, robots' answers, and what is published."""
+"""The driven robots of one server: pages' requests, robots' answers, and what is published.
+
+A *group* is one message with a drive command and the lights that a page sets during a gesture.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -148,13 +151,14 @@ class Drivers:
         self._publish(self.robot(ref).update(clock()))
 
     def renew_keys(self) -> None:
-        """Choose new keys for all robots, because the connection to the broker is new."""
+        """Renew the keys that this server itself chooses, because the connection to the broker is new."""
         for robot in self._driven.values():
             robot.renew_key()
 
     # -- what is due
 
     def tick(self, now: float) -> None:
+        """Publish what is due; send lights again by themselves, as the group that had them may be lost or refused."""
         for ref, robot in list(self._driven.items()):
             self._publish_due(robot, now)
             if robot.may_be_forgotten(now):
@@ -172,29 +176,35 @@ class Drivers:
         send(self._broker.publish, messages)
 
     def _publish(self, commands: list[Command], by: str = "") -> bool:
-        """Publish a person's drive commands to the robot's own topic; return False if one was not accepted.
-
-        Waiting lights share the message of a moving command. A zero goes alone, and before them. After a group, a
-        second zero follows on the group's topic: it replaces a group that still waits for a slow connection.
-        """
+        """Publish a person's drive commands; return False if one was not accepted."""
         accepted = True
-        for ref, drive, qos in commands:
-            topic, view = self._robots.topic(ref, DRIVE), self._robots.view(ref) or RobotView(ref)
-            payload, lights = view.encode(drive), self._lights.get(ref)
-            if drive.moves and lights is not None and lights.grouped_at == inf:
-                members = {DRIVE.metric: payload, lights.metric: lights.message.payload}
-                topic, payload = GROUP.topic(ref), joined(members)
-                self._lights[ref] = lights._replace(grouped_at=clock())
-                self._grouped.add(ref)
-            accepted = self._broker.publish(topic, payload, qos=qos, by=by) and accepted
-            if not drive.moves:
-                if ref in self._grouped:
-                    self._grouped.remove(ref)
-                    self._broker.publish(GROUP.topic(ref), joined({DRIVE.metric: payload}), qos=qos, by=by)
-                self._publish_lights(ref)
+        for command in commands:
+            publish = self._publish_moving if command.drive.moves else self._publish_zero
+            payload = (self._robots.view(command.ref) or RobotView(command.ref)).encode(command.drive)
+            accepted = publish(command, payload, by) and accepted
         if self._changed:
             self._robots.mark_drivers(set(self._changed))
             self._changed.clear()
+        return accepted
+
+    def _publish_moving(self, command: Command, payload: bytes, by: str) -> bool:
+        """Publish a command that moves a robot, in a group with the robot's lights if some wait for it."""
+        ref, lights = command.ref, self._lights.get(command.ref)
+        topic = self._robots.topic(ref, DRIVE)
+        if lights is not None and lights.grouped_at == inf:
+            topic, payload = GROUP.topic(ref), joined({DRIVE.metric: payload, lights.metric: lights.message.payload})
+            self._lights[ref] = lights._replace(grouped_at=clock())
+            self._grouped.add(ref)
+        return self._broker.publish(topic, payload, qos=command.qos, by=by)
+
+    def _publish_zero(self, command: Command, payload: bytes, by: str) -> bool:
+        """Publish a zero by itself, and then the robot's lights: they must not delay it."""
+        ref, qos = command.ref, command.qos
+        accepted = self._broker.publish(self._robots.topic(ref, DRIVE), payload, qos=qos, by=by)
+        if ref in self._grouped:  # the same topic again: this replaces a group that still waits for a slow connection
+            self._grouped.remove(ref)
+            self._broker.publish(GROUP.topic(ref), joined({DRIVE.metric: payload}), qos=qos, by=by)
+        self._publish_lights(ref)
         return accepted
 
     def _publish_lights(self, ref: str) -> None:

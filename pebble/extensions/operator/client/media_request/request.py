@@ -54,7 +54,7 @@ class ViewerRequest:
     def want(self, encoding: str | None, now: float) -> None:
         """Request the medium in ``encoding``, or as configured, with the next ticks. Raises PebbleError.
 
-        Call it once the topics are subscribed to: :meth:`tick` waits from now on for payloads that come in any case.
+        Call it once the topics are subscribed to: :meth:`tick` waits a little first, as the medium may be running.
         """
         self.check(encoding)
         self._encoding, self._began_at, self.settled = encoding, now, False
@@ -108,13 +108,13 @@ class ViewerRequest:
         return messages
 
     def _waits_s(self) -> float:
-        """Return how long to wait for a payload, which shows that the medium is running."""
-        if self._encoding is None:
+        """Return how long to wait, before the request, for a payload or the flag."""
+        if self._encoding is None:  # a running medium is taken as it is
             return _JOIN_S
-        if self._is_up is None:
+        if self._is_up is None:  # :meth:`tick` must know whether to raise the flag
             return _FLAG_S
-        may_be_running = self._shares and self._is_up and not self._requested
-        return _SLOW_S[self._medium] if may_be_running else 0.0
+        may_be_of_others = self._shares and self._is_up and not self._requested
+        return _SLOW_S[self._medium] if may_be_of_others else 0.0
 
     def keyframe(self, encoding: str | None, now: float) -> list[Message]:
         """Request a key frame in the encoding that arrives, at most once a second."""
@@ -138,7 +138,7 @@ class ViewerRequest:
         return offered({self._medium: self.section}, self._medium)
 
     def _ask(self, now: float) -> Message:
-        """Return the request, for the encoding of others if there were any: they may come back and want it."""
+        """Return the request, in the encoding of others if they had requested the medium: they may come back."""
         if self._others is not None:
             self._encoding, self._others = self._others.encoding, None
         self._sent_at, self._requested = now, True

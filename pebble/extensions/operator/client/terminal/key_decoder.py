@@ -46,7 +46,8 @@ class KeyDecoder:
             at = key.end()
         incomplete = data[at:]
         if incomplete != self._waiting:
-            self._waiting = incomplete if len(incomplete) <= _LONGEST else incomplete[:2]
+            is_too_long = len(incomplete) > _LONGEST  # its first bytes are enough to recognise its end
+            self._waiting = incomplete[:2] if is_too_long else incomplete
             self._since = now
         return keys
 
