@@ -193,9 +193,9 @@ class _Session:
             what += " and mm to the left of it (right: minus), such as 1497 -12"
             along, aside = self._numbers(what, 2, is_plausible)
             return arc(sign * along, aside)
-        half_rad = self._gyro(counts) / 2
+        half_turn = self._gyro(counts) / 2  # the direction of an arc's end, from the first heading
         (along,) = self._numbers(what, 1, is_plausible)
-        return arc(sign * along, sign * along * math.tan(half_rad))
+        return arc(sign * along, sign * along * math.tan(half_turn))
 
     def _numbers(self, what: str, count: int, plausible: Callable[[list[float]], bool]) -> list[float]:
         """Ask for ``count`` numbers until they are plausible; return them."""

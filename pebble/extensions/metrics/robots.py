@@ -90,7 +90,7 @@ class Robot:
                 self._loss[name] = dropped / handled
 
     def add_to(self, samples: Samples, now: float) -> None:
-        """Add the robot's samples; while it is silent only that it is, and which of its motor owners are stopped."""
+        """Add the robot's samples; of a silent robot only its heartbeat, and which of its motor owners are stopped."""
         robot, view = id_of(self.view.base), self.view
         online = view.online(now) is True
         samples.add("pebble_robot_online", online, robot=robot)

@@ -146,10 +146,10 @@ class GroupGate:
         return _Part(member, subject, message, way)
 
 
-def gate_of(
+def install_gate(
     config: Config, addresses: Addresses, forwarder: Forwarder, note_drive: Callable[[bytes], None]
 ) -> GroupGate | None:
-    """Return the gate of a robot that takes groups, installed before the forwarder; None for other robots."""
+    """Put a gate before the forwarder of a robot that takes groups, and return it; None for other robots."""
     if not config.services.mqtt_bridge.link.groups:
         return None
     gate = GroupGate(forwarder, addresses, note_drive)

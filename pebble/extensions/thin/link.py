@@ -32,7 +32,7 @@ _RUN_S = 1.0  # late commands that are further apart are no run
 
 
 class _Rule(Struct, frozen=True):
-    """A rule for leaving a level: ``worse_s`` of queue in two of three answers, or ``rise_s`` without a queue."""
+    """A rule for leaving a level: down at ``worse_s`` of queue in two of three answers, up after ``rise_s`` without."""
 
     worse_s: float
     rise_s: float

@@ -55,10 +55,10 @@ class Sifter:
     def _sift(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str
     ) -> Forward | Drop:
-        """Send a message now, or keep it in the sieve or for the next group. Called for each that may be forwarded."""
+        """Send a message that may be forwarded, or keep it, in the sieve or for the next group, and return NO_ROOM."""
         if source.side is not Side.LOCAL or subject.prompt:
             if self._groups is not None and subject.channel is EXPANDER:
-                self._groups.heard(message.payload)
+                self._groups.heard(message.payload)  # an announcement for the bridge itself
                 return Drop.STAYS
             return self._forwarder.pass_now(source, subject, message, forward, account)
         if self._groups is not None and self._joins(subject, message, forward) and self._groups.takes(message):

@@ -11,7 +11,7 @@ from pebble.contract import DRIVE, LINK, WIRE, Channel, codec
 from pebble.contract.levels import LEVELS, Level
 from pebble.contract.payloads import SCRIPT, Drive, LinkState
 from pebble.errors import PayloadError
-from pebble.extensions.thin.group_gate import gate_of
+from pebble.extensions.thin.group_gate import install_gate
 from pebble.extensions.thin.link import LateRun, LinkMeter, Room
 from pebble.extensions.thin.sieve import Rank, Sieve
 from pebble.extensions.thin.sifter import Sifter
@@ -91,7 +91,7 @@ class MediaHold:
         self._driven_at = now
 
     def send(self, now: float) -> None:
-        """Send the requests that have changed with time, and again those that the launcher has not accepted."""
+        """Ask for the pause once a person drives, and later for its end; ask again if the launcher was busy."""
         on = now - self._driven_at < _HOLD_S
         for program, requested in self._requested.items():
             if requested is not on and self._request(program, on):
@@ -110,7 +110,7 @@ def make_uplink(
     if config.services.mqtt_bridge.link.profile != "wide":
         return ThinUplink(config, addresses, remote, forwarder, notifier, clock)
     uplink = Uplink()
-    gate_of(config, addresses, forwarder, uplink.note_drive)
+    install_gate(config, addresses, forwarder, uplink.note_drive)
     return uplink
 
 
@@ -136,7 +136,7 @@ class ThinUplink(Uplink):
         self._meter, self._room = LinkMeter(section.link.profile, section.link.kbit), Room(section.link.kbit)
         self._report = LinkReport(self._meter, addresses[LINK], remote)
         self._guard = threading.Lock()  # of the room: messages take it on the thread that received them
-        gate = gate_of(config, addresses, forwarder, self.note_drive)
+        gate = install_gate(config, addresses, forwarder, self.note_drive)
         self._sieve = Sieve(self._takes, forwarder.counters, clock)
         self._groups: StreamGroups | None = None
         if section.link.group_hz:

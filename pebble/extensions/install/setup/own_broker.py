@@ -13,7 +13,7 @@ LINKS = {CONF: "../conf.d/pebble.conf", PID: "../../../run/mosquitto/mosquitto.p
 
 
 def fleet_of(account: str, base: str, people: Path) -> Fleet:
-    """Return a fleet with accounts for the robot and its page, whose broker requires a login and TLS from others."""
+    """Return a fleet with accounts for the robot and its page. Its broker requires a login; other machines need TLS."""
     accounts = {
         account: Account(roles=(ProgramRole.ROBOT,), bases=(base,)),
         PAGE: Account(roles=(ProgramRole.PAGE,), people=str(people)),

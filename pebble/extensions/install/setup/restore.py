@@ -40,7 +40,7 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
 
     Before anything is written it raises BackupError for an incomplete backup, and SetupError for one that would write
     elsewhere or for a machine with other files in these places. ``agree`` is called with the programs that its config
-    runs, the files beyond its own, and its scripts; it raises to prevent the restore.
+    runs, the foreign files that it names, and its scripts; it raises to prevent the restore.
     """
     backup, places = backups.read(file), system.places
     config = str(places.config.relative_to(places.root))
@@ -57,8 +57,8 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
                 why = "is there already, with other content: only a blank machine becomes this robot"
                 raise SetupError(f"{target} {why}")
     scripts = (f"/{name}" for name in files if name.endswith(_SCRIPT))
-    if beyond := [*_beyond(plain(decode(text_of(files[config].content), config), Notes())), *scripts]:
-        agree(beyond)
+    if foreign := [*_foreign(plain(decode(text_of(files[config].content), config), Notes())), *scripts]:
+        agree(foreign)
     for place in {_place(name) for name in files}:
         system.owner(_PLACES[place][0])  # raises if there is no such user, as without mosquitto
     for name, saved in files.items():
@@ -105,24 +105,24 @@ def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
     return allowed
 
 
-def _beyond(value: Any, *keys: str) -> Iterator[str]:
-    """Yield the programs in a config that setup does not write, and files outside of the robot's, each with its key."""
+def _foreign(value: Any, *keys: str) -> Iterator[str]:
+    """Yield a config's programs that setup never writes, and its files that are not the robot's, with their keys."""
     key = keys[-1] if keys else ""
     is_run = key in _RUNS or key.endswith(("_command", "_env"))
     is_other_program = is_run and value and value not in COMMANDS
-    is_other_file = not is_run and isinstance(value, str) and _is_beyond(value)
+    is_other_file = not is_run and isinstance(value, str) and _is_foreign_path(value)
     if is_other_program or is_other_file:
         yield f"{'.'.join(keys)}: {' '.join(map(str, value)) if isinstance(value, list | dict) else value}"
     if isinstance(value, dict):
         for name, item in value.items():
-            yield from _beyond(item, *keys, str(name))
+            yield from _foreign(item, *keys, str(name))
     elif isinstance(value, list) and not is_run:
         for item in value:
-            yield from _beyond(item, *keys)
+            yield from _foreign(item, *keys)
 
 
-def _is_beyond(text: str) -> bool:
-    """True if a text may be the path of a file that does not belong to the robot."""
+def _is_foreign_path(text: str) -> bool:
+    """True if a text looks like the path of a file that is not the robot's."""
     if not text.startswith(("/", "~", "file:")) and ".." not in text.split("/"):
         return False
     path = os.path.normpath(text if text[0] in "/~" else f"/etc/pebble/{text}")

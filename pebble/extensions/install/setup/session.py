@@ -75,7 +75,7 @@ def _agree(lines: Sequence[str]) -> None:
 
 
 def _failures(job: Job, *, is_started: bool) -> Iterator[str]:
-    """Yield the problems that keep the robot from being driven; if it was started, by its own test."""
+    """Yield the problems that keep the robot from being driven. If it was started, its self-test runs, too."""
     places = job.places
     if not job.system.has_systemd:
         yield f"systemd does not run here, so nothing starts the robot: pebble up {places.config}"

@@ -26,7 +26,7 @@ MANIFEST, SIGNATURE = "RELEASE.json", "RELEASE.json.minisig"
 TEST_ID = b"TEST-KEY"
 _MOST_BYTES = {MANIFEST: 65_536, SIGNATURE: 1_024, "": 50_000_000}  # "": a file that the manifest names
 _UNTRUSTED, _TRUSTED = "untrusted comment: ", "trusted comment: "
-_ID, _SIGNATURE = 10, 74  # bytes up to the end of the key id, and of a signature
+_ID_END, _SIGNED_BYTES = 10, 74  # the end of a kind of two bytes and the key id after it; a whole signature
 _WHEEL = re.compile(r"pebble_robot-[0-9A-Za-z.+]+-py3-none-any\.whl")
 
 
@@ -77,19 +77,19 @@ def check_signature(data: bytes, signature: bytes, keys: Iterable[str], *, test_
         signed, comment_signature = _bytes(first), _bytes(second)
     except ValueError as error:
         raise ReleaseError(f"{SIGNATURE} is no signature by minisign") from error
-    if not untrusted.startswith(_UNTRUSTED) or not comment.startswith(_TRUSTED) or end or len(signed) != _SIGNATURE:
+    if not untrusted.startswith(_UNTRUSTED) or not comment.startswith(_TRUSTED) or end or len(signed) != _SIGNED_BYTES:
         raise ReleaseError(f"{SIGNATURE} is no signature by minisign")
-    key_id = signed[2:_ID]
-    key = next((key for key in map(_key, keys) if key[2:_ID] == key_id), None)
+    key_id = signed[2:_ID_END]
+    key = next((key for key in map(_key, keys) if key[2:_ID_END] == key_id), None)
     if key is None or signed[:2] != b"ED":
         raise ReleaseError(f"{SIGNATURE} is by key {_name(key_id)}, which is none of this robot's")
     if key_id == TEST_ID and not test_key:
         raise ReleaseError(f"{SIGNATURE} is by a test key, with which everybody can sign")
-    public = Ed25519PublicKey.from_public_bytes(key[_ID:])
+    public = Ed25519PublicKey.from_public_bytes(key[_ID_END:])
     trusted = comment.removeprefix(_TRUSTED)
     try:
-        public.verify(signed[_ID:], hashlib.blake2b(data).digest())
-        public.verify(comment_signature, signed[_ID:] + trusted.encode())
+        public.verify(signed[_ID_END:], hashlib.blake2b(data).digest())
+        public.verify(comment_signature, signed[_ID_END:] + trusted.encode())
     except InvalidSignature:
         raise ReleaseError(f"{MANIFEST} or {SIGNATURE} was changed after key {_name(key_id)} had signed it") from None
     return trusted
@@ -133,7 +133,7 @@ def _key(text: str) -> bytes:
         key = _bytes(text)
     except ValueError:
         key = b""
-    if len(key) != _ID + 32 or key[:2] != b"Ed":
+    if len(key) != _ID_END + 32 or key[:2] != b"Ed":
         raise ReleaseError(f"{text[:60]!r} is no public key of minisign")
     return key
 

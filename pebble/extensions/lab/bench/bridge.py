@@ -4,9 +4,9 @@ A robot of each kind, with a stock broker between it and the operator; ``stand-i
 place of the original Pebble; ``C floor``: two such programs in C (floor.c), which carry commands alone. ``down``: from
 the operator's publish call to the last byte of the command's line at the MCU's pty; ``up``: from the MCU's report to
 the operator. Under ``commands`` robots forward no reports. CPU is that of the process that bridges and of the one that
-owns the serial line, for each command and report that they forwarded. Each round starts fresh robots. One after
-another is driven for a second, its turn; every other time in reverse order. Commands and reports that take longer than
-a second are lost, and commands that a newer one overtook.
+owns the serial line, for each command and report that they forwarded. Each round starts fresh robots. They
+are driven in turns of a second, one after another; every other time in reverse order. Commands and reports that take
+longer than a second are lost, and commands that a newer one overtook.
 """
 
 from __future__ import annotations

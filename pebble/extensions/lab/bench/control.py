@@ -2,9 +2,10 @@
 
 One process sends periodically, another returns each message at once; both work as services do with drive commands, and
 use their QoS. The latency is from just before the publish call until the other's handler runs. Every round starts new
-processes, and a broker or hub for each variant; a slice of each variant under the same condition runs directly after
-the other, in either order. Messages of the first 0.1 s do not count, those that do not return within a second of the
-last one are lost. ``media``: pictures of 640x480 flow at 30 Hz through the same broker or shared memory.
+processes, and a broker or hub for each variant. A slice is what one variant sends under one condition; those of all
+variants run directly after each other, in either order. Messages of the first 0.1 s of a slice do not count,
+those that do not return within a second of the last one are lost. ``media``: pictures of 640x480 flow at 30 Hz through
+the same broker or shared memory.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ def run(settings: Settings, console: Console) -> Shown:
 
 
 def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cell]:
-    """Yield the results of one round; every other pass goes backwards."""
+    """Yield the results of one round: some passes through all cases and variants, every other one backwards."""
     with Participants(settings.variants) as participants:
         for pass_ in range(settings.passes):
             for case in in_turn(settings.cases, number + pass_):

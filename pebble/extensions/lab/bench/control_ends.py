@@ -4,7 +4,7 @@ Both handle a message on the transport's thread that receives it, like an idle s
 stock paho.
 
 ``python -m pebble.extensions.lab.bench.control_ends echo|sender stand-in|mqtt|zenoh SETTINGS`` (JSON, for the
-transport). A sender receives slices as JSON and answers each.
+transport). A sender receives slices (messages of one size at one rate, for some time) as JSON and answers each.
 """
 
 from __future__ import annotations

@@ -113,7 +113,8 @@ def panels(count: int, columns: int, size: tuple[float, float], title: str) -> t
     rows = math.ceil(count / columns)
     width = max(5.5, min(_WIDEST, columns * size[0]))
     figure = Figure(figsize=(width, rows * size[1] + 0.9), dpi=_DPI, layout="constrained")
-    figure.suptitle(textwrap.fill(title, int(width * 11.5) - 14), x=0.01, ha="left")  # beside it: “quick run”
+    characters = int(width * 11.5) - 14  # 11.5 fit in an inch; 14 leave room for “quick run” beside the title
+    figure.suptitle(textwrap.fill(title, characters), x=0.01, ha="left")
     return figure, [figure.add_subplot(rows, columns, number + 1) for number in range(count)]
 
 

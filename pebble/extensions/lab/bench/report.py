@@ -114,7 +114,7 @@ def run(names: Sequence[str], folder: Path, *, quick: bool, console: Console) ->
 
 
 def _report_path(folder: Path) -> Path:
-    """Return the report's path. Raises PebbleError if it cannot or must not be written: before an hour of measuring."""
+    """Return the report's path. Raises PebbleError now, not after an hour, if it cannot or must not be written."""
     if find_spec("matplotlib") is None:
         raise PebbleError("a report needs matplotlib, which is not installed: pip install 'pebble-robot[bench]'")
     check_folder(folder)

@@ -64,7 +64,7 @@ def measure_rounds(
     results.took_s = round(time.monotonic() - began, 1)
     if failed:
         results.notes.append(f"{len(failed)} of {rounds} rounds failed and were left out; {failed[0].splitlines()[0]}")
-    enough = rounds < LEAST_ROUNDS or rounds - len(failed) >= LEAST_ROUNDS
+    enough = rounds - len(failed) >= LEAST_ROUNDS or rounds < LEAST_ROUNDS  # a shorter run promises no interval
     results.complete = enough and all(cell.samples for cell in results.cells)
 
 
@@ -117,10 +117,11 @@ def ratio(ours: Cell, theirs: Cell, percent: float = 50) -> Interval:
 
 
 def paired(ours: Samples, theirs: Samples, percent: float = 50) -> Interval:
-    """Return the median over the rounds of the ratio of their percentiles; rounds with two infinite ones are left out.
+    """Return the median over the rounds of our percentile divided by theirs.
 
-    For the interval, as many rounds as there are are drawn with replacement, many times: its ends are quantiles of the
-    medians of these draws, moved outwards by Student's t because there are few rounds.
+    Rounds in which both are infinite are left out. For the interval, rounds are drawn with replacement, as many as
+    there are, many times: its ends are quantiles of the medians of these draws, moved outwards by Student's t because
+    there are few rounds.
     """
     ratios = []
     for our_samples, their_samples in zip(ours, theirs, strict=False):

@@ -132,7 +132,7 @@ class Demo:
             phone.show(self._page_url, console)
 
     def _prepare_recordings(self) -> None:
-        """Request the data that Recordings shows first, now and then, so that the server has it ready for visitors."""
+        """Request from time to time what Recordings shows first, so that the server has it ready for visitors."""
         while not self._ending.wait(_INDEX_S):
             path = f"archive/timeline?day={datetime.now(UTC):%Y-%m-%d}&robot={_GOOB.base}"
             with suppress(OSError), urlopen(self._page_url + path, timeout=_INDEX_S):  # noqa: S310 - its own page

@@ -13,7 +13,7 @@ _SENT = 1000  # drive commands of the operator that are on their way back: 50 s 
 
 
 class Visitors:
-    """A table of the robots that people have. Each is free again in the step after.
+    """A table of the robots that people have: until its next step begins, the operator leaves them alone.
 
     Times are seconds of one monotonic clock.
     """
@@ -29,11 +29,11 @@ class Visitors:
         self._step_began = 0.0
 
     def note_sent(self, topic: str, payload: bytes) -> None:
-        """Note a drive command of the operator's, which the broker sends back to it."""
+        """Note a drive command of the operator's own: when the broker sends it back, it is no person's."""
         self._sent[topic].append(payload)
 
     def receive_drive(self, message: Message, now: float) -> None:
-        """Note a drive command to any robot, by the operator or by a person."""
+        """Note that a person drives a robot, unless the operator itself has sent this command."""
         address, sent = parse_topic(message.topic), self._sent.get(message.topic)
         if sent and message.payload in sent:
             sent.remove(message.payload)

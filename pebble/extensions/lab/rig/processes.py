@@ -43,10 +43,11 @@ def unchanged(command: Sequence[str]) -> Sequence[str]:
 class Program:
     """A child process in a session of its own: Ctrl-C in a terminal reaches only this process, which ends it in order.
 
-    Start programs from the main thread: the kernel ends them when the thread that started them ends.
+    Start programs from the main thread: when the thread that started them ends, the kernel ends them. A program with
+    input, such as a worker, ends when that closes instead.
     """
 
-    has_input: ClassVar = False  # it ends with its standard input, not with the thread that starts it
+    has_input: ClassVar = False
 
     def __init__(self, name: str, command: Sequence[str], log: Path, on_line: OnLine | None = None) -> None:
         """Start the program. ``on_line`` gets its lines of output, on another thread.

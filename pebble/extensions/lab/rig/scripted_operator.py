@@ -111,7 +111,7 @@ class ScriptedOperator:
         self.tick()
 
     def receive(self, message: Message) -> None:
-        """Handle a message of any robot, retained ones too, on any thread; some confirm a stop."""
+        """Keep any robot's message, retained or not, for ``tick``: some confirm a stop. Any thread may call this."""
         self._received.put(message)
 
     @property

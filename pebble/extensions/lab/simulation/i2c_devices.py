@@ -121,6 +121,7 @@ class MotorShield:
         return (self._commanded[0], self._commanded[1]) if self.frequency_hz else (0.0, 0.0)
 
     def write(self, data: bytes) -> None:
+        """Take a message: 0x10 or 0x11 (motor A or B), direction, two bytes of duty; or 0, three bytes of frequency."""
         if len(data) != _MESSAGE:
             return
         self.before_change()

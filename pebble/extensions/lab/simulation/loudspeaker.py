@@ -94,7 +94,7 @@ class _Recorder:
         sound, now = self._sound, time.monotonic_ns()
         path = self._folder / f"{now:020}-{os.getpid()}.wav"
         raw: BinaryIO = self._resources.enter_context(path.open("wb", buffering=0))
-        self._out = self._resources.enter_context(wave.open(raw, "wb"))  # noqa: SIM115 - so it is
+        self._out = self._resources.enter_context(wave.open(raw, "wb"))  # noqa: SIM115 - closed with the others
         self._out.setnchannels(sound.channels)
         self._out.setsampwidth(sound.width)
         self._out.setframerate(sound.rate)

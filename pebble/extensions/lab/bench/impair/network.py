@@ -27,7 +27,7 @@ _QUEUE_S = 0.3  # the queue of a home router's modem, with tail drop
 _QUEUE_PACKETS = 4  # at least; at 64 kbit/s 0.3 s hold fewer than two
 _COMMAND_S = _ANSWER_S = 10.0
 
-#: Opens each new namespace as a file, says when, and ends with its standard input.
+#: Opens the new namespaces as files 3 and 4, says when, and ends with its standard input.
 _HOLDER = "exec 3</proc/self/ns/net; exec unshare --net sh -c 'exec 4</proc/self/ns/net; echo {}; read _'"
 _TABLE = "table ip impair { chain arriving { type filter hook prerouting priority raw; }; }"
 
@@ -49,13 +49,13 @@ class NamespaceNetwork(Worker):
     """
 
     def __init__(self, name: str = "") -> None:
-        file = os.memfd_create("link")  # unnamed: nothing is left behind if we are killed
-        weakref.finalize(self, os.close, file)
+        log = os.memfd_create("link")  # in memory: nothing is left behind if we are killed
+        weakref.finalize(self, os.close, log)
         command = ["unshare", "--net", "sh", "-c", _HOLDER]
-        super().__init__(f"network {name}".strip(), command, Path(f"/proc/self/fd/{file}"))
+        super().__init__(f"network {name}".strip(), command, Path(f"/proc/self/fd/{log}"))
         try:
             self.answer(_ANSWER_S)
-            robot, remote = (f"/proc/{self.pid}/fd/{number}" for number in (3, 4))
+            robot, remote = (f"/proc/{self.pid}/fd/{number}" for number in (3, 4))  # see _HOLDER
             self._robot, self._remote = _Side(robot, ROBOT_HOST), _Side(remote, REMOTE_HOST)
             self.on_robot, self.on_remote = self._robot.inside, self._remote.inside
             self._robot.batch("ip", f"link add {_WIRE} type veth peer name {_WIRE} netns {remote}")

@@ -47,7 +47,7 @@ class PosePage:
             status = path.parent.lstat()
             if status.st_uid != os.getuid() or status.st_mode & 0o022 or not path.parent.is_dir():
                 raise DeviceError(f"{path.parent}: is not a folder that only you may write, remove it")
-            self._lock = os.open(path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o600)  # stays: a lock needs no end
+            self._lock = os.open(path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o600)  # the file is never removed
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._replace()
         except BlockingIOError:

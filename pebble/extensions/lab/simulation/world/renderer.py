@@ -176,12 +176,14 @@ class Renderer:
         np.copyto(out[part], drawn[part], where=mask[part][..., None] > 127)
 
     def _warp(self, texture: Image, to_space: _Floats, box: tuple[int, int, int, int], out: Image) -> None:
-        """Draw a texture into the ``box`` of a picture. The middle of its pixels is at .5."""
+        """Draw a texture into the ``box`` of a picture. ``to_space``: from its pixels to (right, down, ahead)."""
         x0, y0, x1, y1 = box
         lens = np.array(
             [[self._focal, 0.0, self._middle[0] - x0], [0.0, self._focal, self._middle[1] - y0], [0.0, 0.0, 1.0]]
         )
-        to_picture = lens @ to_space @ np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+        # The first pixel's middle is at 0 for OpenCV, and at 0.5 for ``to_space``.
+        half_pixel = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+        to_picture = lens @ to_space @ half_pixel
         self._cv2.warpPerspective(
             texture,
             to_picture,
@@ -223,14 +225,15 @@ def _covers(plan: _Floats, layers: NDArray[np.int_], columns: _Floats) -> NDArra
     start, along = plan[:, 0], plan[:, 1] - plan[:, 0]
     normal = np.stack((along[:, 1], -along[:, 0]), axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
     normal *= np.where((start * normal).sum(axis=1, keepdims=True) > 0, -1.0, 1.0)  # towards the camera
-    # how far the edges of i are in front of j: [i, edge, j]
+    # how far each edge of i is in front of the plane of j: [i, edge, j]
     before = np.einsum("iek,jk->iej", plan, normal) - (start * normal).sum(axis=1)
     nearest, farthest = before.max(axis=1), before.min(axis=1)
     in_front = (farthest > -_TOUCHING_M) & (nearest > _TOUCHING_M)
     behind = (nearest < _TOUCHING_M) & (farthest < -_TOUCHING_M)
     one_plane = (np.abs(before) <= _TOUCHING_M).all(axis=1)
-    sure = in_front | behind.T
-    covers = (sure & ~sure.T) | (one_plane & one_plane.T & (layers[:, None] > layers))
+    may_cover = in_front | behind.T  # i is in front of the plane of j, or j is behind the plane of i
+    # If each may cover the other, neither does. Within one plane the layers decide.
+    covers = (may_cover & ~may_cover.T) | (one_plane & one_plane.T & (layers[:, None] > layers))
     overlap = (columns[:, None, 0] < columns[:, 1]) & (columns[:, 0] < columns[:, None, 1])
     return np.asarray(covers & overlap & ~np.eye(len(plan), dtype=bool))
 

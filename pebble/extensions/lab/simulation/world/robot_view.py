@@ -45,7 +45,7 @@ class RobotView:
         return self._at_ns
 
     def draw(self, out: Image) -> None:
-        """Draw the picture of that moment into an array of shape (height, width, 3)."""
+        """Draw the picture of the moment that ``look`` chose into an array of shape (height, width, 3)."""
         self._renderer.render(self._tracks, self._at_ns, out)
 
     def _not_running(self) -> NotRunningError:
