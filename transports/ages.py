@@ -156,4 +156,4 @@ class MessageAges:
         """
         if boot == self._boot:
             return now - sent
-        return self._clocks.age_s((boot, topic), sent, 0.0, now, self.late_s)
+        return self._clocks.age_s((boot, topic), sent, 0.0, now, self.late_s)  # 0.0: no other evidence of a wait

@@ -101,9 +101,10 @@ class Cycles:
             way, now = self._ways.get((side, topic)) or self._way(side, topic), self._clock()
             count = way.count(payload, now)
             if way.closed and ((is_one_shot and not subject.runs) or count > SUSPICIOUS):
-                return Finding.CIRCULATES
+                return Finding.CIRCULATES  # of the others the first few pass: the caller recognises those
             period = _PERIOD_IN_STORM_S if count > STORM and not way.closed else PROBE_PERIOD_S
             never_probed = way.probed_at == float("-inf")
+            # Where any topic circulates, all others may as well.
             is_suspicious = way.closed or count > usual or (never_probed and bool(self.closed_ways))
             can_be_probed = is_one_shot or len(payload) <= _LONGEST
             # The other way may be younger than the last probe: so the first suspicious message is probed at once.
@@ -197,8 +198,8 @@ class Cycles:
 def _usual_count(subject: Subject) -> int:
     """Return how many equal messages within 2 s are normal; more of them start a probe.
 
-    The first message of an action is probed already, before the action can run twice. Other commands are probed only
-    after a repetition, so that other programs seldom see a probe.
+    The first message of an action is probed already, before the action can run twice. Another command that runs
+    something is probed at its first repetition, and the rest after some, so that other programs seldom see a probe.
     """
     if subject.kind.direction == OUTGOING:
         return STORM

@@ -179,11 +179,11 @@ class Forwarder:
 
     def skips_retained(self, side: Side, topic: bytes) -> bool:
         """True if retained messages of ``topic`` do not pass; counts and logs this message then. For TopicPolicy."""
-        kind = self.subjects.invented(topic)
         if self._names is not None and topic.endswith(_STOP) and self._is_stop(topic.decode(errors="replace")):
-            return False  # it may be a live one
+            return False  # it may be a live stop, with a name in its topic
+        kind = self.subjects.invented(topic)
         if kind is None or (kind is Kind.FLAG and not self._admission.refuses_flag(topic)):
-            return False
+            return False  # not invented, or an unknown flag for which there is room
         drop = Drop.TOO_MANY if kind is Kind.FLAG else Drop.STALE
         self.sides[side].window.note()
         self.counters.add(f"{side.value}: {drop.value}")
@@ -212,10 +212,10 @@ class Forwarder:
         subject, by = sender.subject, sender.account  # sign() may add to this the person for whom the account acts
         outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
         if subject is None:
-            outcome = sender.foreign
+            outcome = sender.foreign  # the reason
         elif isinstance(outcome, Forward):
             match names.sign(sender, message):
-                case Signed(signed, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:  # set on both sides
+                case Signed(signed, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:  # for both sides
                     outcome = self.retained.change(subject, signed)
                 case Signed(signed, by):
                     outcome = self.pass_on(source, subject, signed, outcome, sender.account)

@@ -62,10 +62,14 @@ class Publisher:
             self._sides[origin].returns.expect(message.topic, message.payload)
 
     def is_echo(self, source: SideState, subject: Subject, message: Message) -> bool:
-        """True if we sent ``message`` and it came back; forgets it and all earlier messages of its topic."""
+        """True if ``message`` is ours, and came back by another bridge or from a broker without bridge mode.
+
+        Forgets it and all earlier messages of its topic.
+        """
         topic, payload = message.topic, message.payload
         if (source.side, topic) in self._cycles.closed_ways and source.returns.is_echo(topic, payload):
             return True
+        # Next, from the broker to which it was published: retained ones are recognised by their values instead.
         if source.transport.exact_echo or message.retain or not subject.is_two_way:
             return False
         return source.loopback.is_echo(topic, payload)

@@ -99,8 +99,8 @@ class Reconciliation:
         self._published = {side: BoundedTable[bytes](TOPICS, BYTES, len) for side in Side}
         self._received: dict[Side, set[str]] = {side: set() for side in Side}  # since the connection began
         # Of topics on which the winner has published nothing since its connection began, as far as has arrived:
-        self._offered: set[str] = set()  # those that it seemed to lack, and was sent,
-        self._newer: set[str] = set()  # and those that the loser has changed since
+        self._offered: set[str] = set()  # the winner seemed to lack them, and was sent the loser's values
+        self._newer: set[str] = set()  # the loser has changed them since the winner's values should have been here
         self._synchronized = dict.fromkeys(Side, False)
         self._overtaken: set[str] = set()  # changed by the loser while the winner was away
 
@@ -153,9 +153,9 @@ class Reconciliation:
                 self._newer.discard(topic)
                 self._offered.discard(topic)
             elif other_away and len(self._overtaken) < TOPICS:
-                self._overtaken.add(topic)
+                self._overtaken.add(topic)  # what the winner brings back is older
             elif not retained and self._may_come_late(topic) and len(self._newer) < TOPICS:
-                self._newer.add(topic)
+                self._newer.add(topic)  # what of the winner comes late is older
             self._set(topic, payload, side)
         return resolution
 
@@ -171,7 +171,7 @@ class Reconciliation:
             self._overtaken.clear()
             for topic, payload in self._held.items():
                 self._set(topic, payload, side.other)
-                due.append((side, topic, payload))
+                due.append((side, topic, payload))  # to the winner, which has none
             self._held.clear()
         released = {topic for _, topic, _ in due}
         due += [

@@ -126,8 +126,8 @@ class RetainedTopics:
         retained = self._sides.gate is not Gate.SHUT and self._is_retained(source, message)
         if only_old and not retained:
             return Drop.UNNAMED
-        may_come_back = not any(state.transport.exact_echo for state in self._sides.values())  # ours, unrecognised
-        if not retained and may_come_back and self._reconciliation.value(topic) == payload:
+        ours_may_come_back = not any(state.transport.exact_echo for state in self._sides.values())
+        if not retained and ours_may_come_back and self._reconciliation.value(topic) == payload:
             return Drop.KNOWN
         resolution = self._reconciliation.receive(
             side,

@@ -50,7 +50,7 @@ class RetainedWindow:
         if now >= until:
             return
         self._newest_at = now
-        if until < float("inf"):
+        if until < float("inf"):  # the subscription is complete: so each message puts the end off
             latest = self._subscribed_at + _RETAINED_STOPS_S
             self._stops_until = min(max(now + INITIAL_SYNC_S, until), latest)
 

@@ -62,14 +62,14 @@ class SideState:
             self.subscribing()  # the transport does so at the next connection
             self.restarted = True
             self._lost_at = self._clock()
-            # Known before its retained messages come, which may be before it counts as connected.
+            # Its broker may have restored a save. Noted now, because retained messages may come before CONNECTED does.
             self._went_back = not self._wins and self.transport.was_ended
         elif self._wins:
-            self._went_back = self._was_brief and self.transport.went_back  # it has compared what we published
+            self._went_back = self._was_brief and self.transport.went_back  # it has compared the broker's with ours
 
     @property
     def has_gone_back(self) -> bool:
-        """True if older retained values of this side are from a restored save, and not set again by a program."""
+        """True if an older retained value of this side was restored by its broker, not set again by a program."""
         if not self._went_back:
             return False
         return self._wins or self._was_brief or self.transport.was_ended

@@ -49,7 +49,7 @@ class Control:
         self._turn_due = now if self.peers else None  # when the turn is sent again
         self._state = Paced(lambda: publish(self.state()))
         self._log = RateLimitedLog(log, burst=5)
-        self._next: float | None = None  # the next tick
+        self._tick_due: float | None = None  # when the lease must be ticked next
 
     def state(self) -> ControlState:
         _, name, by, device = self.lease.holder or _NO_CLIENT
@@ -129,8 +129,8 @@ class Control:
             lease.changed = False
             self._state.changed(now)
             self._turn_due = now if self.peers else None
-        if self._next is None and (lease.key or lease.others):
-            self._next = now + _TICK_S
+        if self._tick_due is None and (lease.key or lease.others):
+            self._tick_due = now + _TICK_S
         halts, lease.halts = lease.halts, False
         if halts:
             _, _, by, device = lease.holder or _NO_CLIENT
@@ -141,12 +141,12 @@ class Control:
     @property
     def due(self) -> float | None:
         """Time at which :meth:`tick` must run next; None if nothing is due."""
-        return earliest(self._next, self._state.due, self._turn_due, self._turns.due)
+        return earliest(self._tick_due, self._state.due, self._turn_due, self._turns.due)
 
     def tick(self, now: float) -> None:
         """End control whose time is over. Call :meth:`note` and :meth:`show_turn` afterwards."""
-        if self._next is not None and now >= self._next:
-            self._next = None
+        if self._tick_due is not None and now >= self._tick_due:
+            self._tick_due = None
             self.lease.tick(ms(now))
         self._state.tick(now)
         self._turns.tick(now)

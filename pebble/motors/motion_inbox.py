@@ -126,6 +126,7 @@ class MotionInbox:
                 self._lost = True
 
     def put_drive(self, drive: p.Drive, now: float, company: tuple[Member, ...] = ()) -> bool:
+        """Put a drive command; ``company`` as in `ReceivedDrive`."""
         with self._lock:
             was_empty = self._empty
             sender = run_of(drive)
@@ -133,6 +134,7 @@ class MotionInbox:
                 sender = _HOLDER
             waiting = self._drives.pop(sender, None)
             if len(self._drives) >= _SENDERS:
+                # The oldest run of a script gives way: persons never do.
                 del self._drives[next(key for key in self._drives if key not in (PERSON, _HOLDER))]
                 self.dropped += 1
             newest = ReceivedDrive(drive, now, company)

@@ -122,7 +122,7 @@ class MotorGuard:
         limit: int = self._arbiter.judge(drive.moves, run, valid_ms, ms(now), key, account)
         self._note_barred(now)
         if limit == REFUSED:
-            needs_no_key = run != PERSON or account is None
+            needs_no_key = run != PERSON or account is None  # a script, or another program of the robot
             is_stranger = self._control.lease.refuses(drive.moves, needs_no_key, key, account or "", ms(now))
             reason = self._reason_of_refusal(drive.moves, is_stranger, now)
             self._counters.add(reason)

@@ -222,7 +222,7 @@ class MotorOwner(Service, ABC):
         now, drive = self.clock(), received.drive
         if drive.moves and now - received.at > WAIT_LIMIT_S:
             self.count_late(c.DRIVE)
-            self._control.doubt(now)
+            self._control.doubt(now)  # what held it up may have cost other messages
             return
         valid_s = self._guard.judge(drive, now)
         self._note_control()
@@ -233,7 +233,7 @@ class MotorOwner(Service, ABC):
         valid_s -= now - received.at
         if valid_s <= 0:
             self._halt()
-            if received.company and not drive.moves:
+            if received.company and not drive.moves:  # a zero is never too old, nor is its group
                 self.move_with(drive, 0.0, received.company)
             return
         self._set_deadline(now + valid_s)  # first: it holds even if a subclass fails

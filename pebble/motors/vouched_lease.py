@@ -35,6 +35,7 @@ class VouchedLease(Lease):
         if self.asker and now - self._asked >= self._wait:
             self.asker, self.changed = (), True
         self._held = self.key != "" and self._quiet_ms(self._held_from, now) < _IDLE_MS
+        # Not renewed for too long, or another client asks and the holder is idle:
         if self.key and (self._quiet_ms(self._since, now) >= self._limit_ms or (self.asker and not self._held)):
             self._end(now)
 

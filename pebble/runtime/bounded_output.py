@@ -15,7 +15,7 @@ PAUSE_S: Final = 0.02  # between two reads of a program that floods: it has to w
 _SKIM = 4096  # bytes of a chunk that are read during a flood
 _REPEATS_S = 1.0  # within which the same line again is a repetition
 _QUIET_S, _REPORT_S = 0.5, 5.0  # the missing lines are said so long after the end of the flood, or so often in it
-_clock = re.compile(rb"\d\d:\d\d:\d\d(?:[.,]\d+)? ").match
+_match_time = re.compile(rb"\d\d:\d\d:\d\d(?:[.,]\d+)? ").match
 
 
 class BoundedOutput:
@@ -74,8 +74,8 @@ class BoundedOutput:
             self._write(unfinished)
 
     def _line(self, line: bytes, now: float) -> None:
-        clock = _clock(line)
-        text = line[clock.end() :] if clock else line
+        time_at_start = _match_time(line)
+        text = line[time_at_start.end() :] if time_at_start else line
         if not text:
             return
         if text == self._newest and now - self._newest_at < _REPEATS_S:

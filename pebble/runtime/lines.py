@@ -24,11 +24,9 @@ class LineSplitter:
             if not self._skipping and len(self._tail) + len(part) <= self._limit:
                 lines.append(self._tail + part)
                 self._tail = b""
-                continue
-            self._grow(part, lines)
-            if not self._skipping:
-                lines.append(self._tail)
-            self.reset()
+            else:  # the end of a line that is too long
+                self._grow(part, lines)
+                self.reset()
         self._grow(tail, lines)
         return lines
 

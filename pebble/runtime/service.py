@@ -317,7 +317,7 @@ class Service:
         arrived = self.clock() - message.waited_s
 
         def handle() -> None:
-            # The service's clock may stand still while the machine is suspended; the message's does not.
+            # While the machine is suspended, the service's clock may stand still, but the message's goes on.
             self._handle(channel, lambda: method(value, **names), min(arrived, self.clock() - message.waited_s))
 
         if channel.newest:

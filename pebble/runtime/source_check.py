@@ -51,10 +51,10 @@ class SourceCheck:
     def count(self, times: int, now: float) -> None:
         """Add ``times`` contents that have come since the last call."""
         if self._window is None:
-            self._window, self._count = now + _SETTLE_S, -1
+            self._window, self._count = now + _SETTLE_S, -1  # the source settles first
         if now < self._window:
             return
-        if self._count < 0:
+        if self._count < 0:  # settled: what came until now does not count
             self._window, self._count = now, 0
             return
         self._count += times

@@ -92,7 +92,7 @@ def _write_in_place(file: Path, content: bytes, mode: int) -> None:
         output.truncate()
         output.flush()
         sync_file(output.fileno())
-    file.with_name(f".{file.name}.new").unlink()
+    file.with_name(f".{file.name}.new").unlink()  # which write() could not rename
 
 
 def make_folder(folder: Path) -> None:

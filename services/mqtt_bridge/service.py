@@ -205,7 +205,7 @@ class MqttBridge(ForwardingService):
 
     def connected(self, side: Side, epoch: int) -> None:
         if side is Side.REMOTE:
-            if self.forwarder.gate is Gate.SHUT:
+            if self.forwarder.gate is Gate.SHUT:  # otherwise subscribe_remote() does that, as soon as it is called
                 self._publish_heartbeat(at_once=True)
         else:
             barrier(self.transport, self._same_broker.topic)
@@ -404,6 +404,7 @@ class MqttBridge(ForwardingService):
         if channel is None or codec.is_blank(message.payload):
             return
         if not message.retain and routed.outcome is not Drop.KNOWN:
+            # With a closed gate both sides may be one broker, and the message an operator's.
             by_robot = is_local and self.forwarder.gate is Gate.OPEN
             self._observers.passed(channel, ROBOT if by_robot else routed.by, message.payload)
         self._requests.message(channel, message.payload)

@@ -194,6 +194,6 @@ class StopConnection:
             self._connected_at = self._clock()
             return
         doubtful = self._copies.lost()
-        if state is State.CONNECTING:
+        if state is State.CONNECTING:  # it was lost; if it is CLOSED, we have ended it
             for message in doubtful:
                 self._pass_on(message)

@@ -90,7 +90,7 @@ class MqttMirror(ForwardingService):
     def _check_broker(self, epoch: int) -> None:
         """Watch for probes of the bridge from the broker for some seconds, and forward nothing before that."""
         self.forwarder.rearm()
-        self._announced, self._under_way = False, bool(self._watched)
+        self._announced, self._under_way = False, bool(self._watched)  # until the bridge says that none is under way
         self.unsubscribe(Side.REMOTE)
         self.subscriptions[Side.REMOTE] = [
             self.remote.subscribe(topic, self._from_broker_watched, echo=False, direct=True)
@@ -98,7 +98,8 @@ class MqttMirror(ForwardingService):
         ]
         self._request_probe()
         begins = self.clock() + (CHECK_S if self._watched else 0.0)
-        self.call_at(begins, partial(self._begin, epoch, begins + self._slowest_s))
+        latest = begins + self._slowest_s
+        self.call_at(begins, partial(self._begin, epoch, latest))
 
     def _begin(self, epoch: int, latest: float) -> None:
         """Start forwarding on connection ``epoch``, once no probe is under way, at the latest at ``latest``."""
@@ -109,7 +110,7 @@ class MqttMirror(ForwardingService):
         barrier(self.remote, self._probe_topic)
         if epoch != self.epoch or self.forwarder.gate is not Gate.WAITING:
             return
-        if self._is_operators and not self._announced:  # the bridge has sent no probe since: it may still be theirs
+        if self._is_operators and not self._announced:  # without a new probe the earlier verdict stands
             self._refuse(self._refused)
             return
         self._is_operators, self._refused = False, ""

@@ -204,18 +204,18 @@ class Connection:
             raise self.incoming.lost
         blocked, waiting = bool(self._client.waiting), self.incoming.age.waiting
         began = now = clock.since_boot()
-        wait = min(timeout, self.pings.due_at - began)
+        wait_s = min(timeout, self.pings.due_at - began)
         ready = NOTHING
-        is_fresh = not self.incoming.more and began - waiting.checked_at <= _FRESH_S
-        if not is_fresh:
+        was_just_empty = not self.incoming.more and began - waiting.checked_at <= _FRESH_S
+        if not was_just_empty:
             ready = self._poll.wait(0.0, write=blocked)
             now = clock.since_boot()
         if ready == NOTHING and not self.incoming.more:
-            if not is_fresh:
-                waiting.empty(began)
-            ready = self._poll.wait(max(wait, 0.0), write=blocked)
+            if not was_just_empty:
+                waiting.empty(began)  # as the poll has found nothing since then
+            ready = self._poll.wait(max(wait_s, 0.0), write=blocked)
             now = clock.since_boot()
-            if now - began <= wait + OVERSLEPT_S:
+            if now - began <= wait_s + OVERSLEPT_S:
                 waiting.empty(now)  # what is there has come just now: this process did not sleep
         readable, writable, _woken = ready
         if writable:
@@ -354,6 +354,7 @@ class Connection:
 
     @property
     def answer(self) -> Answer | None:
+        """The newest answer to a ping; None before the first one, and without a socket."""
         with self._lock:
             sock = self._client.socket
             if sock is None:

@@ -162,7 +162,7 @@ class Dialler:
         if late:
             self.addresses.was_slow()
         if self.loses_large or not (silent or late):
-            return False
+            return False  # they are small already, or this loss tells nothing about large packets
         self._large_lost = self._large_lost + 1 if self._may_have_lost_large(lost) else 0
         return self.loses_large
 
@@ -188,9 +188,11 @@ class Dialler:
         """
         addresses, asks_again = self.addresses, self.limits.asks_again
         if self._is_last_attempt and not asks_again:
-            failed = addresses.failed(problem.removeprefix(f"{self.addresses.where} "), held_s)
+            why = problem.removeprefix(f"{addresses.where} ")  # the list of failures names the addresses
+            failures = addresses.failed(why, held_s)
             if addresses.several:
-                problem = f"broker {addresses.host_port}: {failed}"
+                problem = f"broker {addresses.host_port}: {failures}"
         if asks_again and held_s <= 0:
             return "", False
+        # Of a round through several addresses, only the end is worth a line.
         return problem, held_s > 0 or addresses.is_over or not addresses.several

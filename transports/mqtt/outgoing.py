@@ -30,7 +30,7 @@ BACKLOG_BYTES = 256 * 1024  # of their payloads; one message may always wait, wh
 ROUND_TRIPS = 8  # answer times that are remembered
 
 WINDOW_S = 1.0  # a broker that hangs up because of a message does it so soon after the message was written
-SMALL = 256  # bytes that every broker takes: smaller messages count as so large
+SMALL = 256  # bytes that every broker accepts: a smaller message that was accepted counts as so large
 TOPICS = 1000  # that are remembered
 _TCP_INFO = getattr(socket, "TCP_INFO", None)  # Linux only
 _RTT = struct.Struct("@I")  # microseconds
@@ -272,12 +272,13 @@ class InFlightTable:
         return min(self._round_trips, default=0.0)
 
     def newest_answer(self, now: float) -> tuple[int, float]:
-        """Return the number of answered pings, and the seconds of the newest answer or of a longer wait."""
+        """Return the number of answered pings, and how long the newest took, or an unanswered one already takes."""
         waits = now - self._pings[0].sent_at if self._pings else 0.0
         return self._pong_number, max(self._newest_s, waits)
 
     def end(self) -> None:
         """Complete all pending answers, because none can come after the connection's end."""
+        # Those that were written after the newest answered ping, and before the next one:
         unanswered = self._pings[0].written if self._pings else self._written
         self.lost_bytes = max((size for _, size in unanswered.values()), default=0)
         self.complete()
@@ -330,6 +331,7 @@ def present_round_trip_s(sock: socket.socket) -> float:
 
 
 def _round_trip_s(sock: socket.socket, at: int) -> float:
+    """Return the round trip at the offset ``at`` of the kernel's `tcp_info`; 0 if it does not tell."""
     if _TCP_INFO is None:
         return 0.0
     info = b""

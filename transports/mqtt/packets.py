@@ -246,7 +246,7 @@ class Reader:
             at = self._at
             if end - at < 2:
                 if at < end:
-                    self._keep(2)
+                    self._keep(2)  # a type, and one byte of the length
                 else:
                     self._data, self._at = b"", 0
                 break
@@ -256,7 +256,7 @@ class Reader:
             elif size > 127:
                 size, start = _read_variable(data, at + 1)
                 if size < 0:
-                    self._keep(end - at + 1)
+                    self._keep(end - at + 1)  # its length is not whole: at least one more byte
                     break
             stop = start + size
             if size > MAX_PACKET:
@@ -290,7 +290,7 @@ class Reader:
         if qos:  # a message id follows the topic
             payload_at += 2
             if qos == _QOS_1:
-                self.acks += b"\x40\x02" + data[topic_end:payload_at]
+                self.acks += b"\x40\x02" + data[topic_end:payload_at]  # PUBACK
             elif qos == _QOS_2:  # nothing is subscribed to with it: PUBREC, so that the broker goes on
                 self.acks += b"\x50\x02" + data[topic_end:payload_at]
             else:
@@ -314,7 +314,7 @@ class Reader:
         elif first == _PINGRESP:
             self._listener.on_pong()
         elif first == _PUBREL:
-            self.acks += b"\x70\x02" + body[:2]
+            self.acks += b"\x70\x02" + body[:2]  # PUBCOMP
         elif first == _CONNACK:
             self._connack(body)
         else:

@@ -61,8 +61,8 @@ class BrokerDelay:
     has read the last old message of another client. So if nothing at all has come since an overdue ping was sent, the
     messages of the next moment count as having waited as long.
 
-    Answers carry no number, and mosquitto drops them where a client's queue is full. A later PUBACK shows that an
-    answer was lost. So do answers that always come right after the newest of several pings.
+    Answers carry no number, and mosquitto drops them where a client's queue is full: later answers then count for
+    pings before theirs. A later PUBACK shows that; so do answers that always come right after the newest ping.
     """
 
     def __init__(self) -> None:
@@ -134,7 +134,7 @@ class BrokerDelay:
         """
         since = sent_at = now
         for ping in self._pings:
-            if ping.clear:  # the oldest that tells anything
+            if ping.clear:  # of those that tell anything, the oldest
                 since, sent_at = ping.since, ping.sent_at
                 break
         if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:  # nothing came: it stood still
@@ -143,7 +143,8 @@ class BrokerDelay:
         waited = max(self._newest, now - since, self._stall if now < self._until else 0.0)
         if waited <= self._shortest + _NOTICED_S:
             return 0.0
-        return waited - max(self._shortest, min(round_trip_s(), self._shortest + _UPLINK_S))
+        way_s = max(self._shortest, min(round_trip_s(), self._shortest + _UPLINK_S))
+        return waited - way_s
 
 
 class ReadAge:

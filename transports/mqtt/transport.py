@@ -170,6 +170,7 @@ class MqttTransport(Transport):
                 return
             for name in names:
                 self._own_message_filter.subscribe_again(name)
+            # Retained messages come after the SUBACK; the ping's answer follows them.
             answer = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
             acks = [answer, connection.ping(), connection.unsubscribe(names)]
         for ack in acks:

@@ -26,7 +26,7 @@ class Publishers:
         self._is_invented = is_invented
         self.declared: dict[tuple[str, QoS], zenoh.Publisher] = {}
         self.thread = 0  # the identifier of the thread that is inside `put`
-        # Of each topic, by its first message: with two priorities, its messages would overtake each other (T3).
+        # Of each topic, as its first message was: with two priorities, its messages would overtake each other (T3).
         self._urgent: dict[str, bool] = {}
 
     def put(self, session: zenoh.Session, message: Message, urgent: bool) -> None:
@@ -56,7 +56,7 @@ class Publishers:
         the time between two processes. But each key for which one was ever declared costs 2.4 KB here and in the hub
         until the session ends: so no topic that strangers have invented gets one, and only the first of the others.
         """
-        urgent = remember_first(self._urgent, message.topic, urgent)
+        urgent = remember_first(self._urgent, message.topic, urgent)  # also for a topic without a publisher
         if len(self.declared) >= PUBLISHERS or self._is_invented(message.topic):
             return None
         treatment = wire.TREATMENTS[message.qos, urgent]

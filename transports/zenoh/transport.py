@@ -317,7 +317,7 @@ class ZenohTransport(Transport):
             topic, payload = only_topic or key_to_topic(str(sample.key_expr)), sample.payload.to_bytes()
             qos = min(stamp.qos, subscription.qos)
             message = Message(topic, payload, qos, False, stamp.retain_requested, read_at if since is None else since)
-            if may_be_ours and publishers.thread == threading.get_ident():
+            if may_be_ours and publishers.thread == threading.get_ident():  # inside put(), see LoopbackQueue
                 self._loopback.put(subscription, message)
             else:
                 subscription.offer(message)

@@ -1,4 +1,4 @@
-"""A client like Pebble's own client of MQTT, by paho. It takes half as much processor time again, and 5 MB."""
+"""A client like Pebble's own client of MQTT, by paho. It takes 1.5 times the processor time, and 5 MB more."""
 
 import socket
 import ssl

@@ -25,7 +25,7 @@ class PahoTransport(MqttTransport):
 
 
 def _from_config(*, tls: dict[str, Any] | None = None, as_published: bool = True, **fields: Any) -> MqttSettings:
-    """Return the settings of these fields, in which files are texts."""
+    """Return the settings with these fields of a config, in which the paths of files are texts."""
     certificates = None if tls is None else TlsSettings(**_with_paths(tls))
     return MqttSettings(**_with_paths(fields), tls=certificates, as_published=as_published)
 

@@ -118,7 +118,7 @@ class _Removal:
         self._ask(ONLINE.topic(self._name), _note_heartbeat, WATCH_S, self._look)
 
     def _look(self) -> None:
-        if any(len(heartbeats) > 1 for heartbeats in self._answers):  # one may be retained
+        if any(len(heartbeats) > 1 for heartbeats in self._answers):  # only one of them can be retained
             log.info("%s is another robot now: what is retained under this name is its own", self._name)
             self._end()
             self._done()

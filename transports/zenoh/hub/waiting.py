@@ -24,7 +24,7 @@ class WaitingQueries:
         self._received: dict[str, int] = {}  # how many retained messages have arrived, by client
         self._waiting: deque[_Waiting] = deque()  # oldest first
         self._awaited: set[str] = set()  # clients whose messages these wait for
-        self._looks = False  # True if such a message came, so that some query may have all that it needs
+        self._some_arrived = False  # such a message came, so that some query may have all that it needs
 
     def count_from(self, client: str, count: int) -> None:
         """Note that this client has sent ``count`` retained messages until now, and that all of them are here."""
@@ -34,7 +34,7 @@ class WaitingQueries:
         """Note the ``count``-th retained message of this client; 0: the client does not count its messages."""
         if count and client in self._received:
             self._received[client] = max(count, self._received[client])
-            self._looks = self._looks or client in self._awaited
+            self._some_arrived = self._some_arrived or client in self._awaited
 
     def forget(self, client: str) -> None:
         self._received.pop(client, None)
@@ -54,15 +54,15 @@ class WaitingQueries:
         """Return the time at which to call :meth:`take`; infinite if nothing waits."""
         if not self._waiting:
             return float("inf")
-        return float("-inf") if self._looks else self._waiting[0].until
+        return float("-inf") if self._some_arrived else self._waiting[0].until
 
     def take(self, now: float) -> list[zenoh.Query]:
         """Remove and return the queries to answer now: nothing is missing for them, or they have waited long enough."""
         due = []
         while self._waiting and now >= self._waiting[0].until:
             due.append(self._waiting.popleft())
-        if self._looks:
-            self._looks = False
+        if self._some_arrived:
+            self._some_arrived = False
             due += [entry for entry in self._waiting if self._has_arrived(entry.needs)]
             self._waiting = deque(entry for entry in self._waiting if not self._has_arrived(entry.needs))
         if not self._waiting:
