@@ -133,8 +133,8 @@ def obeys_plugin(folder: Path) -> bool:
         lines = read_plain(folder / CONF).decode().splitlines()
         if any(line.startswith("plugin ") and _PLUGIN in line for line in lines):
             return True
-    # Where it runs as another user this may fail, and SIGHUP by this process does not reach it either.
-    with suppress(OSError), as_before():
+    # If mosquitto runs as another user, only root can read this. Then only root can make it reload its files, too.
+    with suppress(OSError), as_before():  # as root again, if this command began as root
         return _PLUGIN in Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")
     return False
 

@@ -63,7 +63,8 @@ class Audit:
         texts = {field: text[:_MAX_TEXT].encode(errors="replace").decode() for field, text in fields}
         refused = what in REFUSED  # of these, one row stands for all of a network, whatever names they try
         like = (what, network_of(address)) if refused else None
-        self._writer.add({"t": time.time(), "what": what, **texts}, like, OF_STRANGERS if refused else DIFFERENT)
+        most = OF_STRANGERS if refused else DIFFERENT
+        self._writer.add({"t": time.time(), "what": what, **texts}, like, most)
 
     def read(self, limit: int, ref: str = "") -> list[Entry]:
         """Return the newest rows, the newest last. ``ref``: those of one robot and of all robots.

@@ -105,10 +105,11 @@ def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dic
 
 
 def priorities(commands: Sequence[str], stops: Sequence[str]) -> dict[str, Any]:
-    """Return Zenoh's setting ``qos``: from other machines only ``stops`` get the first priority, and only they block.
+    """Return Zenoh's setting ``qos`` for messages from other machines; ``stops`` are among ``commands``, all are keys.
 
-    Otherwise the sender would choose: commands with the first priority would delay stops, and a blocking sender would
-    make the hub disconnect a slow receiver. Both parameters are keys; ``stops`` are among ``commands``.
+    Only ``stops`` get the first priority, and only they wait for a slow receiver; other commands are dropped. Otherwise
+    the sender would choose: commands with the first priority would delay stops, and messages that wait would make the
+    hub disconnect a slow receiver.
     """
     rows = (("commands", commands, _COMMANDS), ("stops", stops, _STOPS))
     fields = {"messages": ["put"], "flows": [*IN], "link_protocols": OTHER_MACHINES}

@@ -74,10 +74,10 @@ class CheckedNames(Names):
             if payload_type is EstopCommand:
                 return Signed(_moved(message, sender.topic, _doubted(payload)), NO_ACCOUNT)
             if channel is None or not (channel.suffix in self._strangers or _is_zero(channel, payload)):
-                return Drop.UNNAMED
+                return Drop.UNNAMED  # a drive command that only stops passes without a right
         elif (message.retain or message.retain_requested) and payload_type is not EstopCommand:
             return Drop.STALE
-        if channel is GROUP and not _is_group(payload):
+        if channel is GROUP and not _is_group(payload):  # several commands in one payload
             return Drop.UNREADABLE
         fields, by = _object(payload), account
         if fields is not None:
@@ -90,7 +90,7 @@ class CheckedNames(Names):
                 body["by"] = by
                 payload = _encoder.encode(fields)
         elif channel is not None and payload_type not in _MAY_BE_BARE:
-            return Drop.UNREADABLE
+            return Drop.UNREADABLE  # it is no object
         return Signed(_moved(message, sender.topic, payload), by)
 
 
@@ -134,10 +134,10 @@ def _object(payload: bytes) -> dict[str, Any] | None:
     """Return the JSON object in ``payload`` as every reader of the contract parses it; None if they cannot."""
     try:
         usual = payload[:1] == b"{" and payload[-1:] == b"}" and len(payload) <= _USUAL_BYTES
-        if usual and payload.isascii() and b"\0" not in payload:  # nothing is around the object
+        if usual and payload.isascii() and b"\0" not in payload:  # the fast way to the same result
             fields = _decoder.decode(payload)
         else:
-            fields = codec.plain(DRIVE, payload)
+            fields = codec.plain(DRIVE, payload)  # reads the JSON of any channel
     except (PayloadError, msgspec.DecodeError):
         return None
     return fields if isinstance(fields, dict) else None

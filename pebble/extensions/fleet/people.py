@@ -261,7 +261,8 @@ def _has_user(path: Path, name: str) -> bool:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{unchanged}", uri=True)) as connection:
             if not connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'people'").fetchall():
                 return False  # the program that made it was killed
-            return bool(connection.execute("SELECT 1 FROM people WHERE ? IN (name, '')", (name,)).fetchall())
+            any_or_this = "SELECT 1 FROM people WHERE ? IN (name, '')"  # without a name: any person
+            return bool(connection.execute(any_or_this, (name,)).fetchall())
     except sqlite3.Error as error:
         raise DatabaseError(path, error) from None
 

@@ -21,9 +21,9 @@ def of_broker(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str,
 
 
 def of_certificate(fleet: Fleet, name: str) -> dict[str, Any]:
-    """Return the part of a config for the owner of a certificate, or a file for it.
+    """Return what a certificate's owner needs: a hub its whole file, a robot or neighbour a part of its config.
 
-    Key and authority are in the same folder.
+    Empty for others. The certificate, its key and the authority's certificate are in the same folder.
     """
     roles = fleet.accounts[name].roles
     at_hub = _at_hub(fleet, name, certificates.CA_CERT, name)
@@ -46,15 +46,16 @@ def hub_file(keys: str) -> dict[str, Any]:
 
 
 def boards_file(fleet: Fleet, name: str, below: str) -> dict[str, Any]:
-    """Return the config file of a gateway for boards; ``name`` is its account, which is also that of a neighbour.
+    """Return the config file of the gateway for boards whose account is ``name``.
 
-    ``below``: the path prefix of the fleet's folder in that file.
+    At the LAN's hub the gateway connects for each board, by the board's account as a neighbour. ``below``: the prefix
+    in that file for paths in the fleet's folder.
     """
     server, ca = fleet.brokers[0], below + certificates.CA_CERT
     login = {"username": name, "password_file": f"{name}-password", "tls": {"enabled": True, "ca_cert": ca}}
     neighbours = {
-        account.bases[0]: {"lan": _at_hub(fleet, other, ca, f"{below}{certificates.ACCOUNTS}/{other}")}
-        for other, account in fleet.accounts.items()
+        account.bases[0]: {"lan": _at_hub(fleet, neighbour, ca, f"{below}{certificates.ACCOUNTS}/{neighbour}")}
+        for neighbour, account in fleet.accounts.items()
         if ProgramRole.NEIGHBOUR in account.roles and account.bases[0] in fleet.accounts[name].bases
     }
     return {"id": name, "boards": {"host": server.host, "port": server.port, **login}, "neighbours": neighbours}
@@ -78,4 +79,5 @@ def _who(fleet: Fleet, name: str) -> dict[str, Any]:
     parts = dict(zip(("system", "type", "id"), account.bases[0].split("/"), strict=True))
     defaults = {"system": "pebble", "type": "robots"}
     robot = {key: part for key, part in parts.items() if part != defaults.get(key)}
-    return {"robot": robot, "security": {"level": "login" if account.plain else fleet.level}}
+    level = "login" if account.plain else fleet.level  # a plain robot takes commands without account names
+    return {"robot": robot, "security": {"level": level}}

@@ -204,9 +204,9 @@ def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
 
 
 def covered(right: Right, metric: str) -> str:
-    """Return a metric of the contract that needs another right than this one, but would match ``metric``, a filter.
+    """Return a metric of the contract that the filter ``metric`` matches, but for which ``right`` is not enough.
 
-    Empty if there is none: then :class:`Extra` may grant ``metric`` by this right.
+    Empty if there is none: then :class:`Extra` may grant ``metric`` to this right.
     """
     for channel in c.CHANNELS:
         if channel.direction == INCOMING and channel not in WRITES[right]:
@@ -235,9 +235,10 @@ def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
             yield from (Rule(access, f"{base}/#") for access in ("read", "write"))
             if ProgramRole.ROBOT in account.roles and not at_hub:
                 yield Rule("write", f"{c.SHORT}{name}")
-        else:
+        else:  # a gateway: at a broker it publishes for the robot, at a hub for the robot's operators
             yield from (Rule("read", f"{base}/{direction}/#") for direction in (INCOMING, OUTGOING))
             yield Rule("write", f"{base}/{INCOMING if at_hub else OUTGOING}/#")
+            # It keeps the flags of both sides equal.
             yield from (Rule("write", channel.filter(base)) for channel in c.CHANNELS if channel.kind is Kind.FLAG)
     if ProgramRole.GATEWAY in account.roles and not at_hub:
         yield Rule("read", c.ONLINE.filter(f"+/{GATEWAYS}/+"))
@@ -257,7 +258,7 @@ def _of_neighbour(base: str) -> Iterator[Rule]:
 
 
 def _of_expander() -> Iterator[Rule]:
-    """Yield the rules for the outgoing topics that an expander publishes, and for what it reads."""
+    """Yield the rules of an expander: it reads groups of streams and publishes each stream on its own topic."""
     for channel in c.CHANNELS:
         if channel.kind is Kind.STREAM and channel.remote and channel.bridged and channel is not c.STREAMS:
             yield Rule("write", channel.filter(_ANY))
@@ -269,6 +270,7 @@ def _of_expander() -> Iterator[Rule]:
 def _of_rights(
     name: str, held: frozenset[Right], level: SecurityLevel, plain: Sequence[str], extra: Extra
 ) -> Iterator[Rule]:
+    """Yield the rules of an account for its rights; ``plain``: as in :func:`rules`."""
     if Right.LOOK in held:
         yield Rule("read", f"{_ANY}/{OUTGOING}/#")
         yield Rule("read", f"{_ANY}/{INCOMING}/flags/#")
@@ -281,7 +283,7 @@ def _of_rights(
                 yield Rule("write", f"{_ANY}/{INCOMING}/{BY}/{name}/{metric}")
             for base in bases_without_names:
                 yield Rule("write", f"{base}/{INCOMING}/{metric}")
-    if Right.DRIVE in held:
+    if Right.DRIVE in held:  # for the check of an account, which publishes probes: programs ignore those
         yield Rule("write", c.BRIDGE_PROBE.filter(f"+/{SERVERS}/+"))
     if Right.EXPAND in held:
         yield from _of_expander()

@@ -57,14 +57,15 @@ def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: 
         yield from EVERYTHING
         return
     reads, writes = (_keys(rule.filter for rule in held if rule.access == access) for access in ("read", "write"))
-    asks = tuple(wire.asked(kind, name) for kind in (wire.HELLO, wire.BYE))
-    retained, running_hubs, counts = _retained(reads), (f"{wire.UP}*",), (f"{wire.SYNC}*",)
+    # What ``wire`` adds to messages: the client's hello and goodbye, retained messages and their numbers, running hubs.
+    greetings = tuple(wire.asked(kind, name) for kind in (wire.HELLO, wire.BYE))
+    retained, retained_counts, running_hubs = _retained(reads), (f"{wire.SYNC}*",), (f"{wire.UP}*",)
     yield Grant(OUT, ("put",), reads)
     yield Grant(IN, ("declare_subscriber",), reads)
     yield Grant(IN, ("put",), (*writes, *_retained(_keys(retains))))
     # Zenoh lets a declaration through only if the rule covers all that it asks for, here what local programs do.
     yield Grant(OUT, ("declare_subscriber",), ("**", f"{wire.RETAINED}**"))
-    for keys in (retained, asks, counts):
+    for keys in (retained, greetings, retained_counts):
         yield Grant(IN, ("query",), keys)
         yield Grant(OUT, ("reply", "declare_queryable"), keys)
     yield Grant(IN, ("liveliness_token",), (f"{wire.LIVE}{name}{wire.OF}$*",))

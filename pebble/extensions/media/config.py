@@ -88,7 +88,7 @@ class AudioReceiver(Section, frozen=True, kw_only=True):
     ] = 60
 
     def words(self, rate: int, channels: int) -> list[str]:
-        """Return ``command`` for such sound."""
+        """Return the words of ``command`` for sound of this rate and number of channels, to start the player."""
         values = {"{rate}": str(rate), "{channels}": str(channels), "{device}": self.device}
         words = list(self.command)
         for name, value in values.items():

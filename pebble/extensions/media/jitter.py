@@ -177,7 +177,7 @@ class JitterBuffer:
         chunk = self._next(now)
         if chunk is None:
             self._playing = False
-            if self._waiting:
+            if self._waiting:  # a damaged packet was due: pause as before the first packet
                 self._due = now + self._depth.target_s
             return None
         self._due += chunk.seconds

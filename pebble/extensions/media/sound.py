@@ -19,7 +19,7 @@ SOUND_ENCODINGS: Final = pyav.available(ALL_SOUND)
 
 CHANNELS_LIMIT: Final = 8  # channels of one stream of sound
 LOWEST_RATE: Final = 4000  # Hz; a player would fail with less
-_HIGHEST_PCM_RATE = 65_535  # what the header can express
+_HEADER_LIMIT = 65_535  # the highest rate, and number of samples in a packet, that the header can express
 _LONGEST_S = 1.0  # of one packet: the most the original can be configured to send
 _GAP_MS = 60  # if a chunk begins further than this from the end of the last one, sound is missing between them
 
@@ -71,7 +71,7 @@ class SoundEncoder:
         self.name = "pcm" if codec is None else "opus"
         self.rate, self.channels = intake.rate, intake.channels  # of what is sent
         self._intake, self._numbers, self._codec, self._bundle = intake, numbers, codec, bundle
-        self._samples = min(max(1, self.rate * frame_ms // 1000), _HIGHEST_PCM_RATE)  # of a frame
+        self._samples = min(max(1, self.rate * frame_ms // 1000), _HEADER_LIMIT)  # of a frame
         self._ready: list[bytes] = []  # encoded frames of the packet that is not complete
         self._ready_ms = 0  # when the first of them was captured
 
@@ -124,10 +124,10 @@ def make_sound_encoder(
     numbers = sequence_numbers() if numbers is None else numbers
     rate_out, channels_out = sent_rate or rate, sent_channels or channels
     if name == "pcm":
-        rate_out = rate_out if rate_out <= _HIGHEST_PCM_RATE else opus.RATES[-1]
+        rate_out = rate_out if rate_out <= _HEADER_LIMIT else opus.RATES[-1]
         return SoundEncoder(_Intake(rate, channels, rate_out, channels_out), numbers, chunk_ms)
     if name == "opus":
-        rate_out = next((highest for highest in opus.RATES if highest >= rate_out), opus.RATES[-1])
+        rate_out = next((opus_rate for opus_rate in opus.RATES if opus_rate >= rate_out), opus.RATES[-1])
         intake = _Intake(rate, channels, rate_out, channels_out if channels_out <= 2 else 1)
         frame_ms = next((ms for ms in opus.FRAMES_MS if ms >= chunk_ms), opus.FRAMES_MS[-1])
         codec = OpusEncoder(rate_out, intake.channels, frame_ms=frame_ms, bitrate=bitrate)

@@ -100,9 +100,10 @@ def following(run: int) -> int:
 def next_run(config: Config, barred: int = 0, received: int = 0) -> int:
     """Return the number of a run that starts now: newer than ``barred``, which motor owners report.
 
-    It is also above ``received`` and above every earlier run of this robot, unless these are not ahead of ``barred``:
-    then a stranger has sent a number far ahead. Several processes may call this at once. If the file is missing or
-    damaged, it counts from the clock. Raises PebbleError if another process does not release the file.
+    It is also above ``received`` and every earlier run of this robot, as far as these are newer than ``barred``. One
+    that a stranger has sent, far ahead, is not: numbers have no end, so it counts as older. Several processes may call
+    this at once. If the file is missing or damaged, it counts from the clock. Raises PebbleError if another process
+    does not release the file.
     """
     return _next(config.state_file("autonomy-run"), barred, time.time, received)
 

@@ -435,7 +435,7 @@ def _remove_from_pages(fleet: Fleet, name: str) -> Iterator[str]:
             yield f"{page} has people of its own: if {name} is one, `pebble web user remove {name}` on its machine"
             continue
         file = Path(account.people)
-        with as_before(), as_owner(file.parent):  # its owner is not the fleet's
+        with as_before(), as_owner(file.parent):  # root again (if it was), then the file's owner, not the fleet's
             if not file.is_file():
                 yield f"{page}: {file} is not there: who is in it may still get in by that page"
             elif has_user(file, name):

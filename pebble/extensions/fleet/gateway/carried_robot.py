@@ -34,7 +34,7 @@ LARGEST = 1024 * 1024  # bytes of a message; the brokers of `pebble fleet` take 
 
 
 class NamedSubjects(Subjects):
-    """A robot's subjects without renamed topics. Topics with an account's name are forwarded unchanged."""
+    """A robot's subjects without renamed topics, but with the topics that have an account's name."""
 
     def _find(self, topic: str) -> Subject | None:
         """Return the subject of a topic; behind an account's name it is the one of the same topic without a name."""
@@ -49,9 +49,10 @@ class NamedSubjects(Subjects):
 
 
 class Beginning:
-    """A stopwatch of the start of forwarding. Meanwhile commands may wait at the broker behind retained messages.
+    """A stopwatch of starts of forwarding: if one takes long, commands wait at the broker behind retained messages.
 
-    All robots share a connection that is almost never idle, so pings cannot tell the age of a command.
+    :meth:`aged` marks these, so that stale ones are refused. Pings cannot tell the age of a command here: all robots
+    share a connection that is almost never idle.
     """
 
     LONG_S = 0.5  # what moves a robot may wait so long
@@ -73,12 +74,12 @@ class Beginning:
     def aged(self, message: Message) -> Message:
         """Return ``message`` with the time since which it may have waited at the broker. Called for each message."""
         began = self._began
-        if began is None and self._slow_until == float("-inf"):
+        if began is None and self._slow_until == float("-inf"):  # mostly: no start has taken long
             return message
         now = clock.since_boot()
-        if began is not None and now - began > self.LONG_S:
+        if began is not None and now - began > self.LONG_S:  # the present start takes long
             since = began
-        elif now <= self._slow_until:
+        elif now <= self._slow_until:  # the last long one has just ended
             since = self._slow_since
         else:
             return message
@@ -102,7 +103,7 @@ def _subscribe(robots: Sequence["CarriedRobot"], side: Side, transport: Transpor
     for robot in robots:
         handlers |= robot.subscribing(side, *below)
     subscriptions = iter(transport.subscribe_all(handlers, echo=False, direct=True))
-    if side is Side.REMOTE:
+    if side is Side.REMOTE:  # some brokers send retained messages only for exact names
         transport.ask([flag for robot in robots for flag in robot.subjects.flags])
     for robot in robots:
         robot.subscribed(side, islice(subscriptions, len(below)))  # the next ones, as in ``handlers``

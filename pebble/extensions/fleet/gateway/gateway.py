@@ -112,6 +112,7 @@ class Gateway:
         self._wake.set()
 
     def open(self) -> None:
+        """Open the connections with their rules about topics, and subscribe to stops, robots and other gateways."""
         for transport in (self._hub, self._stops, self._presence, self._broker):
             transport.policy.is_stop = is_stop
             transport.on_state(self._on_state)

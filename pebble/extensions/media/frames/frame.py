@@ -141,7 +141,7 @@ def _jpeg(data: Bytes, info: FrameInfo, width: int | None) -> Bytes:
 
 
 def _scale(width: int, wanted: int | None) -> int:
-    """Return the largest divisor of a picture's ``width`` that leaves the ``wanted`` pixels."""
+    """Return the most (8, 4, 2 or 1) by which ``width`` can be divided without falling below ``wanted``."""
     for scale in (8, 4, 2):
         if wanted is not None and 0 < wanted <= width // scale:
             return scale

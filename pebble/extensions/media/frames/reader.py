@@ -284,7 +284,7 @@ class _LatestFrames:
         items.append(arrival)
         while len(items) > self._depth:
             try:
-                if items.popleft() is not None:
+                if items.popleft() is not None:  # None is no frame: :meth:`wake` adds it
                     dropped += 1
             except IndexError:  # taken in that moment
                 break

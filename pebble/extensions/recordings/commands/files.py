@@ -35,9 +35,9 @@ def mend(
     """
     if not source.is_dir():
         return _mend_file(source, target)
-    owner = Folder(source)
-    with as_owner(source), owner.taken():
-        return _mend_all(owner)
+    recordings = Folder(source)
+    with as_owner(source), recordings.taken():
+        return _mend_all(recordings)
 
 
 def rm(
@@ -67,27 +67,27 @@ def rm(
 
     if not folder.is_dir():
         raise PebbleError(f"{folder}: there is no such folder")
-    owner = Folder(folder)
-    with as_owner(folder), owner.taken():  # a recorder would write retained values again
-        return _rm(owner, base, (since_ns, until_ns), keeps, yes=yes)
+    recordings = Folder(folder)
+    with as_owner(folder), recordings.taken():  # a recorder there would write its retained values again
+        return _rm(recordings, base, (since_ns, until_ns), keeps, yes=yes)
 
 
-def _rm(owner: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keeps, *, yes: bool) -> int:
+def _rm(recordings: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keeps, *, yes: bool) -> int:
     """Delete what ``keeps`` does not accept from a recorder's files, which must be locked; return the exit code."""
     finished, unsure = list[Path](), 0  # unsure: files that stay, and may hold something to delete
-    for entry in owner.entries():
+    for entry in recordings.entries():
         if entry.is_finished:
             finished.append(entry.path)
         else:
             report_left(f"{entry.path}: is not finished, or damaged")
             unsure += 1
     if not unsure:
-        check_names(Query(base), finished, [owner.root])
+        check_names(Query(base), finished, [recordings.root])
     due = [path for path in finished if _reaches_into(path, *period_ns)]
     what = f"{shown(base)} " if base else "everything "
     if period_ns != (0, FOREVER_NS):
         typer.echo(f"{what}{period_words(*period_ns)}")
-    if not yes and not typer.confirm(f"Delete {what}from {len(due)} files in {owner.root}?"):
+    if not yes and not typer.confirm(f"Delete {what}from {len(due)} files in {recordings.root}?"):
         return 1
     deleted = 0
     with progress("deleting", len(due)) as advance:

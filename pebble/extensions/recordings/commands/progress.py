@@ -40,7 +40,7 @@ def progress_of_steps() -> Iterator[Callable[[str, float], None]]:
 
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[float], None]]:
-    """Yield a function that reports how much of a single step is done (0 to 1)."""
+    """Yield a function that reports how much of ``total`` is done, for work of a single step."""
     with progress_of_steps() as show:
         yield lambda done: show(what, done / max(1, total))
 
@@ -53,7 +53,7 @@ def progress_of_time(paths: list[Path], since_ns: int, until_ns: int) -> Iterato
         with RecordingFile(path) as file:
             if file.chunks:
                 first_ns.append(file.first_ns)
-            if file.damage.finished:
+            if file.damage.finished:  # the end of another file may still move
                 last_ns.append(file.last_ns)
     begin = max(since_ns, min(first_ns, default=0))
     end = min(until_ns, max(last_ns))

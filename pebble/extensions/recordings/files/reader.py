@@ -227,7 +227,7 @@ class RecordingFile:
 
     def _take_over(self, summary: Summary) -> bool:
         """Use the summary; False if it does not cover all messages, as in files of other programs."""
-        chunks = [_indexed(index) for index in summary.chunk_indexes if index.message_index_offsets]
+        chunks = [_chunk_of(index) for index in summary.chunk_indexes if index.message_index_offsets]
         counted = summary.statistics
         if counted is None or counted.message_count != sum(chunk.messages for chunk in chunks):
             return False
@@ -320,7 +320,7 @@ class RecordingFile:
             self.channels[record.id] = channel
 
     def _record(self, at: int) -> McapRecord:
-        """Return the record at a position beside chunks. Raises DamageError."""
+        """Return the record at a position outside of chunks. Raises DamageError."""
         head = self._read(at, HEAD.size)
         length = HEAD.unpack(head)[1] if len(head) == HEAD.size else LARGEST_RECORD
         if length >= LARGEST_RECORD:
@@ -367,8 +367,10 @@ def missing_before(metadata: dict[str, dict[str, str]]) -> int:
     return int(text) if text.isascii() and text.isdigit() and len(text) < 18 else 0
 
 
-def _indexed(index: ChunkIndex) -> Chunk:
+def _chunk_of(index: ChunkIndex) -> Chunk:
+    """Return a chunk as the summary describes it."""
     channels = frozenset(index.message_index_offsets)
+    # Behind the chunk there is an index for each channel: a head, and an entry for each message.
     entries = index.message_index_length - INDEX.size * len(channels)
     return Chunk(
         index.message_start_time,

@@ -19,9 +19,10 @@ from pebble.extensions.recordings.files.records import (
 
 INDEX_ENTRY: Final = 16  # bytes
 _INDEX: Final = struct.Struct("<HI")  # channel, length of the entries
-_KINDS: Final = frozenset(Op) - {Op.MESSAGE}  # of records beside chunks
+_KINDS: Final = frozenset(Op) - {Op.MESSAGE}  # of records outside of chunks
 _LONGEST_NAME: Final = 16  # of a compression
-_SEARCHED, _OVERLAP = 1 << 20, 64  # bytes behind damage that are read at once
+#: Bytes behind damage that are searched at once, and as many more as the head of a chunk may have.
+_SEARCHED, _OVERLAP = 1 << 20, 64
 
 #: Takes a position and a length; there may be less.
 Read = Callable[[int, int], bytes]
@@ -62,7 +63,7 @@ class Scan:
             record = self._record_at(self._at)
             if record is None:
                 next_chunk = self._next_chunk(max(self._at + 1, self._searched))
-                if next_chunk is None:
+                if next_chunk is None:  # a chunk may begin at the end, and be complete when the file has grown
                     self._searched = max(self._searched, size - _OVERLAP)
                     break
                 self._damage.add(self._at, f"{next_chunk - self._at:,} bytes are no record")
@@ -78,7 +79,7 @@ class Scan:
         while (record := self._record_at(self._at)) is not None and record.op == Op.MESSAGE_INDEX:
             channel, length = _INDEX.unpack(self._read(self._at + HEAD.size, _INDEX.size))
             counts[channel], self._at = length // INDEX_ENTRY, record.end
-        are_complete = record is not None or self._at >= self._size
+        are_complete = record is not None or self._at >= self._size  # else an index is damaged, or cut off
         return chunk._replace(channels=frozenset(counts if are_complete else ()), messages=sum(counts.values()))
 
     def _record_at(self, at: int) -> Found | None:

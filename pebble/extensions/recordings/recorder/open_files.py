@@ -19,15 +19,14 @@ class RetainedValues:
         self._values = BoundedTable[Item](_TOPICS, _BYTES, lambda item: len(item.payload))
 
     def note(self, item: Item) -> None:
-        """Note a message.
-
-        If the broker does not tell how it was published, a topic known to be retained stays so.
-        """
+        """Note a message if it was published to be retained; if that is unknown, if its topic has a value already."""
         key = f"{item.source} {item.topic}"
         stored = self._values.get(key)
         if item.retained and stored is not None and not stored.retained:
-            return  # fetched by another connection, while a newer one had come
-        is_retained = stored is not None if item.retain is None else item.retain
+            return  # an old value, fetched by another connection, while a live message has come
+        is_retained = item.retain
+        if is_retained is None:
+            is_retained = stored is not None
         if not is_retained:
             return
         if item.payload:

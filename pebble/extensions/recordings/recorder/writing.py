@@ -198,7 +198,8 @@ class Writing:
         lacking, self._lacking = sorted(self._lacking, key=_when), []
         try:
             now_ns = self._clock.now()
-            self._files.get(STATE, now_ns=now_ns, at_ns=self._clock.at(lacking[0].boot_ns) if lacking else now_ns)
+            first_ns = self._clock.at(lacking[0].boot_ns) if lacking else now_ns
+            self._files.get(STATE, now_ns=now_ns, at_ns=first_ns)  # if it can be opened, writing is possible
         except OSError:
             self._lacking = lacking
             return
@@ -223,7 +224,7 @@ class Writing:
     # -- room
 
     def check_space(self, due: Due, *, now_s: float) -> None:
-        """Delete files for room, and block or resume writing. Called a few times a minute."""
+        """Look at the disk if that is due; delete files for room, and stop or resume writing."""
         if not (due.every("space", _SPACE_S) or self._changed):
             return
         options = self._options

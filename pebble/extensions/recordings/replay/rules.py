@@ -99,7 +99,7 @@ class Rules:
         return Outgoing(Message(address.topic, shifted(payload, by_ns), address.qos), moves)
 
     def _listed(self, channel: Channel) -> _Address | None:
-        """Return the channel's address; None also if its robot came later than the start: it may be a live one."""
+        """Return the channel's address; None also if its robot was not recorded yet when the bases were checked."""
         address = self._address(channel)
         return address if address is not None and address.base in self.robots else None
 

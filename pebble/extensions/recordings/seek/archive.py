@@ -29,7 +29,7 @@ _time = attrgetter("log_ns")
 
 
 class _Named(NamedTuple):
-    """The facts in a file name that a recorder made; None for files of other programs."""
+    """A file, and the facts in its name if a recorder made that."""
 
     path: Path
     lane: str  # "": any

@@ -76,7 +76,7 @@ def _days(file: RecordingFile) -> list[Day]:
     for number in sorted({number for chunk in file.chunks for number in _day_numbers(chunk)}):
         begin, end = number * DAY_NS, (number + 1) * DAY_NS
         first, last = max(file.first_ns, begin), min(file.last_ns, end - 1)
-        size = 0 if days else file.size
+        size = 0 if days else file.size  # the first day has all bytes
         gaps_within = sum(begin <= ns < end for ns in gaps)
         driven = _driven(file, begin, end)
         days.append(Day(_day_of(number * 86_400), robots, size, first / 1e6, last / 1e6, gaps_within, driven))

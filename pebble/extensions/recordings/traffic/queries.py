@@ -30,9 +30,10 @@ def _numbers(numbers: Iterable[int]) -> str:
 
 
 def _percentile(value: str, share: float) -> str:
-    """Return SQL for a quantile of rows with a ``place`` in their order, from 0 to ``last``; interpolated linearly.
+    """Return SQL for the quantile ``share`` of ``value``, interpolated linearly.
 
-    Equal to ``quantile_cont``, which would hold all values in memory; sorting can use files.
+    In its table the rows are numbered by ``place`` in the order of the values, from 0 to ``last``. Equal to
+    ``quantile_cont``, which would hold all values in memory; sorting can use files.
     """
     return f"sum({value} * greatest(0, 1 - abs(place - {share} * last)))"
 

@@ -130,6 +130,7 @@ def _scripts(robot: str, target: Target) -> Iterator[tuple[Transport, RobotScrip
     """Yield the connection, the robot's published scripts, and its name."""
     with connected(target_of(robot, target)) as (transport, names):
         scripts = RobotScripts(names)
+        # Commands carry this client's account if the robot, as it says itself, requires names.
         put_names(transport, names, lambda base: base == names.base and scripts.robot.named)
         scripts.subscribe(transport)
         wait_for(lambda: scripts.files is not None and scripts.status is not None, 1.0)

@@ -214,7 +214,7 @@ class Odometry:
         self.pose = part.end(self._base)
         is_ready = self._left.hall.ready and self._right.hall.ready
         if is_ready:  # the part will not be corrected any more
-            if self.moving(now) or not self._was_ready:
+            if self.moving(now) or not self._was_ready:  # at rest it is noise; a warm-up's part may end at rest
                 self.distance_mm += abs(part.ahead_mm)
             self._base, self._part = self.pose, _Part()
         self._was_ready = is_ready

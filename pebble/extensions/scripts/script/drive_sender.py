@@ -106,10 +106,11 @@ class DriveSender:
         self._owners = {**remembered, **states}  # an owner that is gone for a while may come back restarted
         latched = [state for state in states.values() if state.latched]
         self._latched = max(latched, key=lambda state: state.since, default=None)
-        barred_runs = [state.last_barred for state in states.values() if not newer(self.run, state.last_barred)]
-        if any(run != self.run for run in barred_runs):  # a newer run was barred, so there was one
+        last_barred = [state.last_barred for state in states.values()]
+        barring = [run for run in last_barred if not newer(self.run, run)]  # older runs are barred with that one
+        if any(run != self.run for run in barring):  # a newer run was barred, so there was one
             self._superseded = True
-        elif barred_runs and self._barred_at is None:
+        elif barring and self._barred_at is None:
             self._barred_at = now
 
     # -- what follows

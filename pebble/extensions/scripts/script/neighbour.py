@@ -26,7 +26,7 @@ class RobotParts(NamedTuple):
 
     transport: Transport
     wheels: Wheels
-    latest: Callable[[Channel, float], Any]  # returns the newest payload of the neighbour, if it is young enough
+    latest_there: Callable[[Channel, float], Any]  # returns the neighbour's newest payload, if it is young enough
     check: Callable[[], None]  # raises once the script must end
     check_drives: Callable[[], None]  # also raises if the script may not drive
     clock: Callable[[], float]
@@ -43,7 +43,7 @@ class Neighbour:
         self._moves = False  # the newest command moves it
         self._over = False  # the script has ended
         self._lock = threading.Lock()  # else the last command might come after the final zero
-        own.latest(NEIGHBOURS, PRESENT_S)  # subscribes
+        own.latest_there(NEIGHBOURS, PRESENT_S)  # subscribes
 
     @property
     def online(self) -> bool:
@@ -57,7 +57,7 @@ class Neighbour:
         ``shares``, and this one's in ``listens``.
         """
         self._own.check()
-        return self._own.latest(channel, max_age)
+        return self._own.latest_there(channel, max_age)
 
     def drive(self, x: float = 0.0, z: float = 0.0, y: float = 0.0) -> bool:
         """Drive the other robot, for 0.3 s at most, like :meth:`Robot.drive`.
@@ -103,7 +103,7 @@ class Neighbour:
 
     @property
     def _state(self) -> Neighbours | None:
-        state: Neighbours | None = self._own.latest(NEIGHBOURS, PRESENT_S)
+        state: Neighbours | None = self._own.latest_there(NEIGHBOURS, PRESENT_S)
         return state
 
     def _send(self, command: Drive) -> bool:
